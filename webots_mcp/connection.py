@@ -1,0 +1,94 @@
+"""Opening the database: every PRAGMA, in one place, for the bridge and for the server.
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import Final, Literal
+
+from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.errors import DatabaseError, NoDatabaseError
+
+Role = Literal["loop", "writer", "reader"]
+
+OPENING_TIMEOUT_MS: Final = 5000
+CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
+
+# Why: a control loop never waits for a lock; an automatic checkpoint would be its slowest step,
+# so only the maintainer checkpoints; NORMAL costs the last commits at a power cut, never the file.
+_PRAGMAS: Final[dict[Role, tuple[str, ...]]] = {
+    "loop": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON", "busy_timeout=0"),
+    "writer": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
+    "reader": ("query_only=ON",),
+}
+
+
+def connect(database: Database, role: Role, *, create: bool = False) -> sqlite3.Connection:
+    """Open the database in autocommit mode: transactions begin only where the code says so.
+
+    Args:
+        database: A file or a database in memory.
+        role: "loop" never waits for a lock; "writer" waits up to 5 s; "reader" also cannot write.
+        create: Make the file (empty, in WAL mode) and its folder where they are missing.
+
+    Raises:
+        NoDatabaseError: The file is missing and `create` is false.
+        DatabaseError: The folder cannot be made or the file cannot be opened.
+        sqlite3.Error: The file is no database, or is locked for longer than 5 s.
+    """
+    address = database.uri if isinstance(database, MemoryDatabase) else _file_uri(database, create)
+    try:
+        connection = sqlite3.connect(
+            address,
+            uri=True,
+            timeout=OPENING_TIMEOUT_MS / 1000,
+            isolation_level=None,
+            check_same_thread=False,
+        )
+    except sqlite3.OperationalError as error:
+        raise DatabaseError(f"{database} cannot be opened: {error}; check the folder") from error
+    try:
+        if create:
+            _make_wal(connection)
+        for pragma in _PRAGMAS[role]:
+            connection.execute(f"PRAGMA {pragma}")
+    except sqlite3.Error:
+        connection.close()
+        raise
+    return connection
+
+
+def _file_uri(file: Database, create: bool) -> str:
+    assert not isinstance(file, MemoryDatabase)
+    if create:
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise DatabaseError(f"the folder {file.parent} cannot be made: {error}") from error
+    elif not file.exists():
+        raise NoDatabaseError(
+            f"no database at {file}: no controller with an MCPBridge has recorded there yet"
+        )
+    return f"{file.as_uri()}?mode={'rwc' if create else 'rw'}"
+
+
+def _make_wal(connection: sqlite3.Connection) -> None:
+    """Set what can only be set while the file is empty; harmless on one that is not.
+
+    Asking first matters: setting the mode needs a lock even where it changes nothing.
+    """
+    if journal_mode(connection) in ("wal", "memory"):
+        return
+    connection.execute("PRAGMA auto_vacuum=INCREMENTAL")
+    connection.execute("PRAGMA journal_mode=WAL").fetchall()
+
+
+def journal_mode(connection: sqlite3.Connection) -> str:
+    """The journal mode in force; anything but "wal" on a file means: no shared memory there.
+
+    Network file systems and the border between Windows and WSL cannot share memory, and without
+    it readers and writers block each other.
+    """
+    return str(connection.execute("PRAGMA journal_mode").fetchone()[0])

@@ -1,0 +1,120 @@
+"""What the bridge and the server agree on: names, limits, and where data lives.
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, Literal
+
+if TYPE_CHECKING:
+    import tempfile
+
+APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
+SCHEMA_VERSION: Final = 1  # PRAGMA user_version of a database that this version reads and writes
+
+DATABASE_NAME: Final = "webots.db"
+CAMERA_FOLDER: Final = "camera"
+SCREENSHOT_FOLDER: Final = "screenshots"
+DATA_DIR_VARIABLE: Final = "WEBOTS_MCP_DATA_DIR"
+STRICT_VARIABLE: Final = "WEBOTS_MCP_STRICT"
+
+CommandStatus = Literal["pending", "claimed", "done", "failed", "expired", "cancelled", "lost"]
+FINAL_STATUSES: Final = ("done", "failed", "expired", "cancelled", "lost")
+
+BUILT_IN_ACTIONS: Final = (
+    "pause", "resume", "fast", "step", "reset", "reload", "screenshot", "reset_state",
+)  # fmt: skip
+
+COMMAND_TIME_TO_LIVE_S: Final = 10.0
+HEARTBEAT_INTERVAL_S: Final = 0.5  # how often a session says that its loop is alive
+HEARTBEAT_LATE_S: Final = 2.0  # a session silent for longer is not looping
+ISSUED_TIME_TO_LIVE_S: Final = 60.0  # how long a reload may take until it counts as lost
+MAX_STEPS: Final = 100_000
+
+
+class MemoryDatabase:
+    """A database in memory that a bridge and a server in one process share.
+
+    Every connection to `uri` sees the same data; the data lives until `close` (or the end of
+    the process). Pictures need files, so `data_dir` is a temporary folder, made when first asked
+    for and removed with the database.
+    """
+
+    def __init__(self) -> None:
+        self.uri: Final = f"file:/webots-mcp-{os.urandom(8).hex()}?vfs=memdb"
+        self._keeper = sqlite3.connect(self.uri, uri=True, check_same_thread=False)
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+
+    @property
+    def data_dir(self) -> Path:
+        """A temporary folder for the pictures of this database."""
+        if self._folder is None:
+            import tempfile  # only where needed: it is half of this module's import time
+
+            self._folder = tempfile.TemporaryDirectory(prefix="webots-mcp-")
+        return Path(self._folder.name)
+
+    def close(self) -> None:
+        """Forget the data, once the last other connection is closed as well."""
+        self._keeper.close()
+        if self._folder is not None:
+            self._folder.cleanup()
+            self._folder = None
+
+    def __repr__(self) -> str:
+        return f"MemoryDatabase({self.uri!r})"
+
+
+Database = Path | MemoryDatabase
+
+
+def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
+    """Where the database and the pictures live; the same answer for bridge and server.
+
+    In rising order of precedence: `~/.webots-mcp/data`; `mcp_data/` in the nearest folder at or
+    above the current one that is a Webots project (it holds `worlds/` and `controllers/`); the
+    environment variable `WEBOTS_MCP_DATA_DIR`; the argument.
+    """
+    if data_dir is not None:
+        return Path(data_dir).expanduser().resolve()
+    if named := os.environ.get(DATA_DIR_VARIABLE):
+        return Path(named).expanduser().resolve()
+    here = Path.cwd()
+    for folder in (here, *here.parents):
+        if (folder / "worlds").is_dir() and (folder / "controllers").is_dir():
+            return folder / "mcp_data"
+    return Path.home() / ".webots-mcp" / "data"
+
+
+def resolve_database(
+    database: str | os.PathLike[str] | MemoryDatabase | None = None,
+    data_dir: str | os.PathLike[str] | None = None,
+) -> tuple[Database, Path]:
+    """The database and the folder of its pictures, from what a user gave.
+
+    Args:
+        database: A file, `":memory:"` for a new one in memory, an open `MemoryDatabase`, or None
+            for `webots.db` in the data folder.
+        data_dir: The data folder; None for the database's own folder, else `resolve_data_dir`.
+
+    Raises:
+        TypeError: `database` is of another type.
+    """
+    if isinstance(database, str) and database == ":memory:":
+        database = MemoryDatabase()
+    if isinstance(database, MemoryDatabase):
+        return database, database.data_dir if data_dir is None else resolve_data_dir(data_dir)
+    if database is None:
+        folder = resolve_data_dir(data_dir)
+        return folder / DATABASE_NAME, folder
+    if not isinstance(database, (str, os.PathLike)):
+        raise TypeError(
+            f"database={database!r} is a {type(database).__name__}; give a path, ':memory:' or a "
+            "webots_mcp.MemoryDatabase (shared by bridge and server in one process)"
+        )
+    file = Path(database).expanduser().resolve()
+    return file, file.parent if data_dir is None else resolve_data_dir(data_dir)

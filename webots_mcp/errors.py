@@ -1,0 +1,80 @@
+"""Every error that this package raises on purpose.
+
+    WebotsMCPError
+    ├── DatabaseError               the file, not the question, is the problem
+    │   ├── NoDatabaseError         nothing has been recorded there yet
+    │   ├── ForeignDatabaseError    the file is not a recording of this package
+    │   ├── SchemaTooNewError       a newer webots-mcp wrote it
+    │   └── SchemaTooOldError       an older webots-mcp wrote it: migrate first
+    ├── InvalidInputError           the question is the problem; the text says how to ask
+    │   ├── UnknownRobotError
+    │   ├── AmbiguousRobotError
+    │   ├── UnknownRunError
+    │   ├── UnknownSignalError
+    │   ├── UnknownActionError
+    │   └── InvalidRangeError
+    ├── NothingRecordedError        the question is fine, the recording has no answer yet
+    └── CommandRefusedError         the simulation or the robot cannot do what was asked
+
+Each message names the value that was wrong and the next step to take.
+"""
+
+
+class WebotsMCPError(Exception):
+    """Root of all errors that this package raises on purpose."""
+
+
+class DatabaseError(WebotsMCPError):
+    """The database file cannot be used as it is."""
+
+
+class NoDatabaseError(DatabaseError):
+    """There is no database yet: no controller has recorded there."""
+
+
+class ForeignDatabaseError(DatabaseError):
+    """The file is no SQLite database, or belongs to another application."""
+
+
+class SchemaTooNewError(DatabaseError):
+    """The database was written by a newer version of this package."""
+
+
+class SchemaTooOldError(DatabaseError):
+    """The database has an older schema and was not migrated."""
+
+
+class InvalidInputError(WebotsMCPError):
+    """An argument is out of bounds or makes no sense together with another."""
+
+
+class UnknownRobotError(InvalidInputError):
+    """No robot of that name has been recorded."""
+
+
+class AmbiguousRobotError(InvalidInputError):
+    """Several robots are possible and none was named."""
+
+
+class UnknownRunError(InvalidInputError):
+    """No run of that id has been recorded."""
+
+
+class UnknownSignalError(InvalidInputError):
+    """No signal of that name has been recorded."""
+
+
+class UnknownActionError(InvalidInputError):
+    """The robot's controller has registered no such action."""
+
+
+class InvalidRangeError(InvalidInputError):
+    """A time range is empty, reversed or contradictory."""
+
+
+class NothingRecordedError(WebotsMCPError):
+    """The question is fine, but nothing has been recorded that answers it."""
+
+
+class CommandRefusedError(WebotsMCPError):
+    """The simulation or the robot cannot do what a command asked for."""

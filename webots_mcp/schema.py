@@ -1,0 +1,81 @@
+"""Whether a database is ours and of our version, and making an empty one ready.
+
+The schema is defined by `store/models.py` and the migrations; `schema.sql` is generated from them
+(a test compares the two), so that a controller can make a database in milliseconds and without
+importing anything but the standard library.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.contract import APPLICATION_ID, SCHEMA_VERSION
+from webots_mcp.errors import ForeignDatabaseError, SchemaTooNewError, SchemaTooOldError
+
+SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
+
+
+def schema_version(connection: sqlite3.Connection) -> int:
+    """The schema version of a database of ours; 0 for an empty file.
+
+    Raises:
+        ForeignDatabaseError: The file holds tables of another application, or is no database.
+    """
+    try:
+        application_id = int(connection.execute("PRAGMA application_id").fetchone()[0])
+        version = int(connection.execute("PRAGMA user_version").fetchone()[0])
+        tables = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+    except sqlite3.DatabaseError as error:
+        if "locked" in str(error):
+            raise
+        raise ForeignDatabaseError(f"not a database of webots-mcp: {error}") from error
+    if application_id == APPLICATION_ID:
+        return version
+    if tables:
+        raise ForeignDatabaseError(
+            f"this SQLite database belongs to another application (application_id "
+            f"{application_id}, expected {APPLICATION_ID}); choose another file"
+        )
+    return 0
+
+
+def require_current(connection: sqlite3.Connection) -> None:
+    """Raise unless the database has exactly the schema of this version.
+
+    Raises:
+        SchemaTooNewError, SchemaTooOldError, ForeignDatabaseError: As they say.
+    """
+    version = schema_version(connection)
+    if version > SCHEMA_VERSION:
+        raise SchemaTooNewError(
+            f"the database has schema {version}, this webots-mcp knows {SCHEMA_VERSION}: "
+            "upgrade it with 'pip install --upgrade webots-mcp'"
+        )
+    if version < SCHEMA_VERSION:
+        raise SchemaTooOldError(
+            f"the database has schema {version}, this webots-mcp needs {SCHEMA_VERSION}: "
+            "run 'webots-mcp migrate'"
+        )
+
+
+def create_schema(connection: sqlite3.Connection) -> None:
+    """Make the tables in an empty database; of several starters at once, one does it.
+
+    The check and the tables stand in one transaction that takes the write lock first.
+    """
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        if schema_version(connection) == 0:
+            for statement in _statements():
+                connection.execute(statement)
+        connection.execute("COMMIT")
+    except BaseException:
+        connection.execute("ROLLBACK")
+        raise
+
+
+def _statements() -> list[str]:
+    """The statements of `schema.sql`; each ends with a semicolon at the end of a line."""
+    return [part for part in SCHEMA_FILE.read_text("utf-8").split(";\n") if part.strip()]

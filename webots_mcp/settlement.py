@@ -1,0 +1,110 @@
+"""What became of sessions and commands whose process is gone; both sides settle it alike.
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
+
+from __future__ import annotations
+
+import os
+import socket
+import sqlite3
+import sys
+from typing import Final
+
+from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S
+
+EXPIRE: Final = (
+    "UPDATE command SET status = 'expired', finished_wall_time_s = :now, "
+    "error = 'no controller claimed it in time; it will never run' "
+    "WHERE status = 'pending' AND expires_wall_time_s <= :now"
+)
+LOSE: Final = (
+    "UPDATE command SET status = 'lost', finished_wall_time_s = :now, error = :why "
+    "WHERE id = :id AND status = 'claimed'"
+)
+END_SESSION: Final = (
+    "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, hold = NULL, "
+    "end_reason = :reason WHERE id = :id AND ended_wall_time_s IS NULL"
+)
+# Judged from outside: the rows are counted, because the dead process could not say how many.
+END_RUNS: Final = (
+    "UPDATE run SET ended_wall_time_s = last_wall_time_s, end_reason = :reason, "
+    "rows = (SELECT count(*) FROM state WHERE run_id = run.id) "
+    "WHERE session_id = :id AND ended_wall_time_s IS NULL"
+)
+_OPEN_SESSIONS: Final = (
+    "SELECT id, pid, host, EXISTS (SELECT 1 FROM command WHERE session_id = session.id "
+    "AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
+    "FROM session WHERE ended_wall_time_s IS NULL"
+)
+_CLAIMED_BY_ENDED: Final = (
+    "SELECT c.id, c.issued_wall_time_s FROM command c LEFT JOIN session s ON s.id = c.session_id "
+    "WHERE c.status = 'claimed' AND (s.id IS NULL OR s.ended_wall_time_s IS NOT NULL)"
+)
+
+
+def settle(connection: sqlite3.Connection, now_s: float) -> None:
+    """Say what became of everything that nobody alive will finish.
+
+    Pending commands past their time become `expired`. Open sessions whose process on this host is
+    gone are ended (`reload` if they asked for one, else `crashed`). Commands claimed by an ended
+    session become `lost`, and are never run again by themselves; only one that asked Webots for a
+    reload gets a minute for the next session to confirm it.
+
+    The caller opens the transaction, or accepts that each statement is one of its own.
+    """
+    connection.execute(EXPIRE, {"now": now_s})
+    for session_id, pid, host, reloading in connection.execute(_OPEN_SESSIONS).fetchall():
+        if host == socket.gethostname() and not process_alive(pid):
+            end_session(connection, session_id, "reload" if reloading else "crashed")
+    for command_id, issued_s in connection.execute(_CLAIMED_BY_ENDED).fetchall():
+        if issued_s is None:
+            why = "its controller ended before it finished; it may have run in part"
+        elif now_s - issued_s > ISSUED_TIME_TO_LIVE_S:
+            why = "it was issued to Webots, but no new controller session confirmed it"
+        else:
+            continue
+        connection.execute(LOSE, {"id": command_id, "now": now_s, "why": why})
+
+
+def end_session(connection: sqlite3.Connection, session_id: int, reason: str) -> None:
+    """End a session that another process left open, and its runs, as of their last sign of life."""
+    connection.execute(END_SESSION, {"id": session_id, "reason": reason})
+    connection.execute(END_RUNS, {"id": session_id, "reason": reason})
+
+
+def process_alive(pid: int) -> bool:
+    """Whether a process of this host still runs (a pid may have been given to another since)."""
+    if sys.platform == "win32":
+        return _windows_process_alive(pid)
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        return True
+    return not _is_zombie(pid)
+
+
+def _is_zombie(pid: int) -> bool:
+    """A process that ended but was not yet waited for still has a pid; only Linux tells cheaply."""
+    try:
+        with open(f"/proc/{pid}/stat", "rb") as file:  # noqa: PTH123  (no pathlib in the loop)
+            return file.read().rpartition(b") ")[2][:1] == b"Z"
+    except OSError:
+        return False
+
+
+def _windows_process_alive(pid: int) -> bool:
+    """os.kill(pid, 0) would end the process on Windows; asking for its exit code does not."""
+    import ctypes
+
+    query_limited_information, still_active = 0x1000, 259
+    kernel = ctypes.WinDLL("kernel32")  # type: ignore[attr-defined]
+    handle = kernel.OpenProcess(query_limited_information, False, pid)
+    if not handle:
+        return False
+    code = ctypes.c_ulong()
+    kernel.GetExitCodeProcess(handle, ctypes.byref(code))
+    kernel.CloseHandle(handle)
+    return code.value == still_active

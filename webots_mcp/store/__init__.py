@@ -1,0 +1,1 @@
+"""The server's side of the database: models, migrations, queries and the command queue."""

@@ -1,0 +1,108 @@
+"""Bringing a database to the schema of this version, by Alembic."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+import sqlalchemy
+from alembic import command
+from alembic.config import Config
+from sqlalchemy.pool import StaticPool
+
+import webots_mcp
+from webots_mcp.connection import connect
+from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.schema import schema_version
+
+_STAMPS: Final = ("application_id", "user_version")
+
+
+def upgrade(database: Database, revision: str = "head") -> tuple[int, int]:
+    """Bring the database forward; of several starters at once, one does it.
+
+    Args:
+        database: A file (made where missing) or a database in memory.
+        revision: An Alembic revision, or "head".
+
+    Returns:
+        The schema version before and after.
+
+    Raises:
+        ForeignDatabaseError: The file belongs to another application.
+        DatabaseError: The file cannot be opened.
+    """
+    with _alembic(database) as (config, connection):
+        before = schema_version(connection)
+        command.upgrade(config, revision)
+        return before, schema_version(connection)
+
+
+def downgrade(database: Database, revision: str = "base") -> tuple[int, int]:
+    """Bring the database back to an older revision; what the older schema lacks is deleted.
+
+    Returns:
+        The schema version before and after.
+    """
+    with _alembic(database) as (config, connection):
+        before = schema_version(connection)
+        command.downgrade(config, revision)
+        return before, schema_version(connection)
+
+
+@contextlib.contextmanager
+def _alembic(database: Database) -> Iterator[tuple[Config, sqlite3.Connection]]:
+    """An Alembic configuration bound to one connection whose transactions lock at once."""
+    connection = connect(database, "writer", create=True)
+    engine = sqlalchemy.create_engine("sqlite://", creator=lambda: connection, poolclass=StaticPool)
+    # Two starters: the second waits here, then finds the newer revision and has nothing to do.
+    sqlalchemy.event.listen(engine, "begin", _begin_immediate)
+    try:
+        with engine.connect() as bound:
+            config = Config()
+            config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
+            config.attributes["connection"] = bound
+            yield config, connection
+    finally:
+        engine.dispose()
+        connection.close()
+
+
+def _begin_immediate(connection: sqlalchemy.Connection) -> None:
+    connection.exec_driver_sql("BEGIN IMMEDIATE")
+
+
+def migrations_folder() -> Path:
+    """The migrations: inside the package in a wheel, beside it in a checkout."""
+    package = Path(webots_mcp.__file__).parent
+    inside = package / "migrations"
+    return inside if inside.is_dir() else package.parent / "migrations"
+
+
+def dump_schema() -> str:
+    """The text of `schema.sql`: what the migrations make of an empty database.
+
+    Regenerate it with `python -m webots_mcp.store.migrate > webots_mcp/schema.sql`.
+    """
+    with _alembic(MemoryDatabase()) as (config, connection):
+        command.upgrade(config, "head")
+        pragmas = [f"PRAGMA {name} = {_pragma(connection, name)}" for name in _STAMPS]
+        rows = connection.execute(
+            "SELECT sql FROM sqlite_master WHERE sql IS NOT NULL AND name NOT LIKE 'sqlite_%' "
+            "ORDER BY rowid"
+        )
+        revision = connection.execute("SELECT version_num FROM alembic_version").fetchone()[0]
+        stamp = f"INSERT INTO alembic_version (version_num) VALUES ('{revision}')"
+        statements = [*pragmas, *(str(sql).rstrip() for (sql,) in rows), stamp]
+    return "".join(f"{statement};\n" for statement in statements)
+
+
+def _pragma(connection: sqlite3.Connection, name: str) -> int:
+    return int(connection.execute(f"PRAGMA {name}").fetchone()[0])
+
+
+if __name__ == "__main__":
+    print(dump_schema(), end="")  # noqa: T201

@@ -1,0 +1,204 @@
+"""The tables. The one place where their columns are explained.
+
+`sim_time_s` is simulation time, `wall_time_s` is Unix time, both in seconds. Ids never come back
+after a deletion (AUTOINCREMENT), so "after this id" is a safe cursor. The comments travel into
+the database: `.schema` in the `sqlite3` shell shows them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import Column, Float, ForeignKey, Index, Integer, Text, text
+from sqlmodel import Field, SQLModel
+
+SQLModel.metadata.naming_convention = {
+    "ix": "ix_%(table_name)s_%(column_0_N_name)s",
+    "fk": "fk_%(table_name)s_%(column_0_name)s",
+    "uq": "uq_%(table_name)s_%(column_0_name)s",
+}
+_KEEP_IDS = {"sqlite_autoincrement": True}
+
+
+def _id() -> Any:
+    return Field(default=None, sa_column=Column("id", Integer, primary_key=True))
+
+
+def _to(table: str, *, nullable: bool = False) -> Any:
+    """A reference to another table's id; what cannot be without it goes with it."""
+    on_delete = "SET NULL" if nullable else "CASCADE"
+    key = ForeignKey(f"{table}.id", ondelete=on_delete)
+    return Field(default=None, sa_column=Column(Integer, key, nullable=nullable))
+
+
+def _column(kind: Any, comment: str | None = None, **options: Any) -> Any:
+    options.setdefault("nullable", True)
+    return Field(default=None, sa_column=Column(kind, comment=comment, **options))
+
+
+def _text(comment: str | None = None, **options: Any) -> Any:
+    return _column(Text, comment, **options)
+
+
+def _number(comment: str | None = None, **options: Any) -> Any:
+    return _column(Float, comment, **options)
+
+
+def _count(comment: str | None = None) -> Any:
+    return _column(Integer, comment, nullable=False, server_default=text("0"))
+
+
+class Robot(SQLModel, table=True):
+    """A robot name that was ever seen."""
+
+    __table_args__ = (_KEEP_IDS,)
+    id: int | None = _id()
+    name: str = _text(
+        "Robot.name; #2 is appended where two live at once", nullable=False, unique=True
+    )
+    kind: str = _text("Robot or Supervisor", nullable=False)
+    devices: str | None = _text("JSON object: device name to its class")
+    first_seen_wall_time_s: float = _number(nullable=False)
+    last_seen_wall_time_s: float = _number(nullable=False)
+
+
+class Session(SQLModel, table=True):
+    """One controller process, or one bridge in it."""
+
+    __table_args__ = (Index(None, "robot_id", "id"), _KEEP_IDS)
+    id: int | None = _id()
+    robot_id: int = _to("robot")
+    pid: int = _column(Integer, nullable=False)
+    host: str = _text(nullable=False)
+    instance: str = _text("which Webots started it: the same after a reload", nullable=False)
+    controller: str | None = _text("path of the controller file")
+    controller_sha256: str | None = _text()
+    git_commit: str | None = _text("commit checked out around the controller file")
+    versions: str | None = _text("JSON object: python, webots_mcp, sqlite")
+    supervisor: bool = _column(Integer, "1 if it may control the simulation", nullable=False)
+    actions: str | None = _text("JSON object: registered custom action to its docstring")
+    started_wall_time_s: float = _number(nullable=False)
+    last_seen_wall_time_s: float = _number("newest sign of life of its loop", nullable=False)
+    last_poll_wall_time_s: float | None = _number("newest get_command(); null if never called")
+    moved_wall_time_s: float | None = _number("when simulation time was last seen to grow")
+    sim_time_s: float | None = _number("simulation time at last_seen_wall_time_s")
+    hold: str | None = _text("paused or stepping while the bridge holds the loop")
+    rows_waiting: int = _count("rows not yet written, in the controller's memory")
+    rows_dropped: int = _count("rows that could never be written")
+    last_error: str | None = _text("newest thing that could not be recorded, and why")
+    ended_wall_time_s: float | None = _number()
+    end_reason: str | None = _text("finished, reload, crashed, replaced")
+
+
+class Run(SQLModel, table=True):
+    """A stretch of rising simulation time in a session; a reset or a reload begins the next."""
+
+    __table_args__ = (Index(None, "robot_id", "id"), Index(None, "session_id"), _KEEP_IDS)
+    id: int | None = _id()
+    session_id: int = _to("session")
+    robot_id: int = _to("robot")
+    world: str | None = _text("path of the world file")
+    basic_time_step_ms: float | None = _number()
+    start_reason: str = _text("start, reset or reload", nullable=False)
+    started_wall_time_s: float = _number(nullable=False)
+    started_sim_time_s: float = _number(nullable=False)
+    last_wall_time_s: float = _number("last sign of life", nullable=False)
+    last_sim_time_s: float = _number(nullable=False)
+    ended_wall_time_s: float | None = _number()
+    end_reason: str | None = _text("finished, reset, reload, crashed, replaced")
+    rows: int = _count("state rows, as of last_wall_time_s")
+    label: str | None = _text()
+    note: str | None = _text()
+
+
+class State(SQLModel, table=True):
+    """What one publish() recorded."""
+
+    __table_args__ = (Index(None, "run_id", "sim_time_s"), _KEEP_IDS)
+    id: int | None = _id()
+    run_id: int = _to("run")
+    sim_time_s: float = _number(nullable=False)
+    wall_time_s: float = _number(nullable=False)
+    data: str = _text("JSON object", nullable=False)
+    odd: str | None = _text("JSON object: path of a replaced value to what it was (nan, inf, ...)")
+
+
+class Log(SQLModel, table=True):
+    """A line that the controller or the bridge logged."""
+
+    __table_args__ = (Index(None, "run_id", "sim_time_s"), _KEEP_IDS)
+    id: int | None = _id()
+    run_id: int = _to("run")
+    sim_time_s: float = _number(nullable=False)
+    wall_time_s: float = _number(nullable=False)
+    level: str = _text("debug, info, warning, error", nullable=False)
+    source: str = _text("controller or bridge", nullable=False)
+    message: str = _text(nullable=False)
+
+
+class Event(SQLModel, table=True):
+    """Something noticed when it happened."""
+
+    __table_args__ = (Index(None, "run_id", "sim_time_s"), _KEEP_IDS)
+    id: int | None = _id()
+    run_id: int = _to("run")
+    sim_time_s: float = _number(nullable=False)
+    wall_time_s: float = _number(nullable=False)
+    kind: str = _text(
+        "change, start, reset, reload, pause, resume, dropped, storage, ...", nullable=False
+    )
+    name: str | None = _text("the signal that changed, where one did")
+    data: str | None = _text("JSON object")
+
+
+class Command(SQLModel, table=True):
+    """A request to a robot and its fate: claimed by one session, at most once."""
+
+    __table_args__ = (
+        Index("ix_command_pending", "robot_id", "id", sqlite_where=text("status = 'pending'")),
+        Index("ix_command_claimed", "robot_id", "id", sqlite_where=text("status = 'claimed'")),
+        _KEEP_IDS,
+    )
+    id: int | None = _id()
+    robot_id: int = _to("robot")
+    action: str = _text(nullable=False)
+    params: str = _text("JSON object", nullable=False)
+    status: str = _text(
+        "pending, claimed, then one of done, failed, expired, cancelled, lost", nullable=False
+    )
+    requested_by: str | None = _text()
+    idempotency_key: str | None = _text("the same key makes no second command", unique=True)
+    created_wall_time_s: float = _number(nullable=False)
+    expires_wall_time_s: float = _number("if not claimed by then, never run", nullable=False)
+    claimed_wall_time_s: float | None = _number()
+    claimed_sim_time_s: float | None = _number()
+    session_id: int | None = _to("session", nullable=True)
+    issued_wall_time_s: float | None = _number("when a reset or reload was asked of Webots")
+    finished_wall_time_s: float | None = _number()
+    finished_sim_time_s: float | None = _number()
+    result: str | None = _text("JSON value")
+    error: str | None = _text()
+
+
+class Image(SQLModel, table=True):
+    """A camera frame or a screenshot in a file of the data folder."""
+
+    __table_args__ = (Index(None, "run_id", "sim_time_s"), _KEEP_IDS)
+    id: int | None = _id()
+    run_id: int = _to("run")
+    sim_time_s: float = _number(nullable=False)
+    wall_time_s: float = _number(nullable=False)
+    kind: str = _text("camera or screenshot", nullable=False)
+    device: str | None = _text("name of the camera")
+    path: str = _text("relative to the data folder", nullable=False)
+    width: int = _column(Integer, "pixels", nullable=False)
+    height: int = _column(Integer, "pixels", nullable=False)
+    bytes: int = _column(Integer, "size of the file", nullable=False)
+
+
+class Lease(SQLModel, table=True):
+    """Who alone may do a job (today: `maintainer`) until when."""
+
+    name: str = Field(sa_column=Column(Text, primary_key=True))
+    holder: str = _text(nullable=False)
+    until_wall_time_s: float = _number(nullable=False)

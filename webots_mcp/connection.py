@@ -19,19 +19,22 @@ CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wai
 # Why: a control loop never waits for a lock; an automatic checkpoint would be its slowest step,
 # so only the maintainer checkpoints; NORMAL costs the last commits at a power cut, never the file.
 _PRAGMAS: Final[dict[Role, tuple[str, ...]]] = {
-    "loop": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON", "busy_timeout=0"),
+    "loop": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
     "writer": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
     "reader": ("query_only=ON",),
 }
 
 
-def connect(database: Database, role: Role, *, create: bool = False) -> sqlite3.Connection:
+def connect(
+    database: Database, role: Role, *, create: bool = False, patient: bool = True
+) -> sqlite3.Connection:
     """Open the database in autocommit mode: transactions begin only where the code says so.
 
     Args:
         database: A file or a database in memory.
-        role: "loop" never waits for a lock; "writer" waits up to 5 s; "reader" also cannot write.
+        role: "loop" for a controller, "writer" for the server, "reader" cannot write.
         create: Make the file (empty, in WAL mode) and its folder where they are missing.
+        patient: Wait up to 5 s for locks, here and later; a control loop does not.
 
     Raises:
         NoDatabaseError: The file is missing and `create` is false.
@@ -43,7 +46,7 @@ def connect(database: Database, role: Role, *, create: bool = False) -> sqlite3.
         connection = sqlite3.connect(
             address,
             uri=True,
-            timeout=OPENING_TIMEOUT_MS / 1000,
+            timeout=OPENING_TIMEOUT_MS / 1000 if patient else 0,
             isolation_level=None,
             check_same_thread=False,
         )
@@ -58,6 +61,11 @@ def connect(database: Database, role: Role, *, create: bool = False) -> sqlite3.
         connection.close()
         raise
     return connection
+
+
+def never_wait(connection: sqlite3.Connection) -> None:
+    """From now on a lock that is held by another is an error at once, not a wait."""
+    connection.execute("PRAGMA busy_timeout=0")
 
 
 def _file_uri(file: Database, create: bool) -> str:

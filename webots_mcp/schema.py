@@ -28,7 +28,7 @@ def schema_version(connection: sqlite3.Connection) -> int:
         version = int(connection.execute("PRAGMA user_version").fetchone()[0])
         tables = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
     except sqlite3.DatabaseError as error:
-        if "locked" in str(error):
+        if "not a database" not in str(error):
             raise
         raise ForeignDatabaseError(f"not a database of webots-mcp: {error}") from error
     if application_id == APPLICATION_ID:

@@ -1,0 +1,108 @@
+"""Who is recording: the robot, the process, the controller's code. No call can raise here."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import socket
+import sqlite3
+import sys
+from pathlib import Path
+from typing import Any, NamedTuple
+
+
+class Identity(NamedTuple):
+    """What is known of a controller process when its bridge starts."""
+
+    robot_name: str
+    kind: str
+    supervisor: bool
+    devices: dict[str, str]
+    world: str | None
+    basic_time_step_ms: float | None
+    pid: int
+    host: str
+    instance: str
+    controller: str | None
+    controller_sha256: str | None
+    git_commit: str | None
+    versions: dict[str, str]
+
+
+def identify(robot: Any, supervisor: bool, version: str) -> Identity:
+    """Collect the identity; what cannot be found out is None, never an error."""
+    controller = controller_file()
+    return Identity(
+        robot_name=str(robot.getName() or os.environ.get("WEBOTS_ROBOT_NAME") or "robot"),
+        kind="Supervisor" if supervisor else "Robot",
+        supervisor=supervisor,
+        devices={str(name): type(device).__name__ for name, device in _devices(robot).items()},
+        world=str(robot.getWorldPath()) if hasattr(robot, "getWorldPath") else None,
+        basic_time_step_ms=float(robot.getBasicTimeStep()),
+        pid=os.getpid(),
+        host=socket.gethostname(),
+        instance=_instance(),
+        controller=str(controller) if controller else None,
+        controller_sha256=_sha256(controller) if controller else None,
+        git_commit=_git_commit(controller.parent) if controller else None,
+        versions={
+            "python": sys.version.split()[0],
+            "webots_mcp": version,
+            "sqlite": sqlite3.sqlite_version,
+        },
+    )
+
+
+def controller_file() -> Path | None:
+    """The file that runs as the main program, if it is one."""
+    main = getattr(sys.modules.get("__main__"), "__file__", None) or sys.argv[0]
+    path = Path(main).absolute() if main else None
+    return path if path and path.is_file() else None
+
+
+def _devices(robot: Any) -> dict[str, Any]:
+    return getattr(robot, "devices", None) or {}
+
+
+def _instance() -> str:
+    """Which Webots this is: its own temporary folder, else the process that started this one."""
+    return os.environ.get("WEBOTS_INSTANCE_PATH") or f"{socket.gethostname()}:{os.getppid()}"
+
+
+def _sha256(file: Path) -> str | None:
+    try:
+        return hashlib.sha256(file.read_bytes()).hexdigest()
+    except OSError:
+        return None
+
+
+def _git_commit(folder: Path) -> str | None:
+    """The commit that is checked out, read from git's files: no child process in a controller."""
+    try:
+        for place in (folder, *folder.parents):
+            if (place / ".git").exists():
+                return _head(_git_dir(place / ".git"))
+    except OSError:
+        return None
+    return None
+
+
+def _git_dir(git: Path) -> Path:
+    """In a worktree or submodule `.git` is a file that names the folder."""
+    if git.is_dir():
+        return git
+    return (git.parent / git.read_text("utf-8").partition("gitdir:")[2].strip()).resolve()
+
+
+def _head(git: Path) -> str | None:
+    head = (git / "HEAD").read_text("utf-8").strip()
+    if not head.startswith("ref:"):
+        return head
+    ref = head[4:].strip()
+    common = git / "commondir"
+    base = (git / common.read_text("utf-8").strip()).resolve() if common.exists() else git
+    if (base / ref).exists():
+        return (base / ref).read_text("utf-8").strip()
+    packed = base / "packed-refs"
+    lines = packed.read_text("utf-8").splitlines() if packed.exists() else []
+    return next((line.split()[0] for line in lines if line.endswith(f" {ref}")), None)

@@ -1,0 +1,113 @@
+"""A controller process enters itself: robot, session, and what its predecessor left open."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from typing import Final, NamedTuple
+
+from webots_mcp import settlement
+from webots_mcp.bridge.identity import Identity
+from webots_mcp.contract import HEARTBEAT_LATE_S
+
+_KNOWN_ROBOT: Final = (
+    "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
+    "VALUES (:name, :kind, :devices, :now, :now) ON CONFLICT (name) DO UPDATE SET "
+    "kind = excluded.kind, devices = excluded.devices, last_seen_wall_time_s = :now"
+)
+_OPEN_SESSIONS: Final = (
+    "SELECT s.id, s.pid, s.host, s.last_seen_wall_time_s FROM session s "
+    "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
+)
+_PREDECESSOR: Final = "SELECT instance FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
+_NEW_SESSION: Final = (
+    "INSERT INTO session (robot_id, pid, host, instance, controller, controller_sha256, "
+    "git_commit, versions, supervisor, actions, started_wall_time_s, last_seen_wall_time_s) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+)
+
+# Sessions of this very process. A pid alone does not tell: in a container the same one comes back.
+_own_sessions: set[int] = set()
+
+
+class Registration(NamedTuple):
+    """The ids under which a process records."""
+
+    robot_id: int
+    robot_name: str
+    session_id: int
+    reloaded: bool
+
+
+def register(
+    connection: sqlite3.Connection, identity: Identity, actions: str, now_s: float
+) -> Registration:
+    """Enter a session; several starters at once each get their own, with names of their own.
+
+    Everything stands in one transaction that takes the write lock first: what the dead left open
+    is settled, an unfinished session of the same robot is ended as `replaced`, and where a live
+    process already has the name, `#2` (and so on) is appended.
+    """
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        settlement.settle(connection, now_s)
+        name = _free_name(connection, identity, now_s)
+        robot_id = _enter_robot(connection, identity, name, now_s)
+        before = connection.execute(_PREDECESSOR, (robot_id,)).fetchone()
+        session_id = _enter_session(connection, identity, robot_id, actions, now_s)
+        connection.execute("COMMIT")
+    except BaseException:
+        connection.execute("ROLLBACK")
+        raise
+    _own_sessions.add(session_id)
+    reloaded = before is not None and before[0] == identity.instance
+    return Registration(robot_id, name, session_id, reloaded)
+
+
+def deregister(session_id: int) -> None:
+    """This process no longer records under that session."""
+    _own_sessions.discard(session_id)
+
+
+def _free_name(connection: sqlite3.Connection, identity: Identity, now_s: float) -> str:
+    number = 1
+    while True:
+        name = identity.robot_name if number == 1 else f"{identity.robot_name}#{number}"
+        sessions = connection.execute(_OPEN_SESSIONS, (name,)).fetchall()
+        living = [row for row in sessions if _is_living(row, identity, now_s)]
+        if not living:
+            for row in sessions:
+                settlement.end_session(connection, row[0], "replaced")
+            return name
+        number += 1
+
+
+def _is_living(session: tuple[int, int, str, float], identity: Identity, now_s: float) -> bool:
+    """On this host the process tells; on another only a recent heartbeat does."""
+    session_id, pid, host, last_seen_s = session
+    if host != identity.host:
+        return now_s - last_seen_s < HEARTBEAT_LATE_S * 5
+    if pid == identity.pid:
+        return session_id in _own_sessions
+    return settlement.process_alive(pid)
+
+
+def _enter_robot(
+    connection: sqlite3.Connection, identity: Identity, name: str, now_s: float
+) -> int:
+    devices = json.dumps(identity.devices, ensure_ascii=False)
+    values = {"name": name, "kind": identity.kind, "devices": devices, "now": now_s}
+    connection.execute(_KNOWN_ROBOT, values)
+    return int(connection.execute("SELECT id FROM robot WHERE name = ?", (name,)).fetchone()[0])
+
+
+def _enter_session(
+    connection: sqlite3.Connection, identity: Identity, robot_id: int, actions: str, now_s: float
+) -> int:
+    who = (robot_id, identity.pid, identity.host, identity.instance)
+    code = (identity.controller, identity.controller_sha256, identity.git_commit)
+    versions = json.dumps(identity.versions)
+    values = (*who, *code, versions, int(identity.supervisor), actions, now_s, now_s)
+    session_id = connection.execute(_NEW_SESSION, values).lastrowid
+    assert session_id is not None
+    return session_id

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import tempfile
 
 APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
-SCHEMA_VERSION: Final = 1  # PRAGMA user_version of a database that this version reads and writes
+SCHEMA_VERSION: Final = 2  # PRAGMA user_version of a database that this version reads and writes
 
 DATABASE_NAME: Final = "webots.db"
 CAMERA_FOLDER: Final = "camera"
@@ -111,7 +111,7 @@ def resolve_database(
     if database is None:
         folder = resolve_data_dir(data_dir)
         return folder / DATABASE_NAME, folder
-    if not isinstance(database, (str, os.PathLike)):
+    if not isinstance(database, (str, os.PathLike)):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(
             f"database={database!r} is a {type(database).__name__}; give a path, ':memory:' or a "
             "webots_mcp.MemoryDatabase (shared by bridge and server in one process)"

@@ -9,7 +9,7 @@ import os
 import socket
 import sqlite3
 import sys
-from typing import Final
+from typing import Any, Final
 
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S
 
@@ -100,7 +100,7 @@ def _windows_process_alive(pid: int) -> bool:
     import ctypes
 
     query_limited_information, still_active = 0x1000, 259
-    kernel = ctypes.WinDLL("kernel32")  # type: ignore[attr-defined]
+    kernel: Any = getattr(ctypes, "WinDLL")("kernel32")  # noqa: B009  (exists on Windows only)
     handle = kernel.OpenProcess(query_limited_information, False, pid)
     if not handle:
         return False

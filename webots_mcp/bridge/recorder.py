@@ -13,7 +13,6 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
-import subprocess
 import sys
 import threading
 import time
@@ -25,7 +24,12 @@ from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.registration import Registration, deregister, register
 from webots_mcp.connection import connect, journal_mode, never_wait
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION, Database, MemoryDatabase
-from webots_mcp.errors import DatabaseError, ForeignDatabaseError, WebotsMCPError
+from webots_mcp.errors import (
+    DatabaseError,
+    ForeignDatabaseError,
+    SchemaTooNewError,
+    SchemaTooOldError,
+)
 from webots_mcp.schema import create_schema, require_current, schema_version
 
 MAX_WAITING_ROWS: Final = 10_000
@@ -132,6 +136,9 @@ class Recorder:
             How many rows the statement changed, or None where it was put off.
         """
         self.last_use_s = time.monotonic()
+        if self._off is not None:
+            self.rows_dropped += 1
+            return None
         connection = self.connection
         if connection is None or self._waiting or (run is not None and run.id is None):
             self._keep(_Row(statement, run, values))
@@ -353,11 +360,10 @@ class Recorder:
             self._enter(patient)
         except ForeignDatabaseError as error:
             return self._replace_garbage(error)
-        except WebotsMCPError as error:
-            self._off = str(error) if not isinstance(error, DatabaseError) else self._off
-            self._wait_or_give_up(error)
-        except (sqlite3.Error, OSError) as error:
-            self._wait_or_give_up(error)
+        except (SchemaTooNewError, SchemaTooOldError) as error:
+            self._give_up(error)
+        except (DatabaseError, sqlite3.Error, OSError) as error:
+            self._try_later(error)
         return self.connection is not None
 
     def _enter(self, patient: bool) -> None:
@@ -388,14 +394,18 @@ class Recorder:
                 "network drive, or across Windows and WSL): readers will make rows wait",
             )
 
-    def _wait_or_give_up(self, error: Exception) -> None:
+    def _try_later(self, error: Exception) -> None:
         self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
         if "locked" in str(error):
             return
         if isinstance(error, sqlite3.DatabaseError) and "malformed" in str(error):
             self._move_aside(str(error))
             return
-        self.complain(f"open {type(error).__name__}", f"not recording: {error}")
+        self.complain(f"open {type(error).__name__}", f"not recording yet: {error}")
+
+    def _give_up(self, error: Exception) -> None:
+        self._off = str(error)
+        self.complain("off", f"not recording into {self._database}: {error}")
 
     def _replace_garbage(self, error: ForeignDatabaseError) -> bool:
         """A file of our name that is no database is moved aside; anything else is left alone."""
@@ -403,8 +413,7 @@ class Recorder:
         if ours and "not a database" in str(error.__cause__):
             self._move_aside(str(error.__cause__))
             return self._open(patient=False)
-        self._off = str(error)
-        self.complain("foreign", f"not recording into {self._database}: {error}")
+        self._give_up(error)
         return False
 
 
@@ -422,5 +431,7 @@ def _migrate(database: Database) -> None:
     """Bring an older schema forward in a process of its own: Alembic takes a second to import."""
     if isinstance(database, MemoryDatabase):
         return
+    import subprocess  # only here: it would be a tenth of the bridge's import time
+
     line = [sys.executable, "-m", "webots_mcp", "migrate", "--database", str(database)]
     subprocess.run(line, check=False, capture_output=True, timeout=60, stdin=subprocess.DEVNULL)

@@ -1,0 +1,154 @@
+"""Checkpoints, done by one process at a time and never in a control loop.
+
+The log of a WAL database grows until a checkpoint copies it back. An automatic checkpoint would
+be the slowest step of a control loop (5 ms at p99.9, measured), so the bridge's connection makes
+none. Exactly one maintainer does: whoever holds the lease. More than one checkpointing at an
+instant is also what SQLite's WAL-reset bug needs (all versions before 3.51.3).
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect
+from webots_mcp.errors import WebotsMCPError
+from webots_mcp.schema import require_current
+
+INTERVAL_S: Final = 1.0
+LEASE_S: Final = 5.0
+WAL_LIMIT_BYTES: Final = 1_000_000
+
+# Taken when free, ours already, or (by a server) held by a bridge; the row counts as changed in
+# each of these cases and in no other.
+TAKE_LEASE: Final = (
+    "INSERT INTO lease (name, holder, until_wall_time_s) VALUES ('maintainer', :holder, :until) "
+    "ON CONFLICT (name) DO UPDATE SET holder = :holder, until_wall_time_s = :until "
+    "WHERE holder = :holder OR until_wall_time_s < :now "
+    "OR (:holder LIKE 'server %' AND holder LIKE 'bridge %')"
+)
+GIVE_LEASE_BACK: Final = "DELETE FROM lease WHERE name = 'maintainer' AND holder = ?"
+_HOLDER: Final = "SELECT holder, until_wall_time_s FROM lease WHERE name = 'maintainer'"
+
+
+class Maintainer(threading.Thread):
+    """A daemon thread that keeps the log short while it holds the lease.
+
+    Args:
+        database: The file; it may appear later.
+        kind: "server" or "bridge". A server takes the lease from a bridge.
+        on_tick: Called once an interval, lease or not; must not raise or wait.
+        work: Called once an interval with a connection while the lease is held.
+    """
+
+    def __init__(
+        self,
+        database: Path,
+        kind: str,
+        on_tick: Callable[[], object] | None = None,
+        work: Callable[[sqlite3.Connection], object] | None = None,
+    ) -> None:
+        super().__init__(name="webots-mcp maintainer", daemon=True)
+        self._database = database
+        self._holder = f"{kind} {os.getpid()} {os.urandom(3).hex()}"
+        self._on_tick = on_tick
+        self._work = work
+        self._connection: sqlite3.Connection | None = None
+        self._stop = threading.Event()
+        self._held_before = False
+        self._data_version = -1
+        self._complained = ""
+
+    def run(self) -> None:
+        """Tick until stopped; trouble with the file ends a tick, never the thread."""
+        while not self._stop.wait(INTERVAL_S):
+            self._tick_safely()
+        self._give_back()
+
+    def _tick_safely(self) -> None:
+        try:
+            self.tick()
+        except (sqlite3.Error, WebotsMCPError, OSError) as error:
+            self._disconnect()
+            if "locked" not in str(error) and str(error) != self._complained:
+                self._complained = str(error)
+                print(f"webots-mcp: maintenance waits: {error}", file=sys.stderr)  # noqa: T201
+
+    def stop(self) -> None:
+        """End the thread within an instant and give the lease back."""
+        self._stop.set()
+        if self.is_alive():
+            self.join(timeout=2)
+
+    def tick(self) -> bool:
+        """One round of work; True if this maintainer holds the lease."""
+        if self._on_tick is not None:
+            self._on_tick()
+        if not self._database.exists():
+            self._disconnect()
+            return False
+        if self._connection is None:
+            self._connection = self._connect()
+        held = self._hold_lease(self._connection)
+        # A lease that was just taken from another: give a checkpoint of theirs time to end.
+        if held and self._held_before:
+            self._checkpoint(self._connection)
+            if self._work is not None:
+                self._work(self._connection)
+        self._held_before = held
+        return held
+
+    def _connect(self) -> sqlite3.Connection:
+        connection = connect(self._database, "writer", patient=False)
+        try:
+            require_current(connection)
+            connection.execute(f"PRAGMA busy_timeout={CHECKPOINT_TIMEOUT_MS}")
+        except BaseException:
+            connection.close()
+            raise
+        return connection
+
+    def _hold_lease(self, connection: sqlite3.Connection) -> bool:
+        """Renew at half time only, so that most ticks write nothing."""
+        now = time.time()
+        holder, until_s = connection.execute(_HOLDER).fetchone() or ("", 0.0)
+        if holder == self._holder and until_s - now > LEASE_S / 2:
+            return True
+        outranked = holder.startswith("bridge ") and self._holder.startswith("server ")
+        if holder != self._holder and until_s >= now and not outranked:
+            return False
+        values = {"holder": self._holder, "until": now + LEASE_S, "now": now}
+        return connection.execute(TAKE_LEASE, values).rowcount > 0
+
+    def _checkpoint(self, connection: sqlite3.Connection) -> None:
+        """Copy the log back and cut it, if it is long and grew since the last time."""
+        log = Path(f"{self._database}-wal")
+        if not log.exists() or log.stat().st_size < WAL_LIMIT_BYTES:
+            return
+        version = int(connection.execute("PRAGMA data_version").fetchone()[0])
+        if version != self._data_version:
+            self._data_version = version
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+
+    def _give_back(self) -> None:
+        if self._connection is None:
+            return
+        try:
+            self._connection.execute(GIVE_LEASE_BACK, (self._holder,))
+        except sqlite3.Error as error:
+            print(f"webots-mcp: the lease runs out by itself: {error}", file=sys.stderr)  # noqa: T201
+        self._disconnect()
+
+    def _disconnect(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+        self._held_before = False

@@ -1,5 +1,5 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 1;
+PRAGMA user_version = 2;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
@@ -136,4 +136,60 @@ CREATE TABLE state (
 	CONSTRAINT fk_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_state_run_id_sim_time_s ON state (run_id, sim_time_s);
-INSERT INTO alembic_version (version_num) VALUES ('0001');
+CREATE TABLE signal (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	robot_id INTEGER NOT NULL, 
+	name TEXT NOT NULL /* dotted: pose.0, sensors.front, lidar.min */, 
+	kind TEXT NOT NULL /* num, bool, text, angle (radians), null (no value yet) */, 
+	unit TEXT /* where the name tells it */, 
+	path TEXT NOT NULL /* for json_extract(state.data, path) */, 
+	reduce TEXT /* count, min, max, mean or argmin of the long array at path */, 
+	first_seen_wall_time_s FLOAT NOT NULL, 
+	last_seen_wall_time_s FLOAT NOT NULL, 
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held it, up to the watermark */, 
+	null_rows INTEGER DEFAULT 0 NOT NULL /* of them without a value */, 
+	odd_rows INTEGER DEFAULT 0 NOT NULL /* of them with a value that JSON cannot hold (nan, inf, ...) */, 
+	min FLOAT, 
+	max FLOAT, 
+	CONSTRAINT fk_signal_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
+	CONSTRAINT uq_signal_robot_id UNIQUE (robot_id, name)
+);
+CREATE TABLE rollup (
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
+	count INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
+	changes INTEGER DEFAULT 0 NOT NULL /* of them with another value than the one before in the run */, 
+	first FLOAT /* null for text, like all that follow but the times */, 
+	first_sim_time_s FLOAT, 
+	last FLOAT, 
+	last_sim_time_s FLOAT, 
+	min FLOAT, 
+	min_sim_time_s FLOAT /* of the first such extreme */, 
+	max FLOAT, 
+	max_sim_time_s FLOAT /* of the first such extreme */, 
+	sum FLOAT, 
+	squares FLOAT /* sum of squared deviations from sum / count */, 
+	sines FLOAT /* angles only: sum of sines */, 
+	cosines FLOAT /* angles only: sum of cosines */, 
+	PRIMARY KEY (run_id, signal_id, bucket), 
+	CONSTRAINT fk_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+CREATE TABLE change (
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	state_id INTEGER NOT NULL /* state.id of the row, which may have been deleted since */, 
+	sim_time_s FLOAT NOT NULL, 
+	value TEXT /* text (its first 200 characters), true, false or null */, 
+	PRIMARY KEY (run_id, signal_id, state_id), 
+	CONSTRAINT fk_change_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+CREATE TABLE watermark (
+	name TEXT NOT NULL /* rollup */, 
+	state_id INTEGER NOT NULL, 
+	PRIMARY KEY (name)
+);
+INSERT INTO alembic_version (version_num) VALUES ('0002');

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import Column, Float, ForeignKey, Index, Integer, Text, text
+from sqlalchemy import Column, Float, ForeignKey, Index, Integer, Text, UniqueConstraint, text
 from sqlmodel import Field, SQLModel
 
 SQLModel.metadata.naming_convention = {
@@ -29,6 +29,13 @@ def _to(table: str, *, nullable: bool = False) -> Any:
     on_delete = "SET NULL" if nullable else "CASCADE"
     key = ForeignKey(f"{table}.id", ondelete=on_delete)
     return Field(default=None, sa_column=Column(Integer, key, nullable=nullable))
+
+
+def _key(table: str | None, comment: str | None = None) -> Any:
+    """A part of a primary key of several columns, in the order in which they stand."""
+    to = [ForeignKey(f"{table}.id", ondelete="CASCADE")] if table else []
+    column = Column(Integer, *to, primary_key=True, autoincrement=False, comment=comment)
+    return Field(default=None, sa_column=column)
 
 
 def _column(kind: Any, comment: str | None = None, **options: Any) -> Any:
@@ -121,6 +128,68 @@ class State(SQLModel, table=True):
     wall_time_s: float = _number(nullable=False)
     data: str = _text("JSON object", nullable=False)
     odd: str | None = _text("JSON object: path of a replaced value to what it was (nan, inf, ...)")
+
+
+class Signal(SQLModel, table=True):
+    """A number, flag or text that a robot's states hold, by its dotted name."""
+
+    __table_args__ = (UniqueConstraint("robot_id", "name"), _KEEP_IDS)
+    id: int | None = _id()
+    robot_id: int = _to("robot")
+    name: str = _text("dotted: pose.0, sensors.front, lidar.min", nullable=False)
+    kind: str = _text("num, bool, text, angle (radians), null (no value yet)", nullable=False)
+    unit: str | None = _text("where the name tells it")
+    path: str = _text("for json_extract(state.data, path)", nullable=False)
+    reduce: str | None = _text("count, min, max, mean or argmin of the long array at path")
+    first_seen_wall_time_s: float = _number(nullable=False)
+    last_seen_wall_time_s: float = _number(nullable=False)
+    rows: int = _count("state rows that held it, up to the watermark")
+    null_rows: int = _count("of them without a value")
+    odd_rows: int = _count("of them with a value that JSON cannot hold (nan, inf, ...)")
+    min: float | None = _number()
+    max: float | None = _number()
+
+
+class Rollup(SQLModel, table=True):
+    """10 s of simulation time of one signal in one run: what its state rows come to."""
+
+    __table_args__ = {"sqlite_with_rowid": False}
+    run_id: int = _key("run")
+    signal_id: int = _key(None, "signal.id, of the run's robot")
+    bucket: int = _key(None, "floor(sim_time_s / 10)")
+    rows: int = _count("state rows that held the signal")
+    count: int = _count("of them with a value")
+    changes: int = _count("of them with another value than the one before in the run")
+    first: float | None = _number("null for text, like all that follow but the times")
+    first_sim_time_s: float | None = _number()
+    last: float | None = _number()
+    last_sim_time_s: float | None = _number()
+    min: float | None = _number()
+    min_sim_time_s: float | None = _number("of the first such extreme")
+    max: float | None = _number()
+    max_sim_time_s: float | None = _number("of the first such extreme")
+    sum: float | None = _number()
+    squares: float | None = _number("sum of squared deviations from sum / count")
+    sines: float | None = _number("angles only: sum of sines")
+    cosines: float | None = _number("angles only: sum of cosines")
+
+
+class Change(SQLModel, table=True):
+    """A text or boolean signal took another value; its first value in a run counts as one."""
+
+    __table_args__ = {"sqlite_with_rowid": False}
+    run_id: int = _key("run")
+    signal_id: int = _key(None, "signal.id, of the run's robot")
+    state_id: int = _key(None, "state.id of the row, which may have been deleted since")
+    sim_time_s: float = _number(nullable=False)
+    value: str | None = _text("text (its first 200 characters), true, false or null")
+
+
+class Watermark(SQLModel, table=True):
+    """Up to which state row a derived table is complete."""
+
+    name: str = Field(sa_column=Column(Text, primary_key=True, comment="rollup"))
+    state_id: int = _column(Integer, nullable=False)
 
 
 class Log(SQLModel, table=True):

@@ -5,6 +5,8 @@ holds a NaN. So what JSON cannot hold is replaced, and `odd` names the path and 
 
     published value              stored        odd
     NaN, infinity, -infinity     null          "nan", "inf", "-inf"
+    several, all of one kind,
+    in one array                 null each     "lidar.*": "inf" (every null in it)
     bytes, up to 1 kB            base64 text   "bytes"
     array over 4,096 items, in
     a row over 1 MB              null          "array[921600]"
@@ -38,20 +40,25 @@ MAX_ROW_BYTES: Final = 1_000_000
 
 
 class Encoded(NamedTuple):
-    """JSON text, and what had to be replaced in it (JSON object from path to kind, or None)."""
+    """JSON text, and what had to be replaced in it: dotted path to kind."""
 
     text: str
-    odd: str | None
+    odd: dict[str, str]
+
+    @property
+    def odd_text(self) -> str | None:
+        """`odd` as the database holds it: null where nothing was replaced."""
+        return _encode_plain(self.odd) if self.odd else None
 
 
 def encode(state: object) -> Encoded:
     """Encode a state, as fast as its content allows; the state itself is never changed."""
     if orjson is not None and (text := _encode_with_orjson(state)) is not None:
-        return Encoded(text, None)
+        return Encoded(text, {})
     try:
         text = _encode_plain(state)
         if len(text.encode()) <= MAX_ROW_BYTES:
-            return Encoded(text, None)
+            return Encoded(text, {})
     except (ValueError, TypeError, RecursionError):
         pass  # something odd is inside: walk it, once, and name it
     return _encode_odd(state)
@@ -73,8 +80,8 @@ def _encode_odd(state: object) -> Encoded:
         odd.clear()
         text = _encode_plain(_Cleaner(odd, max_items).clean(state, "", 0))
         if len(text.encode()) <= MAX_ROW_BYTES:
-            return Encoded(text, _encode_plain(odd) if odd else None)
-    return Encoded("{}", _encode_plain({"": f"row of {len(text)} characters"}))
+            return Encoded(text, odd)
+    return Encoded("{}", {"": f"row of {len(text)} characters"})
 
 
 def _as_json(value: object) -> object:
@@ -163,6 +170,10 @@ class _Cleaner:
         if len(items) > self._max_items:
             return self._replaced(path, f"array[{len(items)}]")
         prefix = f"{path}." if path else ""
+        kinds = {str(item) for item in items if _is_odd_float(item)}
+        if len(kinds) == 1 and None not in items:
+            self._odd[f"{prefix}*"] = kinds.pop()
+            items = [None if _is_odd_float(item) else item for item in items]
         return [self.clean(item, f"{prefix}{i}", depth + 1) for i, item in enumerate(items)]
 
     def _object(self, value: Any, path: str, depth: int) -> object:
@@ -184,6 +195,10 @@ class _Cleaner:
 
     def _replaced(self, path: str, kind: str) -> None:
         self._odd[path] = kind
+
+
+def _is_odd_float(value: object) -> bool:
+    return isinstance(value, float) and not math.isfinite(value)
 
 
 def _key(key: object) -> str:

@@ -19,7 +19,12 @@ _OPEN_SESSIONS: Final = (
     "SELECT s.id, s.pid, s.host, s.last_seen_wall_time_s FROM session s "
     "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
-_PREDECESSOR: Final = "SELECT instance FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
+# A successor in the same Webots means a reload; so does one after a reload that was asked for.
+_RELOADED: Final = (
+    "SELECT 1 FROM session WHERE id = (SELECT max(id) FROM session WHERE robot_id = :robot) "
+    "AND instance = :instance UNION SELECT 1 FROM command WHERE robot_id = :robot "
+    "AND status = 'claimed' AND action = 'reload' AND issued_wall_time_s IS NOT NULL"
+)
 _NEW_SESSION: Final = (
     "INSERT INTO session (robot_id, pid, host, instance, controller, controller_sha256, "
     "git_commit, versions, supervisor, actions, started_wall_time_s, last_seen_wall_time_s) "
@@ -53,14 +58,14 @@ def register(
         settlement.settle(connection, now_s)
         name = _free_name(connection, identity, now_s)
         robot_id = _enter_robot(connection, identity, name, now_s)
-        before = connection.execute(_PREDECESSOR, (robot_id,)).fetchone()
+        values = {"robot": robot_id, "instance": identity.instance}
+        reloaded = connection.execute(_RELOADED, values).fetchone() is not None
         session_id = _enter_session(connection, identity, robot_id, actions, now_s)
         connection.execute("COMMIT")
     except BaseException:
         connection.execute("ROLLBACK")
         raise
     _own_sessions.add(session_id)
-    reloaded = before is not None and before[0] == identity.instance
     return Registration(robot_id, name, session_id, reloaded)
 
 

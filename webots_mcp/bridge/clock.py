@@ -1,0 +1,57 @@
+"""Simulation time as the controller sees it: when it moves, and when it goes back."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from webots_mcp.bridge.recorder import Run
+from webots_mcp.bridge.simulation import Simulation
+
+_EPSILON_S: Final = 1e-9
+
+
+class Clock:
+    """The newest simulation time, and the run that it belongs to.
+
+    Time going backwards is all the notice that a controller gets of a reset.
+    """
+
+    def __init__(self, simulation: Simulation) -> None:
+        self._simulation = simulation
+        self.sim_time_s = simulation.time_s
+        self.moved_wall_time_s: float | None = None
+        self.run = Run("start", self.sim_time_s)
+        self.ended_sim_time_s = self.sim_time_s  # of the run before this one
+        self._reset_from_s: float | None = None
+
+    def look(self) -> bool:
+        """Read the time; True if it went back since the last look: a new run has begun."""
+        before, now = self.sim_time_s, self._simulation.time_s
+        self.sim_time_s = now
+        if now > before + _EPSILON_S:
+            self.moved_wall_time_s = time.time()
+        if now >= before - _EPSILON_S and not self._is_awaited_reset(now):
+            return False
+        self._reset_from_s = None
+        self.ended_sim_time_s = before
+        self.run = Run("reset", now)
+        return True
+
+    def await_reset(self) -> None:
+        """A reset was asked for. It comes with the end of the next physics step.
+
+        Close to the start the first time after it is not below the last one before it, so from
+        here on the same time, after a step, counts as going back as well.
+        """
+        self._reset_from_s = self.sim_time_s
+
+    def forget_reset(self) -> None:
+        """The reset did not come."""
+        self._reset_from_s = None
+
+    def _is_awaited_reset(self, now_s: float) -> bool:
+        if self._reset_from_s is None:
+            return False
+        early = self._reset_from_s <= self._simulation.basic_time_step_s + _EPSILON_S
+        return now_s <= self._reset_from_s + (self._simulation.basic_time_step_s if early else 0)

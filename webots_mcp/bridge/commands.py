@@ -1,0 +1,130 @@
+"""The controller's end of the command queue: each command runs at most once.
+
+`pending` becomes `claimed` in one statement, before anything runs; a result is written only while
+the command is still claimed by this session. So a command whose controller died in the middle is
+never run a second time, and a result is final once.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from typing import Any, Final, cast
+
+from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.recorder import Recorder
+
+# An indexed read takes no lock. An UPDATE takes the write lock even where it matches nothing, so
+# it is made only after this said that there is something.
+PEEK: Final = (
+    "SELECT 1 FROM command WHERE robot_id = ? AND status = 'pending' "
+    "AND expires_wall_time_s > ? LIMIT 1"
+)
+CLAIM: Final = (
+    "UPDATE command SET status = 'claimed', session_id = :session, claimed_wall_time_s = :now, "
+    "claimed_sim_time_s = :sim_time WHERE status = 'pending' AND id = (SELECT id FROM command "
+    "WHERE robot_id = :robot AND status = 'pending' AND expires_wall_time_s > :now "
+    "ORDER BY id LIMIT 1) RETURNING id, action, params"
+)
+ISSUE: Final = (
+    "UPDATE command SET issued_wall_time_s = ? "
+    "WHERE id = ? AND status = 'claimed' AND session_id = ?"
+)
+FINISH: Final = (
+    "UPDATE command SET status = ?, finished_wall_time_s = ?, finished_sim_time_s = ?, "
+    "result = ?, error = ? WHERE id = ? AND status = 'claimed' AND session_id = ?"
+)
+# The process that asked for the reload is gone; that this one runs is the proof that it worked.
+CONFIRM_RELOAD: Final = (
+    "UPDATE command SET status = 'done', finished_wall_time_s = ?2, finished_sim_time_s = ?3, "
+    "result = json_object('run_id', ?1) WHERE robot_id = ?4 AND action = 'reload' "
+    "AND status = 'claimed' AND issued_wall_time_s IS NOT NULL"
+)
+
+
+class Command:
+    """A claimed command."""
+
+    __slots__ = ("action", "id", "params", "session_id")
+
+    def __init__(self, id: int, action: str, params: dict[str, Any], session_id: int) -> None:  # noqa: A002
+        self.id = id
+        self.action = action
+        self.params = params
+        self.session_id = session_id
+
+    def as_dict(self) -> dict[str, Any]:
+        """What handlers get: the parameters as keys too, where the names are free."""
+        return {**self.params, "id": self.id, "action": self.action, "params": self.params}
+
+
+class CommandQueue:
+    """Claims commands for this session and writes their fate."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+
+    def claim(self, sim_time_s: float) -> Command | None:
+        """The oldest command that waits for this robot, now ours; None costs no lock.
+
+        Raises:
+            sqlite3.Error: Another writer holds the lock (try again with the next call), or the
+                database is in trouble.
+        """
+        recorder, now = self._recorder, time.time()
+        connection, registration = recorder.connection, recorder.registration
+        if connection is None or registration is None:
+            return None
+        if connection.execute(PEEK, (registration.robot_id, now)).fetchone() is None:
+            return None
+        ids = {"session": registration.session_id, "robot": registration.robot_id}
+        times = {"now": now, "sim_time": sim_time_s}
+        # fetchall: a RETURNING that is not read to its end keeps the write lock
+        rows = connection.execute(CLAIM, {**ids, **times}).fetchall()
+        return self._read(rows[0], registration.session_id, sim_time_s) if rows else None
+
+    def _read(
+        self, row: tuple[int, str, str], session_id: int, sim_time_s: float
+    ) -> Command | None:
+        command_id, action, text = row
+        try:
+            params = json.loads(text)
+        except ValueError:
+            params = None
+        if isinstance(params, dict):
+            return Command(command_id, action, cast("dict[str, Any]", params), session_id)
+        command = Command(command_id, action, {}, session_id)
+        self.fail(command, f"params must be a JSON object, got {text[:100]!r}", sim_time_s)
+        return None
+
+    def issue(self, command: Command) -> None:
+        """Note that Webots is about to be asked for what may end this process."""
+        values = (time.time(), command.id, command.session_id)
+        self._recorder.record(ISSUE, None, values)
+        deadline_s = time.monotonic() + 1  # the world stands still for a reload anyway
+        while not self._recorder.flush() and time.monotonic() < deadline_s:
+            time.sleep(0.002)
+
+    def succeed(self, command: Command, result: object, sim_time_s: float) -> None:
+        """Write `done` with the result."""
+        self._finish(command, "done", encode(result).text, None, sim_time_s)
+
+    def fail(self, command: Command, error: str, sim_time_s: float) -> None:
+        """Write `failed` with the reason."""
+        self._finish(command, "failed", None, error, sim_time_s)
+
+    def _finish(
+        self, command: Command, status: str, result: str | None, error: str | None, at_s: float
+    ) -> None:
+        values = (status, time.time(), at_s, result, error, command.id, command.session_id)
+        if self._recorder.record(FINISH, None, values) == 0:
+            self._recorder.complain(
+                f"command {command.id}",
+                f"command {command.id} ({command.action}) was judged lost before it was {status}",
+            )
+
+
+def is_busy(error: sqlite3.Error) -> bool:
+    """Whether another writer held the lock at that instant."""
+    return "locked" in str(error)

@@ -1,0 +1,164 @@
+"""Serving the command queue from inside the user's loop."""
+
+from __future__ import annotations
+
+import inspect
+import sqlite3
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from webots_mcp.bridge.actions import Actions, Progress
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.commands import Command, CommandQueue, is_busy
+from webots_mcp.bridge.hold import PUMP_INTERVAL_S, Hold
+from webots_mcp.bridge.pictures import Album
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.contract import BUILT_IN_ACTIONS
+from webots_mcp.errors import CommandRefusedError, WebotsMCPError
+
+Handler = Callable[[dict[str, Any]], object]
+
+POLL_INTERVAL_S: Final = 0.005
+_ENDS_STEPPING: Final = ("pause", "resume", "fast", "step", "reset", "reload")
+
+
+class Control:
+    """Claims commands, runs them, and holds the loop while the simulation is paused."""
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        recorder: Recorder,
+        clock: Clock,
+        album: Album,
+        call_back: Callable[[], int],
+    ) -> None:
+        self._simulation = simulation
+        self._recorder = recorder
+        self._clock = clock
+        self._queue = CommandQueue(recorder)
+        self._hold = Hold(simulation, recorder, clock)
+        self.actions = Actions(simulation, self._queue, self._hold, clock, album, call_back)
+        self._handlers: dict[str, Handler] = {}
+        self._under_way: dict[Command, Progress] = {}
+        self._next_poll_s = 0.0
+
+    @property
+    def hold(self) -> str | None:
+        """`paused` while the loop is held, `stepping` while it runs a counted number of steps."""
+        if self._hold.held:
+            return "paused"
+        return "stepping" if any(c.action == "step" for c in self._under_way) else None
+
+    def register(self, action: str, handler: Handler) -> None:
+        """Make an action of the user's own known.
+
+        Raises:
+            ValueError: The name is built in, or empty.
+            TypeError: The handler is not a plain function.
+        """
+        if not action or action in BUILT_IN_ACTIONS:
+            raise ValueError(
+                f"action {action!r} cannot be registered: choose a name that is not empty and "
+                f"not built in ({', '.join(BUILT_IN_ACTIONS)})"
+            )
+        if not callable(handler) or inspect.iscoroutinefunction(handler):
+            raise TypeError(f"the handler of {action!r} must be a plain function, not {handler!r}")
+        self._handlers[action] = handler
+        self._recorder.actions[action] = inspect.cleandoc(getattr(handler, "__doc__", None) or "")
+        self._recorder.update_actions()
+
+    def serve(self, every_round: Callable[[], object]) -> Command | None:
+        """One round: what is under way, one new command, and the hold if there is one.
+
+        Returns:
+            The command that was handled last in this call, if any.
+        """
+        now = time.monotonic()
+        if now < self._next_poll_s and not self._under_way:
+            return None
+        self._next_poll_s = now + POLL_INTERVAL_S
+        self._advance_all()
+        handled = self._serve_one()
+        while self._hold.held:
+            every_round()
+            self._hold.pump()
+            self._advance_all()
+            handled = self._serve_one() or handled
+            time.sleep(PUMP_INTERVAL_S if self._hold.held else 0)
+        return handled
+
+    def _serve_one(self) -> Command | None:
+        if self._simulation.over:
+            return None
+        try:
+            command = self._queue.claim(self._clock.sim_time_s)
+        except sqlite3.Error as error:
+            if not is_busy(error):
+                self._recorder.complain("claim", f"commands cannot be read: {error}")
+            return None
+        if command is not None:
+            self._start(command)
+        return command
+
+    def _start(self, command: Command) -> None:
+        if command.action in _ENDS_STEPPING:
+            self._interrupt_steps(command)
+        try:
+            if command.action in BUILT_IN_ACTIONS:
+                self._under_way[command] = self.actions.begin(command)
+                self._advance(command)
+            else:
+                self._succeed(command, self._run_handler(command))
+        except Exception as error:  # noqa: BLE001  (whatever a handler raises is the answer)
+            self._fail(command, _describe(error))
+
+    def _run_handler(self, command: Command) -> object:
+        handler = self._handlers.get(command.action)
+        if handler is not None:
+            return handler(command.as_dict())
+        if self._handlers:
+            known = ", ".join((*self._handlers, *BUILT_IN_ACTIONS))
+            raise CommandRefusedError(f"no action {command.action!r}; this robot knows {known}")
+        # A loop without registered actions may look at what get_command() returns by itself.
+        return {"returned_by_get_command": True}
+
+    def _advance_all(self) -> None:
+        for command in tuple(self._under_way):
+            self._advance(command)
+
+    def _advance(self, command: Command) -> None:
+        try:
+            next(self._under_way[command])
+        except StopIteration as end:
+            self._succeed(command, end.value)
+        except Exception as error:  # noqa: BLE001  (whatever went wrong is the answer)
+            self._fail(command, _describe(error))
+
+    def _interrupt_steps(self, by: Command) -> None:
+        for command in [c for c in self._under_way if c.action == "step"]:
+            self._fail(command, f"interrupted by command {by.id} ({by.action})")
+
+    def _succeed(self, command: Command, result: object) -> None:
+        self._under_way.pop(command, None)
+        self._queue.succeed(command, result, self._clock.sim_time_s)
+
+    def _fail(self, command: Command, error: str) -> None:
+        self._under_way.pop(command, None)
+        self._queue.fail(command, error, self._clock.sim_time_s)
+
+
+def _describe(error: Exception) -> str:
+    """What was wrong; for an exception of the user's own code also its kind and place."""
+    if isinstance(error, WebotsMCPError):
+        return str(error)
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    if frame is None:
+        return f"{type(error).__name__}: {error}"
+    place = Path(frame.tb_frame.f_code.co_filename).name
+    return f"{type(error).__name__}: {error} ({place}, line {frame.tb_lineno})"

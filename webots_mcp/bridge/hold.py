@@ -1,0 +1,58 @@
+"""Pausing the simulation without locking out its own resume."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any, Final
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.recorder import INSERT_EVENT, Recorder
+from webots_mcp.bridge.simulation import Simulation
+
+PUMP_INTERVAL_S: Final = 0.01
+
+
+class Hold:
+    """Whether the user's loop is held, and the simulation mode to go back to.
+
+    A paused simulation blocks every `step(n > 0)`, so after a pause the bridge stays inside
+    `get_command()`, pumps `step(0)`, and goes on serving commands there.
+    """
+
+    def __init__(self, simulation: Simulation, recorder: Recorder, clock: Clock) -> None:
+        self._simulation = simulation
+        self._recorder = recorder
+        self._clock = clock
+        self._mode_before = "real_time"
+        self.held = False
+
+    def take(self, command: Command) -> None:
+        """Pause the simulation and hold the loop from here on."""
+        if self.held:
+            return
+        self._mode_before = self._simulation.mode_name
+        self._simulation.set_mode("pause")
+        self.held = True
+        self._note("pause", {"command_id": command.id})
+
+    def release(self, command: Command, mode: str | None = None) -> None:
+        """Let the loop go on, in `mode` or in the one that it ran in before."""
+        before = self._mode_before if self.held else self._simulation.mode_name
+        self._simulation.set_mode(mode or ("fast" if before == "fast" else "real_time"))
+        if self.held:
+            self.held = False
+            self._note("resume", {"command_id": command.id})
+
+    def pump(self) -> None:
+        """Hear from Webots: it may want to quit, or a person may have pressed play."""
+        if not self._simulation.pump():
+            self.held = False
+        elif not self._simulation.paused:
+            self.held = False
+            self._note("resume", {"by": "a person or another controller, in Webots"})
+
+    def _note(self, kind: str, data: dict[str, Any]) -> None:
+        row = (self._clock.sim_time_s, time.time(), kind, None, json.dumps(data))
+        self._recorder.record(INSERT_EVENT, self._clock.run, row)

@@ -1,0 +1,140 @@
+"""Camera frames and screenshots as files of the data folder, each with a row."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+import zlib
+from collections import deque
+from pathlib import Path
+from typing import Any, Final
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.contract import CAMERA_FOLDER
+from webots_mcp.errors import CommandRefusedError
+
+INSERT_IMAGE: Final = (
+    "INSERT INTO image (run_id, sim_time_s, wall_time_s, kind, device, path, width, height, bytes) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+)
+_FORGET_IMAGE: Final = "DELETE FROM image WHERE path = ?"
+_PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n"
+_PNG_TAIL: Final = b"IEND\xaeB`\x82"
+
+
+class Album:
+    """The newest camera frames of each device; older ones are deleted, with their rows."""
+
+    def __init__(self, recorder: Recorder, clock: Clock, data_dir: Path) -> None:
+        self._recorder = recorder
+        self._clock = clock
+        self._data_dir = data_dir
+        self._kept: dict[str, deque[str]] = {}
+
+    def save_frame(self, camera: Any, max_frames: int) -> str:
+        """Write the camera's image as PNG; returns its path relative to the data folder.
+
+        Raises:
+            CommandRefusedError: The camera is disabled or has no image yet.
+            OSError: The file cannot be written.
+        """
+        device, width, height = str(camera.getName()), camera.getWidth(), camera.getHeight()
+        if camera.getSamplingPeriod() <= 0:
+            raise CommandRefusedError(f"camera {device!r} is disabled: call its enable() first")
+        try:
+            image = camera.getImage()
+        except ValueError as error:
+            raise CommandRefusedError(f"camera {device!r} has no image yet") from error
+        name = f"{_file_name(self._robot_name)}.{_file_name(device)}"
+        kept = self._kept.setdefault(name, self._kept_before(name))
+        path = f"{CAMERA_FOLDER}/{name}.{_next_number(kept):06d}.png"
+        size = self._write(path, encode_png(image, width, height))
+        row = (self._clock.sim_time_s, time.time(), "camera", device, path, width, height, size)
+        self._recorder.record(INSERT_IMAGE, self._clock.run, row)
+        kept.append(path)
+        while len(kept) > max(1, max_frames):
+            self._forget(kept.popleft())
+        return path
+
+    def make_room(self, path: str) -> Path:
+        """The file that a picture is to be written to: its folder exists, it does not."""
+        file = self._data_dir / path
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)
+        return file
+
+    def add_screenshot(self, path: str, width: int, height: int, size: int) -> dict[str, object]:
+        """Enter a picture that the simulator wrote; returns what its command answers."""
+        clock = self._clock
+        row = (clock.sim_time_s, time.time(), "screenshot", None, path, width, height, size)
+        self._recorder.record(INSERT_IMAGE, clock.run, row)
+        return {"path": path, "width": width, "height": height, "bytes": size}
+
+    @property
+    def _robot_name(self) -> str:
+        registration = self._recorder.registration
+        return registration.robot_name if registration else "robot"
+
+    def _kept_before(self, name: str) -> deque[str]:
+        """What an earlier session of the robot left in the folder."""
+        folder = self._data_dir / CAMERA_FOLDER
+        files = sorted(file.name for file in folder.glob(f"{name}.[0-9]*.png"))
+        return deque(f"{CAMERA_FOLDER}/{file}" for file in files)
+
+    def _write(self, path: str, data: bytes) -> int:
+        """Written aside and renamed: a reader never sees half a picture."""
+        file = self.make_room(path)
+        aside = file.with_suffix(".part")
+        aside.write_bytes(data)
+        os.replace(aside, file)  # noqa: PTH105
+        return len(data)
+
+    def _forget(self, path: str) -> None:
+        (self._data_dir / path).unlink(missing_ok=True)
+        self._recorder.record(_FORGET_IMAGE, None, (path,))
+
+
+def encode_png(bgra: bytes, width: int, height: int) -> bytes:
+    """A PNG of a Webots camera image (4 bytes a pixel: blue, green, red, alpha; rows from the top).
+
+    Format: W3C Portable Network Graphics, section 11 (IHDR, IDAT, IEND), 8-bit RGB, filter 0.
+
+    Raises:
+        ValueError: The image does not have 4 * width * height bytes.
+    """
+    if len(bgra) != 4 * width * height:
+        raise ValueError(f"{len(bgra)} bytes are no image of {width} x {height} pixels")
+    rgb = bytearray(3 * width * height)
+    rgb[0::3], rgb[1::3], rgb[2::3] = bgra[2::4], bgra[1::4], bgra[0::4]
+    stride = 3 * width
+    rows = b"".join(b"\0" + rgb[i : i + stride] for i in range(0, len(rgb), stride))
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows, 1)), (b"IEND", b""))
+    return _PNG_HEAD + b"".join(_chunk(kind, data) for kind, data in chunks)
+
+
+def _chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def complete_png_size(file: Path) -> tuple[int, int, int] | None:
+    """(width, height, bytes) of a PNG that was written to its end, else None."""
+    try:
+        data = file.read_bytes()
+    except OSError:
+        return None
+    if not data.startswith(_PNG_HEAD) or not data.endswith(_PNG_TAIL):
+        return None
+    width, height = struct.unpack(">II", data[16:24])
+    return width, height, len(data)
+
+
+def _file_name(text: str) -> str:
+    """A part of a file name, on every system."""
+    return "".join(c if c.isalnum() or c in "-_" else "_" for c in text) or "_"
+
+
+def _next_number(kept: deque[str]) -> int:
+    return int(kept[-1].split(".")[-2]) + 1 if kept else 1

@@ -1,0 +1,133 @@
+"""What the bridge asks of Webots: only from the controller's own thread, never after a quit."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from webots_mcp.errors import CommandRefusedError
+
+_ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
+QUIT: Final = -1
+
+
+class Simulation:
+    """The user's robot, seen as the way to its simulation.
+
+    Args:
+        robot: A Webots `Robot` or `Supervisor`, or an instance of a subclass.
+
+    Raises:
+        TypeError: `robot` is something else.
+    """
+
+    def __init__(self, robot: Any) -> None:
+        _require_robot(robot)
+        self.robot = robot
+        self.over = False
+        self.supervisor: bool = _may_supervise(robot)
+        self._base_step = _base_step(robot)
+
+    @property
+    def time_s(self) -> float:
+        """Simulation time as of the last step; costs no request."""
+        return float(self.robot.getTime())
+
+    @property
+    def basic_time_step_s(self) -> float:
+        """WorldInfo.basicTimeStep in seconds."""
+        return float(self.robot.getBasicTimeStep()) / 1000
+
+    @property
+    def mode(self) -> int:
+        """The simulation mode as of the last answer from Webots."""
+        return int(self.robot.simulationGetMode())
+
+    @property
+    def paused(self) -> bool:
+        """Whether the last answer from Webots said PAUSE."""
+        return self.mode == self.robot.SIMULATION_MODE_PAUSE
+
+    def set_mode(self, name: str) -> None:
+        """Set the mode `pause`, `real_time` or `fast`."""
+        self.robot.simulationSetMode(getattr(self.robot, f"SIMULATION_MODE_{name.upper()}"))
+
+    @property
+    def mode_name(self) -> str:
+        """`pause`, `real_time` or `fast`."""
+        names = {self.robot.SIMULATION_MODE_PAUSE: "pause", self.robot.SIMULATION_MODE_FAST: "fast"}
+        return names.get(self.mode, "real_time")
+
+    def pump(self) -> bool:
+        """Exchange news with Webots without letting time pass; False if Webots says quit.
+
+        Always Robot's own `step`: a subclass may have given its `step` another meaning.
+        """
+        if self._base_step(self.robot, 0) != QUIT:
+            return True
+        self.end()
+        return False
+
+    def end(self) -> None:
+        """Webots wants the controller to end: the API must not be called any more.
+
+        The next `step` of the user's loop would end the process in the middle, without any
+        cleanup, so it is answered here: -1, which ends the loop as Webots itself would.
+        """
+        self.over = True
+        owner: Any = type(self.robot)
+        if owner.step is self._base_step:
+            self.robot.step = _answer_quit
+
+    def require_supervisor(self, action: str) -> None:
+        """Refuse what only a Supervisor can do.
+
+        Raises:
+            CommandRefusedError: With what to change.
+        """
+        if self.supervisor:
+            return
+        missing = (
+            "set the field 'supervisor' of its Robot node to TRUE"
+            if hasattr(self.robot, "simulationSetMode")
+            else "create it with Supervisor() instead of Robot(), and set 'supervisor' to TRUE"
+        )
+        raise CommandRefusedError(f"{action} needs a Supervisor and this robot is none: {missing}")
+
+
+def _answer_quit(*_: object, **__: object) -> int:
+    return QUIT
+
+
+def _require_robot(robot: Any) -> None:
+    missing = [name for name in _ROBOT_METHODS if not callable(getattr(robot, name, None))]
+    if not missing:
+        return
+    inside = next(
+        (
+            name
+            for name in ("robot", "supervisor", "_robot")
+            if callable(getattr(getattr(robot, name, None), "getBasicTimeStep", None))
+        ),
+        None,
+    )
+    hint = f"; give its attribute: MCPBridge(x.{inside})" if inside else ""
+    raise TypeError(
+        f"MCPBridge needs a Webots Robot or Supervisor; {type(robot).__name__} has no "
+        f"{', '.join(missing)}{hint}"
+    )
+
+
+def _may_supervise(robot: Any) -> bool:
+    """Both are needed: the class that has the methods, and the world's permission."""
+    return hasattr(robot, "simulationSetMode") and bool(robot.getSupervisor())
+
+
+def _base_step(robot: Any) -> Callable[..., int]:
+    """Robot's own `step`: of the last class that defines both `step` and `getTime`.
+
+    A subclass that overrides `step` (an environment, say) hardly ever redefines `getTime` too.
+    """
+    owners = [cls for cls in type(robot).__mro__ if {"step", "getTime"} <= vars(cls).keys()]
+    owner: Any = owners[-1] if owners else type(robot)
+    return owner.step

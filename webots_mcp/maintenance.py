@@ -62,14 +62,14 @@ class Maintainer(threading.Thread):
         self._on_tick = on_tick
         self._work = work
         self._connection: sqlite3.Connection | None = None
-        self._stop = threading.Event()
+        self._ending = threading.Event()
         self._held_before = False
         self._data_version = -1
         self._complained = ""
 
     def run(self) -> None:
         """Tick until stopped; trouble with the file ends a tick, never the thread."""
-        while not self._stop.wait(INTERVAL_S):
+        while not self._ending.wait(INTERVAL_S):
             self._tick_safely()
         self._give_back()
 
@@ -84,7 +84,7 @@ class Maintainer(threading.Thread):
 
     def stop(self) -> None:
         """End the thread within an instant and give the lease back."""
-        self._stop.set()
+        self._ending.set()
         if self.is_alive():
             self.join(timeout=2)
 

@@ -75,7 +75,7 @@ class Simulation:
         cleanup, so it is answered here: -1, which ends the loop as Webots itself would.
         """
         self.over = True
-        owner: Any = type(self.robot)
+        owner: Any = self.robot.__class__
         if owner.step is self._base_step:
             self.robot.step = _answer_quit
 

@@ -1,0 +1,167 @@
+"""The command queue: at most once, idempotent, cancelled or expired but never in between."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import threading
+import time
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.store.recorded import Recorded
+from webots_mcp import settlement
+from webots_mcp.bridge.commands import CLAIM
+from webots_mcp.connection import connect
+from webots_mcp.contract import Database
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.queue import (
+    MAX_PARAMS_BYTES,
+    CommandQueue,
+    any_unfinished,
+    commands_since,
+    fetch_command,
+    list_commands,
+)
+
+
+def claim(connection: sqlite3.Connection, robot_id: int, session_id: int) -> list[int]:
+    times = {"now": time.time(), "sim_time": 0.0}
+    ids = {"robot": robot_id, "session": session_id}
+    return [row[0] for row in connection.execute(CLAIM, times | ids).fetchall()]
+
+
+def count(connection: sqlite3.Connection) -> int:
+    return int(connection.execute("SELECT count(*) FROM command").fetchone()[0])
+
+
+def test_a_command_waits_with_its_parameters_and_its_time_to_live(database: Database) -> None:
+    recorded = Recorded(database)
+    robot = recorded.robot()
+    queue = CommandQueue(recorded.connection, clock=lambda: 1000.0)
+    command = queue.enqueue(robot.id, "go", {"b": 1, "a": "ü"}, time_to_live_s=3.0)
+    assert json.loads(command.params) == {"a": "ü", "b": 1}
+    assert (command.status, command.expires_wall_time_s) == ("pending", 1003.0)
+    assert any_unfinished(recorded.connection)
+    recorded.close()
+
+
+def test_sending_again_with_the_same_key_makes_no_second_command(recorded: Recorded) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    first = queue.enqueue(robot.id, "go", {"x": 1}, idempotency_key="k")
+    again = queue.enqueue(robot.id, "go", {"x": 1}, idempotency_key="k")
+    assert first.id == again.id
+    assert count(recorded.connection) == 1
+
+
+def test_a_key_that_belongs_to_another_request_is_refused(recorded: Recorded) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    queue.enqueue(robot.id, "go", {"x": 1}, idempotency_key="k")
+    with pytest.raises(InvalidInputError, match="already belongs"):
+        queue.enqueue(robot.id, "go", {"x": 2}, idempotency_key="k")
+
+
+def test_a_busy_database_is_waited_for(recorded: Recorded) -> None:
+    robot = recorded.robot()
+    recorded.connection.execute("BEGIN IMMEDIATE")
+    with closing(connect(recorded.database, "writer")) as other:
+        other.execute("PRAGMA busy_timeout=50")
+        thread = threading.Timer(0.07, lambda: recorded.connection.execute("COMMIT"))
+        thread.start()
+        command = CommandQueue(other).enqueue(robot.id, "go")
+        thread.join()
+    assert command.status == "pending"
+    assert count(recorded.connection) == 1
+
+
+def test_a_database_that_stays_locked_is_an_error_and_no_command(recorded: Recorded) -> None:
+    robot = recorded.robot()
+    recorded.connection.execute("BEGIN IMMEDIATE")
+    with closing(connect(recorded.database, "writer")) as other:
+        other.execute("PRAGMA busy_timeout=1")
+        with pytest.raises(sqlite3.OperationalError, match="locked"):
+            CommandQueue(other).enqueue(robot.id, "go")
+    recorded.connection.execute("ROLLBACK")
+    assert count(recorded.connection) == 0
+
+
+@pytest.mark.parametrize("params", [{"x": float("nan")}, {"x": object()}])
+def test_parameters_that_are_no_json_are_refused(
+    recorded: Recorded, params: dict[str, object]
+) -> None:
+    robot = recorded.robot()
+    with pytest.raises(InvalidInputError, match="no plain JSON"):
+        CommandQueue(recorded.connection).enqueue(robot.id, "go", params)
+
+
+def test_parameters_beyond_the_limit_are_refused(recorded: Recorded) -> None:
+    robot = recorded.robot()
+    with pytest.raises(InvalidInputError, match="at most 65536"):
+        CommandQueue(recorded.connection).enqueue(robot.id, "go", {"x": "y" * MAX_PARAMS_BYTES})
+
+
+def test_a_cancelled_command_is_never_claimed(recorded: Recorded) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    command = queue.enqueue(robot.id, "go")
+    assert queue.cancel(command.id, "nobody claimed it")
+    assert claim(recorded.connection, robot.id, robot.session_id) == []
+    assert fetch_command(recorded.connection, command.id).error == "nobody claimed it"
+    assert not any_unfinished(recorded.connection)
+
+
+def test_a_claimed_command_cannot_be_cancelled(recorded: Recorded) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    command = queue.enqueue(robot.id, "go")
+    assert claim(recorded.connection, robot.id, robot.session_id) == [command.id]
+    assert not queue.cancel(command.id, "too late")
+    assert fetch_command(recorded.connection, command.id).status == "claimed"
+
+
+def test_of_cancelling_and_claiming_at_once_exactly_one_wins(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "race.db")
+    robot = recorded.robot()
+    queue = CommandQueue(recorded.connection)
+    ids = [queue.enqueue(robot.id, "go").id for _ in range(200)]
+    claimed: list[int] = []
+
+    def claim_all() -> None:
+        with closing(connect(recorded.database, "writer")) as controller:
+            while rows := claim(controller, robot.id, robot.session_id):
+                claimed.extend(rows)
+
+    thread = threading.Thread(target=claim_all)
+    thread.start()
+    cancelled = [i for i in reversed(ids) if queue.cancel(i, "taken back")]
+    thread.join()
+    assert sorted(claimed + cancelled) == ids
+    recorded.close()
+
+
+def test_an_unclaimed_command_expires_and_is_never_run(recorded: Recorded) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    command = queue.enqueue(robot.id, "go", time_to_live_s=0.0)
+    settlement.settle(recorded.connection, time.time() + 1)
+    assert fetch_command(recorded.connection, command.id).status == "expired"
+    assert claim(recorded.connection, robot.id, robot.session_id) == []
+
+
+def test_commands_are_listed_newest_first_in_pages(recorded: Recorded) -> None:
+    queue, robot = CommandQueue(recorded.connection), recorded.robot()
+    other = recorded.robot("crane")
+    ids = [queue.enqueue(robot.id, f"a{i}").id for i in range(5)]
+    queue.enqueue(other.id, "not mine")
+    queue.cancel(ids[0], "x")
+    page = list_commands(recorded.connection, robot.id, limit=2)
+    assert [c.id for c in page] == [ids[4], ids[3]]
+    rest = list_commands(recorded.connection, robot.id, limit=9, before_id=ids[3])
+    assert [c.id for c in rest] == [ids[2], ids[1], ids[0]]
+    only = list_commands(recorded.connection, robot.id, limit=9, status="cancelled")
+    assert [c.id for c in only] == [ids[0]]
+    assert [c.id for c in commands_since(recorded.connection, robot.id, 0.0)] == ids
+
+
+def test_an_unknown_command_is_an_error(recorded: Recorded) -> None:
+    with pytest.raises(InvalidInputError, match="no command 5"):
+        fetch_command(recorded.connection, 5)

@@ -1,0 +1,133 @@
+"""What is said about a robot's time: running, paused, stopped or never seen."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import pytest
+
+from tests.store.recorded import Recorded, RecordedRobot
+from webots_mcp.store.runs import current_run
+from webots_mcp.store.sessions import newest_session
+from webots_mcp.store.status import Status, judge
+
+NOW = 1_800_000_000.0
+
+
+def status_of(robot: RecordedRobot, after_s: float = 0.0) -> Status:
+    session = newest_session(robot.connection, robot.id)
+    return judge(robot.connection, session, current_run(robot.connection, robot.id), NOW + after_s)
+
+
+def dead_pid() -> int:
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+    return process.pid
+
+
+def test_a_robot_whose_time_moves_is_running(recorded: Recorded) -> None:
+    assert status_of(recorded.robot(now=NOW), after_s=0.6) == ("running", None)
+
+
+def test_a_running_robot_stays_running_between_two_heartbeats(recorded: Recorded) -> None:
+    assert status_of(recorded.robot(now=NOW), after_s=1.4).is_moving
+
+
+def test_a_slow_simulation_is_given_the_time_that_its_rows_take(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW)
+    for i in range(4):
+        robot.state(i * 0.016, {}, at=NOW - 3 * (3 - i))
+    assert status_of(robot, after_s=8).text == "running"
+    assert status_of(robot, after_s=12).text == "stopped 12 s ago"
+
+
+def test_one_long_pause_among_the_last_rows_does_not_make_the_robot_look_slow(
+    recorded: Recorded,
+) -> None:
+    robot = recorded.robot(now=NOW)
+    for at in (NOW - 60.2, NOW - 60.1, NOW - 0.2, NOW - 0.1, NOW):
+        robot.state(0.016, {}, at=at)
+    assert status_of(robot, after_s=2).text == "stopped 2.0 s ago"
+
+
+def test_a_held_loop_is_paused(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW, hold="paused", moved_wall_time_s=NOW - 100)
+    assert status_of(robot, after_s=0.5) == ("paused", None)
+
+
+def test_a_loop_that_steps_under_command_is_running(recorded: Recorded) -> None:
+    assert status_of(recorded.robot(now=NOW, hold="stepping")).text == "running"
+
+
+def test_a_hold_whose_heartbeat_stopped_is_no_pause_any_more(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW, hold="paused", moved_wall_time_s=NOW - 5)
+    status = status_of(robot, after_s=30)
+    assert status.text == "stopped 35 s ago"
+    assert "loop is silent" in (status.why or "")
+
+
+def test_a_robot_is_paused_while_another_holds_the_same_simulation(recorded: Recorded) -> None:
+    robot = recorded.robot("rover", now=NOW, last_seen_wall_time_s=NOW - 60)
+    recorded.robot("referee", now=NOW, hold="paused")
+    assert status_of(robot).text == "paused"
+    assert "'referee'" in (status_of(robot).why or "")
+
+
+def test_a_hold_in_another_simulation_says_nothing_about_this_one(recorded: Recorded) -> None:
+    robot = recorded.robot("rover", now=NOW)
+    recorded.robot("referee", now=NOW, hold="paused", instance="webots-2")
+    assert status_of(robot).text == "running"
+
+
+def test_a_silent_loop_in_a_living_process_is_stopped_for_one_of_the_known_reasons(
+    recorded: Recorded,
+) -> None:
+    status = status_of(recorded.robot(now=NOW), after_s=42)
+    assert status.text == "stopped 42 s ago"
+    for reason in ("paused by hand", "breakpoint", "another controller", "extern controller"):
+        assert reason in (status.why or "")
+
+
+def test_a_loop_that_lives_without_moving_time_says_so(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW, moved_wall_time_s=NOW - 20)
+    status = status_of(robot)
+    assert status.text == "stopped 20 s ago"
+    assert "stands still" in (status.why or "")
+
+
+def test_a_controller_that_never_moved_is_not_running(recorded: Recorded) -> None:
+    status = status_of(recorded.robot(now=NOW, moved_wall_time_s=None))
+    assert status.text == "stopped 0.0 s ago"
+    assert "not moved since" in (status.why or "")
+
+
+@pytest.mark.parametrize(
+    ("end_reason", "said"),
+    [("finished", "finished"), ("reload", "reloaded"), ("crashed", "killed or crashed")],
+)
+def test_an_ended_session_tells_how_it_ended(
+    recorded: Recorded, end_reason: str, said: str
+) -> None:
+    robot = recorded.robot(now=NOW, ended_wall_time_s=NOW, end_reason=end_reason)
+    status = status_of(robot, after_s=7)
+    assert status.text == "stopped 7.0 s ago"
+    assert said in (status.why or "")
+
+
+def test_a_process_that_is_gone_is_not_running_even_with_a_fresh_heartbeat(
+    recorded: Recorded,
+) -> None:
+    status = status_of(recorded.robot(now=NOW, pid=dead_pid()))
+    assert status.text == "stopped 0.0 s ago"
+    assert "gone" in (status.why or "")
+
+
+def test_a_session_on_another_host_is_judged_by_its_heartbeat(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW, host="elsewhere", pid=1)
+    assert status_of(robot).text == "running"
+    assert "gone" in (status_of(robot, after_s=60).why or "")
+
+
+def test_without_a_session_a_robot_was_never_seen(recorded: Recorded) -> None:
+    assert judge(recorded.connection, None, None, NOW).text == "never seen"

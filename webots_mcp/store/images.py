@@ -1,0 +1,81 @@
+"""Camera frames and screenshots: rows here, files in the data folder."""
+
+from __future__ import annotations
+
+import sqlite3
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
+
+_COLUMNS: Final = "id, run_id, sim_time_s, wall_time_s, kind, device, path, width, height, bytes"
+_NEWEST: Final = (
+    f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND kind = :kind "
+    "AND (:device IS NULL OR device = :device) ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_BY_ID: Final = f"SELECT {_COLUMNS} FROM image WHERE id = ?"
+_DEVICES: Final = (
+    "SELECT DISTINCT device FROM image WHERE run_id = ? AND kind = 'camera' AND device IS NOT NULL"
+)
+
+
+@dataclass(frozen=True)
+class StoredImage:
+    """A picture that was recorded; `path` is relative to the data folder."""
+
+    id: int
+    run_id: int
+    sim_time_s: float
+    wall_time_s: float
+    kind: str
+    device: str | None
+    path: str
+    width: int
+    height: int
+    bytes: int
+
+    def file(self, data_dir: Path) -> Path:
+        """The file itself.
+
+        Raises:
+            InvalidInputError: The recorded path leads out of the data folder.
+            NothingRecordedError: The file is gone.
+        """
+        file = (data_dir / self.path).resolve()
+        if not file.is_relative_to(data_dir.resolve()):
+            raise InvalidInputError(
+                f"image {self.id} is recorded outside the data folder and is not opened"
+            )
+        if not file.is_file():
+            raise NothingRecordedError(
+                f"image {self.id} was recorded at {file}, but the file is gone: only the newest "
+                "pictures are kept"
+            )
+        return file
+
+
+def newest_camera_image(
+    connection: sqlite3.Connection, run_id: int, device: str | None = None
+) -> StoredImage | None:
+    """The latest camera frame of a run, of one camera or of any."""
+    values = {"run_id": run_id, "kind": "camera", "device": device}
+    row = connection.execute(_NEWEST, values).fetchone()
+    return StoredImage(*row) if row else None
+
+
+def camera_names(connection: sqlite3.Connection, run_id: int) -> list[str]:
+    """The cameras whose frames the run recorded."""
+    return [row[0] for row in connection.execute(_DEVICES, (run_id,)).fetchall()]
+
+
+def fetch_image(connection: sqlite3.Connection, image_id: int) -> StoredImage:
+    """The picture of that id.
+
+    Raises:
+        NothingRecordedError: There is none.
+    """
+    row = connection.execute(_BY_ID, (image_id,)).fetchone()
+    if row is None:
+        raise NothingRecordedError(f"no image {image_id} is recorded")
+    return StoredImage(*row)

@@ -1,0 +1,217 @@
+"""The command queue, from the asker's side: put in, look, take back.
+
+A command runs at most once: it is claimed by one statement of the bridge, and the guards in the
+statements here (`AND status = 'pending'`, the unique key) hold for any number of processes.
+"""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+import uuid
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, TypeVar
+
+from webots_mcp.contract import COMMAND_TIME_TO_LIVE_S, FINAL_STATUSES
+from webots_mcp.errors import InvalidInputError
+
+MAX_PARAMS_BYTES: Final = 65_536
+# A writer connection waits 5 s for the lock by itself; then the statement is sent again.
+_ATTEMPTS: Final = 3
+
+_COLUMNS: Final = (
+    "id, robot_id, action, params, status, requested_by, created_wall_time_s, "
+    "expires_wall_time_s, claimed_wall_time_s, claimed_sim_time_s, session_id, "
+    "issued_wall_time_s, finished_wall_time_s, finished_sim_time_s, result, error"
+)
+_ENQUEUE: Final = (
+    "INSERT INTO command (robot_id, action, params, status, requested_by, idempotency_key, "
+    "created_wall_time_s, expires_wall_time_s) "
+    "VALUES (:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires) "
+    "ON CONFLICT (idempotency_key) DO NOTHING"
+)
+_BY_KEY: Final = f"SELECT {_COLUMNS} FROM command WHERE idempotency_key = ?"
+_BY_ID: Final = f"SELECT {_COLUMNS} FROM command WHERE id = ?"
+_CANCEL: Final = (
+    "UPDATE command SET status = 'cancelled', finished_wall_time_s = :now, error = :why "
+    "WHERE id = :id AND status = 'pending'"
+)
+_NEWEST: Final = (
+    f"SELECT {_COLUMNS} FROM command WHERE robot_id = :robot_id "
+    "AND (:before_id IS NULL OR id < :before_id) AND (:status IS NULL OR status = :status) "
+    "ORDER BY id DESC LIMIT :limit"
+)
+_CREATED_SINCE: Final = (
+    f"SELECT {_COLUMNS} FROM command WHERE robot_id = ? AND created_wall_time_s >= ? ORDER BY id"
+)
+# Two questions, so that each is answered by its partial index.
+_UNFINISHED: Final = (
+    "SELECT EXISTS (SELECT 1 FROM command WHERE status = 'pending') "
+    "OR EXISTS (SELECT 1 FROM command WHERE status = 'claimed')"
+)
+
+
+@dataclass(frozen=True)
+class Command:
+    """A request and its fate; `params` and `result` are JSON text. Columns as in `store.models`."""
+
+    id: int
+    robot_id: int
+    action: str
+    params: str
+    status: str
+    requested_by: str | None
+    created_wall_time_s: float
+    expires_wall_time_s: float
+    claimed_wall_time_s: float | None
+    claimed_sim_time_s: float | None
+    session_id: int | None
+    issued_wall_time_s: float | None
+    finished_wall_time_s: float | None
+    finished_sim_time_s: float | None
+    result: str | None
+    error: str | None
+
+    @property
+    def is_final(self) -> bool:
+        """Whether its fate is settled: a final status never changes again."""
+        return self.status in FINAL_STATUSES
+
+
+class CommandQueue:
+    """Puts commands for one robot's controller into the database.
+
+    Args:
+        connection: A writer connection; the queue never closes it.
+        clock: Unix time in seconds.
+    """
+
+    def __init__(
+        self, connection: sqlite3.Connection, clock: Callable[[], float] = time.time
+    ) -> None:
+        self._connection = connection
+        self._clock = clock
+
+    def enqueue(
+        self,
+        robot_id: int,
+        action: str,
+        params: Mapping[str, Any] | None = None,
+        *,
+        time_to_live_s: float = COMMAND_TIME_TO_LIVE_S,
+        requested_by: str | None = None,
+        idempotency_key: str | None = None,
+    ) -> Command:
+        """Ask for an action; sending it again with the same key makes no second command.
+
+        The insert is repeated while the database is busy. That is safe: every repetition carries
+        the same unique key, so that an insert whose answer was lost is found instead of doubled.
+
+        Args:
+            robot_id: Whose controller is to run it.
+            action: A built-in or registered action.
+            params: Its parameters, plain JSON.
+            time_to_live_s: Unclaimed after this time, it expires and never runs.
+            requested_by: Who asks, for the record.
+            idempotency_key: A key of the caller's; one is made up if it is None.
+
+        Raises:
+            InvalidInputError: The parameters are no plain JSON or too long, or the key already
+                belongs to another request.
+            sqlite3.OperationalError: The database stayed locked.
+        """
+        key = idempotency_key or uuid.uuid4().hex
+        now_s = self._clock()
+        values = {
+            "robot_id": robot_id,
+            "action": action,
+            "params": _encode_params(params or {}),
+            "requested_by": requested_by,
+            "key": key,
+            "now": now_s,
+            "expires": now_s + time_to_live_s,
+        }
+        _while_busy(lambda: self._connection.execute(_ENQUEUE, values))
+        command = Command(*self._connection.execute(_BY_KEY, (key,)).fetchone())
+        if any(getattr(command, name) != values[name] for name in ("robot_id", "action", "params")):
+            raise InvalidInputError(
+                f"idempotency key {key!r} already belongs to command {command.id} "
+                f"({command.action!r}); use another key"
+            )
+        return command
+
+    def cancel(self, command_id: int, why: str) -> bool:
+        """Take back a command that nobody has claimed; True if it will now never run."""
+        values = {"id": command_id, "now": self._clock(), "why": why}
+        return _while_busy(lambda: self._connection.execute(_CANCEL, values)).rowcount == 1
+
+
+def fetch_command(connection: sqlite3.Connection, command_id: int) -> Command:
+    """The command of that id.
+
+    Raises:
+        InvalidInputError: There is none.
+    """
+    row = connection.execute(_BY_ID, (command_id,)).fetchone()
+    if row is None:
+        raise InvalidInputError(f"no command {command_id}; webots_list_commands lists them")
+    return Command(*row)
+
+
+def list_commands(
+    connection: sqlite3.Connection,
+    robot_id: int,
+    *,
+    limit: int,
+    status: str | None = None,
+    before_id: int | None = None,
+) -> list[Command]:
+    """The robot's newest commands, newest first; `before_id` pages towards older ones."""
+    values = {
+        "robot_id": robot_id,
+        "status": status,
+        "limit": limit,
+        "before_id": before_id,
+    }
+    return [Command(*row) for row in connection.execute(_NEWEST, values).fetchall()]
+
+
+def commands_since(
+    connection: sqlite3.Connection, robot_id: int, wall_time_s: float
+) -> list[Command]:
+    """The robot's commands created since then, oldest first."""
+    rows = connection.execute(_CREATED_SINCE, (robot_id, wall_time_s)).fetchall()
+    return [Command(*row) for row in rows]
+
+
+def any_unfinished(connection: sqlite3.Connection) -> bool:
+    """Whether `settlement.settle` could have anything to say about commands."""
+    return bool(connection.execute(_UNFINISHED).fetchone()[0])
+
+
+def _encode_params(params: Mapping[str, Any]) -> str:
+    try:
+        text = json.dumps(dict(params), allow_nan=False, ensure_ascii=False, sort_keys=True)
+    except (TypeError, ValueError) as error:
+        raise InvalidInputError(f"params are no plain JSON: {error}") from error
+    if (size := len(text.encode())) > MAX_PARAMS_BYTES:
+        raise InvalidInputError(
+            f"params are {size} bytes of JSON, at most {MAX_PARAMS_BYTES} are taken; "
+            "write a file and pass its path"
+        )
+    return text
+
+
+_T = TypeVar("_T")
+
+
+def _while_busy(execute: Callable[[], _T], attempts: int = _ATTEMPTS) -> _T:
+    """Repeat a statement that is safe to repeat while another process holds the write lock."""
+    try:
+        return execute()
+    except sqlite3.OperationalError as error:
+        if "locked" not in str(error) or attempts == 1:
+            raise
+    return _while_busy(execute, attempts - 1)

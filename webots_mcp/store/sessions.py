@@ -1,0 +1,95 @@
+"""Controller processes: who they are, and whether they still live."""
+
+from __future__ import annotations
+
+import json
+import socket
+import sqlite3
+from dataclasses import dataclass
+from typing import Any, Final
+
+from webots_mcp.contract import HEARTBEAT_LATE_S
+from webots_mcp.settlement import process_alive
+
+# A session on another host, whose process cannot be asked, counts as dead after this silence.
+REMOTE_SILENCE_S: Final = 5 * HEARTBEAT_LATE_S
+
+_COLUMNS: Final = (
+    "id, robot_id, pid, host, instance, controller, controller_sha256, git_commit, versions, "
+    "supervisor, actions, started_wall_time_s, last_seen_wall_time_s, last_poll_wall_time_s, "
+    "moved_wall_time_s, sim_time_s, hold, rows_waiting, rows_dropped, last_error, "
+    "ended_wall_time_s, end_reason"
+)
+_NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
+_BY_ID: Final = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
+_COMPANIONS: Final = (
+    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND host = :host "
+    "AND id <> :id AND ended_wall_time_s IS NULL ORDER BY id"
+)
+
+
+@dataclass(frozen=True)
+class Session:
+    """One controller process; the row is its bridge's heartbeat. Columns as in `store.models`."""
+
+    id: int
+    robot_id: int
+    pid: int
+    host: str
+    instance: str
+    controller: str | None
+    controller_sha256: str | None
+    git_commit: str | None
+    versions: dict[str, Any]
+    supervisor: bool
+    actions: dict[str, Any]
+    started_wall_time_s: float
+    last_seen_wall_time_s: float
+    last_poll_wall_time_s: float | None
+    moved_wall_time_s: float | None
+    sim_time_s: float | None
+    hold: str | None
+    rows_waiting: int
+    rows_dropped: int
+    last_error: str | None
+    ended_wall_time_s: float | None
+    end_reason: str | None
+
+    def is_alive(self, now_s: float) -> bool:
+        """On this host its process tells; on another only its heartbeat can."""
+        if self.ended_wall_time_s is not None:
+            return False
+        if self.host == socket.gethostname():
+            return process_alive(self.pid)
+        return now_s - self.last_seen_wall_time_s < REMOTE_SILENCE_S
+
+    def heartbeat_is_fresh(self, now_s: float) -> bool:
+        """Whether its loop gave a sign of life lately."""
+        return now_s - self.last_seen_wall_time_s <= HEARTBEAT_LATE_S
+
+
+def newest_session(connection: sqlite3.Connection, robot_id: int) -> Session | None:
+    """The robot's latest controller process, alive or not."""
+    return _session(connection.execute(_NEWEST, (robot_id,)).fetchone())
+
+
+def fetch_session(connection: sqlite3.Connection, session_id: int) -> Session | None:
+    """The session of that id."""
+    return _session(connection.execute(_BY_ID, (session_id,)).fetchone())
+
+
+def companions(connection: sqlite3.Connection, session: Session, now_s: float) -> list[Session]:
+    """The other living sessions in the same simulation."""
+    values = {"instance": session.instance, "host": session.host, "id": session.id}
+    rows = connection.execute(_COMPANIONS, values).fetchall()
+    return [found for row in rows if (found := _session(row)) and found.is_alive(now_s)]
+
+
+def _session(row: tuple[Any, ...] | None) -> Session | None:
+    if row is None:
+        return None
+    values = dict(zip(_COLUMNS.split(", "), row, strict=True))
+    values["versions"] = json.loads(values["versions"] or "{}")
+    values["actions"] = json.loads(values["actions"] or "{}")
+    values["supervisor"] = bool(values["supervisor"])
+    return Session(**values)

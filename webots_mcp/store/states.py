@@ -1,0 +1,142 @@
+"""Published states: the newest one, those of a window, and how fast they come."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final, cast
+
+from webots_mcp.errors import InvalidInputError
+
+_COLUMNS: Final = "id, run_id, sim_time_s, wall_time_s, data, odd"
+_NEWEST: Final = (
+    f"SELECT {_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_RECENT_TIMES: Final = (
+    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
+)
+# Simulation time bounds the search to the index; the id then cuts off what came before.
+_WINDOW: Final = (
+    f"SELECT {_COLUMNS} FROM state WHERE run_id = :run_id AND sim_time_s >= :from_sim_time_s "
+    "AND id > :after_id ORDER BY sim_time_s, id"
+)
+_NEWEST_ID: Final = "SELECT coalesce(max(id), 0) FROM state"
+
+PACE_ROWS: Final = 6
+PACE_WINDOW_S: Final = 5.0
+_PACE_WINDOW_ROWS: Final = 500
+_SHOWN_KEYS: Final = 20
+_SHOWN_KEY_CHARACTERS: Final = 40
+
+
+@dataclass(frozen=True)
+class State:
+    """What one `publish` recorded; `data` and `odd` are JSON text."""
+
+    id: int
+    run_id: int
+    sim_time_s: float
+    wall_time_s: float
+    data: str
+    odd: str | None
+
+    def value(self) -> dict[str, Any]:
+        """The published dict, with "nan", "inf" and the like where JSON has to say null."""
+        value = cast("dict[str, Any]", json.loads(self.data))
+        for path, kind in self.odd_paths().items():
+            _name_replaced(value, path.split("."), kind)
+        return value
+
+    def odd_paths(self) -> dict[str, str]:
+        """Path of every replaced value, and what it was."""
+        return json.loads(self.odd) if self.odd else {}
+
+
+def newest_state(connection: sqlite3.Connection, run_id: int) -> State | None:
+    """The latest row of a run."""
+    row = connection.execute(_NEWEST, (run_id,)).fetchone()
+    return State(*row) if row else None
+
+
+def newest_state_id(connection: sqlite3.Connection) -> int:
+    """A cursor: rows recorded from now on have greater ids."""
+    return int(connection.execute(_NEWEST_ID).fetchone()[0])
+
+
+def states_after(
+    connection: sqlite3.Connection, run_id: int, after_id: int, from_sim_time_s: float
+) -> Iterator[State]:
+    """The rows of a run with greater ids, in order, read one by one."""
+    values = {"run_id": run_id, "after_id": after_id, "from_sim_time_s": from_sim_time_s}
+    return (State(*row) for row in connection.execute(_WINDOW, values))
+
+
+def recent_interval_s(connection: sqlite3.Connection, run_id: int) -> float | None:
+    """Median wall time between the latest rows of a run, in seconds; None with fewer than two."""
+    times = connection.execute(_RECENT_TIMES, (run_id, PACE_ROWS)).fetchall()
+    gaps = sorted(newer[1] - older[1] for newer, older in itertools.pairwise(times))
+    return gaps[len(gaps) // 2] if gaps else None
+
+
+def real_time_factor(connection: sqlite3.Connection, run_id: int) -> float | None:
+    """Simulation time per wall time over the last few seconds that were recorded."""
+    times = connection.execute(_RECENT_TIMES, (run_id, _PACE_WINDOW_ROWS)).fetchall()
+    recent = [time for time in times if times[0][1] - time[1] <= PACE_WINDOW_S]
+    if len(recent) < 2 or recent[0][1] <= recent[-1][1]:
+        return None
+    return (recent[0][0] - recent[-1][0]) / (recent[0][1] - recent[-1][1])
+
+
+def select(value: Any, path: str) -> Any:
+    """The part of a state at a dotted path; `""` is all of it.
+
+    Raises:
+        InvalidInputError: Nothing is there; the text names the part that is missing.
+    """
+    parts = path.split(".") if path else []
+    while parts:
+        key, taken = _key(value, parts, path)
+        value, parts = value[key], parts[taken:]
+    return value
+
+
+def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
+    """The key or index that the path starts with, and how many of its parts that takes.
+
+    A key may itself hold dots, so the longest one that fits is taken.
+    """
+    if isinstance(value, dict):
+        members = cast("dict[str, Any]", value)
+        for taken in range(len(parts), 0, -1):
+            if (key := ".".join(parts[:taken])) in members:
+                return key, taken
+        known = [key[:_SHOWN_KEY_CHARACTERS] for key in list(members)[:_SHOWN_KEYS]]
+        raise InvalidInputError(f"path {path!r}: there is no {parts[0]!r}; there are {known}")
+    if isinstance(value, list):
+        items = cast("list[Any]", value)
+        if parts[0].isdecimal() and int(parts[0]) < len(items):
+            return int(parts[0]), 1
+        raise InvalidInputError(f"path {path!r}: {parts[0]!r} is no index of {len(items)} items")
+    raise InvalidInputError(f"path {path!r}: {parts[0]!r} asks for a part of a single value")
+
+
+def _name_replaced(value: Any, parts: list[str], kind: str) -> None:
+    """Put the kind where null stands for a replaced value; a value that was kept stays.
+
+    The last part `*` stands for every null in an array.
+    """
+    if parts == ["*"] and isinstance(value, list):
+        value[:] = [kind if item is None else item for item in cast("list[Any]", value)]
+        return
+    try:
+        key, taken = _key(value, parts, "")
+    except InvalidInputError:  # the path leads to what was replaced as a whole
+        return
+    if taken < len(parts):
+        _name_replaced(value[key], parts[taken:], kind)
+    elif value[key] is None:
+        value[key] = kind

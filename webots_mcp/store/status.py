@@ -1,0 +1,105 @@
+"""Whether a robot's time is moving, judged from its session row, its process and its companions."""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import Final, NamedTuple
+
+from webots_mcp.contract import HEARTBEAT_INTERVAL_S
+from webots_mcp.store.runs import Run
+from webots_mcp.store.sessions import Session, companions
+from webots_mcp.store.states import recent_interval_s
+
+NEVER_SEEN: Final = "never seen"
+RUNNING: Final = "running"
+PAUSED: Final = "paused"
+
+_STILL_MOVING_S: Final = 1.0
+_SLOWEST_STILL_MOVING_S: Final = 15.0
+
+_ENDED: Final = {
+    "finished": "its controller finished",
+    "reload": "the world was reloaded and no new controller session has appeared yet",
+    "crashed": "its controller process is gone without having finished (killed or crashed)",
+    "replaced": "a newer session took its place",
+}
+_SILENT: Final = (
+    "its controller process lives but its loop is silent: paused by hand in Webots, at a "
+    "breakpoint, another controller looping, or an extern controller missing; from inside the "
+    "simulation these look alike"
+)
+_NOT_STARTED: Final = (
+    "its controller has started, but simulation time has not moved since: the simulation may be "
+    "paused in Webots, or the controller has not reached its loop"
+)
+_STANDING: Final = (
+    "its loop is alive but simulation time stands still: paused by the controller's own code, or "
+    "it calls step(0) only"
+)
+
+
+class Status(NamedTuple):
+    """What to say about a robot, and why where that helps."""
+
+    text: str
+    why: str | None = None
+
+    @property
+    def is_moving(self) -> bool:
+        """Whether simulation time is going on."""
+        return self.text == RUNNING
+
+
+def judge(
+    connection: sqlite3.Connection, session: Session | None, run: Run | None, now_s: float
+) -> Status:
+    """Say whether the robot's time is moving now.
+
+    Args:
+        connection: An open database.
+        session: The robot's latest session.
+        run: Its latest run; the pace of its rows tells how soon silence means anything.
+        now_s: Unix time.
+    """
+    if session is None:
+        return Status(NEVER_SEEN)
+    if not session.is_alive(now_s):
+        return _stopped(session, now_s, _ENDED.get(session.end_reason or "crashed"))
+    if holder := _holder(connection, session, now_s):
+        return Status(PAUSED, None if holder is session else _held_elsewhere(connection, holder))
+    if session.moved_wall_time_s is None:
+        return _stopped(session, now_s, _NOT_STARTED)
+    if now_s - session.moved_wall_time_s <= _still_moving_s(connection, run):
+        return Status(RUNNING)
+    fresh = session.heartbeat_is_fresh(now_s)
+    return _stopped(session, now_s, _STANDING if fresh else _SILENT)
+
+
+def stopped_for(seconds: float) -> str:
+    """`stopped N s ago`, with a decimal only where it tells something."""
+    return f"stopped {max(seconds, 0.0):.{1 if seconds < 10 else 0}f} s ago"
+
+
+def _stopped(session: Session, now_s: float, why: str | None) -> Status:
+    moved_s = session.moved_wall_time_s or session.started_wall_time_s
+    return Status(stopped_for(now_s - moved_s), why)
+
+
+def _holder(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:
+    """The session whose bridge holds the loop: one that is held freezes its whole simulation."""
+    for candidate in (session, *companions(connection, session, now_s)):
+        if candidate.hold == PAUSED and candidate.heartbeat_is_fresh(now_s):
+            return candidate
+    return None
+
+
+def _held_elsewhere(connection: sqlite3.Connection, holder: Session) -> str:
+    name = connection.execute("SELECT name FROM robot WHERE id = ?", (holder.robot_id,)).fetchone()
+    return f"the simulation is held by robot {name[0]!r}: resume it there"
+
+
+def _still_moving_s(connection: sqlite3.Connection, run: Run | None) -> float:
+    """How old the last movement may be; heartbeats tell it only every so often."""
+    interval_s = (recent_interval_s(connection, run.id) if run else None) or 0.0
+    pace_s = min(max(_STILL_MOVING_S, 3 * interval_s), _SLOWEST_STILL_MOVING_S)
+    return pace_s + HEARTBEAT_INTERVAL_S

@@ -1,0 +1,226 @@
+"""What the simulator answers to the messages of controllers."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from controller.wire import Message
+
+from webots_mcp.standin.arena import Body
+from webots_mcp.standin.nodes import NODE_TYPES
+from webots_mcp.standin.picture import Label
+from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
+from webots_mcp.standin.vrml import Node
+
+CUSTOM_DATA_TAG = 0
+"""Stands for the robot itself where devices have their tags."""
+
+FieldReference = tuple[int, str]
+"""Node id and field name."""
+
+
+def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
+    """What a controller is told when it connects."""
+    fields = robot.node.fields
+    return {
+        "name": robot.name,
+        "model": fields["model"],
+        "custom_data": fields["customData"],
+        "supervisor": fields["supervisor"],
+        "synchronization": fields["synchronization"],
+        "basic_time_step": simulator.world.basic_time_step_ms,
+        "world_path": str(simulator.world.path),
+        "project_path": str(simulator.world.path.parent.parent),
+        "time": simulator.time_s,
+        "mode": int(simulator.mode),
+        "devices": [device.description() for device in robot.devices.values()],
+    }
+
+
+def answer(simulator: Simulator, robot: Robot, message: Message) -> Message | None:
+    """Answers a controller; None if the answer has to wait until simulated time has passed."""
+    kind, *rest = message
+    if kind == "step":
+        return _step(simulator, robot, *rest)
+    if kind == "fetch":
+        return ("fetched", robot.devices[rest[0]].fetch())
+    operation, arguments, field_sets = rest
+    requests = SupervisorRequests(simulator, robot)
+    requests.set_fields(field_sets)
+    return ("answer", requests.carry_out(operation, arguments), int(simulator.mode))
+
+
+def step_over(simulator: Simulator, robot: Robot) -> Message:
+    """The answer to a step request: time, mode and the values measured since the last one."""
+    values = [*robot.fresh.items()]
+    robot.fresh.clear()
+    return ("stepped", simulator.time_s, int(simulator.mode), robot.delay_ms, values)
+
+
+def _step(
+    simulator: Simulator, robot: Robot, duration_ms: int, changes: list[Any], field_sets: list[Any]
+) -> Message | None:
+    for tag, setting, value in changes:
+        if tag == CUSTOM_DATA_TAG:
+            robot.node.fields["customData"] = value
+        else:
+            robot.devices[tag].configure(setting, value)
+    SupervisorRequests(simulator, robot).set_fields(field_sets)
+    if duration_ms == 0 or simulator.ask_step(robot, duration_ms):
+        return step_over(simulator, robot)
+    return None
+
+
+class SupervisorRequests:
+    """Carries out the requests of one robot's `Supervisor`.
+
+    The request `simulation_reset` is the method `on_simulation_reset`; the names are those of
+    Webots' C functions without `wb_supervisor_`.
+    """
+
+    def __init__(self, simulator: Simulator, robot: Robot) -> None:
+        self._simulator = simulator
+        self._world = simulator.world
+        self._robot = robot
+
+    def carry_out(self, operation: str, arguments: list[Any]) -> Any:
+        """Answers one request by name."""
+        method: Callable[..., Any] = getattr(self, f"on_{operation}")
+        return method(*arguments)
+
+    # Nodes ---------------------------------------------------------------------------------------
+
+    def on_node_get_root(self) -> Any:
+        """The node around everything."""
+        return self._shown(self._world.root)
+
+    def on_node_get_self(self) -> Any:
+        """The robot's own node."""
+        return self._shown(self._robot.node)
+
+    def on_node_get_from_def(self, def_path: str) -> Any:
+        """A node by its DEF name."""
+        return self._shown(self._world.find(def_path))
+
+    def on_node_get_from_id(self, node_id: int) -> Any:
+        """A node by its number."""
+        nodes = self._world.nodes
+        return self._shown(nodes[node_id]) if 0 <= node_id < len(nodes) else None
+
+    def on_node_get_from_device(self, tag: int) -> Any:
+        """The node of one of the robot's devices."""
+        device = self._robot.devices.get(tag)
+        return self._shown(device.node) if device else None
+
+    def on_node_get_parent_node(self, node_id: int) -> Any:
+        """The node around a node."""
+        return self._shown(self._world.parent_of(self._world.nodes[node_id]))
+
+    def _shown(self, node: Node | None) -> Any:
+        if node is None:
+            return None
+        return (self._world.id_of(node), node.type_name, node.def_name)
+
+    # Fields --------------------------------------------------------------------------------------
+
+    def on_node_get_field(self, node_id: int, name: str) -> Any:
+        """Type and number of entries of a field; None if the node has no such field."""
+        node = self._world.nodes[node_id]
+        definition = NODE_TYPES[node.type_name].get(name)
+        if definition is None:
+            return None
+        many = definition.type_name.startswith("MF")
+        return definition.type_name, len(node.fields[name]) if many else -1
+
+    def on_node_get_field_names(self, node_id: int) -> list[str]:
+        """The names of all fields of a node."""
+        return [*NODE_TYPES[self._world.nodes[node_id].type_name]]
+
+    def on_field_get(self, field: FieldReference, index: int | None) -> Any:
+        """The value of a field or of one entry of it; None beyond its end."""
+        node_id, name = field
+        value = self._world.nodes[node_id].fields[name]
+        if index is not None:
+            value = value[index] if -len(value) <= index < len(value) else None
+        return self._shown(value) if isinstance(value, Node) else value
+
+    def set_fields(self, field_sets: list[Any]) -> None:
+        """Writes fields, and lets what they describe follow."""
+        for (node_id, name), index, value in field_sets:
+            node = self._world.nodes[node_id]
+            if index is None:
+                node.fields[name] = value
+            elif -len(node.fields[name]) <= index < len(node.fields[name]):
+                node.fields[name][index] = value
+            self._follow(node, name, value)
+
+    def _follow(self, node: Node, name: str, value: Any) -> None:
+        if node.type_name == "Robot" and name == "customData":
+            self._simulator.robot_of(node).fresh[CUSTOM_DATA_TAG] = value
+        elif body := self._body_around(node):
+            self._simulator.stand_anew(body)
+
+    # Places --------------------------------------------------------------------------------------
+
+    def on_node_get_pose(self, node_id: int) -> Any:
+        """Orientation (9 numbers) and position (3) in the world; None for what has no place."""
+        frame = self._world.frame_of(self._world.nodes[node_id])
+        return None if frame is None else (frame.rotation, frame.translation)
+
+    def on_node_get_velocity(self, node_id: int) -> Any:
+        """Linear and angular velocity; None for what is not a Solid."""
+        node = self._world.nodes[node_id]
+        body = self._body_around(node)
+        if body is None or "boundingObject" not in node.fields:
+            return None
+        return [*body.velocity_mps, 0.0, 0.0, 0.0, body.yaw_rate_radps]
+
+    def on_node_reset_physics(self, node_id: int) -> None:
+        """Takes a robot's speed away."""
+        for robot in self._simulator.robots:
+            if robot.node is self._world.nodes[node_id]:
+                robot.vehicle.stop()
+
+    def _body_around(self, node: Node | None) -> Body | None:
+        bodies = {body.node: body for body in self._simulator.arena.bodies}
+        while node is not None and node not in bodies:
+            node = self._world.parent_of(node)
+        return bodies[node] if node else None
+
+    # The simulation ------------------------------------------------------------------------------
+
+    def on_simulation_set_mode(self, mode: int) -> None:
+        """Any number that is no mode pauses, as in Webots."""
+        self._simulator.mode = Mode(mode) if mode in [*Mode] else Mode.PAUSE
+
+    def on_simulation_reset(self) -> None:
+        """Resets with the next physics step."""
+        self._simulator.ask_reset()
+
+    def on_simulation_reset_physics(self) -> None:
+        """Stops everything that moves."""
+        self._simulator.stop_motion()
+
+    def on_world_reload(self) -> None:
+        """Reads the world again from its file."""
+        self._simulator.wanted = Wanted("reload")
+
+    def on_world_load(self, path: str) -> None:
+        """Loads another world after the next physics step."""
+        self._simulator.ask_load(str(self._robot.folder / path))
+
+    def on_simulation_quit(self, status: int) -> None:
+        """Ends the simulation."""
+        self._simulator.wanted = Wanted("quit", status=status)
+
+    def on_export_image(self, path: str, quality: int) -> None:
+        """Writes a picture of the arena; relative paths start from the controller's folder."""
+        self._simulator.export(self._robot.folder / path, quality)
+
+    def on_set_label(self, number: int, text: str, x: float, y: float, size: float, rgb: int) -> None:
+        """Shows a text over the picture; an empty one takes it away."""
+        if text:
+            self._simulator.labels[number] = Label(text, x, y, size, rgb)
+        else:
+            self._simulator.labels.pop(number, None)
+

@@ -1,0 +1,251 @@
+"""What stands in the world and what happens when it touches."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from math import cos, hypot, sin
+
+from webots_mcp.standin.camera import SceneColors
+from webots_mcp.standin.frame import Frame, frame_of
+from webots_mcp.standin.shapes import Block, Color, Disc, Shape
+from webots_mcp.standin.vrml import Node
+from webots_mcp.standin.world import World, children_of, descendants_of, own_frame
+
+_GEOMETRIES = ("Box", "Cylinder", "Sphere")
+_DEFAULT_COLOR: Color = (0.5, 0.5, 0.5)
+
+
+@dataclass(frozen=True)
+class Part:
+    """One geometry of a body: its place in the body and half of its size along x, y and z."""
+
+    kind: str
+    frame: Frame
+    half_m: tuple[float, float, float]
+    color: Color
+
+    def standing(self, body: Frame) -> Shape:
+        """This part as a shape in the world, for a body that stands upright."""
+        x, y, z = body.point(self.frame.translation)
+        hx, hy, hz = self.half_m
+        if self.kind == "Box":
+            yaw = body.yaw_rad + self.frame.yaw_rad
+            return Block(x, y, yaw, hx, hy, z - hz, z + hz, self.color)
+        return Disc(x, y, hx, z - hz, z + hz, self.color, self.kind == "Sphere")
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """The disc that a moving body takes up on the floor, relative to its origin."""
+
+    ahead_m: float
+    left_m: float
+    radius_m: float
+
+    @staticmethod
+    def around(parts: list[Part]) -> "Footprint":
+        """The smallest disc around the rectangle that all parts fill."""
+        at_and_half = [(part.frame.translation, _turned_half(part.frame, part.half_m)) for part in parts]
+        if not at_and_half:
+            return Footprint(0.0, 0.0, 0.0)
+        x0, x1 = (
+            min(at[0] - half[0] for at, half in at_and_half),
+            max(at[0] + half[0] for at, half in at_and_half),
+        )
+        y0, y1 = (
+            min(at[1] - half[1] for at, half in at_and_half),
+            max(at[1] + half[1] for at, half in at_and_half),
+        )
+        return Footprint((x0 + x1) / 2.0, (y0 + y1) / 2.0, hypot(x1 - x0, y1 - y0) / 2.0)
+
+
+class Body:
+    """A Solid or Robot at the top of the scene tree, with all that is fixed to it."""
+
+    def __init__(self, node: Node, frame: Frame) -> None:
+        self.node = node
+        self.name: str = node.fields["name"]
+        self.is_obstacle = node.fields["boundingObject"] is not None
+        self.is_movable = node.type_name == "Solid" and node.fields["physics"] is not None
+        self.velocity_mps = (0.0, 0.0)
+        self.yaw_rate_radps = 0.0
+        self.stand(frame)
+
+    def stand(self, frame: Frame) -> None:
+        """Puts the body where `frame` says, tilted as it may be."""
+        self.x, self.y, self.z = frame.translation
+        self.yaw_rad = frame.yaw_rad
+        upright = frame_of((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -self.yaw_rad))
+        tilt = upright.then(Frame(frame.rotation))
+        self.parts = [*_parts_of(self.node, tilt, _color_of(self.node))]
+        self.footprint = Footprint.around(self.parts)
+        self._shapes: tuple[Shape, ...] | None = None
+
+    @property
+    def frame(self) -> Frame:
+        """Where the body stands, upright."""
+        return frame_of((self.x, self.y, self.z), (0.0, 0.0, 1.0, self.yaw_rad))
+
+    def move(self, x: float, y: float, yaw_rad: float) -> None:
+        """Moves the body on the plane and says so in its node."""
+        if (x, y, yaw_rad) == (self.x, self.y, self.yaw_rad):
+            return
+        self.node.fields["translation"] = [x, y, self.z]
+        if yaw_rad != self.yaw_rad:
+            self.node.fields["rotation"] = [0.0, 0.0, 1.0, yaw_rad]
+        self.x, self.y, self.yaw_rad = x, y, yaw_rad
+        self._shapes = None
+
+    @property
+    def shapes(self) -> tuple[Shape, ...]:
+        """The parts where they stand now."""
+        if self._shapes is None:
+            frame = self.frame
+            self._shapes = tuple(part.standing(frame) for part in self.parts)
+        return self._shapes
+
+    def centre(self) -> tuple[float, float]:
+        """Where the centre of the footprint is in the world."""
+        disc, c, s = self.footprint, cos(self.yaw_rad), sin(self.yaw_rad)
+        return (
+            self.x + c * disc.ahead_m - s * disc.left_m,
+            self.y + s * disc.ahead_m + c * disc.left_m,
+        )
+
+
+class Arena:
+    """All bodies of a world, standing ones and movable ones.
+
+    A movable Solid (one with Physics) is pushed along by what drives into it, as far as nothing is
+    in its way; it neither turns nor rolls on.
+    """
+
+    def __init__(self, world: World) -> None:
+        self.bodies = [*_bodies_in(world.root, Frame())]
+        self.colors = _scene_colors(world)
+        self._obstacles = [body for body in self.bodies if body.is_obstacle]
+        self._movable = [body for body in self._obstacles if body.is_movable]
+
+    def scene(self, without: Body) -> list[Shape]:
+        """All shapes but those of one body: what that one can see."""
+        return [shape for body in self.bodies if body is not without for shape in body.shapes]
+
+    def obstacles(self, without: Body) -> list[Shape]:
+        """The shapes that have a bounding object, but for those of one body."""
+        return [
+            shape
+            for body in self.bodies
+            if body is not without and body.is_obstacle
+            for shape in body.shapes
+        ]
+
+    def settle(self, body: Body) -> bool:
+        """Moves a body out of what it has driven into; True if it touched what does not give way."""
+        for movable in self._movable:
+            self._push_away(movable, body)
+        return self._clear(body)
+
+    def _push_away(self, movable: Body, pusher: Body) -> None:
+        x, y = pusher.centre()
+        for shape in movable.shapes:
+            if push := shape.push(x, y, pusher.footprint.radius_m):
+                movable.move(movable.x - push[0], movable.y - push[1], movable.yaw_rad)
+                self._clear(movable, pusher)
+
+    def _clear(self, body: Body, pusher: Body | None = None) -> bool:
+        """Moves a body out of every obstacle; the pusher does not count as one."""
+        (x, y), touched = body.centre(), False
+        for other in self._obstacles:
+            if other is body or other is pusher:
+                continue
+            for shape in _solid_shapes(other):
+                if push := shape.push(x, y, body.footprint.radius_m):
+                    body.move(body.x + push[0], body.y + push[1], body.yaw_rad)
+                    (x, y), touched = body.centre(), True
+        return touched
+
+
+def _solid_shapes(body: Body) -> tuple[Shape, ...]:
+    if body.node.type_name != "Robot":
+        return body.shapes
+    x, y = body.centre()  # two robots meet as discs
+    return (Disc(x, y, body.footprint.radius_m, 0.0, 1.0, _DEFAULT_COLOR),)
+
+
+def _scene_colors(world: World) -> SceneColors:
+    colors: dict[str, Color] = {}
+    for background in world.of_type("Background"):
+        colors["sky"] = _color(background.fields["skyColor"][0])
+    for solid in world.of_type("Solid"):
+        if any(node.type_name == "Plane" for node in descendants_of(solid)):
+            colors["floor"] = _color_of(solid)
+    return SceneColors(**colors)
+
+
+def _bodies_in(node: Node, frame: Frame) -> Iterator[Body]:
+    for child in children_of(node):
+        place = frame.then(own_frame(child))
+        if child.type_name in ("Solid", "Robot"):
+            yield Body(child, place)
+        elif child.type_name in ("Group", "Pose", "Transform"):
+            yield from _bodies_in(child, place)
+
+
+def _parts_of(node: Node, frame: Frame, color: Color) -> Iterator[Part]:
+    """The bounding object of a Solid, or else what can be seen of it, and of all Solids in it."""
+    bounding = node.fields["boundingObject"]
+    shown = [bounding] if bounding else node.fields["children"]
+    for child in shown:
+        yield from _geometries(child, frame, color)
+    for child in node.fields["children"]:
+        yield from _solids(child, frame)
+
+
+def _geometries(node: Node, frame: Frame, color: Color) -> Iterator[Part]:
+    frame = frame.then(own_frame(node))
+    if node.type_name in _GEOMETRIES:
+        yield _part(node, frame, color)
+    elif node.type_name in ("Group", "Pose", "Transform", "Shape"):
+        for child in children_of(node):
+            yield from _geometries(child, frame, color)
+
+
+def _solids(node: Node, frame: Frame) -> Iterator[Part]:
+    frame = frame.then(own_frame(node))
+    if node.type_name == "Solid":
+        yield from _parts_of(node, frame, _color_of(node))
+    elif node.type_name in ("Group", "Pose", "Transform", "HingeJoint"):
+        for child in children_of(node):
+            yield from _solids(child, frame)
+
+
+def _part(geometry: Node, frame: Frame, color: Color) -> Part:
+    fields = geometry.fields
+    if geometry.type_name == "Box":
+        hx, hy, hz = (size / 2.0 for size in fields["size"])
+    elif geometry.type_name == "Sphere":
+        return Part("Sphere", frame, (fields["radius"],) * 3, color)
+    else:
+        hx, hy, hz = fields["radius"], fields["radius"], fields["height"] / 2.0
+    if frame.rotation[8] > 0.999:
+        return Part(geometry.type_name, frame, (hx, hy, hz), color)
+    lying = _turned_half(frame, (hx, hy, hz))  # a lying shape counts as the box around it
+    return Part("Box", Frame(translation=frame.translation), lying, color)
+
+
+def _turned_half(frame: Frame, half_m: tuple[float, float, float]) -> tuple[float, float, float]:
+    r, (hx, hy, hz) = frame.rotation, half_m
+    x, y, z = (abs(r[i]) * hx + abs(r[i + 1]) * hy + abs(r[i + 2]) * hz for i in (0, 3, 6))
+    return x, y, z
+
+
+def _color_of(node: Node) -> Color:
+    for part in descendants_of(node):
+        color = part.fields.get("baseColor") or part.fields.get("diffuseColor")
+        if color:
+            return _color(color)
+    return _DEFAULT_COLOR
+
+
+def _color(numbers: Sequence[float]) -> Color:
+    r, g, b = numbers
+    return r, g, b

@@ -1,0 +1,181 @@
+"""The controllers of a world: which program each robot runs, and how far it is."""
+
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from webots_mcp.standin.process import ControllerProcess
+from webots_mcp.standin.simulator import Robot, Simulator
+
+if TYPE_CHECKING:
+    from webots_mcp.standin.runner import Connection
+
+_NOBODY = ("", "<none>", "void", "<generic>")
+_EXTERN = "<extern>"
+
+
+@dataclass(frozen=True)
+class Launch:
+    """How controllers are started, the same for all robots of a simulation."""
+
+    library: Path
+    instance: Path
+    python: str
+    environment: Mapping[str, str]
+    overrides: Mapping[str, Path]
+    """Controller files by robot name, instead of what the world says."""
+    print_line: Callable[[str], None]
+    on_exit: Callable[[], None]
+
+    def file_of(self, robot: Robot, simulator: Simulator) -> Path | None:
+        """The controller's file; None if the robot has none or it is started by somebody else."""
+        name: str = robot.node.fields["controller"]
+        if robot.name in self.overrides:
+            return self.overrides[robot.name].resolve()
+        if name in (*_NOBODY, _EXTERN):
+            return None
+        return simulator.world.path.parent.parent / "controllers" / name / f"{name}.py"
+
+    def environment_of(self, robot: Robot) -> dict[str, str]:
+        """The environment of the robot's controller, as Webots would set it."""
+        merged = {**os.environ, **self.environment}
+        merged.pop("WEBOTS_CONTROLLER_URL", None)
+        path = [str(self.library), merged.get("PYTHONPATH", "")]
+        return merged | {
+            "WEBOTS_ROBOT_NAME": robot.name,
+            "WEBOTS_INSTANCE_PATH": str(self.instance),
+            "PYTHONPATH": os.pathsep.join(part for part in path if part),
+            "PYTHONIOENCODING": "UTF-8",
+        }
+
+
+@dataclass
+class Controller:
+    """A robot's controller, through all its processes."""
+
+    robot: Robot
+    launch: Launch
+    file: Path | None
+    process: ControllerProcess | None = None
+    starts: int = 0
+    """How often a process was started for this robot in this world."""
+    connection: "Connection | None" = None
+    has_left: bool = False
+    """Whether the present process has closed its connection."""
+    _was_told: bool = field(default=False, repr=False)
+
+    @property
+    def name(self) -> str:
+        """The robot's name."""
+        return self.robot.name
+
+    @property
+    def pid(self) -> int | None:
+        """The process id; None if no process was started."""
+        return self.process.pid if self.process else None
+
+    @property
+    def exit_code(self) -> int | None:
+        """The exit status of the last process; negative: a signal; None while it runs."""
+        return self.process.exit_code if self.process else None
+
+    @property
+    def is_running(self) -> bool:
+        """Whether there is a process that has not exited."""
+        return self.process is not None and self.process.exit_code is None
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether a `Robot` object of the process talks to the simulation."""
+        return self.connection is not None
+
+    @property
+    def was_started(self) -> bool:
+        """Whether there is nothing to start any more."""
+        return self.process is not None or self.file is None
+
+    def kill(self) -> None:
+        """Ends the process at once, as a crash would."""
+        if self.process:
+            self.process.kill()
+
+    @property
+    def holds_up(self) -> bool:
+        """Whether the world has to wait for this controller before the next physics step."""
+        if not self.robot.is_synchronous or self.robot.remaining_ms is not None:
+            return False
+        if self.connection is not None:
+            return True
+        if self.file is None:
+            return self.robot.node.fields["controller"] == _EXTERN
+        return self.is_running and not self.has_left
+
+    @property
+    def has_to_be_told(self) -> bool:
+        """Whether it is connected and does not know yet that it has to quit."""
+        return self.connection is not None and not self._was_told
+
+    @property
+    def is_leaving(self) -> bool:
+        """Whether it was told to quit and is still there."""
+        return self._was_told and (self.is_running or self.connection is not None)
+
+    def start(self) -> None:
+        """Starts a process, if the robot has a controller file."""
+        self.has_left = self._was_told = False
+        self.process = None
+        if self.file is None:
+            return
+        if not self.file.is_file():
+            self.launch.print_line(f"WARNING: {self.name}: the controller {self.file} is missing.")
+            self.file = None
+            return
+        arguments: list[str] = self.robot.node.fields["controllerArgs"]
+        command = [self.launch.python, "-u", self.file.name, *arguments]
+        self.launch.print_line(f"INFO: {self.name}: Starting controller: {' '.join(command)}")
+        self.robot.folder = self.file.parent
+        self.starts += 1
+        self.process = ControllerProcess(
+            command,
+            self.file.parent,
+            self.launch.environment_of(self.robot),
+            lambda line: self.launch.print_line(f"[{self.name}] {line}"),
+            self._exited,
+        )
+
+    def tell_to_quit(self) -> None:
+        """Sends the one answer after which `step` returns -1."""
+        if self.connection and not self._was_told:
+            self._was_told = True
+            self.robot.remaining_ms = None
+            self.connection.send(("quit",))
+
+    def end(self) -> None:
+        """Ends the process by force, if it is still there."""
+        if self.process and self.is_running:
+            if self._was_told:
+                self.launch.print_line(
+                    f"WARNING: {self.name}: Forced termination (because process didn't terminate "
+                    "itself after 1 second)."
+                )
+            self.process.end()
+
+    def _exited(self, process: ControllerProcess) -> None:
+        if process.exit_code == 0:
+            self.launch.print_line(f"INFO: '{self.name}' controller exited successfully.")
+        else:
+            self.launch.print_line(
+                f"WARNING: '{self.name}' controller exited with status: {process.exit_code}."
+            )
+        self.launch.on_exit()
+
+
+def controllers_of(simulator: Simulator, launch: Launch) -> list[Controller]:
+    """A controller for each robot of the world."""
+    return [
+        Controller(robot, launch, launch.file_of(robot, simulator)) for robot in simulator.robots
+    ]
+
+

@@ -1,0 +1,321 @@
+"""The devices of a simulated robot: what they measure, and what they let a controller set."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import cos, inf, nan, pi, sin
+from typing import Any
+
+from webots_mcp.standin import camera
+from webots_mcp.standin.arena import Arena, Body
+from webots_mcp.standin.frame import Frame
+from webots_mcp.standin.nodes import DEVICE_TYPES
+from webots_mcp.standin.physics import Joint, Vehicle
+from webots_mcp.standin.shapes import Shape, nearest_m, targets_from
+from webots_mcp.standin.vrml import Node
+from webots_mcp.standin.world import children_of, own_frame
+
+
+@dataclass(frozen=True)
+class Site:
+    """What a device is built into."""
+
+    vehicle: Vehicle
+    arena: Arena
+    frame: Frame
+    """Where the device stands in the robot."""
+    joint: Joint | None
+
+    @property
+    def body(self) -> Body:
+        """The robot's body."""
+        return self.vehicle.body
+
+    def place(self) -> tuple[float, float, float, float]:
+        """The device in the world: x, y, z in metres and yaw in radians."""
+        body, (x, y, z) = self.body, self.frame.translation
+        c, s = cos(body.yaw_rad), sin(body.yaw_rad)
+        yaw = body.yaw_rad + self.frame.yaw_rad
+        return body.x + c * x - s * y, body.y + s * x + c * y, body.z + z, yaw
+
+
+class Device:
+    """One device; subclasses measure or set something."""
+
+    kind = "Device"
+    """The class of the `controller` package that stands for it."""
+    fetched = False
+    """Whether a sample stays here until the controller looks at it (pictures and scans)."""
+
+    def __init__(self, tag: int, node: Node, site: Site) -> None:
+        self.tag = tag
+        self.node = node
+        self.site = site
+        self.name: str = node.fields["name"]
+        self.period_ms = 0
+        self._wait_ms = 0.0
+
+    def description(self) -> dict[str, Any]:
+        """What the controller is told about the device when it connects."""
+        return {
+            "tag": self.tag,
+            "kind": self.kind,
+            "name": self.name,
+            "model": self.node.fields.get("model", ""),
+            "node_type": self.node.type_name,
+            "fetched": self.fetched,
+        }
+
+    def configure(self, setting: str, value: Any) -> None:
+        """Takes a setting from the controller."""
+        if setting == "period":
+            self.period_ms, self._wait_ms = value, float(value)
+
+    def make_due(self) -> None:
+        """Lets an enabled sensor measure at the end of the step under way."""
+        self._wait_ms = 0.0
+
+    def is_due(self, passed_ms: float) -> bool:
+        """Lets time pass; True if it is time to measure."""
+        if not self.period_ms:
+            return False
+        self._wait_ms -= passed_ms
+        if self._wait_ms > 0.0:
+            return False
+        self._wait_ms += self.period_ms
+        return True
+
+    def measure(self, period_ms: float) -> Any:
+        """What the sensor shows now, as the wire carries it."""
+        raise AttributeError(f"{self.kind} {self.name!r} measures nothing")
+
+    def fetch(self) -> Any:
+        """What the last sample shows, for devices with `fetched`."""
+        raise AttributeError(f"{self.kind} {self.name!r} has no pictures")
+
+
+class Motor(Device):
+    """Turns a joint."""
+
+    kind = "Motor"
+
+    def description(self) -> dict[str, Any]:
+        fields = self.node.fields
+        sensors = self.site.joint.node.fields["device"] if self.site.joint else []
+        names = [node.fields["name"] for node in sensors if node.type_name == "PositionSensor"]
+        return super().description() | {
+            "min_position": fields["minPosition"],
+            "max_position": fields["maxPosition"],
+            "max_velocity": fields["maxVelocity"],
+            "max_torque": fields["maxTorque"],
+            "acceleration": fields["acceleration"],
+            "position_sensor": names[0] if names else None,
+        }
+
+    def configure(self, setting: str, value: Any) -> None:
+        joint = self.site.joint
+        if joint is None:
+            return
+        if setting == "position":
+            joint.target_rad = value
+        elif setting == "velocity":
+            joint.target_radps = value
+        elif setting == "acceleration":
+            joint.acceleration_radps2 = value
+
+
+class PositionSensor(Device):
+    """Says how far a joint has turned, in radians."""
+
+    kind = "PositionSensor"
+
+    def measure(self, period_ms: float) -> float:
+        return self.site.joint.position_rad if self.site.joint else nan
+
+
+class DistanceSensor(Device):
+    """One ray along the sensor's x axis, translated by the lookup table; noise is left out."""
+
+    kind = "DistanceSensor"
+
+    def __init__(self, tag: int, node: Node, site: Site) -> None:
+        super().__init__(tag, node, site)
+        self.table: list[list[float]] = node.fields["lookupTable"] or [[0.0, 0.0, 0.0]]
+
+    def description(self) -> dict[str, Any]:
+        values = [row[1] for row in self.table]
+        return super().description() | {
+            "min_value": min(values),
+            "max_value": max(values),
+            "aperture": self.node.fields["aperture"],
+            "lookup_table": [number for row in self.table for number in row],
+        }
+
+    def measure(self, period_ms: float) -> float:
+        x, y, z, yaw = self.site.place()
+        obstacles = self.site.arena.obstacles(without=self.site.body)
+        if any(s.contains(x, y) and s.bottom_m <= z <= s.top_m for s in obstacles):
+            return self._looked_up(0.0)
+        return self._looked_up(nearest_m(targets_from(obstacles, x, y, z), cos(yaw), sin(yaw)))
+
+    def _looked_up(self, distance_m: float) -> float:
+        if distance_m <= self.table[0][0]:
+            return self.table[0][1]
+        for (x0, y0, _), (x1, y1, _) in zip(self.table, self.table[1:], strict=False):
+            if distance_m <= x1:
+                return y0 + (y1 - y0) * (distance_m - x0) / (x1 - x0)
+        return self.table[-1][1]
+
+
+class Gps(Device):
+    """Where the sensor is, and how fast it moved since its last sample."""
+
+    kind = "GPS"
+
+    def __init__(self, tag: int, node: Node, site: Site) -> None:
+        super().__init__(tag, node, site)
+        self._last: tuple[float, float, float] | None = None
+
+    def make_due(self) -> None:
+        super().make_due()
+        self._last = None
+
+    def measure(self, period_ms: float) -> list[list[float]]:
+        here = self.site.place()[:3]
+        before = self._last or here
+        self._last = here
+        seconds = period_ms / 1000.0
+        return [[*here], [(a - b) / seconds for a, b in zip(here, before, strict=True)]]
+
+
+class InertialUnit(Device):
+    """Roll, pitch and yaw in radians; the floor is flat, so only yaw ever changes."""
+
+    kind = "InertialUnit"
+
+    def measure(self, period_ms: float) -> list[float]:
+        yaw = self.site.place()[3]
+        return [0.0, 0.0, yaw - 2.0 * pi * round(yaw / (2.0 * pi))]
+
+
+class Lidar(Device):
+    """A level fan of rays from left to right; inf where nothing is in range."""
+
+    kind = "Lidar"
+    fetched = True
+
+    def __init__(self, tag: int, node: Node, site: Site) -> None:
+        super().__init__(tag, node, site)
+        self._samples = 0
+        self._seen: tuple[tuple[float, float, float, float], list[Shape]] | None = None
+        self.resolution: int = node.fields["horizontalResolution"]
+        self.field_of_view_rad: float = node.fields["fieldOfView"]
+
+    def description(self) -> dict[str, Any]:
+        fields = self.node.fields
+        return super().description() | {
+            "resolution": self.resolution,
+            "layers": fields["numberOfLayers"],
+            "fov": self.field_of_view_rad,
+            "vertical_fov": fields["verticalFieldOfView"],
+            "min_range": fields["minRange"],
+            "max_range": fields["maxRange"],
+            "near": fields["near"],
+            "frequency": fields["defaultFrequency"],
+        }
+
+    def measure(self, period_ms: float) -> int:
+        self._seen = (self.site.place(), self.site.arena.scene(without=self.site.body))
+        self._samples += 1
+        return self._samples
+
+    def fetch(self) -> list[float]:
+        if self._seen is None:
+            return []
+        (x, y, z, yaw), shapes = self._seen
+        layer = self._ranges(targets_from(shapes, x, y, z), yaw)
+        return layer * self.node.fields["numberOfLayers"]
+
+    def _ranges(self, targets: Any, yaw_rad: float) -> list[float]:
+        low, high = self.node.fields["minRange"], self.node.fields["maxRange"]
+        step = self.field_of_view_rad / max(self.resolution - 1, 1)
+        first = yaw_rad + self.field_of_view_rad / 2.0
+        angles = [first - i * step for i in range(self.resolution)]
+        ranges = [nearest_m(targets, cos(angle), sin(angle)) for angle in angles]
+        return [distance if low <= distance <= high else inf for distance in ranges]
+
+
+class Camera(Device):
+    """Renders what it sees when somebody looks at the picture."""
+
+    kind = "Camera"
+    fetched = True
+
+    def __init__(self, tag: int, node: Node, site: Site) -> None:
+        super().__init__(tag, node, site)
+        self._samples = 0
+        self._seen: camera.View | None = None
+        self.field_of_view_rad: float = node.fields["fieldOfView"]
+
+    def description(self) -> dict[str, Any]:
+        fields = self.node.fields
+        return super().description() | {
+            "width": fields["width"],
+            "height": fields["height"],
+            "fov": self.field_of_view_rad,
+            "near": fields["near"],
+        }
+
+    def configure(self, setting: str, value: Any) -> None:
+        super().configure(setting, value)
+        if setting == "fov":
+            self.field_of_view_rad = value
+
+    def measure(self, period_ms: float) -> int:
+        arena, fields = self.site.arena, self.node.fields
+        self._seen = camera.View(
+            *self.site.place(),
+            width=fields["width"],
+            height=fields["height"],
+            field_of_view_rad=self.field_of_view_rad,
+            shapes=tuple(arena.scene(without=self.site.body)),
+        )
+        self._samples += 1
+        return self._samples
+
+    def fetch(self) -> bytes:
+        return b"" if self._seen is None else camera.render(self._seen, self.site.arena.colors)
+
+
+_BY_NODE_TYPE: dict[str, Callable[[int, Node, Site], Device]] = {
+    "RotationalMotor": Motor,
+    "PositionSensor": PositionSensor,
+    "DistanceSensor": DistanceSensor,
+    "GPS": Gps,
+    "InertialUnit": InertialUnit,
+    "Lidar": Lidar,
+    "Camera": Camera,
+}
+
+
+def devices_in(vehicle: Vehicle, arena: Arena) -> list[Device]:
+    """All devices of a robot in the order of the scene tree; tags count from 1."""
+    found: list[tuple[Node, Site]] = []
+    _find(vehicle.body.node, Site(vehicle, arena, Frame(), None), found)
+    return [
+        _BY_NODE_TYPE[node.type_name](tag, node, site)
+        for tag, (node, site) in enumerate(found, start=1)
+    ]
+
+
+def _find(node: Node, site: Site, found: list[tuple[Node, Site]]) -> None:
+    for child in children_of(node):
+        if child.type_name == "Robot":
+            continue
+        joints = {joint.node: joint for joint in site.vehicle.joints}
+        frame = site.frame.then(own_frame(child))
+        here = Site(site.vehicle, site.arena, frame, joints.get(child, site.joint))
+        if child.type_name in DEVICE_TYPES:
+            found.append((child, here))
+        _find(child, here, found)
+
+

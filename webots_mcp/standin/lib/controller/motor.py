@@ -1,0 +1,128 @@
+"""Motors: what they were told, and telling them."""
+
+from math import isinf, isnan
+
+from .arguments import number
+from .console import say
+from .device import Device
+from .sensors import PositionSensor
+
+
+class Motor(Device):
+    """Turns a joint. The getters give what was commanded, not what is measured."""
+
+    ROTATIONAL, LINEAR = range(2)
+
+    def __init__(self, name: "int | str") -> None:
+        super().__init__(name)
+        self._position = 0.0
+        self._velocity: float = self._description.get("max_velocity", 0.0)
+        self._acceleration: float = self._description.get("acceleration", -1.0)
+
+    def setPosition(self, position: float) -> None:
+        """Turns to an angle in radians; inf lets the motor run with `setVelocity`."""
+        if self._usable(position := number(position), "set_position"):
+            self._position = position
+            self._session.change(self._tag, "position", position)
+
+    def setVelocity(self, velocity: float) -> None:
+        """Sets the speed in radians a second; the motor keeps within its `maxVelocity`."""
+        if not self._usable(velocity := number(velocity), "set_velocity"):
+            return
+        if velocity < 0.0 and not isinf(self._position):
+            say(
+                "Error: wb_motor_set_velocity() called with a negative 'velocity' argument in "
+                "position control mode."
+            )
+            return
+        self._velocity = velocity
+        self._session.change(self._tag, "velocity", velocity)
+
+    def setAcceleration(self, acceleration: float) -> None:
+        """Limits how fast the speed changes, in radians a second squared; -1: no limit."""
+        if self._usable(acceleration := number(acceleration), "set_acceleration"):
+            self._acceleration = acceleration
+            self._session.change(self._tag, "acceleration", acceleration)
+
+    def _usable(self, value: float, what: str) -> bool:
+        if isnan(value):
+            say(f"Error: wb_motor_{what}() called with an invalid argument (NaN).")
+        return not isnan(value)
+
+    def getTargetPosition(self) -> float:
+        """The commanded position in radians."""
+        return self._position
+
+    @property
+    def target_position(self) -> float:
+        """The commanded position in radians."""
+        return self.getTargetPosition()
+
+    @target_position.setter
+    def target_position(self, position: float) -> None:
+        self.setPosition(position)
+
+    def getVelocity(self) -> float:
+        """The commanded speed in radians a second."""
+        return self._velocity
+
+    @property
+    def target_velocity(self) -> float:
+        """The commanded speed in radians a second."""
+        return self.getVelocity()
+
+    @target_velocity.setter
+    def target_velocity(self, velocity: float) -> None:
+        self.setVelocity(velocity)
+
+    def getAcceleration(self) -> float:
+        """The commanded limit of acceleration; -1: none."""
+        return self._acceleration
+
+    def getMaxVelocity(self) -> float:
+        """The `maxVelocity` field, radians a second."""
+        return self._description["max_velocity"]
+
+    @property
+    def max_velocity(self) -> float:
+        """The `maxVelocity` field, radians a second."""
+        return self.getMaxVelocity()
+
+    def getMinPosition(self) -> float:
+        """The `minPosition` field; 0 like `getMaxPosition()` means no limits."""
+        return self._description["min_position"]
+
+    @property
+    def min_position(self) -> float:
+        """The `minPosition` field; 0 like `max_position` means no limits."""
+        return self.getMinPosition()
+
+    def getMaxPosition(self) -> float:
+        """The `maxPosition` field; 0 like `getMinPosition()` means no limits."""
+        return self._description["max_position"]
+
+    @property
+    def max_position(self) -> float:
+        """The `maxPosition` field; 0 like `min_position` means no limits."""
+        return self.getMaxPosition()
+
+    def getMaxTorque(self) -> float:
+        """The `maxTorque` field, newton metres."""
+        return self._description["max_torque"]
+
+    @property
+    def max_torque(self) -> float:
+        """The `maxTorque` field, newton metres."""
+        return self.getMaxTorque()
+
+    def getType(self) -> int:
+        """`Motor.ROTATIONAL`."""
+        return self.ROTATIONAL
+
+    def getPositionSensor(self) -> "PositionSensor | None":
+        """The sensor of the same joint; None if there is none."""
+        name = self._description["position_sensor"]
+        for description in self._session.robot["devices"]:
+            if name is not None and description["name"] == name:
+                return PositionSensor(description["tag"])
+        return None

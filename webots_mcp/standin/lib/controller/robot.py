@@ -1,0 +1,227 @@
+"""The robot: stepping, devices, and what the world says about it."""
+
+import signal
+import threading
+from typing import Any, ClassVar
+
+from . import session as library
+from .arguments import integer, text
+from .camera import Camera
+from .console import say
+from .device import Device
+from .lidar import Lidar
+from .motor import Motor
+from .sensors import GPS, DistanceSensor, InertialUnit, PositionSensor
+from .session import CUSTOM_DATA_TAG, Link, Session
+from .socket_link import SocketLink
+
+_DEVICE_CLASSES: dict[str, type[Device]] = {
+    "Motor": Motor,
+    "PositionSensor": PositionSensor,
+    "DistanceSensor": DistanceSensor,
+    "GPS": GPS,
+    "InertialUnit": InertialUnit,
+    "Lidar": Lidar,
+    "Camera": Camera,
+}
+_DEADLY_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
+
+
+class Robot:
+    """The robot that this process controls; a process has one."""
+
+    created: ClassVar["Robot | None"] = None
+    """The first robot that was made."""
+
+    _session: Session
+    devices: "dict[str, Device]"
+    """All devices by name."""
+
+    def __init__(self) -> None:
+        link = self._connect()
+        if link is None:
+            return
+        Robot.created = self
+        self._session = library.current = Session(link)
+        described = self._session.robot["devices"]
+        self._by_tag = {d["tag"]: _DEVICE_CLASSES[d["kind"]](d["tag"]) for d in described}
+        self.devices = {device.name: device for device in self._by_tag.values()}
+
+    def _connect(self) -> "Link | None":
+        if Robot.created is not None:
+            say("Error: Only one instance of the Robot class should be created.")
+            self._session = Robot.created._session
+            return None
+        _restore_signals()
+        return SocketLink()
+
+    def __del__(self) -> None:
+        if "devices" in self.__dict__:
+            self._session.link.close()
+
+    # Time ----------------------------------------------------------------------------------------
+
+    def step(self, time_step: "int | None" = None) -> int:
+        """Lets time pass.
+
+        Args:
+            time_step: Milliseconds of simulated time, rounded up to a multiple of the basic time
+                step. None: one basic time step. 0 only exchanges values, also while paused.
+
+        Returns:
+            0; -1 once the simulation ends this controller. More than 0 for a robot without
+            synchronization that asked too late: by how many milliseconds.
+        """
+        return self._session.step(self._duration_ms(time_step))
+
+    def stepBegin(self, time_step: "int | None" = None) -> int:
+        """The first half of `step`: asks for time to pass and returns at once."""
+        self._session.begin_step(self._duration_ms(time_step))
+        return 0
+
+    def stepEnd(self) -> int:
+        """The second half of `step`: waits until time has passed."""
+        return self._session.end_step()
+
+    def _duration_ms(self, time_step: "int | None") -> int:
+        return int(self.getBasicTimeStep()) if time_step is None else integer(time_step)
+
+    def getTime(self) -> float:
+        """Simulated time in seconds, as of the last step."""
+        return self._session.time_s
+
+    @property
+    def time(self) -> float:
+        """Simulated time in seconds, as of the last step."""
+        return self.getTime()
+
+    def getBasicTimeStep(self) -> float:
+        """The world's `basicTimeStep` in milliseconds: a float, so `step(int(...))`."""
+        return float(self._session.robot["basic_time_step"])
+
+    @property
+    def basic_time_step(self) -> float:
+        """The world's `basicTimeStep` in milliseconds."""
+        return self.getBasicTimeStep()
+
+    # Devices -------------------------------------------------------------------------------------
+
+    def getDevice(self, name: str) -> Any:
+        """The device with this name; None and a line on stderr if there is none."""
+        device = self.devices.get(text(name))
+        if device is None:
+            say(f'Warning: "{name}" device was not found on robot "{self.getName()}".')
+        return device
+
+    def getNumberOfDevices(self) -> int:
+        """How many devices the robot has."""
+        return len(self._by_tag)
+
+    @property
+    def number_of_devices(self) -> int:
+        """How many devices the robot has."""
+        return self.getNumberOfDevices()
+
+    def getDeviceByIndex(self, index: int) -> Any:
+        """The device at a place in the scene tree's order.
+
+        Raises:
+            KeyError: There is none; a line on stderr says so as well.
+        """
+        tags = [*self._by_tag]
+        if not 0 <= integer(index) < len(tags):
+            say("Error: wb_robot_get_device_by_index() called with an out of range index.")
+            raise KeyError(self.getName())
+        return self._by_tag[tags[index]]
+
+    # What the world says -------------------------------------------------------------------------
+
+    def getName(self) -> str:
+        """The `name` field."""
+        return self._session.robot["name"]
+
+    @property
+    def name(self) -> str:
+        """The `name` field."""
+        return self.getName()
+
+    def getModel(self) -> str:
+        """The `model` field."""
+        return self._session.robot["model"]
+
+    @property
+    def model(self) -> str:
+        """The `model` field."""
+        return self.getModel()
+
+    def getCustomData(self) -> str:
+        """The `customData` field."""
+        return self._session.custom_data
+
+    def setCustomData(self, data: str) -> None:
+        """Sets the `customData` field with the next step."""
+        self._session.custom_data = text(data)
+        self._session.change(CUSTOM_DATA_TAG, "customData", data)
+
+    @property
+    def custom_data(self) -> str:
+        """The `customData` field."""
+        return self.getCustomData()
+
+    @custom_data.setter
+    def custom_data(self, data: str) -> None:
+        self.setCustomData(data)
+
+    def getSupervisor(self) -> bool:
+        """Whether the world gives this robot a supervisor's rights."""
+        return self._session.robot["supervisor"]
+
+    @property
+    def supervisor(self) -> bool:
+        """Whether the world gives this robot a supervisor's rights."""
+        return self.getSupervisor()
+
+    def getSynchronization(self) -> bool:
+        """Whether the world waits for this controller."""
+        return self._session.robot["synchronization"]
+
+    @property
+    def synchronization(self) -> bool:
+        """Whether the world waits for this controller."""
+        return self.getSynchronization()
+
+    def getWorldPath(self) -> str:
+        """The world file."""
+        return self._session.robot["world_path"]
+
+    @property
+    def world_path(self) -> str:
+        """The world file."""
+        return self.getWorldPath()
+
+    def getProjectPath(self) -> str:
+        """The folder that holds `worlds` and `controllers`."""
+        return self._session.robot["project_path"]
+
+    @property
+    def project_path(self) -> str:
+        """The folder that holds `worlds` and `controllers`."""
+        return self.getProjectPath()
+
+    def getMode(self) -> int:
+        """0: simulation. This is about remote control, not about pause."""
+        return 0
+
+    @property
+    def mode(self) -> int:
+        """0: simulation. This is about remote control, not about pause."""
+        return self.getMode()
+
+
+def _restore_signals() -> None:
+    """Signals end the process at once, without KeyboardInterrupt, `finally` or atexit."""
+    if threading.current_thread() is not threading.main_thread():
+        return  # Python lets only the main thread do this
+    for name in _DEADLY_SIGNALS:
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_DFL)

@@ -1,0 +1,59 @@
+"""The connection of a controller process to the simulator that started it."""
+
+import os
+from pathlib import Path
+from typing import Any, NoReturn
+
+from .session import exit_process
+from .wire import ADDRESS_FILE, Inbox, Message, connect, pack
+
+
+class SocketLink:
+    """Talks to the simulator that the `WEBOTS_...` environment variables name."""
+
+    def __init__(self) -> None:
+        port, token = _address().split()
+        self._socket = connect(int(port))
+        self._inbox = Inbox()
+        self.send(("hello", token, os.environ["WEBOTS_ROBOT_NAME"]))
+        kind, answer = self.receive()
+        if kind != "welcome":
+            raise ConnectionRefusedError(f"the simulation refused this controller: {answer}")
+        self.description: dict[str, Any] = answer
+
+    def send(self, message: Message) -> None:
+        """Sends a request; if the simulator is gone, so is this process."""
+        try:
+            self._socket.sendall(pack(message))
+        except OSError:
+            exit_process(1)
+
+    def receive(self) -> Message:
+        """Waits for an answer; if the simulator goes away meanwhile, so does this process."""
+        while (message := self._inbox.take()) is None:
+            try:
+                data = self._socket.recv(1 << 20)
+            except OSError:
+                data = b""
+            if not data:
+                exit_process(1)
+            self._inbox.feed(data)
+        return message
+
+    def exit(self) -> NoReturn:
+        """The API was used after the end."""
+        exit_process(0)
+
+    def close(self) -> None:
+        """Lets the simulator know that this controller is done."""
+        self._socket.close()
+
+
+def _address() -> str:
+    folder = os.environ.get("WEBOTS_INSTANCE_PATH")
+    if not folder or "WEBOTS_ROBOT_NAME" not in os.environ:
+        raise ConnectionError(
+            "no simulation has started this process. Run the controller from a world: "
+            "python -m webots_mcp.standin WORLD; in a test use webots_mcp.standin.InProcessRobot"
+        )
+    return (Path(folder) / ADDRESS_FILE).read_text(encoding="utf-8")

@@ -1,0 +1,120 @@
+"""The supervisor: a robot that may look at the whole world and change it."""
+
+from typing import Any
+
+from .arguments import integer, number, text
+from .console import say
+from .node import Node
+from .robot import Robot
+
+_NULL_NODE = (0, "", "")
+
+
+class Supervisor(Robot):
+    """A robot with more methods; the world decides whether it may use them."""
+
+    SIMULATION_MODE_PAUSE = 0
+    SIMULATION_MODE_REAL_TIME = 1
+    SIMULATION_MODE_FAST = 2
+
+    # Nodes ---------------------------------------------------------------------------------------
+
+    def getRoot(self) -> Node:
+        """The node around everything; its `children` are the top of the scene tree."""
+        return Node(self._session, self._session.ask("node_get_root") or _NULL_NODE)
+
+    def getSelf(self) -> Node:
+        """The robot's own node."""
+        return Node(self._session, self._session.ask("node_get_self") or _NULL_NODE)
+
+    def getFromDef(self, name: str) -> "Node | None":
+        """The node with this DEF name (`A.B`: B inside A); None if there is none."""
+        return self._node(self._session.ask("node_get_from_def", text(name)))
+
+    def getFromId(self, id: int) -> "Node | None":  # noqa: A002 - Webots' name
+        """The node with this number; None if there is none."""
+        return self._node(self._session.ask("node_get_from_id", integer(id)))
+
+    def getFromDevice(self, tag: int) -> "Node | None":
+        """The node of a device: wants `device.tag`, not the device."""
+        return self._node(self._session.ask("node_get_from_device", integer(tag)))
+
+    def getSelected(self) -> "Node | None":
+        """None: there is no window to select a node in."""
+        return None
+
+    def _node(self, found: Any) -> "Node | None":
+        return None if found is None else Node(self._session, found)
+
+    # The simulation ------------------------------------------------------------------------------
+
+    def simulationGetMode(self) -> int:
+        """The mode as of the last answer of the simulator."""
+        return self._session.mode
+
+    def simulationSetMode(self, mode: int) -> None:
+        """Pauses, runs in real time or runs fast; any other number pauses."""
+        self._session.ask("simulation_set_mode", integer(mode))
+
+    @property
+    def simulation_mode(self) -> int:
+        """The mode as of the last answer of the simulator."""
+        return self.simulationGetMode()
+
+    @simulation_mode.setter
+    def simulation_mode(self, mode: int) -> None:
+        self.simulationSetMode(mode)
+
+    def simulationReset(self) -> None:
+        """Resets the world at the end of the next physics step; controllers go on."""
+        self._session.ask("simulation_reset")
+
+    def simulationResetPhysics(self) -> None:
+        """Stops everything that moves."""
+        self._session.ask("simulation_reset_physics")
+
+    def simulationQuit(self, status: int) -> None:
+        """Ends the simulation with an exit status."""
+        self._session.ask("simulation_quit", integer(status))
+
+    def worldReload(self) -> None:
+        """Reads the world from its file again; the next step returns -1."""
+        self._session.ask("world_reload")
+
+    def worldLoad(self, file: str) -> None:
+        """Loads another world after the next physics step."""
+        self._session.ask("world_load", text(file))
+
+    def worldSave(self, file: "str | None" = None) -> int:
+        """0 and a line on stderr: the stand-in writes no worlds."""
+        say("Error: wb_supervisor_world_save(): the stand-in writes no world files.")
+        return 0
+
+    # Pictures ------------------------------------------------------------------------------------
+
+    def exportImage(self, filename: str, quality: int) -> None:
+        """Has the simulator write a .png or .jpg picture, with the next rendering."""
+        filename, quality = text(filename), integer(quality)
+        if not 1 <= quality <= 100:
+            say(f"Error: wb_supervisor_export_image(): quality {quality} is not between 1 and 100.")
+            return
+        self._session.ask("export_image", filename, quality)
+
+    def setLabel(
+        self,
+        id: int,  # noqa: A002 - Webots' name
+        label: str,
+        x: float,
+        y: float,
+        size: float,
+        color: int,
+        transparency: float = 0.0,
+        font: str = "Arial",
+    ) -> None:
+        """Writes a text over the picture: number 0 to 99; x, y and size from 0 to 1."""
+        if not 0 <= integer(id) <= 99:
+            say(f"Error: wb_supervisor_set_label(): id {id} is not between 0 and 99.")
+            return
+        place = (number(x), number(y), number(size))
+        number(transparency), text(font)
+        self._session.ask("set_label", id, text(label), *place, integer(color))

@@ -1,0 +1,163 @@
+"""How motors turn wheels and wheels move a robot."""
+
+from dataclasses import dataclass, field
+from math import cos, isinf, sin
+from typing import Any
+
+from webots_mcp.standin.arena import Arena, Body
+from webots_mcp.standin.vrml import Node
+from webots_mcp.standin.world import descendants_of
+
+
+
+@dataclass
+class Joint:
+    """A hinge, its motor and how far it has turned."""
+
+    node: Node
+    max_velocity_radps: float
+    acceleration_radps2: float
+    min_position_rad: float
+    max_position_rad: float
+    start_rad: float
+    target_rad: float = 0.0
+    """Where the motor is to turn to; inf: turn on with `target_radps` (velocity control)."""
+    target_radps: float = 0.0
+    position_rad: float = 0.0
+    velocity_radps: float = 0.0
+
+    @staticmethod
+    def of(node: Node) -> "Joint":
+        """The joint that a HingeJoint node describes; without a motor it stands still."""
+        motors = [n for n in node.fields["device"] if n.type_name == "RotationalMotor"]
+        fields: dict[str, Any] = motors[0].fields if motors else {}
+        parameters = node.fields["jointParameters"]
+        joint = Joint(
+            node,
+            fields.get("maxVelocity", 0.0),
+            fields.get("acceleration", -1.0),
+            fields.get("minPosition", 0.0),
+            fields.get("maxPosition", 0.0),
+            parameters.fields["position"] if parameters else 0.0,
+        )
+        joint.reset()
+        return joint
+
+    def reset(self) -> None:
+        """Back to the start; the motor holds still until it is told otherwise."""
+        self.position_rad, self.velocity_radps = self.start_rad, 0.0
+        self.hold()
+
+    def hold(self) -> None:
+        """Makes the motor hold where the joint is."""
+        self.target_rad, self.target_radps = self.position_rad, self.max_velocity_radps
+
+    def turn(self, seconds: float) -> float:
+        """Turns for one time step; returns by how much, in radians."""
+        wanted = self._wanted_radps(seconds)
+        if self.acceleration_radps2 > 0.0:
+            change = self.acceleration_radps2 * seconds
+            wanted = min(max(wanted, self.velocity_radps - change), self.velocity_radps + change)
+        self.velocity_radps = wanted
+        turned = wanted * seconds
+        self.position_rad += turned
+        return turned
+
+    def _wanted_radps(self, seconds: float) -> float:
+        limit = self.max_velocity_radps
+        if isinf(self.target_rad):
+            wanted = self.target_radps if self.target_rad > 0.0 else -self.target_radps
+            return min(max(wanted, -limit), limit)
+        target = self.target_rad
+        if self.min_position_rad != self.max_position_rad:
+            target = min(max(target, self.min_position_rad), self.max_position_rad)
+        limit = min(limit, abs(self.target_radps))
+        return min(max((target - self.position_rad) / seconds, -limit), limit)
+
+
+@dataclass
+class Wheel:
+    """A joint about the robot's left-right axis that carries something round."""
+
+    joint: Joint
+    radius_m: float
+    """Negative if turning forwards drives backwards."""
+    left_m: float
+
+
+@dataclass
+class Vehicle:
+    """A robot's body and what moves it; robots without wheels stand where they are."""
+
+    body: Body
+    joints: list[Joint]
+    touching: bool = False
+    collisions: int = 0
+    """How often the robot began to touch something that does not give way."""
+    wheels: list[Wheel] = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.wheels = [wheel for joint in self.joints if (wheel := _wheel_of(joint))]
+        left = [wheel for wheel in self.wheels if wheel.left_m > 0.0]
+        right = [wheel for wheel in self.wheels if wheel.left_m < 0.0]
+        self._sides = (left, right) if left and right else None
+
+    def reset(self) -> None:
+        """Back to the start; where the body stands is the world's business."""
+        for joint in self.joints:
+            joint.reset()
+        self.touching, self.collisions = False, 0
+
+    def stop(self) -> None:
+        """Takes all speed away."""
+        for joint in self.joints:
+            joint.velocity_radps = 0.0
+        self.body.velocity_mps, self.body.yaw_rate_radps = (0.0, 0.0), 0.0
+
+    def drive(self, arena: Arena, seconds: float) -> None:
+        """Moves the robot for one time step.
+
+        Wheels turn as their motors say, whatever is in the way: against a wall they spin, so that
+        wheel sensors and GPS disagree as they do in reality.
+        """
+        rolled = {id(joint): joint.turn(seconds) for joint in self.joints}
+        if self._sides is None:
+            return
+        left, right = (
+            sum(rolled[id(wheel.joint)] * wheel.radius_m for wheel in side) / len(side)
+            for side in self._sides
+        )
+        track = self._sides[0][0].left_m - self._sides[1][0].left_m
+        self._roll((left + right) / 2.0, (right - left) / track, arena, seconds)
+
+    def _roll(self, ahead_m: float, turn_rad: float, arena: Arena, seconds: float) -> None:
+        body = self.body
+        x, y, yaw = body.x, body.y, body.yaw_rad
+        if ahead_m or turn_rad:
+            middle = yaw + turn_rad / 2.0  # exact to second order: the arc's chord
+            body.move(x + ahead_m * cos(middle), y + ahead_m * sin(middle), yaw + turn_rad)
+            self._notice(arena.settle(body))
+        body.velocity_mps = ((body.x - x) / seconds, (body.y - y) / seconds)
+        body.yaw_rate_radps = (body.yaw_rad - yaw) / seconds
+
+    def _notice(self, touching: bool) -> None:
+        self.collisions += touching and not self.touching
+        self.touching = touching
+
+
+def joints_in(robot: Node) -> list[Joint]:
+    """All hinges of a robot, in the order of the scene tree."""
+    return [Joint.of(node) for node in descendants_of(robot) if node.type_name == "HingeJoint"]
+
+
+def _wheel_of(joint: Joint) -> Wheel | None:
+    parameters, end = joint.node.fields["jointParameters"], joint.node.fields["endPoint"]
+    if parameters is None or end is None or joint.max_velocity_radps == 0.0:
+        return None
+    axis, anchor = parameters.fields["axis"], parameters.fields["anchor"]
+    radii = [node.fields["radius"] for node in descendants_of(end) if "radius" in node.fields]
+    if not radii or abs(axis[1]) < 0.9 or anchor[1] == 0.0:
+        return None
+    return Wheel(joint, radii[0] if axis[1] > 0.0 else -radii[0], anchor[1])
+
+

@@ -1,0 +1,135 @@
+"""The picture of the whole arena from above, for `Supervisor.exportImage`."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import cos, sin
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from webots_mcp.standin.arena import Arena, Body
+from webots_mcp.standin.shapes import Block, Color, Shape
+
+if TYPE_CHECKING:
+    from PIL.ImageDraw import ImageDraw
+
+SIZE_PX = (800, 600)
+_MARGIN_PX = 20
+_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture that somebody asked for."""
+
+    path: Path
+    quality: int
+
+
+@dataclass(frozen=True)
+class Label:
+    """A text over the picture; place and size are shares of the picture."""
+
+    text: str
+    x: float
+    y: float
+    size: float
+    rgb: int
+
+
+@dataclass(frozen=True)
+class Chart:
+    """From metres to pixels."""
+
+    x_m: float
+    y_m: float
+    pixels_per_m: float
+
+    @staticmethod
+    def of(shapes: list[Shape]) -> "Chart":
+        """The chart that shows all shapes, x to the right and y upwards."""
+        corners = [corner for shape in shapes for corner in _outline(shape)] or [(-1.0, -1.0)]
+        xs, ys = [x for x, _ in corners], [y for _, y in corners]
+        width, height = max(xs) - min(xs), max(ys) - min(ys)
+        room = [size - 2 * _MARGIN_PX for size in SIZE_PX]
+        scale = min(room[0] / max(width, 0.1), room[1] / max(height, 0.1))
+        return Chart((max(xs) + min(xs)) / 2.0, (max(ys) + min(ys)) / 2.0, scale)
+
+    def at(self, x_m: float, y_m: float) -> tuple[float, float]:
+        """The pixel of a point."""
+        return (
+            SIZE_PX[0] / 2.0 + (x_m - self.x_m) * self.pixels_per_m,
+            SIZE_PX[1] / 2.0 - (y_m - self.y_m) * self.pixels_per_m,
+        )
+
+
+def save_picture(picture: Picture, arena: Arena, time_s: float, labels: Iterable[Label]) -> None:
+    """Draws the arena and writes the file; the format is the extension's.
+
+    Raises:
+        ValueError: The extension is neither .png nor .jpg.
+        OSError: The file cannot be written.
+        ImportError: Pillow is not installed.
+    """
+    from PIL import Image, ImageDraw  # only here: most simulations never need a picture
+
+    kind = _FORMATS.get(picture.path.suffix.lower())
+    if kind is None:
+        raise ValueError(f"unknown extension {picture.path.suffix!r}, use .png or .jpg")
+    image = Image.new("RGB", SIZE_PX, _rgb(arena.colors.sky))
+    pen = ImageDraw.Draw(image)
+    chart = Chart.of([shape for body in arena.bodies for shape in body.shapes])
+    _draw_floor(pen, chart, arena)
+    for body in arena.bodies:
+        _draw_body(pen, chart, body)
+    pen.text((8, 4), f"{time_s:.3f} s", fill=(0, 0, 0), font_size=16)
+    for label in labels:
+        _draw_label(pen, label)
+    image.save(picture.path, kind, quality=picture.quality)
+
+
+def _draw_floor(pen: "ImageDraw", chart: Chart, arena: Arena) -> None:
+    corners = [c for body in arena.bodies for shape in body.shapes for c in _outline(shape)]
+    if not corners:
+        return
+    left, top = chart.at(min(x for x, _ in corners), max(y for _, y in corners))
+    right, bottom = chart.at(max(x for x, _ in corners), min(y for _, y in corners))
+    pen.rectangle((left, top, right, bottom), fill=_rgb(arena.colors.floor))
+
+
+def _draw_body(pen: "ImageDraw", chart: Chart, body: Body) -> None:
+    for shape in body.shapes:
+        _draw_shape(pen, chart, shape)
+    if body.node.type_name == "Robot":
+        radius = max(body.footprint.radius_m, 0.05)
+        x, y = body.centre()
+        nose = (x + radius * cos(body.yaw_rad) * 1.6, y + radius * sin(body.yaw_rad) * 1.6)
+        pen.line((*chart.at(x, y), *chart.at(*nose)), fill=(220, 30, 30), width=4)
+        pen.text(chart.at(x + radius, y + radius), body.name, fill=(0, 0, 0), font_size=14)
+
+
+def _draw_shape(pen: "ImageDraw", chart: Chart, shape: Shape) -> None:
+    if isinstance(shape, Block):
+        pen.polygon([chart.at(*corner) for corner in _outline(shape)], fill=_rgb(shape.color))
+        return
+    radius_px = shape.radius_m * chart.pixels_per_m
+    pen.circle(chart.at(shape.x, shape.y), radius_px, fill=_rgb(shape.color))
+
+
+def _draw_label(pen: "ImageDraw", label: Label) -> None:
+    at = (label.x * SIZE_PX[0], label.y * SIZE_PX[1])
+    rgb = (label.rgb >> 16 & 255, label.rgb >> 8 & 255, label.rgb & 255)
+    pen.text(at, label.text, fill=rgb, font_size=max(label.size * SIZE_PX[1], 8.0))
+
+
+def _outline(shape: Shape) -> list[tuple[float, float]]:
+    if not isinstance(shape, Block):
+        r = shape.radius_m
+        return [(shape.x + dx, shape.y + dy) for dx in (-r, r) for dy in (-r, r)]
+    c, s, a, b = cos(shape.yaw_rad), sin(shape.yaw_rad), shape.half_x_m, shape.half_y_m
+    corners = ((a, b), (-a, b), (-a, -b), (a, -b))
+    return [(shape.x + c * u - s * v, shape.y + s * u + c * v) for u, v in corners]
+
+
+def _rgb(color: Color) -> tuple[int, int, int]:
+    r, g, b = (min(max(round(part * 255), 0), 255) for part in color)
+    return r, g, b

@@ -1,0 +1,304 @@
+"""The loop that runs a simulation: serves controllers, keeps time, starts and ends processes."""
+
+import hmac
+import secrets
+import selectors
+import socket
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from controller.wire import Inbox, Message, pack
+
+from webots_mcp.standin.answers import answer, description, step_over
+from webots_mcp.standin.controllers import Controller
+from webots_mcp.standin.errors import StandInError, WorldError
+from webots_mcp.standin.simulator import Mode, Simulator
+from webots_mcp.standin.world import load_world
+
+_PATIENCE_S = 1.0
+"""How long Webots waits for a controller to ask for something, and then for it to exit."""
+_MAX_LAG_S = 0.1
+"""Real time that is lost is caught up with at most so much."""
+
+
+class Connection:
+    """The socket of one controller."""
+
+    def __init__(self, stream: socket.socket) -> None:
+        stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        self.stream = stream
+        self.inbox = Inbox()
+        self.controller: Controller | None = None
+
+    def send(self, message: Message) -> None:
+        """Sends an answer; a controller that is gone is noticed when its socket is read."""
+        with suppress(OSError):
+            self.stream.sendall(pack(message))
+
+    def receive(self) -> list[Message] | None:
+        """The messages that have arrived; None if the controller is gone."""
+        try:
+            data = self.stream.recv(1 << 16)
+        except OSError:
+            data = b""
+        if not data:
+            return None
+        self.inbox.feed(data)
+        return [*iter(self.inbox.take, None)]
+
+
+class Runner:
+    """Runs a simulation in the thread that calls `run`; other threads use `call`."""
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        controllers_for: Callable[[Simulator], list[Controller]],
+        notify: Callable[[], None],
+    ) -> None:
+        self.simulator = simulator
+        self.controllers = controllers_for(simulator)
+        self.token = secrets.token_hex(16)
+        self.exit_status: int | None = None
+        self._controllers_for = controllers_for
+        self._notify = notify
+        self._calls: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
+        self._steps_asked = 0
+        self._due_s = 0.0
+        self._ending = False
+        self._selector = selectors.DefaultSelector()
+        self._door = socket.create_server(("127.0.0.1", 0))
+        self.port: int = self._door.getsockname()[1]
+        self._bell, self._bell_rope = socket.socketpair()
+        self._selector.register(self._door, selectors.EVENT_READ, self._welcome)
+        self._selector.register(self._bell, selectors.EVENT_READ, self._answer_bell)
+
+    # From other threads --------------------------------------------------------------------------
+
+    def call(self, function: Callable[[], Any]) -> Any:
+        """Has the loop call a function between two physics steps; returns what it returns.
+
+        Raises:
+            StandInError: The simulation has ended.
+        """
+        future: Future[Any] = Future()
+        self._calls.append((function, future))
+        self.wake()
+        if self.exit_status is not None:
+            self._cancel_calls()
+        if future.cancelled():
+            raise StandInError("the simulation has ended")
+        return future.result()
+
+    def wake(self) -> None:
+        """Lets the loop look around, if it waits."""
+        with suppress(OSError):
+            self._bell_rope.send(b"!")
+
+    # The loop ------------------------------------------------------------------------------------
+
+    def run(self) -> None:
+        """Runs until somebody quits."""
+        try:
+            if self.simulator.mode is not Mode.PAUSE:
+                self._start_controllers()
+            while self.exit_status is None:
+                self._listen(self._patience_s())
+                if self._may_advance():
+                    self._advance()
+        finally:
+            self._shut_down()
+
+    def _patience_s(self) -> float | None:
+        if not self._wants_to_advance() or self._held_up():
+            return None
+        if self.simulator.mode is Mode.FAST or self._steps_asked:
+            return 0.0
+        return max(self._due_s - time.monotonic(), 0.0)
+
+    def _wants_to_advance(self) -> bool:
+        return self.simulator.mode is not Mode.PAUSE or self._steps_asked > 0
+
+    def _held_up(self) -> bool:
+        return any(controller.holds_up for controller in self.controllers)
+
+    def _may_advance(self) -> bool:
+        return self.exit_status is None and self._patience_s() == 0.0
+
+    def _advance(self) -> None:
+        self._due_s = max(
+            self._due_s + self.simulator.world.basic_time_step_ms / 1000.0,
+            time.monotonic() - _MAX_LAG_S,
+        )
+        done = self.simulator.advance()
+        for controller in self.controllers:
+            if controller.robot in done and controller.connection:
+                controller.connection.send(step_over(self.simulator, controller.robot))
+        if self._steps_asked:
+            self._steps_asked -= 1
+        self._carry_out_wanted()
+        self._notify()
+
+    def _listen(self, timeout_s: float | None) -> None:
+        for key, _ in self._selector.select(timeout_s):
+            key.data(key.fileobj)
+
+    def _listen_until(self, condition: Callable[[], bool]) -> None:
+        deadline_s = time.monotonic() + _PATIENCE_S
+        while not condition() and (left_s := deadline_s - time.monotonic()) > 0.0:
+            self._listen(left_s)
+
+    def _answer_bell(self, bell: socket.socket) -> None:
+        bell.recv(1024)
+        while self._calls and not self._ending:
+            function, future = self._calls.popleft()
+            try:
+                future.set_result(function())
+            except StandInError as error:
+                future.set_exception(error)
+
+    # Controllers ---------------------------------------------------------------------------------
+
+    def _welcome(self, door: socket.socket) -> None:
+        connection = Connection(door.accept()[0])
+        self._selector.register(
+            connection.stream, selectors.EVENT_READ, lambda _: self._hear(connection)
+        )
+
+    def _hear(self, connection: Connection) -> None:
+        messages = connection.receive()
+        if messages is None:
+            self._forget(connection)
+            return
+        for message in messages:
+            if connection.controller is None:
+                self._admit(connection, message)
+            else:
+                self._serve(connection, connection.controller, message)
+
+    def _admit(self, connection: Connection, message: Message) -> None:
+        _, token, name = message
+        controller = next((c for c in self.controllers if c.name == name), None)
+        if not hmac.compare_digest(token, self.token) or controller is None:
+            connection.send(("refused", f"there is no robot {name!r} here, or the token is wrong"))
+        elif controller.connection is not None:
+            connection.send(("refused", f"robot {name!r} has a controller already"))
+        else:
+            controller.connection, connection.controller = connection, controller
+            controller.robot.forget_controller()
+            connection.send(("welcome", description(self.simulator, controller.robot)))
+            self._notify()
+
+    def _serve(self, connection: Connection, controller: Controller, message: Message) -> None:
+        if self._ending:
+            controller.tell_to_quit()
+            return
+        reply = answer(self.simulator, controller.robot, message)
+        if reply:
+            connection.send(reply)
+        if message[0] == "ask":
+            self._carry_out_wanted()
+            self._notify()
+
+    def _forget(self, connection: Connection) -> None:
+        self._selector.unregister(connection.stream)
+        connection.stream.close()
+        if controller := connection.controller:
+            controller.connection, connection.controller = None, None
+            controller.has_left = True
+            controller.robot.forget_controller()
+            self._notify()
+
+    def _start_controllers(self) -> None:
+        for controller in self.controllers:
+            controller.start()
+
+    def _end_controllers(self) -> None:
+        """As Webots does it: a second to ask, a second to exit, then by force."""
+        self._ending = True
+        for controller in self.controllers:
+            if controller.robot.remaining_ms is not None:
+                controller.tell_to_quit()
+        self._listen_until(lambda: not any(c.has_to_be_told for c in self.controllers))
+        for controller in self.controllers:
+            controller.tell_to_quit()
+        self._listen_until(lambda: not any(c.is_leaving for c in self.controllers))
+        for controller in self.controllers:
+            controller.end()
+            if connection := controller.connection:
+                self._forget(connection)
+        self._ending = False
+
+    # A person's hands, to be used through `call` -------------------------------------------------
+
+    def set_mode(self, mode: Mode) -> None:
+        """Pauses or runs."""
+        self.simulator.mode = mode
+        self._after_mode_change()
+
+    def step(self) -> None:
+        """Makes one basic time step and pauses."""
+        self.simulator.mode = Mode.PAUSE
+        self._steps_asked += 1
+        self._after_mode_change()
+
+    def reset(self) -> None:
+        """Resets the world and starts all controllers again."""
+        self._end_controllers()
+        self.simulator.reset()
+        self._start_controllers()
+        self._notify()
+
+    def load(self, path: Path) -> None:
+        """Reads a world and starts its controllers; a bad world is named and the old one stays."""
+        self._end_controllers()
+        try:
+            world = load_world(path)
+            self.simulator = Simulator(world, self.simulator.mode, self.simulator.log)
+            self.controllers = self._controllers_for(self.simulator)
+        except WorldError as error:
+            self.simulator.log(f"ERROR: {error}; the world stays as it was")
+            self.simulator.reset()
+        if self.simulator.mode is not Mode.PAUSE:
+            self._start_controllers()
+        self._notify()
+
+    def quit(self, status: int) -> None:
+        """Ends the simulation."""
+        self.exit_status = status
+
+    def _after_mode_change(self) -> None:
+        self._due_s = time.monotonic()
+        for controller in self.controllers:  # a world loaded in pause starts them only now
+            if self._wants_to_advance() and not controller.was_started:
+                controller.start()
+        self._notify()
+
+    def _carry_out_wanted(self) -> None:
+        wanted, self.simulator.wanted = self.simulator.wanted, None
+        if wanted is None:
+            return
+        if wanted.action == "quit":
+            self.quit(wanted.status)
+        else:
+            self.load(Path(wanted.path) if wanted.path else self.simulator.world.path)
+
+    def _shut_down(self) -> None:
+        self.exit_status = self.exit_status or 0
+        self._end_controllers()
+        for key in [*self._selector.get_map().values()]:
+            key.fileobj.close()  # type: ignore[union-attr]
+        self._selector.close()
+        self._bell_rope.close()
+        self._cancel_calls()
+        self._notify()
+
+    def _cancel_calls(self) -> None:
+        while self._calls:
+            with suppress(IndexError):
+                self._calls.popleft()[1].cancel()

@@ -1,0 +1,183 @@
+"""Upright shapes on a plane: how rays hit them, and how they push a disc away.
+
+The stand-in is two-dimensional with heights: a box is a turned rectangle, a cylinder or a ball a
+disc, each between a bottom and a top.
+"""
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from math import cos, hypot, inf, sin, sqrt
+from typing import NamedTuple, TypeAlias
+
+Color = tuple[float, float, float]
+"""Red, green and blue, each 0 to 1."""
+Push: TypeAlias = "tuple[float, float] | None"
+"""By how much, in metres, something has to move to be clear; None if it is clear."""
+
+
+class Edge(NamedTuple):
+    """One side of a block, seen from a point: everything is relative to that point."""
+
+    nx: float
+    ny: float
+    offset_m: float
+    """Distance from the point to the line of the edge."""
+    ex: float
+    ey: float
+    start_m: float
+    """Where the edge begins, measured along (ex, ey)."""
+    length_m: float
+    shape: "Shape"
+
+    def distance_m(self, dx: float, dy: float) -> float:
+        """How far the ray in direction (dx, dy) runs until it hits; inf if it does not."""
+        closing = self.nx * dx + self.ny * dy
+        if closing <= 1e-12:
+            return inf
+        distance = self.offset_m / closing
+        along = distance * (self.ex * dx + self.ey * dy) - self.start_m
+        return distance if 0.0 <= along <= self.length_m else inf
+
+
+class Circle(NamedTuple):
+    """The outline of a disc, seen from a point."""
+
+    x: float
+    y: float
+    radius_m: float
+    gap_m2: float
+    """Squared distance to the centre minus squared radius."""
+    shape: "Shape"
+
+    def distance_m(self, dx: float, dy: float) -> float:
+        """How far the ray in direction (dx, dy) runs until it hits; inf if it does not."""
+        ahead = self.x * dx + self.y * dy
+        square = ahead * ahead - self.gap_m2
+        return ahead - sqrt(square) if ahead > 0.0 and square >= 0.0 else inf
+
+
+Target: TypeAlias = "Edge | Circle"
+
+
+@dataclass(frozen=True)
+class Block:
+    """A box that stands upright."""
+
+    x: float
+    y: float
+    yaw_rad: float
+    half_x_m: float
+    half_y_m: float
+    bottom_m: float
+    top_m: float
+    color: Color
+
+    def _local(self, x: float, y: float) -> tuple[float, float]:
+        c, s = cos(self.yaw_rad), sin(self.yaw_rad)
+        dx, dy = x - self.x, y - self.y
+        return c * dx + s * dy, c * dy - s * dx
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether the point is inside."""
+        u, v = self._local(x, y)
+        return abs(u) < self.half_x_m and abs(v) < self.half_y_m
+
+    def targets(self, x: float, y: float, height_m: float | None) -> Iterator[Target]:
+        """The sides that can be seen from a point, at one height or (None) at any."""
+        if height_m is not None and not self.bottom_m <= height_m <= self.top_m:
+            return
+        c, s = cos(self.yaw_rad), sin(self.yaw_rad)
+        u, v = self._local(x, y)
+        a, b = self.half_x_m, self.half_y_m
+        for nx, ny, beyond, at, half in (
+            *((c, s, u - a, v, b), (-c, -s, -u - a, -v, b)),
+            *((-s, c, v - b, -u, a), (s, -c, -v - b, u, a)),
+        ):
+            if beyond > 0.0:
+                yield Edge(-nx, -ny, beyond, -ny, nx, -half - at, 2.0 * half, self)
+
+    def push(self, x: float, y: float, radius_m: float) -> Push:
+        """What moves a disc out of this block, the shortest way."""
+        u, v = self._local(x, y)
+        if abs(u) >= self.half_x_m + radius_m or abs(v) >= self.half_y_m + radius_m:
+            return None
+        pu, pv = self._local_push(u, v, radius_m)
+        c, s = cos(self.yaw_rad), sin(self.yaw_rad)
+        return (c * pu - s * pv, s * pu + c * pv) if pu or pv else None
+
+    def _local_push(self, u: float, v: float, radius_m: float) -> tuple[float, float]:
+        a, b = self.half_x_m, self.half_y_m
+        du, dv = u - min(max(u, -a), a), v - min(max(v, -b), b)
+        if distance := hypot(du, dv):
+            depth = max(radius_m - distance, 0.0) / distance
+            return du * depth, dv * depth
+        if a - abs(u) < b - abs(v):  # the centre is inside: leave by the nearest side
+            return (a - abs(u) + radius_m) * (1.0 if u >= 0.0 else -1.0), 0.0
+        return 0.0, (b - abs(v) + radius_m) * (1.0 if v >= 0.0 else -1.0)
+
+
+@dataclass(frozen=True)
+class Disc:
+    """A cylinder that stands upright, or a ball."""
+
+    x: float
+    y: float
+    radius_m: float
+    bottom_m: float
+    top_m: float
+    color: Color
+    is_ball: bool = False
+
+    def contains(self, x: float, y: float) -> bool:
+        """Whether the point is inside."""
+        return hypot(x - self.x, y - self.y) < self.radius_m
+
+    def targets(self, x: float, y: float, height_m: float | None) -> Iterator[Target]:
+        """The outline as seen from a point, at one height or (None) at any."""
+        radius = self.radius_m if height_m is None else self._radius_at(height_m)
+        cx, cy = self.x - x, self.y - y
+        gap = cx * cx + cy * cy - radius * radius
+        if radius > 0.0 and gap > 0.0:
+            yield Circle(cx, cy, radius, gap, self)
+
+    def _radius_at(self, height_m: float) -> float:
+        if not self.bottom_m <= height_m <= self.top_m:
+            return 0.0
+        if not self.is_ball:
+            return self.radius_m
+        above = height_m - (self.bottom_m + self.top_m) / 2.0
+        return sqrt(max(self.radius_m**2 - above**2, 0.0))
+
+    def push(self, x: float, y: float, radius_m: float) -> Push:
+        """What moves another disc out of this one."""
+        dx, dy = x - self.x, y - self.y
+        distance = hypot(dx, dy)
+        depth = self.radius_m + radius_m - distance
+        if depth <= 0.0:
+            return None
+        return (dx / distance * depth, dy / distance * depth) if distance else (depth, 0.0)
+
+
+Shape: TypeAlias = "Block | Disc"
+
+
+def targets_from(shapes: Iterable[Shape], x: float, y: float, height_m: float | None) -> list[Target]:
+    """Everything that rays from a point can hit.
+
+    Args:
+        shapes: What there is.
+        x: Where the rays start, metres.
+        y: Where the rays start, metres.
+        height_m: Only what is there at this height; None for everything.
+    """
+    return [target for shape in shapes for target in shape.targets(x, y, height_m)]
+
+
+def nearest_m(targets: Iterable[Target], dx: float, dy: float) -> float:
+    """Distance to the first thing in the direction of a unit vector; inf if there is none."""
+    nearest = inf
+    for target in targets:
+        distance = target.distance_m(dx, dy)
+        if distance < nearest:
+            nearest = distance
+    return nearest

@@ -1,0 +1,244 @@
+"""A running simulation with real controller processes."""
+
+import shutil
+import sys
+import tempfile
+import threading
+import time
+import weakref
+from collections import deque
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import TypeVar
+
+from controller.wire import ADDRESS_FILE
+
+from webots_mcp.standin.controllers import Controller, Launch, controllers_of
+from webots_mcp.standin.errors import StandInError
+from webots_mcp.standin.runner import Runner
+from webots_mcp.standin.simulator import Mode, Robot, Simulator
+from webots_mcp.standin.world import load_world
+
+_MODES = {"pause": Mode.PAUSE, "realtime": Mode.REAL_TIME, "fast": Mode.FAST}
+_LIBRARY = Path(__file__).parent / "lib"
+_NOTICE_S = 0.002
+_RECHECK_S = 0.05
+_CONSOLE_LINES = 10_000
+
+T = TypeVar("T")
+
+
+class Simulation:
+    """A world that runs in a background thread, its controllers as processes of their own.
+
+    Use it in a `with` statement; leaving it ends all controllers. The methods named after buttons
+    are a person's hands on Webots' window: they return once the simulation has obeyed.
+    """
+
+    def __init__(
+        self,
+        world: str | Path,
+        *,
+        mode: str = "realtime",
+        console: Callable[[str], object] | None = None,
+        environment: Mapping[str, str] | None = None,
+        controllers: Mapping[str, str | Path] | None = None,
+        python: str = sys.executable,
+    ) -> None:
+        """Loads a world; nothing runs before `start` or `with`.
+
+        Args:
+            world: A .wbt file, best in a project: `worlds/x.wbt` beside `controllers/`.
+            mode: `pause`, `realtime` or `fast`, as for Webots' `--mode`. A world that is loaded
+                in pause starts its controllers with the first step.
+            console: Is called with each line of Webots' console, from one thread at a time.
+            environment: Variables for the controllers, on top of those of this process.
+            controllers: Controller files by robot name, instead of those that the world names.
+            python: The interpreter of the controllers.
+
+        Raises:
+            WorldError: The world cannot be used.
+            StandInError: There is no such mode.
+        """
+        if mode not in _MODES:
+            raise StandInError(f"mode has to be one of {', '.join(_MODES)}, not {mode!r}")
+        self._console = console
+        self._lines: deque[str] = deque(maxlen=_CONSOLE_LINES)
+        self._printing = threading.Lock()
+        self._changed = threading.Condition()
+        self._noticed_s = 0.0
+        self._instance = Path(tempfile.mkdtemp(prefix="webots-standin-"))
+        self._clean_up = weakref.finalize(self, shutil.rmtree, self._instance, True)
+        overrides = {name: Path(file) for name, file in (controllers or {}).items()}
+        launch = Launch(
+            _LIBRARY, self._instance, python, environment or {}, overrides, self._print, self._exited
+        )
+        self._runner = Runner(
+            Simulator(load_world(world), _MODES[mode], self._print),
+            lambda simulator: controllers_of(simulator, launch),
+            self._notice,
+        )
+        self._thread = threading.Thread(target=self._runner.run, name="simulation", daemon=True)
+
+    # Life ----------------------------------------------------------------------------------------
+
+    def start(self) -> "Simulation":
+        """Starts the controllers and, unless it is to be paused, time."""
+        address = self._instance / ADDRESS_FILE
+        address.touch(mode=0o600)
+        address.write_text(f"{self._runner.port} {self._runner.token}", encoding="utf-8")
+        self._thread.start()
+        return self
+
+    def close(self) -> None:
+        """Quits, if that has not happened yet, and waits until all processes are gone."""
+        if self._thread.is_alive() and self.is_running:
+            self.quit()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._clean_up()
+
+    def __enter__(self) -> "Simulation":
+        return self.start()
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the simulation has not been quit."""
+        return self._runner.exit_status is None
+
+    @property
+    def exit_status(self) -> int | None:
+        """The status given to `simulationQuit`; None while it runs."""
+        return self._runner.exit_status
+
+    # What is the case ----------------------------------------------------------------------------
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time in seconds."""
+        return self._runner.simulator.time_s
+
+    @property
+    def mode(self) -> Mode:
+        """How the simulation runs."""
+        return self._runner.simulator.mode
+
+    @property
+    def labels(self) -> dict[int, str]:
+        """The texts of `setLabel` by number."""
+        return {number: label.text for number, label in self._runner.simulator.labels.items()}
+
+    @property
+    def console(self) -> list[str]:
+        """The last lines of the console: `[robot] text` from controllers, others from Webots."""
+        with self._printing:
+            return [*self._lines]
+
+    def robot(self, name: str) -> Robot:
+        """What is really the case with a robot: its `position`, `yaw_rad`, `collisions`, ...
+
+        Raises:
+            WorldError: The world has no robot with this name.
+        """
+        return self._runner.simulator.robot(name)
+
+    def controller(self, name: str) -> Controller:
+        """A robot's controller: its `pid`, `exit_code`, `starts`, `kill()`, ...
+
+        Raises:
+            StandInError: The world has no robot with this name.
+        """
+        for controller in self._runner.controllers:
+            if controller.name == name:
+                return controller
+        raise StandInError(f"no robot {name!r} in {self._runner.simulator.world.path.name}")
+
+    def environment_of(self, name: str) -> dict[str, str]:
+        """The environment in which a program of yours can be the controller of an <extern> robot."""
+        controller = self.controller(name)
+        return controller.launch.environment_of(controller.robot)
+
+    def wait_for(self, condition: Callable[[], T], timeout_s: float = 10.0) -> T:
+        """Waits until something is the case; looks whenever something has happened.
+
+        Args:
+            condition: Is called in this thread until its value is true.
+            timeout_s: The longest time to wait, in seconds of wall time.
+
+        Returns:
+            The true value.
+
+        Raises:
+            TimeoutError: It was not the case in time; the message ends with the console.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while not (value := condition()):
+            left_s = deadline_s - time.monotonic()
+            if left_s <= 0.0:
+                tail = "\n".join(self.console[-20:])
+                raise TimeoutError(f"not the case after {timeout_s} s; the console says:\n{tail}")
+            with self._changed:
+                self._changed.wait(min(left_s, _RECHECK_S))
+        return value
+
+    # A person's hands ----------------------------------------------------------------------------
+
+    def pause(self) -> None:
+        """Presses pause."""
+        self._runner.call(lambda: self._runner.set_mode(Mode.PAUSE))
+
+    def resume(self) -> None:
+        """Presses play: real time."""
+        self._runner.call(lambda: self._runner.set_mode(Mode.REAL_TIME))
+
+    def fast(self) -> None:
+        """Presses fast."""
+        self._runner.call(lambda: self._runner.set_mode(Mode.FAST))
+
+    def step(self) -> None:
+        """Presses step: one basic time step as soon as all controllers have asked, then pause."""
+        self._runner.call(self._runner.step)
+
+    def reset(self) -> None:
+        """Resets the world and starts all controllers again."""
+        self._runner.call(self._runner.reset)
+
+    def reload(self) -> None:
+        """Reads the world from its file again and starts all controllers again."""
+        self._runner.call(lambda: self._runner.load(self._runner.simulator.world.path))
+
+    def quit(self, status: int = 0) -> None:
+        """Closes the window."""
+        self._runner.call(lambda: self._runner.quit(status))
+
+    # From the simulation's threads ---------------------------------------------------------------
+
+    def _print(self, line: str) -> None:
+        with self._printing:
+            self._lines.append(line)
+            if self._console:
+                self._console(line)
+        self._tell()
+
+    def _exited(self) -> None:
+        self._runner.wake()
+        self._tell()
+
+    def _notice(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._noticed_s > _NOTICE_S:  # a thread switch for each step would cost too much
+            self._noticed_s = now_s
+            self._tell()
+
+    def _tell(self) -> None:
+        with self._changed:
+            self._changed.notify_all()

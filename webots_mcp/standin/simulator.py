@@ -1,0 +1,232 @@
+"""The simulation itself: robots, time and modes; no messages, no processes, no sockets.
+
+Whoever drives a `Simulator` makes the physics steps (`advance`) and carries out what the
+simulation wants done to itself (`wanted`: reload, load, quit).
+"""
+
+from collections.abc import Callable
+from enum import IntEnum
+from math import ceil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from webots_mcp.standin.arena import Arena, Body
+from webots_mcp.standin.devices import Device, devices_in
+from webots_mcp.standin.errors import WorldError
+from webots_mcp.standin.physics import Vehicle, joints_in
+from webots_mcp.standin.picture import Label, Picture, save_picture
+from webots_mcp.standin.vrml import Node
+from webots_mcp.standin.world import World
+
+class Mode(IntEnum):
+    """How the simulation runs; the numbers are those of `Supervisor.SIMULATION_MODE_...`."""
+
+    PAUSE = 0
+    REAL_TIME = 1
+    FAST = 2
+
+
+class Wanted(NamedTuple):
+    """What a controller asked to be done to the whole simulation."""
+
+    action: str
+    """`reload`, `load` or `quit`."""
+    path: str = ""
+    status: int = 0
+
+
+class Robot:
+    """A robot of the world and the state of its controller's requests."""
+
+    def __init__(self, body: Body, arena: Arena) -> None:
+        self.node: Node = body.node
+        self.vehicle = Vehicle(body, joints_in(body.node))
+        self.devices: dict[int, Device] = {d.tag: d for d in devices_in(self.vehicle, arena)}
+        self.folder = Path.cwd()
+        """Where the relative paths of its controller start."""
+        self.remaining_ms: float | None = None
+        """Simulated time until the step that the controller asked for is over; None: no request."""
+        self.ahead_ms = 0.0
+        """Simulated time that has passed since the end of the last step it asked for."""
+        self.delay_ms = 0
+        """By how much the last step came too late, for robots without synchronization."""
+        self.fresh: dict[int, Any] = {}
+        """Values that the controller has not been sent yet, by tag."""
+
+    @property
+    def name(self) -> str:
+        """The `name` field."""
+        return self.node.fields["name"]
+
+    @property
+    def is_synchronous(self) -> bool:
+        """Whether the world waits for its controller."""
+        return self.node.fields["synchronization"]
+
+    @property
+    def position(self) -> tuple[float, float, float]:
+        """Where it really is, in metres."""
+        body = self.vehicle.body
+        return body.x, body.y, body.z
+
+    @property
+    def yaw_rad(self) -> float:
+        """Where it really heads."""
+        return self.vehicle.body.yaw_rad
+
+    @property
+    def wheel_positions_rad(self) -> list[float]:
+        """How far each joint has turned."""
+        return [joint.position_rad for joint in self.vehicle.joints]
+
+    @property
+    def collisions(self) -> int:
+        """How often it began to touch something that does not give way."""
+        return self.vehicle.collisions
+
+    @property
+    def is_touching(self) -> bool:
+        """Whether it drives against something now."""
+        return self.vehicle.touching
+
+    def forget_controller(self) -> None:
+        """Makes ready for another controller: no request, no sensor enabled, motors still."""
+        self.remaining_ms, self.ahead_ms = None, 0.0
+        self.fresh.clear()
+        for device in self.devices.values():
+            device.configure("period", 0)
+        for joint in self.vehicle.joints:
+            joint.hold()
+
+
+class Simulator:
+    """One world in motion."""
+
+    def __init__(self, world: World, mode: Mode, log: Callable[[str], None]) -> None:
+        self.world = world
+        self.mode = mode
+        self.log = log
+        self.arena = Arena(world)
+        self.robots = [
+            Robot(b, self.arena) for b in self.arena.bodies if b.node.type_name == "Robot"
+        ]
+        names = [robot.name for robot in self.robots]
+        if double := {name for name in names if names.count(name) > 1}:
+            raise WorldError(f"two robots have the name {double.pop()!r}; give each its own")
+        self.time_ms = 0.0
+        self.wanted: Wanted | None = None
+        self.labels: dict[int, Label] = {}
+        self._reset_asked = False
+        self._load_asked: Wanted | None = None
+        self._pictures: list[Picture] = []
+        self._start = {
+            node: ([*node.fields["translation"]], [*node.fields["rotation"]])
+            for node in world.nodes
+            if "rotation" in node.fields
+        }
+
+    @property
+    def time_s(self) -> float:
+        """Simulated time in seconds."""
+        return self.time_ms / 1000.0
+
+    def robot(self, name: str) -> Robot:
+        """The robot with this name."""
+        for robot in self.robots:
+            if robot.name == name:
+                return robot
+        known = ", ".join(repr(robot.name) for robot in self.robots)
+        raise WorldError(f"no robot {name!r} in {self.world.path.name}; it has {known or 'none'}")
+
+    def robot_of(self, node: Node) -> Robot:
+        """The robot that a Robot node describes."""
+        return next(robot for robot in self.robots if robot.node is node)
+
+    def ask_step(self, robot: Robot, duration_ms: int) -> bool:
+        """Takes a controller's request to simulate; True if that much has passed already."""
+        basic = self.world.basic_time_step_ms
+        robot.remaining_ms = ceil(duration_ms / basic) * basic - robot.ahead_ms
+        return self._is_over(robot)
+
+    def _is_over(self, robot: Robot) -> bool:
+        if robot.remaining_ms is None or robot.remaining_ms > 0.0:
+            return False
+        late_ms = -robot.remaining_ms
+        robot.remaining_ms = None
+        robot.ahead_ms = late_ms if robot.is_synchronous else 0.0
+        robot.delay_ms = 0 if robot.is_synchronous else int(late_ms)
+        return True
+
+    def advance(self) -> list[Robot]:
+        """Makes one physics step; returns the robots whose controllers have waited for it."""
+        basic = self.world.basic_time_step_ms
+        for robot in self.robots:
+            robot.vehicle.drive(self.arena, basic / 1000.0)
+        self.time_ms += basic
+        if self._reset_asked:
+            self.reset()
+            self.time_ms = basic  # the step that resets counts
+        for robot in self.robots:
+            self._measure(robot, basic)
+        self._render()
+        self.wanted, self._load_asked = self._load_asked or self.wanted, None
+        return [robot for robot in self.robots if self._let_pass(robot, basic)]
+
+    def _measure(self, robot: Robot, passed_ms: float) -> None:
+        for device in robot.devices.values():
+            if device.is_due(passed_ms):
+                robot.fresh[device.tag] = device.measure(device.period_ms)
+
+    def _let_pass(self, robot: Robot, passed_ms: float) -> bool:
+        if robot.remaining_ms is None:
+            robot.ahead_ms += passed_ms
+            return False
+        robot.remaining_ms -= passed_ms
+        return self._is_over(robot)
+
+    def reset(self) -> None:
+        """Puts everything back to the start of the world, at time 0; controllers go on."""
+        self._reset_asked = False
+        self.time_ms = 0.0
+        for node, (translation, rotation) in self._start.items():
+            node.fields["translation"], node.fields["rotation"] = [*translation], [*rotation]
+        for body in self.arena.bodies:
+            self.stand_anew(body)
+        for robot in self.robots:
+            robot.vehicle.reset()
+            robot.ahead_ms = 0.0
+            for device in robot.devices.values():
+                device.make_due()
+
+    def stand_anew(self, body: Body) -> None:
+        """Lets a body follow its node's fields."""
+        frame = self.world.frame_of(body.node)
+        assert frame is not None
+        body.stand(frame)
+
+    def stop_motion(self) -> None:
+        """Takes the speed of everything away."""
+        for robot in self.robots:
+            robot.vehicle.stop()
+
+    def ask_reset(self) -> None:
+        """Resets at the end of the next physics step."""
+        self._reset_asked = True
+
+    def ask_load(self, path: str) -> None:
+        """Loads another world after the next physics step."""
+        self._load_asked = Wanted("load", path)
+
+    def export(self, path: Path, quality: int) -> None:
+        """Writes a picture: at once when paused, else with the next rendering."""
+        self._pictures.append(Picture(path, quality))
+        if self.mode is Mode.PAUSE:
+            self._render()
+
+    def _render(self) -> None:
+        pictures, self._pictures = self._pictures, []
+        for picture in pictures:
+            try:
+                save_picture(picture, self.arena, self.time_s, [*self.labels.values()])
+            except (OSError, ValueError, ImportError) as error:
+                self.log(f"ERROR: cannot export the image {picture.path}: {error}")

@@ -1,0 +1,172 @@
+"""Reads the VRML dialect of .wbt files into a tree of nodes; knows nothing of what nodes mean."""
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, TypeAlias
+
+from webots_mcp.standin.errors import WorldError
+
+Value: TypeAlias = "bool | str | Node | list[float] | list[Value] | None"
+"""A field as written: numbers are always a list of floats, `[...]` is a list of anything."""
+
+_TOKEN = re.compile(r'[\s,]+|#[^\n]*|(?P<token>"(?:[^"\\]|\\.)*"|[\[\]{}]|[^\s\[\]{}",#]+)')
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
+_NAME = re.compile(r"[A-Za-z_][^\s\"'#,.\[\]\\{}]*\Z")
+_WORDS: dict[str, bool | None] = {"TRUE": True, "FALSE": False, "NULL": None}
+
+
+class Token(NamedTuple):
+    """A word of the file and the line it stands on."""
+
+    text: str
+    line: int
+
+
+@dataclass(eq=False)
+class Node:
+    """A node of the scene tree; the parser fills in the fields that the file names, as `Value`s."""
+
+    type_name: str
+    def_name: str
+    line: int
+    fields: dict[str, Any] = field(default_factory=lambda: {})
+
+
+def tokens_of(text: str) -> Iterator[Token]:
+    """Splits a world into words; comments, commas and white space fall away."""
+    line, position = 1, 0
+    while position < len(text):
+        match = _TOKEN.match(text, position)
+        if match is None:
+            raise WorldError(f"unexpected character {text[position]!r}", line)
+        if word := match["token"]:
+            yield Token(word, line)
+        line += match[0].count("\n")
+        position = match.end()
+
+
+class Parser:
+    """Recursive descent over the words of one world."""
+
+    def __init__(self, text: str) -> None:
+        self._tokens = [*tokens_of(text)]
+        self._next = 0
+        self._defined: dict[str, Node] = {}
+        self._last_line = self._tokens[-1].line if self._tokens else 1
+
+    def nodes(self) -> list[Node]:
+        """The nodes at the top of the file, in order."""
+        nodes: list[Node] = []
+        while self._next < len(self._tokens):
+            nodes.append(self._node())
+        return nodes
+
+    def _peek(self) -> Token:
+        if self._next == len(self._tokens):
+            raise WorldError("the file ends in the middle of a node", self._last_line)
+        return self._tokens[self._next]
+
+    def _take(self) -> Token:
+        token = self._peek()
+        self._next += 1
+        return token
+
+    def _name(self, what: str) -> Token:
+        token = self._take()
+        if not _NAME.match(token.text):
+            raise WorldError(f"expected {what}, found {token.text!r}", token.line)
+        return token
+
+    def _node(self) -> Node:
+        token = self._name("a node")
+        if token.text == "USE":
+            return self._used()
+        if token.text in ("EXTERNPROTO", "IMPORTABLE", "PROTO"):
+            raise WorldError(
+                "the stand-in knows no PROTO nodes: write the world with base nodes "
+                "(Solid, Robot, HingeJoint, ...)",
+                token.line,
+            )
+        if token.text != "DEF":
+            return self._body(token, "")
+        name = self._name("a DEF name").text
+        return self._body(self._name("a node type"), name)
+
+    def _used(self) -> Node:
+        token = self._name("a DEF name")
+        if token.text not in self._defined:
+            raise WorldError(f"USE {token.text} comes before any DEF {token.text}", token.line)
+        return self._defined[token.text]
+
+    def _body(self, type_token: Token, def_name: str) -> Node:
+        node = Node(type_token.text, def_name, type_token.line)
+        brace = self._take()
+        if brace.text != "{":
+            raise WorldError(f"expected {{ after {node.type_name}, found {brace.text!r}", brace.line)
+        while self._peek().text != "}":
+            token = self._name("a field name or }")
+            node.fields[token.text] = self._value(token)
+        self._take()
+        if def_name:
+            self._defined[def_name] = node
+        return node
+
+    def _value(self, owner: Token) -> Value:
+        token = self._peek()
+        if token.text == "[":
+            return self._list(owner)
+        if _NUMBER.match(token.text):
+            return self._numbers()
+        if token.text in _WORDS or token.text.startswith('"'):
+            return _word(self._take())
+        if token.text in "]{}":
+            raise WorldError(f"field {owner.text} has no value", token.line)
+        return self._node()
+
+    def _numbers(self) -> list[float]:
+        numbers: list[float] = []
+        while _NUMBER.match(self._peek().text):
+            numbers.append(float(self._take().text))
+        return numbers
+
+    def _list(self, owner: Token) -> list[Value] | list[float]:
+        self._take()
+        if _NUMBER.match(self._peek().text):
+            numbers = self._numbers()
+            self._close(owner)
+            return numbers
+        values: list[Value] = []
+        while self._peek().text != "]":
+            values.append(self._value(owner))
+        self._close(owner)
+        return values
+
+    def _close(self, owner: Token) -> None:
+        token = self._take()
+        if token.text != "]":
+            raise WorldError(f"field {owner.text}: expected ], found {token.text!r}", token.line)
+
+
+def _word(token: Token) -> bool | str | None:
+    if token.text in _WORDS:
+        return _WORDS[token.text]
+    return re.sub(r"\\(.)", r"\1", token.text[1:-1])
+
+
+def parse(text: str) -> list[Node]:
+    """Reads the text of a .wbt file.
+
+    Args:
+        text: The whole file.
+
+    Returns:
+        The nodes at the top of the scene tree. A `USE` gives the very node that its `DEF` named.
+
+    Raises:
+        WorldError: The text is not a world; the message names the line.
+    """
+    first_line = text.partition("\n")[0]
+    if not re.match(r"#VRML_SIM R20\d\d[ab]? utf8", first_line):
+        raise WorldError(f'a world begins with "#VRML_SIM R2023b utf8", not {first_line[:40]!r}', 1)
+    return Parser(text).nodes()

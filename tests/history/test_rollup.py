@@ -1,0 +1,209 @@
+"""Rolling up changes nothing: the rollup is what its rows come to, however they came in."""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+import threading
+from collections import defaultdict
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.history.recording import Recorder, record_rover
+from webots_mcp.connection import connect
+from webots_mcp.contract import MemoryDatabase
+from webots_mcp.schema import create_schema
+from webots_mcp.store.history.leaves import flatten
+from webots_mcp.store.history.rollup import BUCKET_S, forget, roll, watermark
+from webots_mcp.store.history.summary import Summary, merge, summarise
+
+Rows = list[tuple[float, dict[str, Any]]]
+finite = st.floats(-1e9, 1e9, allow_nan=False) | st.integers(-1000, 1000)
+angle = st.floats(-3.2, 3.2, allow_nan=False)
+state: st.SearchStrategy[dict[str, Any]] = st.fixed_dictionaries(
+    {},
+    optional={
+        "speed": finite | st.none(),
+        "yaw": angle,
+        "pose": st.lists(finite, max_size=4),
+        "mode": st.sampled_from(["cruise", "turn", None]),
+        "nested": st.fixed_dictionaries({"bumper": st.booleans()}),
+        "lidar": st.lists(finite, min_size=15, max_size=19),
+    },
+)
+steps = st.tuples(st.floats(0.0, 8.0), state)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.lists(steps, max_size=25), min_size=1, max_size=3), st.integers(1, 9))
+def test_rolling_in_any_pieces_equals_computing_from_the_rows(
+    runs: list[list[tuple[float, dict[str, Any]]]], budget_rows: int
+) -> None:
+    database = MemoryDatabase()
+    with closing(connect(database, "writer")) as connection:
+        create_schema(connection)
+        recorder = Recorder(connection)
+        robot_id = recorder.robot("r")
+        session_id = recorder.session(robot_id, "x")
+        recorded = [_record(recorder, session_id, robot_id, run) for run in runs]
+        while not roll(connection, budget_rows).done:
+            pass
+        rolled = _stored_rollups(connection)
+        expected = {
+            (run_id, *key): summary
+            for run_id, rows in recorded
+            for key, summary in _computed(rows).items()
+        }
+        assert rolled.keys() == expected.keys()
+        for key, summary in expected.items():
+            assert _same(rolled[key], summary), key
+    database.close()
+
+
+def _record(
+    recorder: Recorder, session_id: int, robot_id: int, run: list[tuple[float, dict[str, Any]]]
+) -> tuple[int, Rows]:
+    recorder.run(session_id, robot_id)
+    rows: Rows = []
+    time_s = 0.0
+    for step_s, published in run:
+        time_s += step_s
+        recorder.publish(time_s, published)
+        rows.append((time_s, published))
+    return recorder.run_id, rows
+
+
+def _stored_rollups(connection: sqlite3.Connection) -> dict[tuple[int, str, int], Summary]:
+    columns = ", ".join(f"u.{name}" for name in Summary._fields)
+    rows = connection.execute(
+        f"SELECT run_id, name, bucket, {columns} FROM rollup u JOIN signal s ON s.id = signal_id"
+    )
+    return {(row[0], row[1], row[2]): Summary._make(row[3:]) for row in rows}
+
+
+def _computed(rows: Rows) -> dict[tuple[str, int], Summary]:
+    points: defaultdict[tuple[str, int], list[tuple[float, Any]]] = defaultdict(list)
+    for time_s, published in rows:
+        for name, value in flatten(json.loads(json.dumps(published))).items():
+            points[name, math.floor(time_s / BUCKET_S)].append((time_s, value))
+    return {
+        key: summarise(*zip(*pairs, strict=True), angle=key[0] == "yaw")
+        for key, pairs in points.items()
+    }
+
+
+@given(st.lists(finite | st.none(), min_size=1, max_size=60), st.data())
+def test_merging_the_parts_of_a_stretch_equals_summarising_it_whole(
+    values: list[float | None], data: st.DataObject
+) -> None:
+    cut = data.draw(st.integers(0, len(values)))
+    times = [float(index) for index in range(len(values))]
+    parts = [summarise(times[:cut], values[:cut]), summarise(times[cut:], values[cut:])]
+    assert _same(merge(parts), summarise(times, values))
+
+
+def _same(merged: Summary, whole: Summary) -> bool:
+    """Exactly, but for the sums, which depend on the order of adding."""
+    scale = max(1.0, abs(whole.sum or 0), whole.squares or 0)
+    return merged[:11] == whole[:11] and all(
+        (a is None) == (b is None) and abs((a or 0) - (b or 0)) <= 1e-9 * scale
+        for a, b in zip(merged[11:], whole[11:], strict=True)
+    )
+
+
+def test_two_callers_at_once_take_every_row_in_once(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    with closing(connect(file, "writer", create=True)) as connection:
+        create_schema(connection)
+        record_rover(connection)
+        threads = [threading.Thread(target=_roll_all, args=(file,)) for _ in range(3)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        rows = connection.execute("SELECT count(*) FROM state").fetchone()[0]
+        counted = connection.execute("SELECT rows FROM signal WHERE name = 'mode'").fetchone()[0]
+        assert counted == rows
+        assert watermark(connection) == rows
+
+
+def _roll_all(file: Path) -> None:
+    with closing(connect(file, "writer")) as connection:
+        while not roll(connection, 500).done:
+            pass
+
+
+@pytest.mark.parametrize("lose", ["DELETE FROM rollup", "DELETE FROM watermark"])
+def test_lost_rollups_are_rebuilt_from_the_rows(empty: sqlite3.Connection, lose: str) -> None:
+    record_rover(empty)
+    roll(empty, 100_000)
+    before = _everything(empty)
+    empty.execute(lose)
+    if "watermark" in lose:
+        forget(empty)
+    roll(empty, 100_000)
+    assert _everything(empty) == before
+
+
+def _everything(connection: sqlite3.Connection) -> list[list[Any]]:
+    tables = ("rollup", "change", "signal", "watermark")
+    return [connection.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
+
+
+def test_an_unreadable_row_costs_itself_and_not_the_rollup(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder.publish(0.0, {"x": 1})
+    recorder.insert("state", **recorder.at(1.0), data='{"x": NaN')
+    recorder.insert("state", **recorder.at(2.0), data="[1, 2]")
+    recorder.publish(3.0, {"x": 3})
+    assert roll(empty) == (4, True)
+    assert empty.execute("SELECT rows, min, max FROM signal").fetchall() == [(2, 1.0, 3.0)]
+
+
+def test_change_points_carry_on_across_batches(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for index, mode in enumerate(["a", "a", "b", "b", None, None, "a"]):
+        recorder.publish(float(index), {"mode": mode, "on": index > 3})
+    while not roll(empty, 2).done:
+        pass
+    changes = empty.execute(
+        "SELECT name, sim_time_s, value FROM change JOIN signal s ON s.id = signal_id ORDER BY 1, 2"
+    ).fetchall()
+    assert changes == [
+        ("mode", 0.0, "a"), ("mode", 2.0, "b"), ("mode", 4.0, None), ("mode", 6.0, "a"),
+        ("on", 0.0, "false"), ("on", 4.0, "true"),
+    ]  # fmt: skip
+
+
+def test_a_heading_in_degrees_is_no_angle_in_radians(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder.publish(0.0, {"heading": 3.0, "yaw": 3.0})
+    roll(empty)
+    recorder.publish(1.0, {"heading": 270.0, "yaw": -3.0})
+    roll(empty)
+    kinds = dict(empty.execute("SELECT name, kind FROM signal").fetchall())
+    assert kinds == {"heading": "num", "yaw": "angle"}
+
+
+def test_a_robot_that_invents_names_for_ever_does_not_fill_the_register(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for index in range(30):
+        recorder.publish(float(index), {f"key{index}_{i}": i for i in range(100)})
+    roll(empty)
+    assert empty.execute("SELECT count(*) FROM signal").fetchone()[0] == 2000

@@ -1,0 +1,78 @@
+"""A batch of state rows turned into columns: one per run and signal."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import cast
+
+from webots_mcp.store.history.leaves import REDUCTIONS, Value, flatten, parse
+
+Point = tuple[int, float, Value]  # state id, simulation time, value
+
+
+@dataclass(slots=True)
+class BatchColumn:
+    """One signal of one run in the rows of the batch.
+
+    Attributes:
+        sample: The data of the first row that holds the signal: it tells where its value stands.
+    """
+
+    robot_id: int
+    run_id: int
+    name: str
+    sample: str
+    points: list[Point] = field(default_factory=list[Point])
+    odd_rows: int = 0
+    first_wall_time_s: float = 0.0
+    last_wall_time_s: float = 0.0
+
+
+class Batch:
+    """State rows in the order of their ids, as they are added."""
+
+    def __init__(self) -> None:
+        self.rows = 0
+        self.last_id = 0
+        self._runs: dict[int, dict[str, BatchColumn]] = {}
+
+    def add(
+        self,
+        state_id: int,
+        robot_id: int,
+        run_id: int,
+        sim_time_s: float,
+        wall_time_s: float,
+        data: str,
+        odd: str | None,
+    ) -> None:
+        """Add a row; one whose data is no JSON object only counts."""
+        self.rows += 1
+        self.last_id = state_id
+        columns = self._runs.setdefault(run_id, {})
+        for name, value in flatten(parse(data)).items():
+            column = columns.get(name)
+            if column is None:
+                column = columns[name] = BatchColumn(robot_id, run_id, name, data)
+                column.first_wall_time_s = wall_time_s
+            column.points.append((state_id, sim_time_s, value))
+            column.last_wall_time_s = wall_time_s
+        for name in odd_names(odd):
+            if name in columns:
+                columns[name].odd_rows += 1
+
+    def columns(self) -> Iterator[BatchColumn]:
+        """Every signal of every run."""
+        for columns in self._runs.values():
+            yield from columns.values()
+
+
+def odd_names(odd: str | None) -> set[str]:
+    """The signals that a row's `odd` is about: by their own name, or by an item of their array."""
+    if odd is None:
+        return set()
+    paths = cast("dict[str, str]", json.loads(odd))
+    arrays = {path.rpartition(".")[0] for path in paths if "." in path}
+    return {*paths, *(f"{array}.{reduction}" for array in arrays for reduction in REDUCTIONS)}

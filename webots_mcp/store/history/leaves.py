@@ -1,0 +1,156 @@
+"""The values of one published state by their dotted names: pose.0, sensors.front, lidar.min."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from typing import Any, Final, Literal, NamedTuple, cast
+
+Kind = Literal["num", "bool", "text", "angle", "null"]
+Value = int | float | str | None  # a bool is an int
+
+LONGEST_SPREAD_ARRAY: Final = 16  # a longer one is reduced: nobody asks for lidar.117
+REDUCTIONS: Final = ("count", "min", "max", "mean", "argmin")
+MAX_TEXT: Final = 200  # characters of a text value that are kept and compared
+MAX_ANGLE_RAD: Final = 6.3  # a value beyond is in degrees, or turns were counted
+
+_INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
+_ANGLE_NAME: Final = re.compile(
+    r"(^|[._])(yaw|heading|theta|bearing|roll|pitch)(_rad)?(\.\d+)?$", re.IGNORECASE
+)
+_UNIT_SUFFIXES: Final = {
+    "_rad_s": "rad/s", "_m_s": "m/s", "_mps": "m/s", "_m_s2": "m/s²", "_rad": "rad",
+    "_deg": "deg", "_mm": "mm", "_m": "m", "_ms": "ms", "_s": "s", "_hz": "Hz", "_v": "V",
+    "_a": "A", "_w": "W", "_nm": "N·m", "_n": "N", "_kg": "kg", "_percent": "%", "_bytes": "B",
+}  # fmt: skip
+
+
+class Place(NamedTuple):
+    """Where a signal's value stands in a state row.
+
+    Attributes:
+        path: For `json_extract(state.data, path)`.
+        reduce: None, or how the long array at `path` becomes one number.
+    """
+
+    path: str
+    reduce: str | None
+
+
+def parse(text: str) -> dict[str, Any]:
+    """A state row's JSON text; empty where it is no JSON object (rows of foreign origin)."""
+    try:
+        state = json.loads(text)
+    except (ValueError, RecursionError):
+        return {}
+    return cast("dict[str, Any]", state) if isinstance(state, dict) else {}
+
+
+def flatten(state: dict[str, Any]) -> dict[str, Value]:
+    """Every number, flag, text and null of a state, by its dotted name.
+
+    Arrays of more than 16 items become `name.count`, `.min`, `.max`, `.mean` and `.argmin` (of
+    their numbers; `count` and `argmin` of all items). Where two leaves share a name (a key that
+    holds a dot), the first counts.
+    """
+    leaves: dict[str, Value] = {}
+    _spread("", state.items(), leaves)
+    return leaves
+
+
+def _spread(prefix: str, items: Iterable[tuple[str, Any]], leaves: dict[str, Value]) -> None:
+    for key, value in items:
+        name = prefix + key
+        kind = cast("type[object]", type(value))
+        if kind is dict:
+            _spread(f"{name}.", value.items(), leaves)
+        elif kind is not list:
+            if name not in leaves:
+                leaves[name] = value
+        elif len(value) <= LONGEST_SPREAD_ARRAY:
+            _spread(f"{name}.", zip(_INDEXES, value, strict=False), leaves)
+        else:
+            _reduce(name, value, leaves)
+
+
+def _reduce(name: str, array: list[Any], leaves: dict[str, Value]) -> None:
+    numbers = [item for item in array if type(item) is float or type(item) is int]
+    low = min(numbers, default=None)
+    reduced: tuple[Value, ...] = (
+        len(array),
+        low,
+        max(numbers, default=None),
+        sum(numbers) / len(numbers) if numbers else None,
+        None if low is None else array.index(low),
+    )
+    for reduction, value in zip(REDUCTIONS, reduced, strict=True):
+        leaves.setdefault(f"{name}.{reduction}", value)
+
+
+def places(state: dict[str, Any]) -> dict[str, Place]:
+    """Where each leaf of a state stands; the same names as `flatten`, but slower.
+
+    Left out are names with a quote, a backslash or a control character: no JSON path reaches them.
+    """
+    found: dict[str, Place] = {}
+    _locate("", "$", state, found)
+    return {name: place for name, place in found.items() if _reachable(name)}
+
+
+def _locate(name: str, path: str, value: Any, found: dict[str, Place]) -> None:
+    prefix = f"{name}." if name else ""
+    if isinstance(value, dict):
+        for key, item in cast("dict[str, Any]", value).items():
+            _locate(prefix + key, f"{path}.{_step(key)}", item, found)
+    elif not isinstance(value, list):
+        found.setdefault(name, Place(path, None))
+    elif len(cast("list[Any]", value)) <= LONGEST_SPREAD_ARRAY:
+        for index, item in enumerate(cast("list[Any]", value)):
+            _locate(f"{prefix}{index}", f"{path}[{index}]", item, found)
+    else:
+        for reduction in REDUCTIONS:
+            found.setdefault(prefix + reduction, Place(path, reduction))
+
+
+def _step(key: str) -> str:
+    return key if key.isidentifier() and key.isascii() else f'"{key}"'
+
+
+def _reachable(name: str) -> bool:
+    return not any(character in '"\\' or character < " " for character in name)
+
+
+def kind_of(name: str, value: Value) -> Kind:
+    """What a single value says about its signal; an angle also by the signal's name."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return "bool"
+    if isinstance(value, str):
+        return "text"
+    return "angle" if _ANGLE_NAME.search(name) and abs(value) <= MAX_ANGLE_RAD else "num"
+
+
+def widen(known: Kind, seen: Kind) -> Kind:
+    """The kind of a signal that was `known` when a value of kind `seen` comes."""
+    if known == seen or seen == "null":
+        return known
+    if known == "null":
+        return seen
+    return "text" if "text" in (known, seen) else "num"
+
+
+def unit_of(name: str, kind: Kind) -> str | None:
+    """The unit, where the name ends in one (`speed_m_s`) or the signal is an angle."""
+    if kind == "angle":
+        return "rad"
+    last = name.rpartition(".")[2].lower()
+    return next((unit for suffix, unit in _UNIT_SUFFIXES.items() if last.endswith(suffix)), None)
+
+
+def shown(value: Value) -> str | None:
+    """A value of a text or boolean signal as the change table keeps it."""
+    if value is None or isinstance(value, str):
+        return value[:MAX_TEXT] if value else value
+    return json.dumps(value)

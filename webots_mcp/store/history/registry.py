@@ -1,0 +1,145 @@
+"""The register of signals: every dotted name that a robot's states ever held."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any, Final, cast
+
+from webots_mcp.store.history.batch import Batch, BatchColumn
+from webots_mcp.store.history.leaves import Kind, Place, kind_of, parse, places, unit_of, widen
+from webots_mcp.store.history.summary import usable_numbers
+
+MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
+
+_OF_ROBOT: Final = (
+    "SELECT id, robot_id, name, kind, unit, path, reduce FROM signal WHERE robot_id = ?"
+)
+_ADD: Final = (
+    "INSERT INTO signal (robot_id, name, kind, unit, path, reduce, first_seen_wall_time_s, "
+    "last_seen_wall_time_s) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
+)
+_UPDATE: Final = (
+    "UPDATE signal SET kind = :kind, unit = :unit, rows = rows + :rows, "
+    "null_rows = null_rows + :null_rows, odd_rows = odd_rows + :odd_rows, "
+    "last_seen_wall_time_s = max(last_seen_wall_time_s, :seen), "
+    "min = min(coalesce(min, :min), coalesce(:min, min)), "
+    "max = max(coalesce(max, :max), coalesce(:max, max)) WHERE id = :id"
+)
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A signal of a robot, and how its value is read from a state row.
+
+    Attributes:
+        id: In the register; None for one that was seen only in rows after the watermark.
+        path: For `json_extract(state.data, path)`.
+        reduce: None, or how the long array at `path` becomes one number.
+    """
+
+    id: int | None
+    robot_id: int
+    name: str
+    kind: Kind
+    unit: str | None
+    path: str
+    reduce: str | None
+
+    @property
+    def is_number(self) -> bool:
+        """Whether it has a minimum and a mean; text and flags have change points instead."""
+        return self.kind in ("num", "angle", "null")
+
+
+def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, Signal]:
+    """The signals of a robot in the register, by name."""
+    rows = connection.execute(_OF_ROBOT, (robot_id,)).fetchall()
+    return {row[2]: Signal(*row) for row in rows}
+
+
+def seen_in(column: BatchColumn, known: Kind = "null") -> Kind:
+    """The kind of a signal, after the values of this column."""
+    for value in _telling(column):
+        known = widen(known, kind_of(column.name, value))
+    return known
+
+
+def _telling(column: BatchColumn) -> list[Any]:
+    """One value of each type, and the extremes, tell the kind as well as all values do."""
+    values = [point[2] for point in column.points]
+    by_type: dict[type, Any] = {type(value): value for value in values}
+    numbers = [value for value in values if type(value) is float or type(value) is int]
+    return [*by_type.values(), *([min(numbers), max(numbers)] if numbers else [])]
+
+
+def enter_signals(connection: sqlite3.Connection, batch: Batch) -> dict[tuple[int, str], Signal]:
+    """Enter the names of a batch that are new, count its rows, and return what is registered.
+
+    Names beyond `MAX_SIGNALS` of a robot, and names that no JSON path can reach, stay out.
+    """
+    by_signal: defaultdict[tuple[int, str], list[BatchColumn]] = defaultdict(list)
+    for column in batch.columns():
+        by_signal[column.robot_id, column.name].append(column)
+    known = {robot_id: registered(connection, robot_id) for robot_id, _ in by_signal}
+    entered: dict[tuple[int, str], Signal] = {}
+    for (robot_id, name), columns in by_signal.items():
+        signal = known[robot_id].get(name) or _enter(connection, columns, known[robot_id])
+        if signal is not None:
+            entered[robot_id, name] = _update(connection, signal, columns)
+    return entered
+
+
+def _enter(
+    connection: sqlite3.Connection, columns: list[BatchColumn], known: dict[str, Signal]
+) -> Signal | None:
+    first, last = columns[0], columns[-1]
+    signal = unregistered(first) if len(known) < MAX_SIGNALS else None
+    if signal is None:
+        return None
+    seen = (first.first_wall_time_s, last.last_wall_time_s)
+    described = (signal.name, signal.kind, signal.unit, signal.path, signal.reduce)
+    added = connection.execute(_ADD, (first.robot_id, *described, *seen)).lastrowid
+    known[first.name] = replace(signal, id=added)
+    return known[first.name]
+
+
+def unregistered(column: BatchColumn) -> Signal | None:
+    """A signal that is known from a column only; None where no JSON path reaches it."""
+    place = _places_of(column.sample).get(column.name)
+    if place is None:
+        return None
+    kind = seen_in(column)
+    unit = unit_of(column.name, kind)
+    return Signal(None, column.robot_id, column.name, kind, unit, place.path, place.reduce)
+
+
+@lru_cache(maxsize=8)  # a row that brings one new name mostly brings several
+def _places_of(data: str) -> dict[str, Place]:
+    return places(parse(data))
+
+
+def _update(
+    connection: sqlite3.Connection, signal: Signal, columns: Sequence[BatchColumn]
+) -> Signal:
+    kind = signal.kind
+    for column in columns:
+        kind = seen_in(column, kind)
+    values = [point[2] for column in columns for point in column.points]
+    _, numbers = usable_numbers(range(len(values)), values)
+    counted = {
+        "id": signal.id,
+        "kind": kind,
+        "unit": unit_of(signal.name, kind),
+        "rows": len(values),
+        "null_rows": sum(value is None for value in values),
+        "odd_rows": sum(column.odd_rows for column in columns),
+        "seen": max(column.last_wall_time_s for column in columns),
+        "min": min(numbers, default=None),
+        "max": max(numbers, default=None),
+    }
+    connection.execute(_UPDATE, counted)
+    return replace(signal, kind=kind, unit=cast("str | None", counted["unit"]))

@@ -21,16 +21,12 @@ def schema_version(connection: sqlite3.Connection) -> int:
     """The schema version of a database of ours; 0 for an empty file.
 
     Raises:
-        ForeignDatabaseError: The file holds tables of another application, or is no database.
+        ForeignDatabaseError: The file holds tables of another application.
+        sqlite3.DatabaseError: The file is no database, or is damaged.
     """
-    try:
-        application_id = int(connection.execute("PRAGMA application_id").fetchone()[0])
-        version = int(connection.execute("PRAGMA user_version").fetchone()[0])
-        tables = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
-    except sqlite3.DatabaseError as error:
-        if "not a database" not in str(error):
-            raise
-        raise ForeignDatabaseError(f"not a database of webots-mcp: {error}") from error
+    application_id = int(connection.execute("PRAGMA application_id").fetchone()[0])
+    version = int(connection.execute("PRAGMA user_version").fetchone()[0])
+    tables = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
     if application_id == APPLICATION_ID:
         return version
     if tables:

@@ -93,7 +93,10 @@ def _as_json(value: object) -> object:
     convert = _conversion(value)
     if convert is None:
         raise TypeError(f"{type(value).__name__} has no JSON counterpart")
-    return convert(value)
+    try:
+        return convert(value)
+    except Exception as error:
+        raise TypeError(f"{type(value).__name__} failed to convert: {error}") from error
 
 
 _encode_plain: Final = json.JSONEncoder(

@@ -173,7 +173,7 @@ class MCPBridge:
             self._failed("auto_publish", error)
             state = dict[str, object]()
         if include_time:
-            state["time"] = self._clock.sim_time_s
+            state["time"] = self._simulation.time_s
         self.publish({**state, **(extra or {})})
 
     # -- beside the state ----------------------------------------------------------------------

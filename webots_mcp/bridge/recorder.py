@@ -37,6 +37,9 @@ MAX_WAITING_BYTES: Final = 16_000_000
 _ROWS_PER_FLUSH: Final = 500  # about 5 ms: a loop that catches up must not stall over it
 _RETRY_INTERVAL_S: Final = 1.0
 
+_SQLITE_HEADER: Final = b"SQLite format 3\0"
+_DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
+
 INSERT_STATE: Final = (
     "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, odd) VALUES (?, ?, ?, ?, ?)"
 )
@@ -291,7 +294,7 @@ class Recorder:
         if "locked" in text:
             return  # another writer, this instant: the next call tries again
         self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
-        if "malformed" in text or "not a database" in text:
+        if _is_damage(text):
             self._move_aside(text)
         elif "no such table" in text or "FOREIGN KEY" in text:
             self._start_over(f"the database lost this session ({text})")
@@ -358,12 +361,15 @@ class Recorder:
             return False
         try:
             self._enter(patient)
-        except ForeignDatabaseError as error:
-            return self._replace_garbage(error)
-        except (SchemaTooNewError, SchemaTooOldError) as error:
-            self._give_up(error)
+        except (ForeignDatabaseError, SchemaTooNewError, SchemaTooOldError) as error:
+            self._off = str(error)
+            self.complain("off", f"not recording into {self._database}: {error}")
         except (DatabaseError, sqlite3.Error, OSError) as error:
-            self._try_later(error)
+            self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
+            if _is_damage(str(error)):
+                return self._replace_damaged(str(error))
+            if "locked" not in str(error):
+                self.complain(f"open {type(error).__name__}", f"not recording yet: {error}")
         return self.connection is not None
 
     def _enter(self, patient: bool) -> None:
@@ -394,27 +400,23 @@ class Recorder:
                 "network drive, or across Windows and WSL): readers will make rows wait",
             )
 
-    def _try_later(self, error: Exception) -> None:
-        self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
-        if "locked" in str(error):
-            return
-        if isinstance(error, sqlite3.DatabaseError) and "malformed" in str(error):
-            self._move_aside(str(error))
-            return
-        self.complain(f"open {type(error).__name__}", f"not recording yet: {error}")
-
-    def _give_up(self, error: Exception) -> None:
-        self._off = str(error)
-        self.complain("off", f"not recording into {self._database}: {error}")
-
-    def _replace_garbage(self, error: ForeignDatabaseError) -> bool:
-        """A file of our name that is no database is moved aside; anything else is left alone."""
-        ours = isinstance(self._database, Path) and self._database.name == DATABASE_NAME
-        if ours and "not a database" in str(error.__cause__):
-            self._move_aside(str(error.__cause__))
-            return self._open(patient=False)
-        self._give_up(error)
+    def _replace_damaged(self, why: str) -> bool:
+        """A damaged database, or a file of our name, is moved aside; any other file is not ours."""
+        if self._is_ours():
+            self._move_aside(why)
+            return self.connection is None and self._retry_at_s == 0 and self._open(patient=False)
+        self._off = why
+        self.complain("off", f"not recording into {self._database}: {why}; choose another file")
         return False
+
+    def _is_ours(self) -> bool:
+        assert isinstance(self._database, Path)
+        with self._database.open("rb") as file:
+            return self._database.name == DATABASE_NAME or file.read(16) == _SQLITE_HEADER
+
+
+def _is_damage(text: str) -> bool:
+    return any(sign in text for sign in _DAMAGE)
 
 
 def _weight(row: _Row) -> int:

@@ -1,0 +1,110 @@
+"""A robot of the stand-in in this process, a database in memory, and a bridge between them."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.connection import connect
+from webots_mcp.contract import Database
+from webots_mcp.standin import InProcessSupervisor
+
+STEP_MS = 16
+
+
+class Recording:
+    """What a test asks a database, and the commands that it sends to the robot."""
+
+    def __init__(self, database: Database) -> None:
+        self.database = database
+
+    def rows(self, sql: str, *values: object) -> list[Any]:
+        """All rows; rows of one column as plain values."""
+        connection = connect(self.database, "reader")
+        try:
+            found = connection.execute(sql, values).fetchall()
+        finally:
+            connection.close()
+        return [row[0] if len(row) == 1 else row for row in found]
+
+    def states(self) -> list[dict[str, Any]]:
+        return [json.loads(text) for text in self.rows("SELECT data FROM state ORDER BY id")]
+
+    def send(self, action: str, /, time_to_live_s: float = 10, **params: object) -> int:
+        connection = connect(self.database, "writer")
+        try:
+            return send(connection, action, params, time_to_live_s)
+        finally:
+            connection.close()
+
+    def fate(self, command_id: int) -> tuple[str, Any, str | None]:
+        """Status, result and error of a command."""
+        sql = "SELECT status, result, error FROM command WHERE id = ?"
+        status, result, error = self.rows(sql, command_id)[0]
+        return status, json.loads(result) if result else None, error
+
+
+def send(
+    connection: sqlite3.Connection, action: str, params: object, time_to_live_s: float = 10
+) -> int:
+    now = time.time()
+    text = params if isinstance(params, str) else json.dumps(params)
+    cursor = connection.execute(
+        "INSERT INTO command (robot_id, action, params, status, created_wall_time_s, "
+        "expires_wall_time_s) VALUES ((SELECT max(id) FROM robot), ?, ?, 'pending', ?, ?)",
+        (action, text, now, now + time_to_live_s),
+    )
+    assert cursor.lastrowid is not None
+    return cursor.lastrowid
+
+
+@pytest.fixture
+def database() -> Iterator[MemoryDatabase]:
+    memory = MemoryDatabase()
+    yield memory
+    memory.close()
+
+
+@pytest.fixture
+def recording(database: MemoryDatabase) -> Recording:
+    return Recording(database)
+
+
+@pytest.fixture
+def robot() -> InProcessSupervisor:
+    return InProcessSupervisor("rover")
+
+
+@pytest.fixture
+def bridge(
+    robot: InProcessSupervisor, database: MemoryDatabase, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[MCPBridge]:
+    """A bridge that records every call; strict, so that a test sees what went wrong."""
+    monkeypatch.setenv("WEBOTS_MCP_STRICT", "1")
+    with MCPBridge(robot, throttle_interval=1, database=database) as bridge:
+        yield bridge
+
+
+@pytest.fixture
+def drive(robot: InProcessSupervisor, bridge: MCPBridge) -> Callable[[int], None]:
+    """The user's loop: so many rounds of step, publish, get_command."""
+
+    def rounds(count: int) -> None:
+        for _ in range(count):
+            assert robot.step(STEP_MS) != -1
+            bridge.publish({"mode": "cruise"})
+            eager(bridge)
+
+    return rounds
+
+
+def eager(bridge: MCPBridge) -> dict[str, Any] | None:
+    """get_command() without its rule to look into the queue at most every 5 ms."""
+    bridge._control._next_poll_s = 0.0  # pyright: ignore[reportPrivateUsage]
+    return bridge.get_command()

@@ -1,0 +1,219 @@
+"""What publish() records, and what it does with what JSON cannot hold."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import enum
+import json
+import math
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.bridge.conftest import STEP_MS, Recording
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.bridge import encoding
+from webots_mcp.standin import InProcessSupervisor
+
+
+class Mode(enum.Enum):
+    CRUISE = "cruise"
+
+
+class Gear(enum.IntEnum):
+    FIRST = 1
+
+
+@dataclasses.dataclass
+class Pose:
+    x: float
+    y: float
+
+
+@pytest.fixture(params=["orjson", "standard library"])
+def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both encoders give the same text."""
+    if request.param != "orjson":
+        monkeypatch.setattr(encoding, "orjson", None)
+
+
+def test_every_nth_call_is_recorded_and_force_records_now(
+    robot: InProcessSupervisor, recording: Recording
+) -> None:
+    with MCPBridge(robot, database=recording.database) as bridge:  # type: ignore[arg-type]
+        for number in range(1, 12):
+            bridge.publish({"number": number})
+        bridge.publish({"number": 99}, force=True)
+        assert bridge.stats().publish_throttled == 9
+    assert [state["number"] for state in recording.states()] == [5, 10, 99]
+
+
+def test_a_row_carries_simulation_time_wall_time_and_the_run(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    robot.step(STEP_MS)
+    bridge.publish({"x": 1})
+    sql = "SELECT sim_time_s, wall_time_s > 1.7e9, run_id FROM state"
+    assert recording.rows(sql) == [(pytest.approx(0.016), 1, bridge.run_id)]
+
+
+@pytest.mark.usefixtures("encoder")
+def test_what_controllers_have_is_stored_as_plain_json(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish(
+        {
+            "pose": (1.5, 2.5),
+            "scalar": np.float32(0.5),
+            "array": np.arange(3),
+            "flags": np.array([True, False]),
+            "mode": Mode.CRUISE,
+            "gear": Gear.FIRST,
+            "data": Pose(1.0, 2.0),
+            "path": Path("worlds") / "arena.wbt",
+            "set": {7},
+            3: "three",
+            None: "none",
+        }
+    )
+    assert recording.states() == [
+        {
+            "pose": [1.5, 2.5],
+            "scalar": 0.5,
+            "array": [0, 1, 2],
+            "flags": [True, False],
+            "mode": "cruise",
+            "gear": 1,
+            "data": {"x": 1.0, "y": 2.0},
+            "path": str(Path("worlds") / "arena.wbt"),
+            "set": [7],
+            "3": "three",
+            "null": "none",
+        }
+    ]
+    assert recording.rows("SELECT odd FROM state") == [None]
+
+
+@pytest.mark.usefixtures("encoder")
+def test_nan_and_infinity_come_back_recognisable_and_do_not_break_sqlite(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    scan = [0.5, math.inf, math.inf]
+    bridge.publish({"gap": math.nan, "far": -math.inf, "scan": scan, "mixed": [math.nan, None]})
+    sql = "SELECT data ->> '$.scan[0]', data ->> '$.gap', json_valid(data) FROM state"
+    assert recording.rows(sql) == [(0.5, None, 1)]
+    (odd,) = recording.rows("SELECT odd FROM state")
+    assert json.loads(odd) == {"gap": "nan", "far": "-inf", "scan.*": "inf", "mixed.0": "nan"}
+
+
+@pytest.mark.usefixtures("encoder")
+def test_a_value_that_cannot_be_stored_costs_that_value_and_is_logged_once(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    for _ in range(3):
+        bridge.publish({"x": 1, "handle": object(), "raw": b"abc", (1, 2): "tuple"})
+    state = recording.states()[0]
+    assert state == {"x": 1, "handle": None, "raw": "YWJj", "(1, 2)": "tuple"}
+    assert bridge.stats().values_replaced == 6
+    logged = recording.rows("SELECT message FROM log WHERE source = 'bridge'")
+    assert [line.split()[0] for line in logged] == ["handle", "raw"]
+
+
+@pytest.mark.usefixtures("encoder")
+def test_a_huge_array_costs_itself_and_not_the_row(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.publish({"x": 1, "image": np.zeros((640, 480, 3)), "list": [0.25] * 400_000})
+    assert recording.states() == [{"x": 1, "image": None, "list": None}]
+    (odd,) = recording.rows("SELECT odd FROM state")
+    assert json.loads(odd) == {"image": "array[921600]", "list": "array[400000]"}
+
+
+def test_a_state_that_contains_itself_is_cut(bridge: MCPBridge, recording: Recording) -> None:
+    state: dict[str, Any] = {"x": 1}
+    state["self"] = state
+    bridge.publish(state)
+    (odd,) = recording.rows("SELECT odd FROM state")
+    assert set(json.loads(odd).values()) == {"too deep"}
+
+
+def test_the_callers_dict_is_never_changed(bridge: MCPBridge) -> None:
+    state = {"pose": [1.0, math.nan], "nested": {"raw": b"x", 1: (2, 3)}}
+    before = copy.deepcopy(state)
+    bridge.publish(state)
+    bridge.auto_publish(extra=state)
+    assert repr(state) == repr(before)
+
+
+def test_an_object_that_fails_while_it_is_read_costs_itself(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    class Broken:
+        def tolist(self) -> list[int]:
+            raise RuntimeError("no data")
+
+    bridge.publish({"x": 1, "broken": Broken()})
+    assert recording.states() == [{"x": 1, "broken": None}]
+
+
+def test_a_state_that_is_no_dict_is_counted_and_does_not_stop_the_loop(
+    robot: InProcessSupervisor, database: MemoryDatabase, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with MCPBridge(robot, throttle_interval=1, database=database) as bridge:
+        bridge.publish([1, 2])  # type: ignore[arg-type]
+        assert bridge.stats().failures == 1
+        assert "publish() takes a dict, got list" in (bridge.stats().last_error or "")
+    assert capfd.readouterr().err.count("publish() takes a dict") == 1
+
+
+def test_changes_of_texts_and_flags_become_events(bridge: MCPBridge, recording: Recording) -> None:
+    for mode, stuck in (("cruise", False), ("cruise", False), ("turn", False), ("turn", True)):
+        bridge.publish({"mode": mode, "stuck": stuck})
+    sql = "SELECT name, data FROM event WHERE kind = 'change' ORDER BY id"
+    assert recording.rows(sql) == [
+        ("mode", '{"from":"cruise","to":"turn"}'),
+        ("stuck", '{"from":false,"to":true}'),
+    ]
+
+
+def test_auto_publish_reads_enabled_devices_only(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    for name in ("ds_left", "gps", "inertial unit", "lidar"):
+        robot.getDevice(name).enable(STEP_MS)
+    robot.step(STEP_MS)
+    robot.step(STEP_MS)
+    bridge.auto_publish(extra={"note": "hello"})
+    (state,) = recording.states()
+    assert set(state) == {"pose", "sensors", "motors", "time", "note"}
+    assert set(state["sensors"]) == {"ds_left", "gps", "inertial unit", "lidar"}
+    assert state["pose"][:2] == pytest.approx([-1.2, 0.0], abs=0.01)
+    assert state["sensors"]["lidar"]["count"] == 180
+    assert len(state["sensors"]["lidar"]["sector_min_m"]) == 8
+    assert state["time"] == pytest.approx(0.032)
+
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary(max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(st.dictionaries(st.text(), JSON, max_size=5))
+def test_whatever_is_published_sqlite_can_read_and_nothing_odd_goes_unnamed(
+    state: dict[str, Any],
+) -> None:
+    encoded = encoding.encode(state)
+    connection = sqlite3.connect(":memory:")
+    (valid,) = connection.execute("SELECT json_valid(?)", (encoded.text,)).fetchone()
+    connection.close()
+    assert valid == 1
+    stored = json.loads(encoded.text)
+    again = encoding.encode(stored)
+    assert json.loads(again.text) == stored
+    assert again.odd == {}

@@ -1,0 +1,192 @@
+"""Runs, sessions, resets and reloads."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from tests.bridge.conftest import STEP_MS, Recording
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
+
+
+def test_a_reset_by_the_controller_begins_a_new_run_and_ends_the_old_one(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    drive: Callable[[int], None],
+) -> None:
+    drive(10)
+    robot.simulationReset()
+    drive(3)
+    bridge.close()
+    sql = "SELECT start_reason, end_reason, rows, last_sim_time_s FROM run ORDER BY id"
+    assert recording.rows(sql) == [
+        ("start", "reset", 10, pytest.approx(0.16)),
+        ("reset", "finished", 3, pytest.approx(0.048)),
+    ]
+    assert recording.rows("SELECT count(*) FROM state GROUP BY run_id") == [10, 3]
+
+
+def test_a_reset_fires_callbacks_once_and_is_detected_once(
+    robot: InProcessSupervisor, bridge: MCPBridge, drive: Callable[[int], None]
+) -> None:
+    calls: list[str] = []
+    bridge.on_reload(lambda: calls.append("reset"))
+    drive(3)
+    assert not bridge.detect_reload()
+    robot.simulationReset()
+    drive(3)
+    assert bridge.detect_reload()
+    assert not bridge.detect_reload()
+    assert calls == ["reset"]
+
+
+def test_detect_reload_alone_notices_a_reset(robot: InProcessSupervisor, bridge: MCPBridge) -> None:
+    for _ in range(3):
+        robot.step(STEP_MS)
+        assert not bridge.detect_reload()
+    robot.simulationReset()
+    robot.step(STEP_MS)
+    assert bridge.detect_reload()
+
+
+def test_a_callback_that_fails_does_not_stop_the_loop_or_the_next_callback(
+    robot: InProcessSupervisor, database: MemoryDatabase, capfd: pytest.CaptureFixture[str]
+) -> None:
+    calls: list[str] = []
+
+    def fail() -> None:
+        raise RuntimeError("broken callback")
+
+    with MCPBridge(robot, database=database) as bridge:
+        bridge.on_reload(fail)
+        bridge.on_reload(lambda: calls.append("second"))
+        robot.step(STEP_MS)
+        robot.step(STEP_MS)
+        bridge.publish({})
+        robot.simulationReset()
+        robot.step(STEP_MS)
+        bridge.publish({})
+    assert calls == ["second"]
+    assert "broken callback" in capfd.readouterr().err
+
+
+def test_a_successor_in_the_same_webots_is_a_reload(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    MCPBridge(InProcessSupervisor("rover"), database=database).close()
+    with MCPBridge(InProcessSupervisor("rover"), database=database) as bridge:
+        calls: list[str] = []
+        bridge.on_reload(lambda: calls.append("reload"))
+        assert bridge.detect_reload()
+        bridge.publish({}, force=True)
+        assert not bridge.detect_reload()
+        assert calls == ["reload"]
+    assert recording.rows("SELECT start_reason FROM run ORDER BY id") == ["start", "reload"]
+
+
+def test_a_successor_in_another_webots_is_a_start(
+    database: MemoryDatabase, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WEBOTS_INSTANCE_PATH", "first")
+    MCPBridge(InProcessSupervisor("rover"), database=database).close()
+    monkeypatch.setenv("WEBOTS_INSTANCE_PATH", "second")
+    with MCPBridge(InProcessSupervisor("rover"), database=database) as bridge:
+        assert not bridge.detect_reload()
+
+
+def test_two_live_robots_of_one_name_get_names_of_their_own(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    with (
+        MCPBridge(InProcessSupervisor("rover"), database=database) as first,
+        MCPBridge(InProcessSupervisor("rover"), database=database) as second,
+    ):
+        assert (first.robot_name, second.robot_name) == ("rover", "rover#2")
+    assert recording.rows("SELECT name FROM robot ORDER BY id") == ["rover", "rover#2"]
+
+
+def test_a_second_bridge_on_the_same_robot_takes_over(
+    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
+) -> None:
+    first = MCPBridge(robot, database=database)
+    with MCPBridge(robot, database=database) as second:
+        assert second.robot_name == first.robot_name
+    sql = "SELECT end_reason FROM session ORDER BY id"
+    assert recording.rows(sql) == ["replaced", "finished"]
+
+
+def test_a_session_says_which_code_ran_where(bridge: MCPBridge, recording: Recording) -> None:
+    sql = "SELECT pid > 0, length(host) > 0, supervisor, versions ->> 'webots_mcp' FROM session"
+    assert recording.rows(sql) == [(1, 1, 1, "0.1.0")]
+    assert bridge.robot_name == "rover"
+    assert "Lidar" in recording.rows("SELECT devices FROM robot")[0]
+
+
+def test_an_exception_that_leaves_the_block_ends_the_session_as_crashed(
+    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
+) -> None:
+    with pytest.raises(ZeroDivisionError), MCPBridge(robot, database=database):
+        _ = 1 / 0
+    assert recording.rows("SELECT end_reason FROM session") == ["crashed"]
+
+
+class Environment(InProcessSupervisor):
+    """A reinforcement learning environment: its step() means something else."""
+
+    def step(self, action: str) -> tuple[float, bool]:  # type: ignore[override]
+        return 0.5, super().step(STEP_MS) == -1  # type: ignore[misc]
+
+
+def test_a_subclass_with_another_step_can_be_paused_and_resumed(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    environment = Environment("rover")
+    with MCPBridge(environment, throttle_interval=1, database=database) as bridge:
+        assert environment.step("forward") == (0.5, False)
+        pause, resume = recording.send("pause"), recording.send("resume")
+        bridge.get_command()
+        assert environment.step("forward") == (0.5, False)
+    assert [recording.fate(c)[0] for c in (pause, resume)] == ["done", "done"]
+
+
+def test_an_object_that_owns_the_robot_is_refused_with_the_way_to_its_robot(
+    database: MemoryDatabase,
+) -> None:
+    class Owner:
+        robot = InProcessSupervisor("rover")
+
+    with pytest.raises(TypeError, match=r"MCPBridge\(x\.robot\)"):
+        MCPBridge(Owner(), database=database)
+
+
+def test_a_wrong_database_or_interval_is_refused(robot: InProcessSupervisor) -> None:
+    with pytest.raises(TypeError, match="database=42 is a int"):
+        MCPBridge(robot, database=42)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="throttle_interval must be 1 or more, got 0"):
+        MCPBridge(robot, throttle_interval=0, database=":memory:")
+
+
+def test_a_plain_robot_records_as_well(database: MemoryDatabase, recording: Recording) -> None:
+    with MCPBridge(InProcessRobot("rover"), throttle_interval=1, database=database) as bridge:
+        bridge.publish({"x": 1})
+    assert recording.rows("SELECT kind FROM robot") == ["Robot"]
+    assert recording.states() == [{"x": 1}]
+
+
+def test_webots_ending_the_controller_ends_the_users_loop_and_the_session(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    simulation = InProcessSimulation()
+    robot = InProcessSupervisor("rover", world=simulation)
+    bridge = MCPBridge(robot, throttle_interval=1, database=database)
+    robot.step(STEP_MS)
+    recording.send("pause")
+    bridge.on_reload(lambda: None)
+    bridge.register_command("leave", lambda _: simulation.quit())
+    recording.send("leave")
+    bridge.get_command()  # held, until the quit is seen
+    assert robot.step(STEP_MS) == -1
+    assert recording.rows("SELECT end_reason FROM session") == ["finished"]

@@ -1,0 +1,371 @@
+"""A database in trouble costs rows, never the robot."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.bridge.conftest import STEP_MS, Recording, send
+from webots_mcp import MCPBridge
+from webots_mcp.bridge import recorder
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION
+from webots_mcp.schema import create_schema
+from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.migrate import upgrade
+
+NOT_ROOT = pytest.mark.skipif(
+    sys.platform == "win32" or os.geteuid() == 0, reason="root may write read-only files"
+)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "mcp_data" / DATABASE_NAME
+
+
+@pytest.fixture
+def filed(file: Path) -> Recording:
+    return Recording(file)
+
+
+@pytest.fixture
+def bridge(robot: InProcessSupervisor, file: Path) -> Iterator[MCPBridge]:
+    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
+        yield bridge
+
+
+@pytest.fixture
+def retry_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No waiting between tries, so that the tests need no sleep."""
+    monkeypatch.setattr(recorder, "_RETRY_INTERVAL_S", 0.0)
+
+
+def numbers(recording: Recording) -> list[int]:
+    return [state["n"] for state in recording.states()]
+
+
+def test_rows_that_meet_a_lock_wait_and_are_written_in_order(
+    bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    bridge.publish({"n": 0})
+    other = connect(file, "writer")
+    other.execute("BEGIN IMMEDIATE")
+    started_s = time.perf_counter()
+    for n in range(1, 100):
+        bridge.publish({"n": n})
+    assert time.perf_counter() - started_s < 1  # a single wait for the lock would be five
+    assert bridge.stats().rows_waiting == 99
+    assert numbers(filed) == [0]
+    other.execute("COMMIT")
+    other.close()
+    bridge.publish({"n": 100})
+    assert bridge.stats().rows_waiting == 0
+    assert numbers(filed) == list(range(101))
+
+
+def test_beyond_the_limit_the_oldest_rows_are_dropped_counted_and_told(
+    bridge: MCPBridge,
+    file: Path,
+    filed: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(recorder, "MAX_WAITING_ROWS", 10)
+    other = connect(file, "writer")
+    other.execute("BEGIN IMMEDIATE")
+    for n in range(25):
+        bridge.publish({"n": n})
+    other.execute("COMMIT")
+    other.close()
+    bridge.publish({"n": 25})
+    assert numbers(filed) == list(range(16, 26))
+    assert bridge.stats().rows_dropped == 16
+    (told,) = filed.rows("SELECT data FROM event WHERE kind = 'dropped'")
+    assert json.loads(told)["rows"] == 16
+    assert capfd.readouterr().err.count("rows are being dropped") == 1
+
+
+@pytest.mark.usefixtures("retry_at_once")
+def test_a_full_disk_makes_rows_wait_until_there_is_room(
+    bridge: MCPBridge, filed: Recording, capfd: pytest.CaptureFixture[str]
+) -> None:
+    connection = bridge._recorder.connection  # pyright: ignore[reportPrivateUsage]
+    assert connection is not None
+    bridge.publish({"n": 0})
+    (pages,) = connection.execute("PRAGMA page_count").fetchone()
+    connection.execute(f"PRAGMA max_page_count={pages}")
+    n = 0
+    while not bridge.stats().rows_waiting:
+        n += 1
+        bridge.publish({"n": n, "padding": "x" * 1000})
+    bridge.publish({"n": n + 1})
+    assert capfd.readouterr().err.count("database or disk is full") == 1
+    connection.execute("PRAGMA max_page_count=1000000")
+    bridge.publish({"n": n + 2})
+    assert numbers(filed) == list(range(n + 3))
+
+
+@pytest.mark.usefixtures("retry_at_once")
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be deleted there")
+def test_a_deleted_database_is_made_again_and_told(
+    bridge: MCPBridge, file: Path, filed: Recording, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bridge.publish({"n": 0})
+    for part in file.parent.glob(f"{DATABASE_NAME}*"):
+        part.unlink()
+    heartbeat_now(bridge)
+    bridge.publish({"n": 1})
+    assert numbers(filed) == [1]
+    assert filed.rows("SELECT count(*) FROM event WHERE kind = 'storage'") == [1]
+    assert "deleted or replaced" in capfd.readouterr().err
+
+
+@pytest.mark.usefixtures("retry_at_once")
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be moved there")
+def test_a_database_that_is_damaged_in_mid_run_is_moved_aside_and_a_new_one_begun(
+    bridge: MCPBridge, file: Path, filed: Recording, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bridge.publish({"n": 0})
+    damage_schema(file)
+    bridge.publish({"n": 1})
+    bridge.publish({"n": 2})
+    assert numbers(filed) == [1, 2]
+    assert len(list(file.parent.glob(f"{DATABASE_NAME}.damaged-*"))) >= 1
+    assert filed.rows("SELECT count(*) FROM event WHERE kind = 'storage'") == [1]
+    assert capfd.readouterr().err.count("was damaged") == 1
+
+
+def test_a_damaged_database_is_moved_aside_at_the_start(
+    robot: InProcessSupervisor, file: Path, filed: Recording
+) -> None:
+    MCPBridge(robot, data_dir=file.parent).close()
+    content = bytearray(file.read_bytes())
+    content[100:] = b"\xa5" * (len(content) - 100)
+    file.write_bytes(content)
+    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
+        bridge.publish({"n": 1})
+    assert numbers(filed) == [1]
+    (kept,) = file.parent.glob(f"{DATABASE_NAME}.damaged-*")
+    assert kept.read_bytes() == content
+
+
+def test_a_file_that_is_no_database_is_moved_aside_only_under_our_name(
+    robot: InProcessSupervisor, file: Path, filed: Recording, tmp_path: Path
+) -> None:
+    file.parent.mkdir()
+    file.write_text("this is no database, but it is long enough to look like one" * 20)
+    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
+        bridge.publish({"n": 1})
+    assert numbers(filed) == [1]
+    notes = tmp_path / "notes.txt"
+    notes.write_text("my notes" * 200)
+    with MCPBridge(robot, database=notes, throttle_interval=1) as bridge:
+        bridge.publish({"n": 1})
+        assert bridge.stats().rows_dropped > 0
+        assert "not recording into" in (bridge.stats().last_error or "")
+    assert notes.read_text() == "my notes" * 200
+
+
+def test_a_database_of_another_application_is_left_alone(
+    robot: InProcessSupervisor, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    other = tmp_path / "other.db"
+    connection = sqlite3.connect(other)
+    connection.execute("CREATE TABLE customer (name)")
+    connection.close()
+    with MCPBridge(robot, database=other, throttle_interval=1) as bridge:
+        bridge.publish({"n": 1})
+    assert "belongs to another application" in capfd.readouterr().err
+    assert Recording(other).rows("SELECT name FROM sqlite_master") == ["customer"]
+
+
+def test_a_newer_schema_is_said_and_the_robot_drives_on(
+    robot: InProcessSupervisor, file: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    connection = connect(file, "writer", create=True)
+    create_schema(connection)
+    connection.execute(f"PRAGMA user_version={SCHEMA_VERSION + 1}")
+    connection.close()
+    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
+        bridge.publish({"n": 1})
+        assert bridge.get_command() is None
+        assert bridge.stats().rows_dropped > 0
+    assert "pip install --upgrade webots-mcp" in capfd.readouterr().err
+
+
+def test_an_older_schema_is_brought_forward_with_its_data(
+    robot: InProcessSupervisor, file: Path, filed: Recording
+) -> None:
+    upgrade(file, "0001")
+    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
+        bridge.publish({"n": 1})
+        assert bridge.stats().last_error is None
+    assert filed.rows("PRAGMA user_version") == [SCHEMA_VERSION]
+    assert numbers(filed) == [1]
+
+
+def test_strict_mode_raises_instead(
+    robot: InProcessSupervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WEBOTS_MCP_STRICT", "1")
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with pytest.raises(Exception, match="cannot be made"):
+        MCPBridge(robot, data_dir=blocked / "below")
+
+
+def test_a_folder_that_cannot_be_made_costs_rows_only(
+    robot: InProcessSupervisor, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("")
+    with MCPBridge(robot, data_dir=blocked / "below", throttle_interval=1) as bridge:
+        robot.step(STEP_MS)
+        bridge.publish({"n": 1})
+        assert bridge.get_command() is None
+        assert bridge.stats().rows_waiting >= 1
+    assert "cannot be made" in capfd.readouterr().err
+
+
+@NOT_ROOT
+def test_a_read_only_folder_costs_rows_only(robot: InProcessSupervisor, tmp_path: Path) -> None:
+    tmp_path.chmod(stat.S_IRUSR | stat.S_IXUSR)
+    try:
+        with MCPBridge(robot, data_dir=tmp_path / "x", throttle_interval=1) as bridge:
+            bridge.publish({"n": 1})
+            assert bridge.stats().rows_waiting >= 1
+    finally:
+        tmp_path.chmod(stat.S_IRWXU)
+
+
+@pytest.mark.usefixtures("retry_at_once")
+def test_a_database_that_turns_read_only_costs_rows_only(
+    bridge: MCPBridge, filed: Recording, capfd: pytest.CaptureFixture[str]
+) -> None:
+    connection = bridge._recorder.connection  # pyright: ignore[reportPrivateUsage]
+    assert connection is not None
+    connection.execute("PRAGMA query_only=ON")
+    bridge.publish({"n": 0})
+    bridge.publish({"n": 1})
+    assert bridge.stats().rows_waiting == 2
+    assert capfd.readouterr().err.count("readonly") == 1
+    connection.execute("PRAGMA query_only=OFF")
+    bridge.publish({"n": 2})
+    assert numbers(filed) == [0, 1, 2]
+
+
+def test_a_command_that_meets_a_lock_is_claimed_with_the_next_call(
+    bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    bridge.register_command("greet", lambda _: "hello")
+    other = connect(file, "writer")
+    other.execute("BEGIN IMMEDIATE")
+    sent = send(other, "greet", {})
+    assert bridge.get_command() is None
+    other.execute("COMMIT")
+    other.close()
+    poll_until(bridge, lambda: filed.fate(sent)[0] == "done")
+    assert filed.fate(sent)[1] == "hello"
+
+
+def test_an_answer_that_meets_a_lock_is_written_later(
+    bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    other = connect(file, "writer")
+
+    def lock(_: object) -> str:
+        other.execute("BEGIN IMMEDIATE")
+        return "locked"
+
+    bridge.register_command("lock", lock)
+    sent = filed.send("lock")
+    poll_until(bridge, lambda: other.in_transaction)
+    assert filed.fate(sent)[0] == "claimed"
+    other.execute("COMMIT")
+    other.close()
+    bridge.publish({"n": 1})
+    assert filed.fate(sent)[:2] == ("done", "locked")
+
+
+def test_rows_of_a_loop_that_stands_still_are_written_by_the_maintainer(
+    bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    other = connect(file, "writer")
+    other.execute("BEGIN IMMEDIATE")
+    bridge.publish({"n": 1})
+    other.execute("COMMIT")
+    other.close()
+    deadline_s = time.monotonic() + 10
+    while not numbers(filed):
+        assert time.monotonic() < deadline_s
+    assert numbers(filed) == [1]
+
+
+def test_the_log_is_cut_while_a_controller_runs(bridge: MCPBridge, file: Path) -> None:
+    log = Path(f"{file}-wal")
+    padding = "x" * 1000
+    deadline_s = time.monotonic() + 20
+    longest = shortest = 0
+    while longest < 1_000_000 or shortest >= longest:
+        bridge.publish({"padding": padding})
+        longest, shortest = max(longest, log.stat().st_size), log.stat().st_size
+        assert time.monotonic() < deadline_s
+
+
+@pytest.mark.parametrize("method", ["publish", "log", "get_command", "auto_publish"])
+def test_after_close_nothing_raises(bridge: MCPBridge, method: str) -> None:
+    bridge.close()
+    arguments = {"publish": ({"n": 1},), "log": ("late",)}.get(method, ())
+    assert getattr(bridge, method)(*arguments) is None
+
+
+def test_a_log_line_may_hold_any_text(bridge: MCPBridge, filed: Recording) -> None:
+    bridge.log("null \0 and \ud800 surrogate", level="warning")
+    bridge.log(42, level="loud")
+    sql = "SELECT level, message FROM log ORDER BY id"
+    assert filed.rows(sql) == [("warning", "null \\0 and ? surrogate"), ("info", "42")]
+
+
+def test_importing_the_bridge_needs_nothing_but_the_standard_library(tmp_path: Path) -> None:
+    package = Path(recorder.__file__).parents[2]
+    program = (
+        f"import sys; sys.path.insert(0, {str(package)!r}); from webots_mcp import MCPBridge; "
+        "heavy = {'sqlmodel', 'sqlalchemy', 'alembic', 'mcp', 'pydantic', 'PIL', 'numpy', "
+        "'subprocess', 'asyncio', 'dataclasses', 'controller'} & set(sys.modules); "
+        "print(sorted(heavy))"
+    )
+    line = [sys.executable, "-I", "-S", "-c", program]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def heartbeat_now(bridge: MCPBridge) -> None:
+    """The next call looks after the file, as it would half a second later."""
+    bridge._next_beat_s = 0.0  # pyright: ignore[reportPrivateUsage]
+    bridge.get_command()
+
+
+def poll_until(bridge: MCPBridge, reached: Callable[[], bool]) -> None:
+    deadline_s = time.monotonic() + 5
+    while not reached():
+        bridge.get_command()
+        assert time.monotonic() < deadline_s
+
+
+def damage_schema(file: Path) -> None:
+    """Make every statement fail that is prepared from now on."""
+    other = sqlite3.connect(file, isolation_level=None)
+    other.execute("PRAGMA writable_schema=ON")
+    other.execute("UPDATE sqlite_master SET sql = 'CREATE nonsense' WHERE name = 'state'")
+    other.execute("PRAGMA schema_version=9999")
+    other.close()

@@ -1,7 +1,6 @@
 """What the simulator answers to the messages of controllers."""
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from controller.wire import Message
@@ -17,6 +16,8 @@ CUSTOM_DATA_TAG = 0
 
 FieldReference = tuple[int, str]
 """Node id and field name."""
+FieldSet = tuple[FieldReference, int | None, Any]
+"""A field, the index of an entry or None, and the new value."""
 
 
 def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
@@ -58,7 +59,7 @@ def step_over(simulator: Simulator, robot: Robot) -> Message:
 
 
 def _step(
-    simulator: Simulator, robot: Robot, duration_ms: int, changes: list[Any], field_sets: list[Any]
+    simulator: Simulator, robot: Robot, duration_ms: int, changes: list[Any], field_sets: list[FieldSet]
 ) -> Message | None:
     for tag, setting, value in changes:
         if tag == CUSTOM_DATA_TAG:
@@ -144,7 +145,7 @@ class SupervisorRequests:
             value = value[index] if -len(value) <= index < len(value) else None
         return self._shown(value) if isinstance(value, Node) else value
 
-    def set_fields(self, field_sets: list[Any]) -> None:
+    def set_fields(self, field_sets: list[FieldSet]) -> None:
         """Writes fields, and lets what they describe follow."""
         for (node_id, name), index, value in field_sets:
             node = self._world.nodes[node_id]
@@ -217,10 +218,11 @@ class SupervisorRequests:
         """Writes a picture of the arena; relative paths start from the controller's folder."""
         self._simulator.export(self._robot.folder / path, quality)
 
-    def on_set_label(self, number: int, text: str, x: float, y: float, size: float, rgb: int) -> None:
+    def on_set_label(
+        self, number: int, text: str, x: float, y: float, size: float, rgb: int
+    ) -> None:
         """Shows a text over the picture; an empty one takes it away."""
         if text:
             self._simulator.labels[number] = Label(text, x, y, size, rgb)
         else:
             self._simulator.labels.pop(number, None)
-

@@ -29,7 +29,7 @@ class Part:
         hx, hy, hz = self.half_m
         if self.kind == "Box":
             yaw = body.yaw_rad + self.frame.yaw_rad
-            return Block(x, y, yaw, hx, hy, z - hz, z + hz, self.color)
+            return Block(x, y, cos(yaw), sin(yaw), hx, hy, z - hz, z + hz, self.color)
         return Disc(x, y, hx, z - hz, z + hz, self.color, self.kind == "Sphere")
 
 
@@ -44,7 +44,9 @@ class Footprint:
     @staticmethod
     def around(parts: list[Part]) -> "Footprint":
         """The smallest disc around the rectangle that all parts fill."""
-        at_and_half = [(part.frame.translation, _turned_half(part.frame, part.half_m)) for part in parts]
+        at_and_half = [
+            (part.frame.translation, _turned_half(part.frame, part.half_m)) for part in parts
+        ]
         if not at_and_half:
             return Footprint(0.0, 0.0, 0.0)
         x0, x1 = (
@@ -139,7 +141,7 @@ class Arena:
         ]
 
     def settle(self, body: Body) -> bool:
-        """Moves a body out of what it has driven into; True if it touched what does not give way."""
+        """Moves a body out of what it drove into; True if that did not give way."""
         for movable in self._movable:
             self._push_away(movable, body)
         return self._clear(body)

@@ -4,7 +4,7 @@ from array import array
 from dataclasses import dataclass
 from math import cos, hypot, inf, sin, tan
 
-from webots_mcp.standin.shapes import Circle, Color, Shape, Target, targets_from
+from webots_mcp.standin.shapes import Color, Shape, Target, targets_from
 
 _LIGHT = (0.8, 0.6)
 """Where the light comes from, so that the sides of a box differ."""
@@ -69,11 +69,7 @@ def _row(view: View, height_m: float, scale_px: float) -> int:
 
 
 def _shaded(target: Target, distance_m: float, dx: float, dy: float) -> bytes:
-    if isinstance(target, Circle):
-        nx = (target.x - distance_m * dx) / target.radius_m
-        ny = (target.y - distance_m * dy) / target.radius_m
-    else:
-        nx, ny = target.nx, target.ny
+    nx, ny = target.inward(distance_m, dx, dy)
     light = 0.7 + 0.3 * (nx * _LIGHT[0] + ny * _LIGHT[1])
     r, g, b = target.shape.color
     return pixel((r * light, g * light, b * light))

@@ -177,5 +177,3 @@ def controllers_of(simulator: Simulator, launch: Launch) -> list[Controller]:
     return [
         Controller(robot, launch, launch.file_of(robot, simulator)) for robot in simulator.robots
     ]
-
-

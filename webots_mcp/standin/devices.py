@@ -99,8 +99,9 @@ class Motor(Device):
     kind = "Motor"
 
     def description(self) -> dict[str, Any]:
+        """Adds what the device's getters tell."""
         fields = self.node.fields
-        sensors = self.site.joint.node.fields["device"] if self.site.joint else []
+        sensors: list[Node] = self.site.joint.node.fields["device"] if self.site.joint else []
         names = [node.fields["name"] for node in sensors if node.type_name == "PositionSensor"]
         return super().description() | {
             "min_position": fields["minPosition"],
@@ -112,6 +113,7 @@ class Motor(Device):
         }
 
     def configure(self, setting: str, value: Any) -> None:
+        """Takes a setting from the controller."""
         joint = self.site.joint
         if joint is None:
             return
@@ -129,6 +131,7 @@ class PositionSensor(Device):
     kind = "PositionSensor"
 
     def measure(self, period_ms: float) -> float:
+        """The angle of the joint in radians."""
         return self.site.joint.position_rad if self.site.joint else nan
 
 
@@ -142,6 +145,7 @@ class DistanceSensor(Device):
         self.table: list[list[float]] = node.fields["lookupTable"] or [[0.0, 0.0, 0.0]]
 
     def description(self) -> dict[str, Any]:
+        """Adds what the device's getters tell."""
         values = [row[1] for row in self.table]
         return super().description() | {
             "min_value": min(values),
@@ -151,11 +155,11 @@ class DistanceSensor(Device):
         }
 
     def measure(self, period_ms: float) -> float:
+        """The looked-up value of the distance."""
         x, y, z, yaw = self.site.place()
         obstacles = self.site.arena.obstacles(without=self.site.body)
-        if any(s.contains(x, y) and s.bottom_m <= z <= s.top_m for s in obstacles):
-            return self._looked_up(0.0)
-        return self._looked_up(nearest_m(targets_from(obstacles, x, y, z), cos(yaw), sin(yaw)))
+        targets = targets_from(obstacles, x, y, z, reach_m=self.table[-1][0])
+        return self._looked_up(nearest_m(targets, cos(yaw), sin(yaw)))
 
     def _looked_up(self, distance_m: float) -> float:
         if distance_m <= self.table[0][0]:
@@ -176,10 +180,12 @@ class Gps(Device):
         self._last: tuple[float, float, float] | None = None
 
     def make_due(self) -> None:
+        """Forgets the last place as well."""
         super().make_due()
         self._last = None
 
     def measure(self, period_ms: float) -> list[list[float]]:
+        """Position in metres and velocity in metres a second."""
         here = self.site.place()[:3]
         before = self._last or here
         self._last = here
@@ -193,6 +199,7 @@ class InertialUnit(Device):
     kind = "InertialUnit"
 
     def measure(self, period_ms: float) -> list[float]:
+        """Roll, pitch and yaw, yaw between -pi and pi."""
         yaw = self.site.place()[3]
         return [0.0, 0.0, yaw - 2.0 * pi * round(yaw / (2.0 * pi))]
 
@@ -211,6 +218,7 @@ class Lidar(Device):
         self.field_of_view_rad: float = node.fields["fieldOfView"]
 
     def description(self) -> dict[str, Any]:
+        """Adds what the device's getters tell."""
         fields = self.node.fields
         return super().description() | {
             "resolution": self.resolution,
@@ -224,15 +232,17 @@ class Lidar(Device):
         }
 
     def measure(self, period_ms: float) -> int:
+        """The number of the scan; `fetch` gives the scan itself."""
         self._seen = (self.site.place(), self.site.arena.scene(without=self.site.body))
         self._samples += 1
         return self._samples
 
     def fetch(self) -> list[float]:
+        """Distances in metres, layer after layer."""
         if self._seen is None:
             return []
         (x, y, z, yaw), shapes = self._seen
-        layer = self._ranges(targets_from(shapes, x, y, z), yaw)
+        layer = self._ranges(targets_from(shapes, x, y, z, self.node.fields["maxRange"]), yaw)
         return layer * self.node.fields["numberOfLayers"]
 
     def _ranges(self, targets: Any, yaw_rad: float) -> list[float]:
@@ -257,6 +267,7 @@ class Camera(Device):
         self.field_of_view_rad: float = node.fields["fieldOfView"]
 
     def description(self) -> dict[str, Any]:
+        """Adds what the device's getters tell."""
         fields = self.node.fields
         return super().description() | {
             "width": fields["width"],
@@ -266,11 +277,13 @@ class Camera(Device):
         }
 
     def configure(self, setting: str, value: Any) -> None:
+        """Takes a setting from the controller."""
         super().configure(setting, value)
         if setting == "fov":
             self.field_of_view_rad = value
 
     def measure(self, period_ms: float) -> int:
+        """The number of the picture; `fetch` gives the picture itself."""
         arena, fields = self.site.arena, self.node.fields
         self._seen = camera.View(
             *self.site.place(),
@@ -283,6 +296,7 @@ class Camera(Device):
         return self._samples
 
     def fetch(self) -> bytes:
+        """The picture: blue, green, red and alpha of each pixel."""
         return b"" if self._seen is None else camera.render(self._seen, self.site.arena.colors)
 
 
@@ -317,5 +331,3 @@ def _find(node: Node, site: Site, found: list[tuple[Node, Site]]) -> None:
         if child.type_name in DEVICE_TYPES:
             found.append((child, here))
         _find(child, here, found)
-
-

@@ -36,7 +36,9 @@ class Frame(NamedTuple):
         """A frame given in this frame, seen from outside."""
         a, b = self.rotation, inner.rotation
         rows = ((a[i], a[i + 1], a[i + 2]) for i in (0, 3, 6))
-        product = tuple(p * b[k] + q * b[k + 3] + r * b[k + 6] for p, q, r in rows for k in (0, 1, 2))
+        product = tuple(
+            p * b[k] + q * b[k + 3] + r * b[k + 6] for p, q, r in rows for k in (0, 1, 2)
+        )
         return Frame(product, self.point(inner.translation))  # type: ignore[arg-type]
 
 

@@ -34,9 +34,7 @@ class InProcessSimulation:
     The methods named after buttons are a person's hands on Webots' window.
     """
 
-    def __init__(
-        self, world: str | Path = DEFAULT_WORLD, *, pause_timeout_s: float = 0.0
-    ) -> None:
+    def __init__(self, world: str | Path = DEFAULT_WORLD, *, pause_timeout_s: float = 0.0) -> None:
         """Loads a world, running fast.
 
         Args:

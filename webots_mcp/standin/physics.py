@@ -9,7 +9,6 @@ from webots_mcp.standin.vrml import Node
 from webots_mcp.standin.world import descendants_of
 
 
-
 @dataclass
 class Joint:
     """A hinge, its motor and how far it has turned."""
@@ -159,5 +158,3 @@ def _wheel_of(joint: Joint) -> Wheel | None:
     if not radii or abs(axis[1]) < 0.9 or anchor[1] == 0.0:
         return None
     return Wheel(joint, radii[0] if axis[1] > 0.0 else -radii[0], anchor[1])
-
-

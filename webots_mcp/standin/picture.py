@@ -125,7 +125,7 @@ def _outline(shape: Shape) -> list[tuple[float, float]]:
     if not isinstance(shape, Block):
         r = shape.radius_m
         return [(shape.x + dx, shape.y + dy) for dx in (-r, r) for dy in (-r, r)]
-    c, s, a, b = cos(shape.yaw_rad), sin(shape.yaw_rad), shape.half_x_m, shape.half_y_m
+    c, s, a, b = shape.cos_yaw, shape.sin_yaw, shape.half_x_m, shape.half_y_m
     corners = ((a, b), (-a, b), (-a, -b), (a, -b))
     return [(shape.x + c * u - s * v, shape.y + s * u + c * v) for u, v in corners]
 

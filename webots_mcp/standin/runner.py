@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -167,10 +168,10 @@ class Runner:
     def _welcome(self, door: socket.socket) -> None:
         connection = Connection(door.accept()[0])
         self._selector.register(
-            connection.stream, selectors.EVENT_READ, lambda _: self._hear(connection)
+            connection.stream, selectors.EVENT_READ, partial(self._hear, connection)
         )
 
-    def _hear(self, connection: Connection) -> None:
+    def _hear(self, connection: Connection, _: socket.socket) -> None:
         messages = connection.receive()
         if messages is None:
             self._forget(connection)

@@ -4,9 +4,9 @@ The stand-in is two-dimensional with heights: a box is a turned rectangle, a cyl
 disc, each between a bottom and a top.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
-from math import cos, hypot, inf, sin, sqrt
+from math import hypot, inf, sqrt
 from typing import NamedTuple, TypeAlias
 
 Color = tuple[float, float, float]
@@ -38,6 +38,10 @@ class Edge(NamedTuple):
         along = distance * (self.ex * dx + self.ey * dy) - self.start_m
         return distance if 0.0 <= along <= self.length_m else inf
 
+    def inward(self, distance_m: float, dx: float, dy: float) -> tuple[float, float]:
+        """The direction straight into the shape where a ray hits it."""
+        return self.nx, self.ny
+
 
 class Circle(NamedTuple):
     """The outline of a disc, seen from a point."""
@@ -55,8 +59,28 @@ class Circle(NamedTuple):
         square = ahead * ahead - self.gap_m2
         return ahead - sqrt(square) if ahead > 0.0 and square >= 0.0 else inf
 
+    def inward(self, distance_m: float, dx: float, dy: float) -> tuple[float, float]:
+        """The direction straight into the shape where a ray hits it."""
+        return (self.x - distance_m * dx) / self.radius_m, (
+            self.y - distance_m * dy
+        ) / self.radius_m
 
-Target: TypeAlias = "Edge | Circle"
+
+class Here(NamedTuple):
+    """A shape that the point is inside of."""
+
+    shape: "Shape"
+
+    def distance_m(self, dx: float, dy: float) -> float:
+        """Nothing: the ray ends where it starts."""
+        return 0.0
+
+    def inward(self, distance_m: float, dx: float, dy: float) -> tuple[float, float]:
+        """The ray's own direction."""
+        return dx, dy
+
+
+Target: TypeAlias = "Edge | Circle | Here"
 
 
 @dataclass(frozen=True)
@@ -65,7 +89,8 @@ class Block:
 
     x: float
     y: float
-    yaw_rad: float
+    cos_yaw: float
+    sin_yaw: float
     half_x_m: float
     half_y_m: float
     bottom_m: float
@@ -73,28 +98,29 @@ class Block:
     color: Color
 
     def _local(self, x: float, y: float) -> tuple[float, float]:
-        c, s = cos(self.yaw_rad), sin(self.yaw_rad)
         dx, dy = x - self.x, y - self.y
-        return c * dx + s * dy, c * dy - s * dx
+        return self.cos_yaw * dx + self.sin_yaw * dy, self.cos_yaw * dy - self.sin_yaw * dx
 
-    def contains(self, x: float, y: float) -> bool:
-        """Whether the point is inside."""
-        u, v = self._local(x, y)
-        return abs(u) < self.half_x_m and abs(v) < self.half_y_m
-
-    def targets(self, x: float, y: float, height_m: float | None) -> Iterator[Target]:
+    def targets(self, x: float, y: float, height_m: float | None, reach_m: float) -> list[Target]:
         """The sides that can be seen from a point, at one height or (None) at any."""
         if height_m is not None and not self.bottom_m <= height_m <= self.top_m:
-            return
-        c, s = cos(self.yaw_rad), sin(self.yaw_rad)
+            return []
         u, v = self._local(x, y)
         a, b = self.half_x_m, self.half_y_m
-        for nx, ny, beyond, at, half in (
-            *((c, s, u - a, v, b), (-c, -s, -u - a, -v, b)),
-            *((-s, c, v - b, -u, a), (s, -c, -v - b, u, a)),
-        ):
-            if beyond > 0.0:
-                yield Edge(-nx, -ny, beyond, -ny, nx, -half - at, 2.0 * half, self)
+        beyond_x, beyond_y = abs(u) - a, abs(v) - b
+        if beyond_x > reach_m or beyond_y > reach_m:
+            return []
+        if beyond_x <= 0.0 and beyond_y <= 0.0:
+            return [] if height_m is None else [Here(self)]
+        c, s = self.cos_yaw, self.sin_yaw
+        seen: list[Target] = []
+        if beyond_x > 0.0:
+            side = 1.0 if u > 0.0 else -1.0
+            seen.append(Edge(-c * side, -s * side, beyond_x, -s, c, -b - v, 2.0 * b, self))
+        if beyond_y > 0.0:
+            side = 1.0 if v > 0.0 else -1.0
+            seen.append(Edge(s * side, -c * side, beyond_y, c, s, -a - u, 2.0 * a, self))
+        return seen
 
     def push(self, x: float, y: float, radius_m: float) -> Push:
         """What moves a disc out of this block, the shortest way."""
@@ -102,8 +128,10 @@ class Block:
         if abs(u) >= self.half_x_m + radius_m or abs(v) >= self.half_y_m + radius_m:
             return None
         pu, pv = self._local_push(u, v, radius_m)
-        c, s = cos(self.yaw_rad), sin(self.yaw_rad)
-        return (c * pu - s * pv, s * pu + c * pv) if pu or pv else None
+        if not pu and not pv:
+            return None
+        c, s = self.cos_yaw, self.sin_yaw
+        return c * pu - s * pv, s * pu + c * pv
 
     def _local_push(self, u: float, v: float, radius_m: float) -> tuple[float, float]:
         a, b = self.half_x_m, self.half_y_m
@@ -128,17 +156,16 @@ class Disc:
     color: Color
     is_ball: bool = False
 
-    def contains(self, x: float, y: float) -> bool:
-        """Whether the point is inside."""
-        return hypot(x - self.x, y - self.y) < self.radius_m
-
-    def targets(self, x: float, y: float, height_m: float | None) -> Iterator[Target]:
+    def targets(self, x: float, y: float, height_m: float | None, reach_m: float) -> list[Target]:
         """The outline as seen from a point, at one height or (None) at any."""
         radius = self.radius_m if height_m is None else self._radius_at(height_m)
         cx, cy = self.x - x, self.y - y
         gap = cx * cx + cy * cy - radius * radius
-        if radius > 0.0 and gap > 0.0:
-            yield Circle(cx, cy, radius, gap, self)
+        if radius <= 0.0 or gap > reach_m * (reach_m + 2.0 * radius):
+            return []
+        if gap <= 0.0:
+            return [] if height_m is None else [Here(self)]
+        return [Circle(cx, cy, radius, gap, self)]
 
     def _radius_at(self, height_m: float) -> float:
         if not self.bottom_m <= height_m <= self.top_m:
@@ -161,16 +188,19 @@ class Disc:
 Shape: TypeAlias = "Block | Disc"
 
 
-def targets_from(shapes: Iterable[Shape], x: float, y: float, height_m: float | None) -> list[Target]:
+def targets_from(
+    shapes: Iterable[Shape], x: float, y: float, height_m: float | None, reach_m: float = inf
+) -> list[Target]:
     """Everything that rays from a point can hit.
 
     Args:
         shapes: What there is.
         x: Where the rays start, metres.
         y: Where the rays start, metres.
-        height_m: Only what is there at this height; None for everything.
+        height_m: Only what is there at this height; None for everything around the point.
+        reach_m: How long the rays are; what is farther away may be left out.
     """
-    return [target for shape in shapes for target in shape.targets(x, y, height_m)]
+    return [t for shape in shapes for t in shape.targets(x, y, height_m, reach_m)]
 
 
 def nearest_m(targets: Iterable[Target], dx: float, dy: float) -> float:

@@ -72,7 +72,13 @@ class Simulation:
         self._clean_up = weakref.finalize(self, shutil.rmtree, self._instance, True)
         overrides = {name: Path(file) for name, file in (controllers or {}).items()}
         launch = Launch(
-            _LIBRARY, self._instance, python, environment or {}, overrides, self._print, self._exited
+            _LIBRARY,
+            self._instance,
+            python,
+            environment or {},
+            overrides,
+            self._print,
+            self._exited,
         )
         self._runner = Runner(
             Simulator(load_world(world), _MODES[mode], self._print),
@@ -163,7 +169,7 @@ class Simulation:
         raise StandInError(f"no robot {name!r} in {self._runner.simulator.world.path.name}")
 
     def environment_of(self, name: str) -> dict[str, str]:
-        """The environment in which a program of yours can be the controller of an <extern> robot."""
+        """The environment that makes a program of yours the controller of an <extern> robot."""
         controller = self.controller(name)
         return controller.launch.environment_of(controller.robot)
 

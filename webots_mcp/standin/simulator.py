@@ -18,6 +18,7 @@ from webots_mcp.standin.picture import Label, Picture, save_picture
 from webots_mcp.standin.vrml import Node
 from webots_mcp.standin.world import World
 
+
 class Mode(IntEnum):
     """How the simulation runs; the numbers are those of `Supervisor.SIMULATION_MODE_...`."""
 
@@ -226,7 +227,10 @@ class Simulator:
     def _render(self) -> None:
         pictures, self._pictures = self._pictures, []
         for picture in pictures:
-            try:
-                save_picture(picture, self.arena, self.time_s, [*self.labels.values()])
-            except (OSError, ValueError, ImportError) as error:
-                self.log(f"ERROR: cannot export the image {picture.path}: {error}")
+            self._save(picture)
+
+    def _save(self, picture: Picture) -> None:
+        try:
+            save_picture(picture, self.arena, self.time_s, [*self.labels.values()])
+        except (OSError, ValueError, ImportError) as error:
+            self.log(f"ERROR: cannot export the image {picture.path}: {error}")

@@ -103,7 +103,9 @@ class Parser:
         node = Node(type_token.text, def_name, type_token.line)
         brace = self._take()
         if brace.text != "{":
-            raise WorldError(f"expected {{ after {node.type_name}, found {brace.text!r}", brace.line)
+            raise WorldError(
+                f"expected {{ after {node.type_name}, found {brace.text!r}", brace.line
+            )
         while self._peek().text != "}":
             token = self._name("a field name or }")
             node.fields[token.text] = self._value(token)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from webots_mcp.standin.errors import WorldError
 from webots_mcp.standin.frame import Frame, frame_of
@@ -111,7 +111,8 @@ def children_of(node: Node) -> Iterator[Node]:
         if isinstance(value, Node):
             yield value
         elif isinstance(value, list):
-            yield from (item for item in value if isinstance(item, Node))
+            items = cast("list[Any]", value)
+            yield from (item for item in items if isinstance(item, Node))
 
 
 def descendants_of(node: Node) -> Iterator[Node]:

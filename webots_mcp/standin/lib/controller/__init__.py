@@ -1,4 +1,4 @@
-"""A stand-in for Webots' Python package `controller`; it talks to webots_mcp.standin, not to Webots."""
+"""A stand-in for Webots' Python package `controller`; its simulator is webots_mcp.standin."""
 
 from .camera import Camera
 from .device import Device, Sensor

@@ -8,7 +8,7 @@ def integer(value: Any) -> int:
     """An `int` argument; everything else is refused, `32.0` too."""
     if not isinstance(value, int):
         raise ctypes.ArgumentError(
-            f"argument 1: TypeError: '{type(value).__name__}' object cannot be interpreted as an int"
+            f"argument 1: TypeError: an int is needed, not {type(value).__name__} {value!r}"
         )
     return value
 

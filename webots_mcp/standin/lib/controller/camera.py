@@ -1,5 +1,7 @@
 """The camera."""
 
+# ruff: noqa: N802 - the names are those of Webots
+
 from pathlib import Path
 
 from .arguments import integer, number, text
@@ -101,7 +103,7 @@ class Camera(Sensor):
         self.setFov(fov)
 
     def saveImage(self, filename: str, quality: int) -> int:
-        """Writes the last picture to a .png or .jpg file before it returns: 0, or -1 if it cannot."""
+        """Writes the last picture to a .png or .jpg file: 0, or -1 if that fails."""
         path, quality = Path(text(filename)), integer(quality)
         if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
             return -1

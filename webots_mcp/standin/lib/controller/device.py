@@ -1,5 +1,7 @@
 """What all devices have in common."""
 
+# ruff: noqa: N802, N803 - the names are those of Webots
+
 from typing import Any
 
 from . import session as library
@@ -74,7 +76,7 @@ class Sensor(Device):
             basic_ms = int(self._session.robot["basic_time_step"])
             self.enable(basic_ms if sampling_period is None else sampling_period)
 
-    def enable(self, samplingPeriod: int) -> None:  # noqa: N803 - Webots' name
+    def enable(self, samplingPeriod: int) -> None:
         """Measures every so many milliseconds, from the next step on; 0 disables."""
         self._session.enable(self._tag, max(integer(samplingPeriod), 0))
 

@@ -1,8 +1,10 @@
 """Fields of nodes."""
 
-from typing import TYPE_CHECKING, Any
+# ruff: noqa: N802 - the names are those of Webots
 
-from .arguments import integer
+from typing import TYPE_CHECKING, Any, cast
+
+from .arguments import integer, number
 from .console import say
 from .node_types import FIELD_NUMBER_OF
 from .session import Session
@@ -100,8 +102,7 @@ class Field:
             say("Error: new field value has wrong type or length.")
             return
         value = bool(value) if type_name.endswith("Bool") else value
-        value = [float(part) for part in value] if isinstance(value, list) else value
-        self._session.set_field(self._key, index, value)
+        self._session.set_field(self._key, index, _as_sent(value))
 
     def _is(self, type_name: str, what: str) -> bool:
         if type_name != self._type_name:
@@ -212,6 +213,12 @@ class Field:
     def setMFString(self, index: int, value: str) -> None:
         """Sets one entry with the next step."""
         self._write("MFString", index, value)
+
+
+def _as_sent(value: Any) -> Any:
+    if not isinstance(value, list):
+        return value
+    return [number(part) for part in cast("list[Any]", value)]
 
 
 def _fits(kind: str, value: Any) -> bool:

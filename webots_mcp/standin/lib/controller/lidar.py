@@ -1,5 +1,7 @@
 """The lidar."""
 
+# ruff: noqa: N802 - the names are those of Webots
+
 import ctypes
 from math import cos, sin
 from typing import Any, NamedTuple

@@ -1,5 +1,7 @@
 """Motors: what they were told, and telling them."""
 
+# ruff: noqa: N802 - the names are those of Webots
+
 from math import isinf, isnan
 
 from .arguments import number

@@ -1,11 +1,13 @@
 """Nodes of the scene tree, as a supervisor sees them."""
 
+# ruff: noqa: N802, N803 - the names are those of Webots
+
 from math import nan
 from typing import TYPE_CHECKING, Any
 
 from .arguments import integer, text
 from .field import Field
-from .node_types import NODE_TYPES, NUMBER_OF
+from .node_types import CONSTANTS, NUMBER_OF
 from .session import Session
 
 if TYPE_CHECKING:
@@ -16,8 +18,8 @@ class _NodeTypes(type):
     """Gives `Node` a constant for each node type, as `Node.GPS`."""
 
     def __getattr__(cls, name: str) -> int:
-        if name in NODE_TYPES:
-            return NODE_TYPES.index(name)
+        if name in CONSTANTS:
+            return CONSTANTS[name]
         raise AttributeError(f"type object 'Node' has no attribute {name!r}")
 
 
@@ -90,7 +92,7 @@ class Node(metaclass=_NodeTypes):
 
     # Fields --------------------------------------------------------------------------------------
 
-    def getField(self, fieldName: str) -> "Field | None":  # noqa: N803 - Webots' name
+    def getField(self, fieldName: str) -> "Field | None":
         """A field by name; None if the node has no such field."""
         found = self._session.ask("node_get_field", self._id, text(fieldName))
         return None if found is None else Field(self._session, self._id, fieldName, found)

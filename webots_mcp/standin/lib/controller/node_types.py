@@ -4,22 +4,23 @@ Field types have Webots' numbers. Node types have numbers of the stand-in's own:
 `Node.GPS`, never with a number.
 """
 
-NODE_TYPES = (
-    "NO_NODE APPEARANCE BACKGROUND BOX CAMERA CONTACT_PROPERTIES CYLINDER DIRECTIONAL_LIGHT "
-    "DISTANCE_SENSOR GPS GROUP HINGE_JOINT HINGE_JOINT_PARAMETERS INERTIAL_UNIT LIDAR MATERIAL "
-    "PBR_APPEARANCE PHYSICS PLANE POINT_LIGHT POSE POSITION_SENSOR ROBOT ROTATIONAL_MOTOR SHAPE "
-    "SOLID SPHERE SPOT_LIGHT TRANSFORM VIEWPOINT WORLD_INFO"
-).split()
+import re
 
 _NAMES = (
-    "- Appearance Background Box Camera ContactProperties Cylinder DirectionalLight "
-    "DistanceSensor GPS Group HingeJoint HingeJointParameters InertialUnit Lidar Material "
-    "PBRAppearance Physics Plane PointLight Pose PositionSensor Robot RotationalMotor Shape "
-    "Solid Sphere SpotLight Transform Viewpoint WorldInfo"
-).split()
+    *("Appearance", "Background", "Box", "Camera", "ContactProperties", "Cylinder"),
+    *("DirectionalLight", "DistanceSensor", "GPS", "Group", "HingeJoint", "HingeJointParameters"),
+    *("InertialUnit", "Lidar", "Material", "PBRAppearance", "Physics", "Plane", "PointLight"),
+    *("Pose", "PositionSensor", "Robot", "RotationalMotor", "Shape", "Solid", "Sphere"),
+    *("SpotLight", "Transform", "Viewpoint", "WorldInfo"),
+)
+_WORD_START = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
-NUMBER_OF = {name: number for number, name in enumerate(_NAMES)}
+NUMBER_OF = {name: number for number, name in enumerate(_NAMES, start=1)}
 """The number of a node type by the name that stands in world files."""
+
+CONSTANTS = {_WORD_START.sub("_", name).upper(): number for name, number in NUMBER_OF.items()}
+"""The number of a node type by the name of its constant, as `DISTANCE_SENSOR`; `NO_NODE` is 0."""
+CONSTANTS["NO_NODE"] = 0
 
 _SINGLE = ("Bool", "Int32", "Float", "Vec2f", "Vec3f", "Rotation", "Color", "String", "Node")
 

@@ -1,5 +1,7 @@
 """The robot: stepping, devices, and what the world says about it."""
 
+# ruff: noqa: N802 - the names are those of Webots
+
 import signal
 import threading
 from typing import Any, ClassVar

@@ -1,5 +1,7 @@
 """Sensors that give numbers."""
 
+# ruff: noqa: N802 - the names are those of Webots
+
 from math import cos, hypot, nan, sin
 
 from .console import say

@@ -1,4 +1,4 @@
-"""The state of the controller library: one connection, what it was told, what it was asked to send."""
+"""The state of the controller library: what it was told, and what it has yet to send."""
 
 import os
 import threading
@@ -97,7 +97,7 @@ class Session:
     def end_step(self) -> int:
         """Waits until that time has passed; -1 if the simulator ends the controller."""
         with self.lock:
-            reply = ("quit",) if self._quitting else self._stepped or self.link.receive()
+            reply: Message = ("quit",) if self._quitting else self._stepped or self.link.receive()
             self._stepped, self._in_step = None, False
             if reply[0] == "quit":
                 self._quitting = self._ended = True
@@ -162,7 +162,9 @@ class Session:
             say(f"Error: ignoring illegal call to {function} in a 'Robot' controller.")
             say("Error: this function can only be used in a 'Supervisor' controller.")
         elif self._in_step:
-            say(f"Warning: {function} called between wb_robot_step_begin() and wb_robot_step_end().")
+            say(
+                f"Warning: {function} called between wb_robot_step_begin() and wb_robot_step_end()."
+            )
         return self.robot["supervisor"] and not self._in_step
 
     def _take_field_sets(self) -> list[Any]:
@@ -177,6 +179,7 @@ class Session:
 
 current: "Session | None" = None
 """The session of the process's one robot; devices made by name belong to it."""
+
 
 def exit_process(status: int) -> NoReturn:
     """Ends the process as C `exit` ends it: no exception, no `finally`, no atexit, no flush."""

@@ -1,5 +1,7 @@
 """The supervisor: a robot that may look at the whole world and change it."""
 
+# ruff: noqa: N802 - the names are those of Webots
+
 from typing import Any
 
 from .arguments import integer, number, text
@@ -115,6 +117,7 @@ class Supervisor(Robot):
         if not 0 <= integer(id) <= 99:
             say(f"Error: wb_supervisor_set_label(): id {id} is not between 0 and 99.")
             return
+        number(transparency)
+        text(font)
         place = (number(x), number(y), number(size))
-        number(transparency), text(font)
         self._session.ask("set_label", id, text(label), *place, integer(color))

@@ -1,0 +1,81 @@
+"""Runs a world in the foreground: `python -m webots_mcp.standin WORLD`."""
+
+import argparse
+import signal
+import sys
+import threading
+from collections.abc import Sequence
+
+from webots_mcp.standin import Simulation, StandInError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs until the time is over, a supervisor quits, or Ctrl-C or SIGTERM arrives.
+
+    Returns:
+        The exit status: that of `simulationQuit`, 0 otherwise, 2 for a world that cannot be used.
+    """
+    options = _parser().parse_args(arguments)
+    stopped = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.set())
+    try:
+        simulation = Simulation(
+            options.world,
+            mode=options.mode,
+            console=_show,
+            controllers=dict(options.robot),
+        )
+    except StandInError as error:
+        print(f"webots_mcp.standin: {error}", file=sys.stderr)  # noqa: T201 - a command
+        return 2
+    with simulation:
+        _wait(simulation, stopped, options.duration)
+        status = simulation.exit_status
+    return status or 0
+
+
+def _wait(simulation: Simulation, stopped: threading.Event, duration_s: float | None) -> None:
+    def is_over() -> bool:
+        timed_out = duration_s is not None and simulation.time_s >= duration_s
+        return timed_out or stopped.is_set() or not simulation.is_running
+
+    simulation.wait_for(is_over, timeout_s=float("inf"))
+
+
+def _show(line: str) -> None:
+    print(line, flush=True)  # noqa: T201 - the console
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m webots_mcp.standin",
+        description="Runs a world on a small stand-in for Webots, with its controllers.",
+    )
+    parser.add_argument("world", help="a .wbt file, best in a project: worlds/ beside controllers/")
+    parser.add_argument(
+        "--mode", choices=("pause", "realtime", "fast"), default="realtime", help="as for Webots"
+    )
+    parser.add_argument(
+        "--duration", type=float, metavar="S", help="end after so many seconds of simulated time"
+    )
+    parser.add_argument(
+        "--robot",
+        type=_robot,
+        action="append",
+        default=[],
+        metavar="NAME=FILE",
+        help="run this file as the controller of a robot, instead of what the world says",
+    )
+    return parser
+
+
+def _robot(text: str) -> tuple[str, str]:
+    name, equals, file = text.partition("=")
+    if not (name and equals and file):
+        raise argparse.ArgumentTypeError(f"{text!r} is not NAME=FILE")
+    return name, file
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""Controllers as real processes, in the stand-in's arena or on their own."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.bridge.conftest import Recording
+from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.standin import Simulation
+from webots_mcp.standin.in_process import DEFAULT_WORLD
+
+Start = Callable[..., Simulation]
+
+CONTROLLER = """
+import sys
+from controller import Supervisor
+from webots_mcp import MCPBridge
+
+robot = Supervisor()
+bridge = MCPBridge(robot, throttle_interval=1)
+"""
+
+
+@pytest.fixture
+def data_dir(tmp_path: Path) -> Path:
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def filed(data_dir: Path) -> Recording:
+    return Recording(data_dir / DATABASE_NAME)
+
+
+@pytest.fixture
+def start(tmp_path: Path, data_dir: Path) -> Iterator[Start]:
+    """Start the arena with a controller whose text follows on `CONTROLLER`."""
+    running: list[Simulation] = []
+
+    def run(loop: str, mode: str = "fast") -> Simulation:
+        controller = tmp_path / "rover.py"
+        controller.write_text(CONTROLLER + loop)
+        simulation = Simulation(
+            DEFAULT_WORLD,
+            mode=mode,
+            controllers={"rover": controller},
+            environment={"WEBOTS_MCP_DATA_DIR": str(data_dir)},
+        )
+        running.append(simulation.start())
+        return simulation
+
+    yield run
+    for simulation in running:
+        simulation.close()
+
+
+@pytest.fixture
+def script(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
+    """Start a Python program of its own."""
+
+    def run(program: str, *arguments: object) -> subprocess.Popen[str]:
+        file = tmp_path / "program.py"
+        file.write_text(program)
+        return subprocess.Popen(
+            [sys.executable, str(file), *map(str, arguments)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    return run
+
+
+def last_number(simulation: Simulation) -> int:
+    """The newest number that a controller printed; -1 before the first."""
+    words = [line.split()[-1] for line in reversed(simulation.console)]
+    return next((int(word) for word in words if word.isdigit()), -1)

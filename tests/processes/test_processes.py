@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -111,7 +112,7 @@ def test_pause_step_resume_and_reset_work_on_a_real_controller(
     simulation = start(COUNTING, mode="realtime")
     simulation.wait_for(lambda: last_number(simulation) >= 3, timeout_s=30)
 
-    def run(action: str, **params: object) -> dict[str, object]:
+    def run(action: str, **params: Any) -> dict[str, object]:
         sent = filed.send(action, **params)
         simulation.wait_for(lambda: filed.fate(sent)[0] in ("done", "failed"), timeout_s=15)
         status, result, error = filed.fate(sent)

@@ -59,7 +59,11 @@ def step_over(simulator: Simulator, robot: Robot) -> Message:
 
 
 def _step(
-    simulator: Simulator, robot: Robot, duration_ms: int, changes: list[Any], field_sets: list[FieldSet]
+    simulator: Simulator,
+    robot: Robot,
+    duration_ms: int,
+    changes: list[Any],
+    field_sets: list[FieldSet],
 ) -> Message | None:
     for tag, setting, value in changes:
         if tag == CUSTOM_DATA_TAG:

@@ -154,13 +154,14 @@ class Controller:
 
     def end(self) -> None:
         """Ends the process by force, if it is still there."""
-        if self.process and self.is_running:
-            if self._was_told:
-                self.launch.print_line(
-                    f"WARNING: {self.name}: Forced termination (because process didn't terminate "
-                    "itself after 1 second)."
-                )
-            self.process.end()
+        if self.process is None:
+            return
+        if self.is_running and self._was_told:
+            self.launch.print_line(
+                f"WARNING: {self.name}: Forced termination (because process didn't terminate "
+                "itself after 1 second)."
+            )
+        self.process.end()
 
     def _exited(self, process: ControllerProcess) -> None:
         if process.exit_code == 0:

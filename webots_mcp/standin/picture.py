@@ -99,8 +99,8 @@ def _draw_floor(pen: "ImageDraw", chart: Chart, arena: Arena) -> None:
 def _draw_body(pen: "ImageDraw", chart: Chart, body: Body) -> None:
     for shape in body.shapes:
         _draw_shape(pen, chart, shape)
-    if body.node.type_name == "Robot":
-        radius = max(body.footprint.radius_m, 0.05)
+    radius = body.footprint.radius_m
+    if body.node.type_name == "Robot" and radius:
         x, y = body.centre()
         nose = (x + radius * cos(body.yaw_rad) * 1.6, y + radius * sin(body.yaw_rad) * 1.6)
         pen.line((*chart.at(x, y), *chart.at(*nose)), fill=(220, 30, 30), width=4)

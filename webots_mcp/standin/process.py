@@ -52,7 +52,8 @@ class ControllerProcess:
 
     def end(self) -> None:
         """Terminates the process, the hard way if need be, and waits until it is gone."""
-        self._process.terminate()
+        if self.exit_code is None:
+            self._process.terminate()
         try:
             self._process.wait(_TERMINATION_S)
         except subprocess.TimeoutExpired:

@@ -7,7 +7,7 @@ import socket
 import time
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -72,12 +72,18 @@ class Runner:
         self._steps_asked = 0
         self._due_s = 0.0
         self._ending = False
+        self._over = False
+        self._selector: selectors.BaseSelector
+        self._bell_rope: socket.socket
+
+    def open(self) -> int:
+        """Opens the door for controllers; returns its port."""
         self._selector = selectors.DefaultSelector()
-        self._door = socket.create_server(("127.0.0.1", 0))
-        self.port: int = self._door.getsockname()[1]
-        self._bell, self._bell_rope = socket.socketpair()
-        self._selector.register(self._door, selectors.EVENT_READ, self._welcome)
-        self._selector.register(self._bell, selectors.EVENT_READ, self._answer_bell)
+        door = socket.create_server(("127.0.0.1", 0))
+        bell, self._bell_rope = socket.socketpair()
+        self._selector.register(door, selectors.EVENT_READ, self._welcome)
+        self._selector.register(bell, selectors.EVENT_READ, _hush)
+        return door.getsockname()[1]
 
     # From other threads --------------------------------------------------------------------------
 
@@ -90,11 +96,12 @@ class Runner:
         future: Future[Any] = Future()
         self._calls.append((function, future))
         self.wake()
-        if self.exit_status is not None:
+        if self._over:
             self._cancel_calls()
-        if future.cancelled():
-            raise StandInError("the simulation has ended")
-        return future.result()
+        try:
+            return future.result()
+        except CancelledError:
+            raise StandInError("the simulation has ended") from None
 
     def wake(self) -> None:
         """Lets the loop look around, if it waits."""
@@ -110,6 +117,8 @@ class Runner:
                 self._start_controllers()
             while self.exit_status is None:
                 self._listen(self._patience_s())
+                self._answer_calls()
+                self._carry_out_wanted()
                 if self._may_advance():
                     self._advance()
         finally:
@@ -154,13 +163,12 @@ class Runner:
         while not condition() and (left_s := deadline_s - time.monotonic()) > 0.0:
             self._listen(left_s)
 
-    def _answer_bell(self, bell: socket.socket) -> None:
-        bell.recv(1024)
-        while self._calls and not self._ending:
+    def _answer_calls(self) -> None:
+        while self._calls:
             function, future = self._calls.popleft()
             try:
                 future.set_result(function())
-            except StandInError as error:
+            except Exception as error:  # noqa: BLE001 - it is the caller's
                 future.set_exception(error)
 
     # Controllers ---------------------------------------------------------------------------------
@@ -203,7 +211,6 @@ class Runner:
         if reply:
             connection.send(reply)
         if message[0] == "ask":
-            self._carry_out_wanted()
             self._notify()
 
     def _forget(self, connection: Connection) -> None:
@@ -295,11 +302,16 @@ class Runner:
         for key in [*self._selector.get_map().values()]:
             key.fileobj.close()  # type: ignore[union-attr]
         self._selector.close()
+        self._over = True
         self._bell_rope.close()
         self._cancel_calls()
         self._notify()
 
     def _cancel_calls(self) -> None:
-        while self._calls:
-            with suppress(IndexError):
+        with suppress(IndexError):  # both threads may get here at once
+            while self._calls:
                 self._calls.popleft()[1].cancel()
+
+
+def _hush(bell: socket.socket) -> None:
+    bell.recv(1024)

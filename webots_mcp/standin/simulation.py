@@ -8,6 +8,7 @@ import time
 import weakref
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import TypeVar
@@ -91,16 +92,16 @@ class Simulation:
 
     def start(self) -> "Simulation":
         """Starts the controllers and, unless it is to be paused, time."""
-        address = self._instance / ADDRESS_FILE
-        address.touch(mode=0o600)
-        address.write_text(f"{self._runner.port} {self._runner.token}", encoding="utf-8")
+        address = self._instance / ADDRESS_FILE  # the folder is this user's alone
+        address.write_text(f"{self._runner.open()} {self._runner.token}", encoding="utf-8")
         self._thread.start()
         return self
 
     def close(self) -> None:
         """Quits, if that has not happened yet, and waits until all processes are gone."""
-        if self._thread.is_alive() and self.is_running:
-            self.quit()
+        if self._thread.is_alive():
+            with suppress(StandInError):  # somebody else has quit meanwhile
+                self.quit()
         if self._thread.ident is not None:
             self._thread.join()
         self._clean_up()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Final
 
 import sqlalchemy
@@ -13,7 +12,7 @@ from alembic import command
 from alembic.config import Config
 from sqlalchemy.pool import StaticPool
 
-import webots_mcp
+from webots_mcp.bundled import bundled
 from webots_mcp.connection import connect
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.schema import schema_version
@@ -63,7 +62,7 @@ def _alembic(database: Database) -> Iterator[tuple[Config, sqlite3.Connection]]:
     try:
         with engine.connect() as bound:
             config = Config()
-            config.set_main_option("script_location", str(migrations_folder()).replace("%", "%%"))
+            config.set_main_option("script_location", str(bundled("migrations")).replace("%", "%%"))
             config.attributes["connection"] = bound
             yield config, connection
     finally:
@@ -73,13 +72,6 @@ def _alembic(database: Database) -> Iterator[tuple[Config, sqlite3.Connection]]:
 
 def _begin_immediate(connection: sqlalchemy.Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE")
-
-
-def migrations_folder() -> Path:
-    """The migrations: inside the package in a wheel, beside it in a checkout."""
-    package = Path(webots_mcp.__file__).parent
-    inside = package / "migrations"
-    return inside if inside.is_dir() else package.parent / "migrations"
 
 
 def dump_schema() -> str:

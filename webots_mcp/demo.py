@@ -1,0 +1,173 @@
+"""The main job from end to end, with nothing installed but this package.
+
+A robot drives in the stand-in's arena (a real controller process that records into a real
+database), an MCP server runs beside it, and a real MCP client asks over stdio.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shlex
+import sys
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any, Final
+
+import anyio
+from mcp import Client, StdioServerParameters
+from mcp.types import CallToolResult, ImageContent, TextContent
+
+from webots_mcp.bundled import bundled
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.standin import Simulation
+
+DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
+_ROBOT: Final = "rover"
+_START_TIMEOUT_S: Final = 30.0
+_ANSWER_CHARACTERS: Final = 420
+
+# What a person would say, and the tool call that an assistant makes of it.
+CONVERSATION: Final[tuple[tuple[str, str, dict[str, Any]], ...]] = (
+    ("What is the robot doing?", "webots_get_robot_state", {}),
+    ("What do its sensors say?", "webots_get_sensors", {}),
+    ("What does it see?", "webots_get_camera", {}),
+    ("Drive faster.", "webots_send_command", {"action": "set_speed", "params": {"speed": 6.0}}),
+    ("Pause.", "webots_simulation_control", {"command": "pause"}),
+    ("Five steps.", "webots_simulation_control", {"command": "step", "steps": 5}),
+    ("Go on.", "webots_simulation_control", {"command": "resume"}),
+    ("Show me the arena.", "webots_take_screenshot", {}),
+    ("Watch it for five seconds.", "webots_monitor", {"duration_s": 5}),
+    ("Start over.", "webots_simulation_control", {"command": "reset"}),
+)
+
+
+def run(data_dir: Path = DEFAULT_DATA_DIR, *, keep: bool = False) -> None:
+    """Run the demo; prints each question with its answer.
+
+    Args:
+        data_dir: Where the database and the pictures go.
+        keep: Leave the robot running until Ctrl-C, so that another client can connect.
+
+    Raises:
+        NothingRecordedError: The controller did not come up.
+    """
+    world = bundled("examples") / "worlds" / "arena.wbt"
+    _say(f"Starting {world.name} on the stand-in simulator (this is not Webots) ...")
+    with Simulation(world, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
+        _wait_for_rows(simulation, data_dir)
+        anyio.run(_converse, data_dir)
+        _tell_where(data_dir)
+        if keep:
+            _keep(simulation, data_dir)
+
+
+def _wait_for_rows(simulation: Simulation, data_dir: Path) -> None:
+    """Until the controller that was just started has published and saved a picture."""
+    before = _newest_image(data_dir)
+    try:
+        simulation.wait_for(lambda: _newest_image(data_dir) > before, _START_TIMEOUT_S)
+    except TimeoutError as error:
+        raise NothingRecordedError(f"the demo's controller recorded nothing: {error}") from error
+
+
+def _newest_image(data_dir: Path) -> int:
+    database = data_dir / DATABASE_NAME
+    if not database.exists():
+        return 0
+    with contextlib.closing(connect(database, "reader")) as connection:
+        tables = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'image'").fetchone()
+        sql = "SELECT coalesce(max(id), 0) FROM image WHERE kind = 'camera'"
+        return int(connection.execute(sql).fetchone()[0]) if tables else 0
+
+
+async def _converse(data_dir: Path) -> None:
+    async with _client(data_dir) as client:
+        for question, tool, arguments in CONVERSATION:
+            _say(f"\n> {question}\n  {tool}({_compact(arguments) if arguments else ''})")
+            started_s = time.monotonic()
+            result = await client.call_tool(tool, arguments, progress_callback=_show_progress)
+            _clear_progress()
+            _show(result, time.monotonic() - started_s)
+
+
+@contextlib.asynccontextmanager
+async def _client(data_dir: Path) -> AsyncIterator[Client]:
+    """A client on a server of its own; the server's log stays out of the conversation."""
+    server = StdioServerParameters(
+        command=sys.executable,
+        args=["-m", "webots_mcp", "serve", "--data-dir", str(data_dir)],
+        env=dict(os.environ),
+    )
+    async with Client(server) as client:
+        yield client
+
+
+async def _show_progress(progress: float, total: float | None, message: str | None) -> None:
+    if sys.stdout.isatty():
+        print(f"\r  {message or progress}", end="\x1b[K", flush=True)
+
+
+def _clear_progress() -> None:
+    if sys.stdout.isatty():
+        print("\r\x1b[K", end="", flush=True)
+
+
+def _show(result: CallToolResult, duration_s: float) -> None:
+    """The answer as the assistant reads it: the structured content, else text and pictures."""
+    if result.structured_content is not None and not result.is_error:
+        _say(f"  {_cut(_compact(result.structured_content))}")
+    else:
+        for block in result.content:
+            if isinstance(block, TextContent):
+                _say(f"  {_cut(block.text)}")
+            elif isinstance(block, ImageContent):
+                _say(f"  [{block.mime_type}, {len(block.data) * 3 // 4} bytes]")
+    _say(f"  ({duration_s:.2f} s)")
+    if result.is_error:
+        raise NothingRecordedError("the demo's server answered with an error, see above")
+
+
+def _compact(value: object) -> str:
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _cut(text: str) -> str:
+    """The beginning of a long answer, and how long it is."""
+    if len(text) <= _ANSWER_CHARACTERS:
+        return text
+    return f"{text[:_ANSWER_CHARACTERS]} ... ({len(text)} characters)"
+
+
+def _tell_where(data_dir: Path) -> None:
+    database = shlex.quote(str(data_dir / DATABASE_NAME))
+    _say(f"\nThe database: {database}\nThree questions for the sqlite3 shell:")
+    for sql in (
+        "SELECT sim_time_s, data ->> '$.mode' FROM state ORDER BY id DESC LIMIT 5",
+        "SELECT action, status, result FROM command ORDER BY id DESC LIMIT 5",
+        "SELECT id, start_reason, rows, end_reason FROM run",
+    ):
+        _say(f'  sqlite3 {database} "{sql}"')
+
+
+def _keep(simulation: Simulation, data_dir: Path) -> None:
+    command = shlex.join([_server_command(), "serve", "--data-dir", str(data_dir)])
+    _say("\nThe robot keeps running until Ctrl-C. Connect Claude Code from another terminal:")
+    _say(f"  claude mcp add webots -- {command}")
+    with contextlib.suppress(KeyboardInterrupt):
+        while simulation.is_running:
+            time.sleep(0.2)
+
+
+def _server_command() -> str:
+    """The console script of this environment, wherever the client is started."""
+    script = Path(sys.executable).with_name("webots-mcp")
+    return str(script) if script.exists() else "webots-mcp"
+
+
+def _say(text: str) -> None:
+    print(text, flush=True)

@@ -160,6 +160,11 @@ def test_an_object_that_fails_while_it_is_read_costs_itself(
     assert recording.states() == [{"x": 1, "broken": None}]
 
 
+def test_a_dataclass_may_be_the_whole_state(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.publish(Pose(1.0, 2.0))  # type: ignore[arg-type]
+    assert recording.states() == [{"x": 1.0, "y": 2.0}]
+
+
 def test_a_state_that_is_no_dict_is_counted_and_does_not_stop_the_loop(
     robot: InProcessSupervisor, database: MemoryDatabase, capfd: pytest.CaptureFixture[str]
 ) -> None:

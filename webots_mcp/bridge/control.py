@@ -13,6 +13,7 @@ from webots_mcp.bridge.actions import Actions, Progress
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.commands import Command, CommandQueue, is_busy
 from webots_mcp.bridge.hold import PUMP_INTERVAL_S, Hold
+from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Simulation
@@ -33,6 +34,7 @@ class Control:
         simulation: Simulation,
         recorder: Recorder,
         clock: Clock,
+        journal: Journal,
         album: Album,
         call_back: Callable[[], int],
     ) -> None:
@@ -40,7 +42,7 @@ class Control:
         self._recorder = recorder
         self._clock = clock
         self._queue = CommandQueue(recorder)
-        self._hold = Hold(simulation, recorder, clock)
+        self._hold = Hold(simulation, journal)
         self.actions = Actions(simulation, self._queue, self._hold, clock, album, call_back)
         self._handlers: dict[str, Handler] = {}
         self._under_way: dict[Command, Progress] = {}

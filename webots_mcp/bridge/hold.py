@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import time
-from typing import Any, Final
+from typing import Final
 
-from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.commands import Command
-from webots_mcp.bridge.recorder import INSERT_EVENT, Recorder
+from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Simulation
 
 PUMP_INTERVAL_S: Final = 0.01
@@ -21,10 +18,9 @@ class Hold:
     `get_command()`, pumps `step(0)`, and goes on serving commands there.
     """
 
-    def __init__(self, simulation: Simulation, recorder: Recorder, clock: Clock) -> None:
+    def __init__(self, simulation: Simulation, journal: Journal) -> None:
         self._simulation = simulation
-        self._recorder = recorder
-        self._clock = clock
+        self._journal = journal
         self._mode_before = "real_time"
         self.held = False
 
@@ -35,7 +31,7 @@ class Hold:
         self._mode_before = self._simulation.mode_name
         self._simulation.set_mode("pause")
         self.held = True
-        self._note("pause", {"command_id": command.id})
+        self._journal.event("pause", {"command_id": command.id})
 
     def release(self, command: Command, mode: str | None = None) -> None:
         """Let the loop go on, in `mode` or in the one that it ran in before."""
@@ -43,7 +39,7 @@ class Hold:
         self._simulation.set_mode(mode or ("fast" if before == "fast" else "real_time"))
         if self.held:
             self.held = False
-            self._note("resume", {"command_id": command.id})
+            self._journal.event("resume", {"command_id": command.id})
 
     def pump(self) -> None:
         """Hear from Webots: it may want to quit, or a person may have pressed play."""
@@ -51,8 +47,4 @@ class Hold:
             self.held = False
         elif not self._simulation.paused:
             self.held = False
-            self._note("resume", {"by": "a person or another controller, in Webots"})
-
-    def _note(self, kind: str, data: dict[str, Any]) -> None:
-        row = (self._clock.sim_time_s, time.time(), kind, None, json.dumps(data))
-        self._recorder.record(INSERT_EVENT, self._clock.run, row)
+            self._journal.event("resume", {"by": "a person or another controller, in Webots"})

@@ -17,15 +17,9 @@ from webots_mcp.bridge.control import Control, Handler
 from webots_mcp.bridge.devices import read_devices
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.identity import identify
+from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
-from webots_mcp.bridge.recorder import (
-    END_RUN,
-    INSERT_EVENT,
-    INSERT_LOG,
-    INSERT_STATE,
-    Pulse,
-    Recorder,
-)
+from webots_mcp.bridge.recorder import END_RUN, Pulse, Recorder
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.contract import (
     HEARTBEAT_INTERVAL_S,
@@ -37,8 +31,6 @@ from webots_mcp.contract import (
 from webots_mcp.maintenance import Maintainer
 
 LEVELS: Final = ("debug", "info", "warning", "error")
-NOT_FINITE: Final = ("nan", "inf", "-inf")
-_MOST_LOST_PATHS: Final = 20
 _CALM_S: Final = 0.5  # a loop that recorded nothing for so long stands still
 
 
@@ -190,7 +182,7 @@ class MCPBridge:
                 known = ", ".join(LEVELS)
                 self._recorder.complain("level", f"log level {level!r} is none of {known}")
                 level = "info"
-            self._write_log(level, "controller", str(message))
+            self._journal.log(level, "controller", str(message))
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("log", error)
 
@@ -268,7 +260,7 @@ class MCPBridge:
             rows_dropped=recorder.rows_dropped,
             publish_calls=self._publish_calls,
             publish_throttled=self._publish_throttled,
-            values_replaced=self._values_replaced,
+            values_replaced=self._journal.values_replaced,
             publish_mean_us=1e6 * self._publish_s / max(1, self._published),
             publish_max_us=1e6 * self._publish_max_s,
             failures=self._failures,
@@ -315,8 +307,14 @@ class MCPBridge:
             self.database, self._identity, self._clock.run, strict=self._strict
         )
         self._album = Album(self._recorder, self._clock, self.data_dir)
+        self._journal = Journal(self._recorder, self._clock)
         self._control = Control(
-            self._simulation, self._recorder, self._clock, self._album, self._call_back
+            self._simulation,
+            self._recorder,
+            self._clock,
+            self._journal,
+            self._album,
+            self._call_back,
         )
         self._maintainer = self._start_maintainer()
 
@@ -338,10 +336,9 @@ class MCPBridge:
         self._closed = False
         self._callbacks: list[Callable[[], object]] = []
         self._changes = Changes()
-        self._lost: set[str] = set()
         self._publish_calls = self._publish_throttled = self._published = 0
         self._publish_s = self._publish_max_s = 0.0
-        self._values_replaced = self._failures = 0
+        self._failures = 0
         self._last_poll_wall_s: float | None = None
         self._next_beat_s = 0.0
         registration = self._recorder.registration
@@ -352,7 +349,7 @@ class MCPBridge:
     def _enter_first_run(self, reason: str) -> None:
         run, now = self._clock.run, time.time()
         run.start_reason = reason
-        self._note(reason, None, None)
+        self._journal.event(reason)
         registration = self._recorder.registration
         if registration is not None:
             values = (now, self._clock.sim_time_s, registration.robot_id)
@@ -367,7 +364,7 @@ class MCPBridge:
         self._recorder.run = run
         self._changes.forget()
         self._reload_undetected = self._reload_unfired = True
-        self._note("reset", None, None)
+        self._journal.event("reset")
         self._fire_reload()
         self._beat()
 
@@ -376,35 +373,12 @@ class MCPBridge:
         encoded = encode(state)
         if not encoded.text.startswith("{"):
             raise TypeError(f"publish() takes a dict, got {type(state).__name__}: {state!r:.80}")
-        run = self._clock.run
-        run.rows += 1
-        at = (self._clock.sim_time_s, time.time())
-        self._recorder.record(INSERT_STATE, run, (*at, encoded.text, encoded.odd_text))
-        if encoded.odd:
-            self._count_replaced(encoded.odd)
-        for name, before, after in self._changes.look(state):
-            self._note("change", name, {"from": before, "to": after})
+        self._journal.state(encoded)
+        if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
+            for name, before, after in self._changes.look(state):
+                self._journal.event("change", {"from": before, "to": after}, name)
         if time.monotonic() >= self._next_beat_s:
             self._beat()
-
-    def _count_replaced(self, odd: dict[str, str]) -> None:
-        """NaN and infinity are everyday; a value that was lost is said once a path."""
-        self._values_replaced += len(odd)
-        for path, kind in odd.items():
-            if kind in NOT_FINITE or path in self._lost or len(self._lost) >= _MOST_LOST_PATHS:
-                continue
-            self._lost.add(path)
-            self._write_log("warning", "bridge", f"{path or 'state'} could not be stored: {kind}")
-
-    def _write_log(self, level: str, source: str, message: str) -> None:
-        text = message.encode("utf-8", "replace").decode().replace("\0", "\\0")
-        row = (self._clock.sim_time_s, time.time(), level, source, text)
-        self._recorder.record(INSERT_LOG, self._clock.run, row)
-
-    def _note(self, kind: str, name: str | None, data: dict[str, object] | None) -> None:
-        text = encode(data).text if data is not None else None
-        row = (self._clock.sim_time_s, time.time(), kind, name, text)
-        self._recorder.record(INSERT_EVENT, self._clock.run, row)
 
     def _beat(self) -> None:
         """Say that the loop is alive, and what it can see of time."""

@@ -21,31 +21,24 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.bridge.identity import Identity
-from webots_mcp.bridge.registration import Registration, deregister, register
-from webots_mcp.connection import connect, journal_mode, never_wait
-from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION, Database, MemoryDatabase
+from webots_mcp.bridge.opening import is_damage, is_ours, open_session
+from webots_mcp.bridge.registration import Registration, deregister
+from webots_mcp.connection import journal_mode
+from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import (
     DatabaseError,
     ForeignDatabaseError,
     SchemaTooNewError,
     SchemaTooOldError,
 )
-from webots_mcp.schema import create_schema, require_current, schema_version
 
 MAX_WAITING_ROWS: Final = 10_000
 MAX_WAITING_BYTES: Final = 16_000_000
 _ROWS_PER_FLUSH: Final = 500  # about 5 ms: a loop that catches up must not stall over it
 _RETRY_INTERVAL_S: Final = 1.0
 
-_SQLITE_HEADER: Final = b"SQLite format 3\0"
-_DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
-
 INSERT_STATE: Final = (
     "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, odd) VALUES (?, ?, ?, ?, ?)"
-)
-INSERT_LOG: Final = (
-    "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
-    "VALUES (?, ?, ?, ?, ?, ?)"
 )
 INSERT_EVENT: Final = (
     "INSERT INTO event (run_id, sim_time_s, wall_time_s, kind, name, data) "
@@ -294,7 +287,7 @@ class Recorder:
         if "locked" in text:
             return  # another writer, this instant: the next call tries again
         self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
-        if _is_damage(text):
+        if is_damage(text):
             self._move_aside(text)
         elif "no such table" in text or "FOREIGN KEY" in text:
             self._start_over(f"the database lost this session ({text})")
@@ -366,33 +359,18 @@ class Recorder:
             self.complain("off", f"not recording into {self._database}: {error}")
         except (DatabaseError, sqlite3.Error, OSError) as error:
             self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
-            if _is_damage(str(error)):
+            if is_damage(str(error)):
                 return self._replace_damaged(str(error))
             if "locked" not in str(error):
                 self.complain(f"open {type(error).__name__}", f"not recording yet: {error}")
         return self.connection is not None
 
     def _enter(self, patient: bool) -> None:
-        connection = connect(self._database, "loop", create=True, patient=patient)
-        try:
-            self._prepare(connection, patient)
-            actions = json.dumps(self.actions, ensure_ascii=False)
-            self.registration = register(connection, self._identity, actions, time.time())
-            never_wait(connection)
-        except BaseException:
-            connection.close()
-            raise
-        self.connection = connection
+        actions = json.dumps(self.actions, ensure_ascii=False)
+        opened = open_session(self._database, self._identity, actions, patient=patient)
+        self.connection, self.registration = opened
         self._file = self._identify_file()
-
-    def _prepare(self, connection: sqlite3.Connection, patient: bool) -> None:
-        version = schema_version(connection)
-        if version == 0:
-            create_schema(connection)
-        elif version < SCHEMA_VERSION and patient:
-            _migrate(self._database)
-        require_current(connection)
-        mode = journal_mode(connection)
+        mode = journal_mode(self.connection)
         if mode not in ("wal", "memory"):
             self.complain(
                 "journal",
@@ -402,21 +380,12 @@ class Recorder:
 
     def _replace_damaged(self, why: str) -> bool:
         """A damaged database, or a file of our name, is moved aside; any other file is not ours."""
-        if self._is_ours():
+        if is_ours(self._database):
             self._move_aside(why)
             return self.connection is None and self._retry_at_s == 0 and self._open(patient=False)
         self._off = why
         self.complain("off", f"not recording into {self._database}: {why}; choose another file")
         return False
-
-    def _is_ours(self) -> bool:
-        assert isinstance(self._database, Path)
-        with self._database.open("rb") as file:
-            return self._database.name == DATABASE_NAME or file.read(16) == _SQLITE_HEADER
-
-
-def _is_damage(text: str) -> bool:
-    return any(sign in text for sign in _DAMAGE)
 
 
 def _weight(row: _Row) -> int:
@@ -427,13 +396,3 @@ def _weight(row: _Row) -> int:
 def _roll_back(connection: sqlite3.Connection) -> None:
     if connection.in_transaction:
         connection.execute("ROLLBACK")
-
-
-def _migrate(database: Database) -> None:
-    """Bring an older schema forward in a process of its own: Alembic takes a second to import."""
-    if isinstance(database, MemoryDatabase):
-        return
-    import subprocess  # only here: it would be a tenth of the bridge's import time
-
-    line = [sys.executable, "-m", "webots_mcp", "migrate", "--database", str(database)]
-    subprocess.run(line, check=False, capture_output=True, timeout=60, stdin=subprocess.DEVNULL)

@@ -1,0 +1,54 @@
+"""Who may import whom, and what the public surface is."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import webots_mcp
+
+PACKAGE = Path(webots_mcp.__file__).parent
+
+# Part of the package: the parts that it may import. Everything below the line of `connection` is
+# standard library only, because it runs inside a robot's controller.
+ALLOWED = {
+    "contract": set[str](),
+    "errors": set[str](),
+    "bundled": set[str](),
+    "connection": {"contract", "errors"},
+    "schema": {"contract", "errors"},
+    "settlement": {"contract"},
+    "maintenance": {"connection", "errors", "schema"},
+    "standin": {"standin", "bundled"},
+}
+STDLIB = {"contract", "errors", "bundled", *ALLOWED["maintenance"], "settlement", "maintenance"}
+ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
+ALLOWED["store"] = STDLIB | {"store"}
+ALLOWED["server"] = STDLIB | {"store", "server", "__version__"}
+
+
+def imports(file: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(file.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module == "webots_mcp":
+            yield from (f"webots_mcp.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+
+
+@pytest.mark.parametrize("part", ALLOWED)
+def test_each_part_imports_only_what_stands_below_it(part: str) -> None:
+    files = [PACKAGE / f"{part}.py"] if (PACKAGE / f"{part}.py").exists() else []
+    files += (PACKAGE / part).rglob("*.py")
+    assert files
+    for file in files:
+        ours = {name.split(".")[1] for name in imports(file) if name.startswith("webots_mcp.")}
+        assert ours <= ALLOWED[part], f"{file.name} imports {ours - ALLOWED[part]}"
+
+
+def test_the_public_surface_is_exactly_this() -> None:
+    assert webots_mcp.__all__ == ["BridgeStats", "MCPBridge", "MemoryDatabase", "__version__"]

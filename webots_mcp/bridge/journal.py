@@ -1,0 +1,59 @@
+"""The rows of the current run: states, logs, events."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.encoding import Encoded, encode
+from webots_mcp.bridge.recorder import INSERT_EVENT, INSERT_STATE, Recorder
+
+NOT_FINITE: Final = ("nan", "inf", "-inf")
+_MOST_LOST_PATHS: Final = 20
+_INSERT_LOG: Final = (
+    "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
+    "VALUES (?, ?, ?, ?, ?, ?)"
+)
+
+
+class Journal:
+    """Stamps what is recorded with the run, simulation time and wall time of this moment."""
+
+    def __init__(self, recorder: Recorder, clock: Clock) -> None:
+        self._recorder = recorder
+        self._clock = clock
+        self._lost: set[str] = set()
+        self.values_replaced = 0
+
+    def state(self, encoded: Encoded) -> None:
+        """Record a published state."""
+        clock = self._clock
+        clock.run.rows += 1
+        row = (clock.sim_time_s, time.time(), encoded.text, encoded.odd_text)
+        self._recorder.record(INSERT_STATE, clock.run, row)
+        if encoded.odd:
+            self._count_replaced(encoded.odd)
+
+    def log(self, level: str, source: str, message: str) -> None:
+        """Record a line; SQLite's shell would end it at a NUL, and no encoding has surrogates."""
+        text = message.encode("utf-8", "replace").decode().replace("\0", "\\0")
+        row = (self._clock.sim_time_s, time.time(), level, source, text)
+        self._recorder.record(_INSERT_LOG, self._clock.run, row)
+
+    def event(
+        self, kind: str, data: dict[str, object] | None = None, name: str | None = None
+    ) -> None:
+        """Record something that was noticed now."""
+        text = encode(data).text if data is not None else None
+        row = (self._clock.sim_time_s, time.time(), kind, name, text)
+        self._recorder.record(INSERT_EVENT, self._clock.run, row)
+
+    def _count_replaced(self, odd: dict[str, str]) -> None:
+        """NaN and infinity are everyday; a value that was lost is said once a path."""
+        self.values_replaced += len(odd)
+        for path, kind in odd.items():
+            if kind in NOT_FINITE or path in self._lost or len(self._lost) >= _MOST_LOST_PATHS:
+                continue
+            self._lost.add(path)
+            self.log("warning", "bridge", f"{path or 'state'} could not be stored: {kind}")

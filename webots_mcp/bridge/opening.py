@@ -1,0 +1,77 @@
+"""Opening the database of a controller: making it, bringing it forward, entering a session."""
+
+from __future__ import annotations
+
+import sqlite3
+import sys
+import time
+from typing import Final
+
+from webots_mcp.bridge.identity import Identity
+from webots_mcp.bridge.registration import Registration, register
+from webots_mcp.connection import connect, never_wait
+from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION, Database, MemoryDatabase
+from webots_mcp.schema import create_schema, require_current, schema_version
+
+_SQLITE_HEADER: Final = b"SQLite format 3\0"
+_DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
+
+
+def open_session(
+    database: Database, identity: Identity, actions: str, *, patient: bool
+) -> tuple[sqlite3.Connection, Registration]:
+    """Open or make the database, and enter a session of this process.
+
+    Args:
+        database: Where to record.
+        identity: Who records.
+        actions: The registered custom actions as JSON text.
+        patient: Wait for locks and migrate an older schema: at the start, not in the loop.
+
+    Returns:
+        A connection that never waits for a lock, and the ids to record under.
+
+    Raises:
+        DatabaseError, sqlite3.Error, OSError: It cannot be used, at least now.
+    """
+    connection = connect(database, "loop", create=True, patient=patient)
+    try:
+        _prepare(connection, database, patient)
+        registration = register(connection, identity, actions, time.time())
+        never_wait(connection)
+    except BaseException:
+        connection.close()
+        raise
+    return connection, registration
+
+
+def _prepare(connection: sqlite3.Connection, database: Database, patient: bool) -> None:
+    version = schema_version(connection)
+    if version == 0:
+        create_schema(connection)
+    elif version < SCHEMA_VERSION and patient:
+        _migrate(database)
+    require_current(connection)
+
+
+def _migrate(database: Database) -> None:
+    """Bring an older schema forward in a process of its own: Alembic takes a second to import."""
+    if isinstance(database, MemoryDatabase):
+        return
+    import subprocess  # only here: it would be a tenth of the bridge's import time
+
+    line = [sys.executable, "-m", "webots_mcp", "migrate", "--database", str(database)]
+    subprocess.run(line, check=False, capture_output=True, timeout=60, stdin=subprocess.DEVNULL)
+
+
+def is_damage(text: str) -> bool:
+    """Whether an error of SQLite says that the file itself is broken."""
+    return any(sign in text for sign in _DAMAGE)
+
+
+def is_ours(database: Database) -> bool:
+    """Whether a broken file may be moved aside: it was a database, or has our name."""
+    if isinstance(database, MemoryDatabase):
+        return False
+    with database.open("rb") as file:
+        return database.name == DATABASE_NAME or file.read(16) == _SQLITE_HEADER

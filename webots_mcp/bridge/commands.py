@@ -37,9 +37,10 @@ FINISH: Final = (
 )
 # The process that asked for the reload is gone; that this one runs is the proof that it worked.
 CONFIRM_RELOAD: Final = (
-    "UPDATE command SET status = 'done', finished_wall_time_s = ?2, finished_sim_time_s = ?3, "
-    "result = json_object('run_id', ?1) WHERE robot_id = ?4 AND action = 'reload' "
-    "AND status = 'claimed' AND issued_wall_time_s IS NOT NULL"
+    "UPDATE command SET status = 'done', finished_wall_time_s = :now, "
+    "finished_sim_time_s = :sim_time, result = json_object('run_id', :run) "
+    "WHERE robot_id = :robot AND action = 'reload' AND status = 'claimed' "
+    "AND issued_wall_time_s IS NOT NULL"
 )
 
 

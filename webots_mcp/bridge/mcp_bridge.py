@@ -19,7 +19,7 @@ from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
-from webots_mcp.bridge.recorder import END_RUN, Pulse, Recorder
+from webots_mcp.bridge.recorder import Pulse, Recorder
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.contract import (
     HEARTBEAT_INTERVAL_S,
@@ -347,21 +347,19 @@ class MCPBridge:
         self._enter_first_run("reload" if reloaded else "start")
 
     def _enter_first_run(self, reason: str) -> None:
-        run, now = self._clock.run, time.time()
+        run = self._clock.run
         run.start_reason = reason
         self._journal.event(reason)
         registration = self._recorder.registration
         if registration is not None:
-            values = (now, self._clock.sim_time_s, registration.robot_id)
+            times = {"now": time.time(), "sim_time": self._clock.sim_time_s}
+            values = {**times, "robot": registration.robot_id}
             self._recorder.record(CONFIRM_RELOAD, run, values)
 
     def _begin_run(self) -> None:
         """Simulation time went back: the old run ends with what was last known of it."""
-        old, run = self._recorder.run, self._clock.run
-        self._recorder.record(
-            END_RUN, old, ("reset", time.time(), self._clock.ended_sim_time_s, old.rows)
-        )
-        self._recorder.run = run
+        self._recorder.end_run("reset", self._clock.ended_sim_time_s)
+        self._recorder.run = self._clock.run
         self._changes.forget()
         self._reload_undetected = self._reload_unfired = True
         self._journal.event("reset")

@@ -49,9 +49,9 @@ _INSERT_RUN: Final = (
     "started_wall_time_s, started_sim_time_s, last_wall_time_s, last_sim_time_s) "
     "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
 )
-END_RUN: Final = (  # the run's id comes first, as in every row of a run
-    "UPDATE run SET end_reason = ?2, ended_wall_time_s = ?3, last_wall_time_s = ?3, "
-    "last_sim_time_s = ?4, rows = ?5 WHERE id = ?1"
+_END_RUN: Final = (
+    "UPDATE run SET end_reason = :reason, ended_wall_time_s = :now, last_wall_time_s = :now, "
+    "last_sim_time_s = :sim_time, rows = :rows WHERE id = :run"
 )
 _BEAT_SESSION: Final = (
     "UPDATE session SET last_seen_wall_time_s = ?, last_poll_wall_time_s = ?, "
@@ -63,6 +63,9 @@ _END_SESSION: Final = (
     "UPDATE session SET ended_wall_time_s = ?, last_seen_wall_time_s = ?, end_reason = ?, "
     "hold = NULL, rows_waiting = 0, rows_dropped = ?, last_error = ? WHERE id = ?"
 )
+
+
+Values = tuple[Any, ...] | dict[str, Any]
 
 
 class Run:
@@ -90,7 +93,7 @@ class Pulse(NamedTuple):
 class _Row(NamedTuple):
     statement: str
     run: Run | None
-    values: tuple[Any, ...]
+    values: Values
 
 
 class Recorder:
@@ -120,13 +123,14 @@ class Recorder:
 
     # -- writing -------------------------------------------------------------------------------
 
-    def record(self, statement: str, run: Run | None, values: tuple[Any, ...]) -> int | None:
+    def record(self, statement: str, run: Run | None, values: Values) -> int | None:
         """Write a row now, or keep it for the next call.
 
         Args:
-            statement: An INSERT or UPDATE; if `run` is given, its first parameter is the run's id.
-            run: The run that the row belongs to.
-            values: The other parameters.
+            statement: An INSERT or UPDATE; if `run` is given, the run's id is its first
+                parameter, or the one named `run`.
+            run: The run that the row belongs to; its id may not be known yet.
+            values: The other parameters, in order or by name.
 
         Returns:
             How many rows the statement changed, or None where it was put off.
@@ -140,8 +144,7 @@ class Recorder:
             self._keep(_Row(statement, run, values))
             return 1 if self.flush() else None
         try:
-            parameters = values if run is None else (run.id, *values)
-            changed = connection.execute(statement, parameters).rowcount
+            changed = connection.execute(statement, _bind(run, values)).rowcount
         except sqlite3.Error as error:
             self._keep(_Row(statement, run, values))
             self._put_off(error)
@@ -202,12 +205,9 @@ class Recorder:
             self._waiting_bytes -= _weight(row)
 
     def _write(self, connection: sqlite3.Connection, row: _Row) -> None:
-        if row.run is None:
-            connection.execute(row.statement, row.values)
-            return
-        if row.run.id is None:
+        if row.run is not None and row.run.id is None:
             self._insert_run(connection, row.run)
-        connection.execute(row.statement, (row.run.id, *row.values))
+        connection.execute(row.statement, _bind(row.run, row.values))
 
     def _insert_run(self, connection: sqlite3.Connection, run: Run) -> None:
         assert self.registration is not None
@@ -256,10 +256,15 @@ class Recorder:
             values = (text, self.registration.session_id)
             self.record("UPDATE session SET actions = ? WHERE id = ?", None, values)
 
+    def end_run(self, reason: str, sim_time_s: float) -> None:
+        """The current run is over, as of the simulation time that was seen last."""
+        times = {"now": time.time(), "sim_time": sim_time_s}
+        self.record(_END_RUN, self.run, {"reason": reason, **times, "rows": self.run.rows})
+
     def close(self, reason: str, sim_time_s: float) -> None:
         """Write what waits (trying for up to a second), end run and session, close the file."""
         now = time.time()
-        self.record(END_RUN, self.run, (reason, now, sim_time_s, self.run.rows))
+        self.end_run(reason, sim_time_s)
         if self.registration is not None:
             health = (self.rows_dropped, self.last_error)
             values = (now, now, reason, *health, self.registration.session_id)
@@ -388,9 +393,16 @@ class Recorder:
         return False
 
 
+def _bind(run: Run | None, values: Values) -> Values:
+    if run is None:
+        return values
+    return (run.id, *values) if isinstance(values, tuple) else {"run": run.id, **values}
+
+
 def _weight(row: _Row) -> int:
     """About the bytes that a waiting row holds: its texts."""
-    return 200 + sum(len(value) for value in row.values if isinstance(value, str))
+    values = row.values if isinstance(row.values, tuple) else row.values.values()
+    return 200 + sum(len(value) for value in values if isinstance(value, str))
 
 
 def _roll_back(connection: sqlite3.Connection) -> None:

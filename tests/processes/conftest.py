@@ -80,3 +80,12 @@ def last_number(simulation: Simulation) -> int:
     """The newest number that a controller printed; -1 before the first."""
     words = [line.split()[-1] for line in reversed(simulation.console)]
     return next((int(word) for word in words if word.isdigit()), -1)
+
+
+def has_states(recording: Recording) -> bool:
+    """Whether a controller has made the database and published into it."""
+    assert isinstance(recording.database, Path)
+    tables = "SELECT count(*) FROM sqlite_master WHERE name = 'state'"
+    return (
+        recording.database.exists() and recording.rows(tables) == [1] and recording.states() != []
+    )

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.bridge.conftest import Recording
-from tests.processes.conftest import Start, last_number
+from tests.processes.conftest import Start, has_states, last_number
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.settlement import settle
@@ -57,7 +57,7 @@ while robot.step(16) != -1:
     bridge.get_command()
 """
     )
-    simulation.wait_for(lambda: filed.database.exists() and filed.states(), timeout_s=30)  # type: ignore[union-attr]
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
     sent = filed.send("hang")
     simulation.wait_for(lambda: any("hanging" in line for line in simulation.console))
     assert filed.fate(sent)[0] == "claimed"
@@ -87,7 +87,7 @@ while robot.step(16) != -1:
     bridge.get_command()
 """
     )
-    simulation.wait_for(lambda: filed.database.exists() and filed.states(), timeout_s=30)  # type: ignore[union-attr]
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
     sent = filed.send("reload")
     simulation.wait_for(lambda: filed.fate(sent)[0] == "done", timeout_s=30)
     simulation.wait_for(lambda: len(filed.rows("SELECT DISTINCT run_id FROM state")) == 2)

@@ -14,11 +14,12 @@ from webots_mcp.errors import InvalidInputError, InvalidRangeError
 from webots_mcp.store.logs import LogFilter, count_lines, newest_lines
 from webots_mcp.store.states import (
     State,
+    fetch_states,
     newest_state,
     newest_state_id,
     real_time_factor,
     select,
-    states_after,
+    state_ids_after,
 )
 from webots_mcp.store.window import Window, resolve_window
 
@@ -92,7 +93,8 @@ def test_only_rows_recorded_after_the_cursor_are_read(recorded: Recorded) -> Non
     cursor = newest_state_id(recorded.connection)
     robot.state(1.0, {"x": 2})
     robot.state(2.0, {"x": 3})
-    rows = list(states_after(recorded.connection, robot.run_id, cursor, 1.0))
+    ids = state_ids_after(recorded.connection, robot.run_id, cursor, 1.0)
+    rows = list(fetch_states(recorded.connection, [*ids, 999]))
     assert [row.value()["x"] for row in rows] == [2, 3]
 
 

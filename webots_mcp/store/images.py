@@ -14,7 +14,6 @@ _NEWEST: Final = (
     f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND kind = :kind "
     "AND (:device IS NULL OR device = :device) ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
-_BY_ID: Final = f"SELECT {_COLUMNS} FROM image WHERE id = ?"
 _DEVICES: Final = (
     "SELECT DISTINCT device FROM image WHERE run_id = ? AND kind = 'camera' AND device IS NOT NULL"
 )
@@ -36,23 +35,26 @@ class StoredImage:
     bytes: int
 
     def file(self, data_dir: Path) -> Path:
-        """The file itself.
+        """The file itself; see `inside` for the errors."""
+        return inside(data_dir, self.path)
 
-        Raises:
-            InvalidInputError: The recorded path leads out of the data folder.
-            NothingRecordedError: The file is gone.
-        """
-        file = (data_dir / self.path).resolve()
-        if not file.is_relative_to(data_dir.resolve()):
-            raise InvalidInputError(
-                f"image {self.id} is recorded outside the data folder and is not opened"
-            )
-        if not file.is_file():
-            raise NothingRecordedError(
-                f"image {self.id} was recorded at {file}, but the file is gone: only the newest "
-                "pictures are kept"
-            )
-        return file
+
+def inside(data_dir: Path, path: str) -> Path:
+    """The file at a recorded path.
+
+    Raises:
+        InvalidInputError: The path leads out of the data folder.
+        NothingRecordedError: The file is gone.
+    """
+    file = (data_dir / path).resolve()
+    if not file.is_relative_to(data_dir.resolve()):
+        raise InvalidInputError(f"{path!r} lies outside the data folder and is not opened")
+    if not file.is_file():
+        raise NothingRecordedError(
+            f"{file} was recorded, but the file is gone: only the newest pictures are kept, and "
+            "the server may have been started with another --data-dir than the controller"
+        )
+    return file
 
 
 def newest_camera_image(
@@ -67,15 +69,3 @@ def newest_camera_image(
 def camera_names(connection: sqlite3.Connection, run_id: int) -> list[str]:
     """The cameras whose frames the run recorded."""
     return [row[0] for row in connection.execute(_DEVICES, (run_id,)).fetchall()]
-
-
-def fetch_image(connection: sqlite3.Connection, image_id: int) -> StoredImage:
-    """The picture of that id.
-
-    Raises:
-        NothingRecordedError: There is none.
-    """
-    row = connection.execute(_BY_ID, (image_id,)).fetchone()
-    if row is None:
-        raise NothingRecordedError(f"no image {image_id} is recorded")
-    return StoredImage(*row)

@@ -79,6 +79,13 @@ class Command:
         """Whether its fate is settled: a final status never changes again."""
         return self.status in FINAL_STATUSES
 
+    def decoded_result(self) -> Any:
+        """What the controller answered; None where it did not, or where it is no JSON."""
+        try:
+            return json.loads(self.result) if self.result is not None else None
+        except ValueError:
+            return None
+
 
 class CommandQueue:
     """Puts commands for one robot's controller into the database.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, cast
 
@@ -20,10 +20,11 @@ _RECENT_TIMES: Final = (
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 )
 # Simulation time bounds the search to the index; the id then cuts off what came before.
-_WINDOW: Final = (
-    f"SELECT {_COLUMNS} FROM state WHERE run_id = :run_id AND sim_time_s >= :from_sim_time_s "
+_WINDOW_IDS: Final = (
+    "SELECT id FROM state WHERE run_id = :run_id AND sim_time_s >= :from_sim_time_s "
     "AND id > :after_id ORDER BY sim_time_s, id"
 )
+_BY_ID: Final = f"SELECT {_COLUMNS} FROM state WHERE id = ?"
 _NEWEST_ID: Final = "SELECT coalesce(max(id), 0) FROM state"
 
 PACE_ROWS: Final = 6
@@ -67,12 +68,20 @@ def newest_state_id(connection: sqlite3.Connection) -> int:
     return int(connection.execute(_NEWEST_ID).fetchone()[0])
 
 
-def states_after(
+def state_ids_after(
     connection: sqlite3.Connection, run_id: int, after_id: int, from_sim_time_s: float
-) -> Iterator[State]:
-    """The rows of a run with greater ids, in order, read one by one."""
+) -> list[int]:
+    """The ids of a run's rows after that one, in order; read from the index alone."""
     values = {"run_id": run_id, "after_id": after_id, "from_sim_time_s": from_sim_time_s}
-    return (State(*row) for row in connection.execute(_WINDOW, values))
+    return [row[0] for row in connection.execute(_WINDOW_IDS, values).fetchall()]
+
+
+def fetch_states(connection: sqlite3.Connection, ids: Iterable[int]) -> Iterator[State]:
+    """The rows of those ids, one by one; one that was deleted meanwhile is left out."""
+    for state_id in ids:
+        row = connection.execute(_BY_ID, (state_id,)).fetchone()
+        if row is not None:
+            yield State(*row)
 
 
 def recent_interval_s(connection: sqlite3.Connection, run_id: int) -> float | None:

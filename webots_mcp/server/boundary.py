@@ -1,0 +1,146 @@
+"""Where our functions become MCP tools: their declaration, their errors and their answers.
+
+Every tool passes `tool`, so that this is the one place where our exceptions become `ToolError`
+and where an answer gets its text.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Awaitable, Callable, Generator, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Final, ParamSpec, TypeVar, cast, get_type_hints
+
+from mcp.server import MCPServer
+from mcp.server.mcpserver import Context
+from mcp.server.mcpserver.exceptions import ToolError
+from mcp.types import CallToolResult, TextContent, ToolAnnotations
+
+from webots_mcp.errors import NoDatabaseError, NothingRecordedError, WebotsMCPError
+from webots_mcp.server.results import Answer, CommandAnswer
+from webots_mcp.server.shortening import compact_json
+
+READS: Final = ToolAnnotations(read_only_hint=True, open_world_hint=False)
+ACTS: Final = ToolAnnotations(
+    read_only_hint=False, destructive_hint=False, idempotent_hint=False, open_world_hint=False
+)
+RESTARTS: Final = ACTS.model_copy(update={"destructive_hint": True})
+
+_BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
+_DECLARATION: Final = "webots_mcp_declaration"
+
+_P = ParamSpec("_P")
+_R = TypeVar("_R")
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """What a client is told about a tool beside its name and its parameters."""
+
+    title: str
+    annotations: ToolAnnotations
+
+
+def tool(
+    title: str, annotations: ToolAnnotations
+) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
+    """Declare a method as an MCP tool of its own name.
+
+    Its docstring is the description. An `Answer` goes out as structured content and as the same
+    compact text; our errors become `ToolError`; where nothing was recorded, a reading tool
+    answers so instead of failing.
+    """
+
+    def declare(method: Callable[_P, _R]) -> Callable[_P, _R]:
+        wrap = _wrap_async if inspect.iscoroutinefunction(method) else _wrap
+        wrapper = wrap(method, _empty_answer(method, annotations))
+        setattr(wrapper, _DECLARATION, Declaration(title, annotations))
+        return cast("Callable[_P, _R]", wrapper)
+
+    return declare
+
+
+def register(mcp: MCPServer, family: object, *, read_only: bool) -> None:
+    """Add the declared tools of an object; with `read_only` those that only read."""
+    for method, declaration in _declared(family):
+        if declaration.annotations.read_only_hint or not read_only:
+            description = inspect.getdoc(method)
+            mcp.add_tool(method, None, declaration.title, description, declaration.annotations)
+
+
+def reporter(ctx: Context[Any]) -> Callable[[float, float, str], Awaitable[None]]:
+    """Progress for the client that asked, if it wants any: done, total, message."""
+
+    async def report(done: float, total: float, message: str) -> None:
+        await ctx.report_progress(done, total, message)
+
+    return report
+
+
+def _declared(family: object) -> Iterator[tuple[Callable[..., Any], Declaration]]:
+    for name in vars(type(family)):
+        declaration = getattr(getattr(family, name), _DECLARATION, None)
+        if isinstance(declaration, Declaration):
+            yield getattr(family, name), declaration
+
+
+def _wrap(method: Callable[..., Any], empty: Callable[[str], Any]) -> Callable[..., Any]:
+    @functools.wraps(method)
+    def wrapper(*args: Any, **kwargs: Any) -> Any:
+        try:
+            with _tool_errors():
+                return _as_result(method(*args, **kwargs))
+        except NothingRecordedError as error:
+            return _as_result(empty(str(error)))
+
+    return wrapper
+
+
+def _wrap_async(method: Callable[..., Any], empty: Callable[[str], Any]) -> Callable[..., Any]:
+    @functools.wraps(method)
+    async def wrapper(*args: Any, **kwargs: Any) -> Any:
+        try:
+            with _tool_errors():
+                return _as_result(await method(*args, **kwargs))
+        except NothingRecordedError as error:
+            return _as_result(empty(str(error)))
+
+    return wrapper
+
+
+@contextmanager
+def _tool_errors() -> Generator[None]:
+    """Our errors tell the model what to do; any other is a defect and stays on the server."""
+    try:
+        yield
+    except (NoDatabaseError, NothingRecordedError) as error:
+        raise NothingRecordedError(str(error)) from error
+    except WebotsMCPError as error:
+        raise ToolError(str(error)) from error
+
+
+def _empty_answer(method: Callable[..., Any], annotations: ToolAnnotations) -> Callable[[str], Any]:
+    """How to answer that nothing was recorded: in the tool's own form, or as an error."""
+    if not annotations.read_only_hint:
+        return _refuse
+    answer = get_type_hints(method)["return"]
+    if isinstance(answer, type) and issubclass(answer, Answer):
+        return lambda text: answer(status="never seen", hint=text)
+    return lambda text: [text]
+
+
+def _refuse(text: str) -> Any:
+    raise ToolError(text)
+
+
+def _as_result(answer: Any) -> Any:
+    """Structured content and the same as compact text; pictures and their captions as they are."""
+    if not isinstance(answer, Answer):
+        return answer
+    data = answer.model_dump(mode="json", exclude_none=True)
+    bad = isinstance(answer, CommandAnswer) and answer.outcome in _BAD_ENDS
+    return CallToolResult(
+        content=[TextContent(text=compact_json(data))], structured_content=data, is_error=bad
+    )

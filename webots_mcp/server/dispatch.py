@@ -1,0 +1,180 @@
+"""Sending a command to a robot's controller, and waiting for the truth about it."""
+
+from __future__ import annotations
+
+import difflib
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import anyio
+from anyio import to_thread
+
+from webots_mcp.contract import BUILT_IN_ACTIONS, HEARTBEAT_LATE_S
+from webots_mcp.errors import UnknownActionError
+from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.server.results import CommandAnswer
+from webots_mcp.server.shortening import RESULT_BUDGET, cut_text, shorten
+from webots_mcp.store.queue import Command, CommandQueue, fetch_command
+
+Report = Callable[[float, float, str], Awaitable[None]]
+
+# A look at one row by its key costs microseconds, as little as PRAGMA data_version, and is right
+# for commits of the same connection as well.
+_POLL_INTERVAL_S: Final = 0.004
+_REPORT_INTERVAL_S: Final = 1.0
+# The deadline decides, by taking the command back. Only if this server dies while it waits does
+# the command's own time to live end it, soon after anybody could still be waiting for it.
+_OUTLIVES_WAITING_S: Final = 1.0
+_ERROR_CHARACTERS: Final = 2_000
+_SHOWN_ACTIONS: Final = 30
+
+
+@dataclass(frozen=True)
+class Request:
+    """An action for one robot, and how long to wait for its outcome."""
+
+    robot: str | None
+    action: str
+    params: Mapping[str, Any]
+    timeout_s: float
+
+
+class Dispatcher:
+    """Sends commands and watches their rows."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    async def ask(self, request: Request, report: Report) -> CommandAnswer:
+        """Send a command, wait until its fate is settled or time is up, and say what happened.
+
+        At the deadline a command that nobody has claimed is taken back, so that it cannot run when
+        nobody waits for it any more; the same happens when the caller goes away.
+
+        Raises:
+            InvalidInputError: The robot, the action or its parameters are wrong.
+            NothingRecordedError: There is no robot to ask.
+        """
+        started_s = time.monotonic()
+        command = await self.settle(request, report)
+        waited_s = round(time.monotonic() - started_s, 3)
+        return await to_thread.run_sync(self._answer, command, waited_s)
+
+    async def settle(self, request: Request, report: Report) -> Command:
+        """Like `ask`, but returns the command itself."""
+        command = await to_thread.run_sync(self._enqueue, request)
+        try:
+            return await self._watch(command.id, request.timeout_s, report)
+        except anyio.get_cancelled_exc_class():
+            with anyio.CancelScope(shield=True):
+                await to_thread.run_sync(self._take_back, command.id, "the asker went away")
+            raise
+
+    def _enqueue(self, request: Request) -> Command:
+        with self._recording.writer() as connection:
+            view = look(connection, request.robot)
+            _require_action(view, request.action)
+            return CommandQueue(connection).enqueue(
+                view.robot.id,
+                request.action,
+                request.params,
+                time_to_live_s=request.timeout_s + _OUTLIVES_WAITING_S,
+                requested_by="mcp",
+            )
+
+    async def _watch(self, command_id: int, timeout_s: float, report: Report) -> Command:
+        started_s = time.monotonic()
+        next_report_s = _REPORT_INTERVAL_S
+        with self._recording.reader() as connection:
+            while not (command := fetch_command(connection, command_id)).is_final:
+                waited_s = time.monotonic() - started_s
+                if waited_s >= timeout_s:
+                    return await to_thread.run_sync(self._at_the_deadline, command_id)
+                if waited_s >= next_report_s:
+                    next_report_s += _REPORT_INTERVAL_S
+                    await to_thread.run_sync(self._recording.settle)
+                    await report(waited_s, timeout_s, _progress(command, waited_s))
+                await anyio.sleep(_POLL_INTERVAL_S)
+            return command
+
+    def _at_the_deadline(self, command_id: int) -> Command:
+        self._recording.settle()
+        return self._take_back(command_id, "nobody claimed it in time; it will not run")
+
+    def _take_back(self, command_id: int, why: str) -> Command:
+        with self._recording.writer() as connection:
+            CommandQueue(connection).cancel(command_id, why)
+            return fetch_command(connection, command_id)
+
+    def _answer(self, command: Command, waited_s: float) -> CommandAnswer:
+        with self._recording.reader() as connection:
+            name = connection.execute(
+                "SELECT name FROM robot WHERE id = ?", (command.robot_id,)
+            ).fetchone()[0]
+            view = look(connection, name)
+            return CommandAnswer(
+                **view.header(),
+                command_id=command.id,
+                action=command.action,
+                outcome=command.status,
+                waited_s=waited_s,
+                result=shown_result(command),
+                error=cut_text(command.error, _ERROR_CHARACTERS) if command.error else None,
+                hint=_hint(view, command),
+            )
+
+
+def shown_result(command: Command, budget: int = RESULT_BUDGET) -> Any:
+    """The result of a command, shortened."""
+    return None if command.result is None else shorten(command.decoded_result(), budget).value
+
+
+def _require_action(view: View, action: str) -> None:
+    """Refuse what the controller does not know.
+
+    A controller that has registered nothing may look at what get_command() returns: it gets all.
+    """
+    known = list(view.session.actions) if view.session else []
+    if not known or action in known or action in BUILT_IN_ACTIONS:
+        return
+    near = difflib.get_close_matches(action, [*known, *BUILT_IN_ACTIONS], n=3, cutoff=0.5)
+    offer = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
+    raise UnknownActionError(
+        f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its actions are "
+        f"{known[:_SHOWN_ACTIONS]}, built in are {list(BUILT_IN_ACTIONS)}"
+    )
+
+
+def _progress(command: Command, waited_s: float) -> str:
+    doing = "waiting for the controller" if command.status == "pending" else "under way"
+    return f"{command.action}: {doing} for {waited_s:.0f} s"
+
+
+def _hint(view: View, command: Command) -> str | None:
+    """What an outcome means where it does not speak for itself."""
+    if command.status == "claimed":
+        return (
+            "the controller is still at it; webots_list_commands will show how it ended; do not "
+            "send it again"
+        )
+    if command.status in ("cancelled", "expired"):
+        return _why_unclaimed(view)
+    if command.status == "lost":
+        return "it may have run in part: look at the robot before you send it again"
+    return None
+
+
+def _why_unclaimed(view: View) -> str:
+    session = view.session
+    if session is None or not view.robot.live:
+        return f"no live controller: {view.status.why or 'it was never seen'}; start it first"
+    if session.last_poll_wall_time_s is None:
+        return "the controller's loop never calls bridge.get_command(): add that line to its loop"
+    if not session.heartbeat_is_fresh(view.now_s):
+        return view.status.why or "its loop is silent"
+    silent_s = view.now_s - session.last_poll_wall_time_s
+    if silent_s > HEARTBEAT_LATE_S:
+        return f"its loop runs, but last called bridge.get_command() {silent_s:.0f} s ago"
+    return "its loop is alive but did not come to it in time: ask again with a longer timeout_s"

@@ -1,0 +1,154 @@
+"""What the tools answer: one compact object each, with the same header."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+
+class Table(BaseModel):
+    """Rows under column names; a name says its unit."""
+
+    columns: list[str]
+    rows: list[list[Any]]
+
+
+class Answer(BaseModel):
+    """The header of every answer: about what, as of when, and whether time is moving."""
+
+    robot: str | None = None
+    run_id: int | None = None
+    sim_time_s: float | None = Field(
+        default=None, description="Simulation time of the newest data."
+    )
+    age_s: float | None = Field(default=None, description="Wall time since the newest data.")
+    status: str | None = Field(
+        default=None, description="running, paused, 'stopped N s ago' or 'never seen'."
+    )
+    why: str | None = Field(default=None, description="What the status rests on.")
+    hint: str | None = Field(default=None, description="What to do next.")
+
+
+class StateAnswer(Answer):
+    """The newest published state."""
+
+    state: Any = Field(default=None, description="Data published by the controller.")
+    shortened: str | None = Field(default=None, description="Rule by which parts were left out.")
+
+
+class SensorsAnswer(Answer):
+    """The newest sensor values."""
+
+    sensors: dict[str, Any] = Field(default_factory=dict[str, Any])
+    odd: dict[str, str] | None = Field(
+        default=None, description="Values that JSON cannot hold: path to nan, inf, ..."
+    )
+    not_published: dict[str, str] | None = Field(
+        default=None, description="Sensor devices that the state does not mention: name to class."
+    )
+    shortened: str | None = None
+
+
+class FullStateAnswer(Answer):
+    """The newest state or a part of it, newest events, and the recorder's health."""
+
+    state: Any = None
+    path: str | None = None
+    total: int | None = Field(default=None, description="Length of the array or text at the path.")
+    next_offset: int | None = Field(
+        default=None, description="Ask again with this offset for more."
+    )
+    shortened: str | None = None
+    odd: dict[str, str] | None = None
+    events: Table | None = None
+    recorder: dict[str, Any] | None = Field(
+        default=None, description="Rows waiting and dropped, last error, controller code."
+    )
+
+
+class WorldAnswer(Answer):
+    """The world, the run, and who is in it."""
+
+    world: str | None = None
+    basic_time_step_ms: float | None = None
+    real_time_factor: float | None = Field(
+        default=None, description="Simulation time per wall time over the last seconds recorded."
+    )
+    supervisor: bool | None = Field(
+        default=None, description="Whether it may control the simulation."
+    )
+    run: dict[str, Any] | None = None
+    runs_recorded: int | None = None
+    controller: dict[str, Any] | None = None
+    devices: dict[str, str] | None = None
+    companions: Table | None = Field(
+        default=None, description="Other robots in the same simulation."
+    )
+    database: str | None = None
+    data_dir: str | None = None
+
+
+class RobotsAnswer(Answer):
+    """All robots ever seen."""
+
+    robots: Table | None = None
+
+
+class LogsAnswer(Answer):
+    """Log lines, oldest first."""
+
+    lines: Table | None = None
+    matching: int | None = Field(
+        default=None, description="How many lines match (with a cursor: how many older ones)."
+    )
+    cursor: int | None = Field(
+        default=None, description="Ask again with this cursor for older lines."
+    )
+
+
+class MonitorAnswer(Answer):
+    """What was recorded while watching."""
+
+    watched_s: float | None = Field(default=None, description="Wall time.")
+    from_sim_time_s: float | None = None
+    rows: int | None = Field(default=None, description="States recorded in the window.")
+    sampled: int | None = Field(default=None, description="How many of them were read, if not all.")
+    runs: list[int] | None = Field(
+        default=None, description="More than one: time went back in between."
+    )
+    movement: dict[str, Any] | None = None
+    changes: Table | None = Field(
+        default=None, description="Changed text and flags, pauses, resets."
+    )
+    signals: Table | None = Field(default=None, description="Numbers that changed most, first.")
+    steady: int | None = Field(default=None, description="Numeric signals that did not change.")
+    events: dict[str, int] | None = Field(default=None, description="Other events by kind.")
+    logs: Table | None = Field(default=None, description="Lines of level warning and above.")
+    commands: Table | None = None
+
+
+class CommandAnswer(Answer):
+    """What became of a command."""
+
+    command_id: int | None = None
+    action: str | None = None
+    outcome: str | None = Field(
+        default=None, description="done, failed, expired, cancelled, lost, or claimed (under way)."
+    )
+    waited_s: float | None = None
+    result: Any = Field(default=None, description="What the controller answered.")
+    error: str | None = Field(default=None, description="What the controller or the bridge said.")
+
+
+class CommandsAnswer(Answer):
+    """Commands, newest first, and what can be asked for."""
+
+    commands: Table | None = None
+    cursor: int | None = Field(
+        default=None, description="Ask again with this cursor for older ones."
+    )
+    actions: dict[str, str] | None = Field(
+        default=None, description="The controller's own actions with their docstrings."
+    )
+    built_in: list[str] | None = None

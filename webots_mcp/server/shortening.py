@@ -1,0 +1,161 @@
+"""Published values, made short enough to be read whole, by rules that are stated in the answer."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, NamedTuple, cast
+
+STATE_BUDGET: Final = 4_800  # characters of JSON; a token is about four
+FULL_BUDGET: Final = 16_000
+RESULT_BUDGET: Final = 3_200
+DETAIL_BUDGET: Final = 320
+
+_DIGITS: Final = 4
+_ODD_NUMBERS: Final = ("nan", "inf", "-inf")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """How much of one value is shown."""
+
+    items: int
+    text: int
+    keys: int
+    depth: int
+    exact: bool = False
+
+    def rule(self) -> str:
+        """The rule in words."""
+        return (
+            f"arrays over {self.items} items are summarised; texts over {self.text} characters, "
+            f"objects over {self.keys} keys and what is nested over {self.depth} deep are cut"
+        )
+
+
+# From generous to tight: the first under which a value fits its budget is taken.
+GLANCE: Final = (
+    Limits(items=16, text=200, keys=64, depth=8),
+    Limits(items=8, text=80, keys=32, depth=5),
+    Limits(items=4, text=40, keys=20, depth=3),
+    Limits(items=2, text=20, keys=10, depth=2),
+    Limits(items=2, text=12, keys=6, depth=1),
+)
+
+
+WHOLE: Final = tuple(
+    replace(limits, exact=True)
+    for limits in (Limits(items=2000, text=4000, keys=1000, depth=20), *GLANCE)
+)
+
+
+class Shortened(NamedTuple):
+    """A value that fits its budget, and the rule by which something was left out (else None)."""
+
+    value: Any
+    rule: str | None
+
+
+def shorten(value: Any, budget: int = STATE_BUDGET, levels: Sequence[Limits] = GLANCE) -> Shortened:
+    """Make a JSON value fit `budget` characters of compact JSON.
+
+    Long arrays of numbers become `{"count", "min", "max", "mean", "argmin"}`, the names that the
+    same array's signals have. With the levels `GLANCE` numbers are rounded to 4 significant
+    digits, which is the stated default and not reported; with `WHOLE` they are exact.
+    """
+    for limits in levels:
+        shortener = _Shortener(limits)
+        short = shortener.shorten(value, 0)
+        if len(compact_json(short)) <= budget:
+            return Shortened(short, limits.rule() if shortener.cut else None)
+    return Shortened(_cut(compact_json(value), budget // 2), f"cut to {budget // 2} characters")
+
+
+def compact_json(value: Any) -> str:
+    """JSON without blanks, as the model reads it."""
+    return json.dumps(value, ensure_ascii=False, separators=(",", ":"))
+
+
+def round_number(value: float) -> float:
+    """A number with 4 significant digits."""
+    return float(f"{value:.{_DIGITS}g}")
+
+
+def cut_text(text: str, longest: int) -> str:
+    """A text with its true length at the end where something was left out."""
+    return text if len(text) <= longest else _cut(text, longest)
+
+
+def _cut(text: str, longest: int) -> str:
+    return f"{text[:longest]}… [{len(text)} characters]"
+
+
+class _Shortener:
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self.cut = False
+
+    def shorten(self, value: Any, depth: int) -> Any:
+        if isinstance(value, float):
+            return value if self._limits.exact else round_number(value)
+        if isinstance(value, str):
+            return self._text(value)
+        if isinstance(value, dict):
+            return self._object(cast("dict[str, Any]", value), depth)
+        if isinstance(value, list):
+            return self._array(cast("list[Any]", value), depth)
+        return value
+
+    def _text(self, text: str) -> str:
+        self.cut |= len(text) > self._limits.text
+        return cut_text(text, self._limits.text)
+
+    def _object(self, members: dict[str, Any], depth: int) -> Any:
+        if depth >= self._limits.depth and members:
+            self.cut = True
+            return f"{{{len(members)} keys}}"
+        shown = {
+            self._text(key): self.shorten(item, depth + 1)
+            for key, item in list(members.items())[: self._limits.keys]
+        }
+        if len(members) > len(shown):
+            self.cut = True
+            shown["…"] = f"{len(members) - len(shown)} more keys"
+        return shown
+
+    def _array(self, items: list[Any], depth: int) -> Any:
+        if len(items) > self._limits.items:
+            self.cut = True
+            return self._summary(items, depth)
+        if depth >= self._limits.depth and any(isinstance(item, (dict, list)) for item in items):
+            self.cut = True
+            return f"[{len(items)} items]"
+        return [self.shorten(item, depth + 1) for item in items]
+
+    def _summary(self, items: list[Any], depth: int) -> dict[str, Any]:
+        numbers = [item for item in items if type(item) in (int, float)]
+        others = [item for item in items if type(item) not in (int, float)]
+        if all(item is None or item in _ODD_NUMBERS for item in others):
+            return {**self._statistics(items, numbers), **_counts(others)}
+        first = [self.shorten(item, depth + 1) for item in items[: min(3, self._limits.items)]]
+        return {"count": len(items), "first": first}
+
+    @staticmethod
+    def _statistics(items: list[Any], numbers: list[float]) -> dict[str, Any]:
+        if not numbers:
+            return {"count": len(items)}
+        low, high, mean = min(numbers), max(numbers), sum(numbers) / len(numbers)
+        return {
+            "count": len(items),
+            "min": round_number(low),
+            "max": round_number(high),
+            "mean": round_number(mean),
+            "argmin": items.index(low),
+        }
+
+
+def _counts(others: list[Any]) -> dict[str, int]:
+    """How many items are no numbers, by what they are."""
+    names = ["null" if item is None else str(item) for item in others]
+    return {name: names.count(name) for name in dict.fromkeys(names)}

@@ -1,0 +1,202 @@
+"""Tools that show what a robot published last."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, cast
+
+from pydantic import Field
+
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.server.boundary import READS, tool
+from webots_mcp.server.parameters import RobotName, RunId
+from webots_mcp.store.recording import Recording, View
+from webots_mcp.server.results import FullStateAnswer, SensorsAnswer, StateAnswer, Table
+from webots_mcp.server.sensing import sensor_part, unpublished
+from webots_mcp.server.shortening import (
+    DETAIL_BUDGET,
+    FULL_BUDGET,
+    WHOLE,
+    cut_text,
+    shorten,
+)
+from webots_mcp.store.events import newest_events
+from webots_mcp.store.sessions import fetch_session
+from webots_mcp.store.states import State, select
+
+_PUBLISH: Final = (
+    "nothing was published in this run yet: call bridge.publish({...}) in the controller's loop "
+    "(every 5th call is recorded, or each one with force=True)"
+)
+_EVENTS: Final = 20
+_SHOWN_ODD: Final = 20
+_SHOWN_DEVICES: Final = 30
+_ERROR_CHARACTERS: Final = 500
+
+PagePath = Annotated[
+    str,
+    Field(max_length=1000, description="Dotted path of a part, e.g. 'sensors.lidar'; '' is all."),
+]
+Offset = Annotated[
+    int, Field(ge=0, description="First item (array) or character (text) at the path.")
+]
+PageSize = Annotated[
+    int, Field(ge=1, le=2000, description="How many items or characters at the path.")
+]
+
+
+class StateTools:
+    """The newest state, whole or in part."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    @tool("Get the robot's state", READS)
+    def webots_get_robot_state(self, robot: RobotName = None, run_id: RunId = None) -> StateAnswer:
+        """The newest state that the robot's controller published, shortened where it is long.
+
+        Long arrays come as count, min, max, mean, argmin; webots_get_full_state has them whole.
+        """
+        with self._recording.view(robot, run_id) as view:
+            if view.state is None:
+                return StateAnswer(**view.header(), hint=_PUBLISH)
+            short = shorten(view.state.value())
+            hint = "webots_get_full_state(path=...) shows a part whole" if short.rule else None
+            return StateAnswer(**view.header(), state=short.value, shortened=short.rule, hint=hint)
+
+    @tool("Get the sensors", READS)
+    def webots_get_sensors(self, robot: RobotName = None, run_id: RunId = None) -> SensorsAnswer:
+        """The newest sensor values: members of the state named after a sensor device or like one.
+
+        Values that JSON cannot hold (nan, inf) are named in their place and listed in `odd`.
+        """
+        with self._recording.view(robot, run_id) as view:
+            if view.state is None:
+                return SensorsAnswer(**view.header(), hint=_PUBLISH)
+            state = view.state.value()
+            sensors = sensor_part(state, view.robot.devices)
+            short = shorten(sensors)
+            missing = unpublished(sensors, view.robot.devices)
+            return SensorsAnswer(
+                **view.header(),
+                sensors=short.value,
+                odd=_odd_in(view.state, sensors),
+                not_published=dict(list(missing.items())[:_SHOWN_DEVICES]) or None,
+                shortened=short.rule,
+                hint=None if sensors else _no_sensors(state),
+            )
+
+    @tool("Get the full state", READS)
+    def webots_get_full_state(
+        self,
+        path: PagePath = "",
+        offset: Offset = 0,
+        limit: PageSize = 500,
+        robot: RobotName = None,
+        run_id: RunId = None,
+    ) -> FullStateAnswer:
+        """The newest state with exact numbers, or a part of it, in pages where it is long.
+
+        Without a path also the newest events and the recorder's health: rows waiting and dropped,
+        last error, version of the controller's code.
+        """
+        with self._recording.view(robot, run_id) as view:
+            if view.state is None:
+                return FullStateAnswer(**view.header(), hint=_PUBLISH, recorder=_recorder(view))
+            part = select(view.state.value(), path)
+            answer = _page(part, path, offset, limit)
+            answer |= view.header()
+            if not path:
+                odd = list(view.state.odd_paths().items())[:_SHOWN_ODD]
+                answer |= {"odd": dict(odd) or None, "events": _events(view)}
+                answer |= {"recorder": _recorder(view)}
+            return FullStateAnswer(**answer)
+
+
+def _page(part: Any, path: str, offset: int, limit: int) -> dict[str, Any]:
+    """A value that fits; of an array or a text the items from `offset` on."""
+    if not isinstance(part, (list, str)):
+        short = shorten(part, FULL_BUDGET, WHOLE)
+        return {"path": path or None, "state": short.value, "shortened": short.rule}
+    whole = cast("list[Any] | str", part)
+    page = whole[offset : offset + limit]
+    rule = None
+    if isinstance(page, list):
+        items, rule = _fitting_items(page)
+        page = items
+    end = offset + len(page)
+    following = end if end < len(whole) else None
+    return {
+        "path": path,
+        "state": page,
+        "total": len(whole),
+        "next_offset": following,
+        "shortened": rule,
+    }
+
+
+def _fitting_items(items: list[Any]) -> tuple[list[Any], str | None]:
+    """As many items as fit the budget; only an item that is itself too long is shortened."""
+    fitting: list[Any] = []
+    room, rule = FULL_BUDGET, None
+    for item in items:
+        short = shorten(item, FULL_BUDGET // 4, WHOLE)
+        room -= len(str(short.value)) + 1
+        if room < 0 and fitting:
+            break
+        fitting.append(short.value)
+        rule = rule or short.rule
+    return fitting, rule
+
+
+def _events(view: View) -> Table:
+    events = newest_events(view.connection, view.require_run().id, _EVENTS)
+    rows = [
+        [round(event.sim_time_s, 3), event.kind, event.name, _details(event.details())]
+        for event in events
+    ]
+    return Table(columns=["sim_time_s", "kind", "name", "data"], rows=rows)
+
+
+def _details(details: Any) -> Any:
+    return shorten(details, DETAIL_BUDGET).value
+
+
+def _recorder(view: View) -> dict[str, Any] | None:
+    """The health of the session that recorded the run."""
+    session = view.session
+    if view.run is not None and (session is None or session.id != view.run.session_id):
+        session = fetch_session(view.connection, view.run.session_id)
+    if session is None:
+        return None
+    error = cut_text(session.last_error, _ERROR_CHARACTERS) if session.last_error else None
+    return {
+        "rows_recorded": view.run.rows if view.run else 0,
+        "rows_waiting": session.rows_waiting,
+        "rows_dropped": session.rows_dropped,
+        "last_error": error,
+        "heartbeat_age_s": view.age_s(session.last_seen_wall_time_s),
+        "polls_commands": session.last_poll_wall_time_s is not None,
+        "controller": session.controller,
+        "controller_sha256": session.controller_sha256,
+        "git_commit": session.git_commit,
+        "versions": session.versions,
+    }
+
+
+def _odd_in(state: State, part: dict[str, Any]) -> dict[str, str] | None:
+    """The replaced values among those members of the state."""
+    odd = {
+        path: kind
+        for path, kind in state.odd_paths().items()
+        if any(path == key or path.startswith(f"{key}.") for key in part)
+    }
+    return dict(list(odd.items())[:_SHOWN_ODD]) or None
+
+
+def _no_sensors(state: dict[str, Any]) -> str:
+    if not state:
+        raise NothingRecordedError("the newest state is empty")
+    return (
+        "no member of the state is named after a sensor device or like a sensor; "
+        "webots_get_robot_state shows the whole state"
+    )

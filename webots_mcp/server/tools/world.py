@@ -1,0 +1,139 @@
+"""Tools that show which robots there are and in which world."""
+
+from __future__ import annotations
+
+import time
+from typing import Any, Final
+
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.server.boundary import READS, tool
+from webots_mcp.server.parameters import RobotName, RunId
+from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, view_of
+from webots_mcp.server.results import RobotsAnswer, Table, WorldAnswer
+from webots_mcp.server.shortening import cut_text, round_number
+from webots_mcp.store.robots import list_robots
+from webots_mcp.store.runs import Run, count_runs
+from webots_mcp.store.sessions import Session, companions, fetch_session
+from webots_mcp.store.states import real_time_factor
+
+_SHOWN_ROBOTS: Final = 50
+_SHOWN_DEVICES: Final = 60
+_LONGEST_NAME: Final = 100
+_ROBOT_COLUMNS: Final = (
+    "robot", "kind", "live", "status", "run_id", "sim_time_s", "age_s", "runs", "actions",
+)  # fmt: skip
+
+
+class WorldTools:
+    """Robots, worlds and runs."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    @tool("List the robots", READS)
+    def webots_list_robots(self) -> RobotsAnswer:
+        """Every robot ever recorded: whether it is live, whether its time moves, its current run.
+
+        The header is that of the only live robot, if there is just one. `actions` counts the
+        robot's own commands; webots_list_commands describes them.
+        """
+        with self._recording.reader() as connection:
+            now_s = time.time()
+            robots = list_robots(connection, now_s)
+            if not robots:
+                raise NothingRecordedError(f"no robot has been recorded yet. {GETTING_STARTED}")
+            views = [view_of(connection, robot, None, now_s) for robot in _liveliest(robots)]
+            live = [view for view in views if view.robot.live]
+            hint = f"{len(robots)} robots in all, the latest {len(views)} are shown"
+            return RobotsAnswer(
+                **(live[0].header() if len(live) == 1 else {}),
+                robots=Table(columns=list(_ROBOT_COLUMNS), rows=[_row(view) for view in views]),
+                hint=hint if len(robots) > len(views) else None,
+            )
+
+    @tool("Get world information", READS)
+    def webots_get_world_info(self, robot: RobotName = None, run_id: RunId = None) -> WorldAnswer:
+        """The world file, its time step, the run and its pace, the controller's code, other robots.
+
+        Also where the database and the pictures lie.
+        """
+        with self._recording.view(robot, run_id) as view:
+            run = view.require_run()
+            session = fetch_session(view.connection, run.session_id)
+            return WorldAnswer(
+                **view.header(),
+                world=run.world,
+                basic_time_step_ms=run.basic_time_step_ms,
+                real_time_factor=_pace(view, run),
+                supervisor=session.supervisor if session else None,
+                run=_run(view, run),
+                runs_recorded=count_runs(view.connection, view.robot.id),
+                controller=_controller(session),
+                devices=_devices(view.robot.devices),
+                companions=_companions(view),
+                database=name_of(self._recording.database),
+                data_dir=str(self._recording.data_dir),
+            )
+
+
+def _liveliest(robots: list[Any]) -> list[Any]:
+    """Those seen last, where there are too many to show; in the order of their first appearance."""
+    latest = sorted(robots, key=lambda robot: (robot.live, robot.last_seen_wall_time_s))
+    shown = {robot.id for robot in latest[-_SHOWN_ROBOTS:]}
+    return [robot for robot in robots if robot.id in shown]
+
+
+def _row(view: View) -> list[Any]:
+    header, session = view.header(), view.session
+    runs = count_runs(view.connection, view.robot.id)
+    newest = [header[name] for name in ("status", "run_id", "sim_time_s", "age_s")]
+    actions = len(session.actions) if session else 0
+    name = cut_text(view.robot.name, _LONGEST_NAME)
+    return [name, view.robot.kind, view.robot.live, *newest, runs, actions]
+
+
+def _pace(view: View, run: Run) -> float | None:
+    factor = real_time_factor(view.connection, run.id)
+    return None if factor is None else round_number(factor)
+
+
+def _run(view: View, run: Run) -> dict[str, Any]:
+    """What the run is; `rows` is as of its last heartbeat."""
+    ended = {"ended_by": run.end_reason} if run.ended_wall_time_s is not None else {}
+    return {
+        "id": run.id,
+        "began_by": run.start_reason,
+        "began_ago_s": view.age_s(run.started_wall_time_s),
+        "sim_duration_s": round(run.last_sim_time_s - run.started_sim_time_s, 3),
+        "rows": run.rows,
+        **ended,
+    }
+
+
+def _controller(session: Session | None) -> dict[str, Any] | None:
+    if session is None:
+        return None
+    return {
+        "file": session.controller,
+        "sha256": session.controller_sha256,
+        "git_commit": session.git_commit,
+        "pid": session.pid,
+        "host": session.host,
+        **session.versions,
+    }
+
+
+def _devices(devices: dict[str, str]) -> dict[str, str] | None:
+    return dict(list(devices.items())[:_SHOWN_DEVICES]) or None
+
+
+def _companions(view: View) -> Table | None:
+    if view.session is None:
+        return None
+    others = companions(view.connection, view.session, view.now_s)
+    robots = {robot.id: robot for robot in list_robots(view.connection, view.now_s)}
+    rows = [
+        [robots[other.robot_id].name, robots[other.robot_id].kind, other.hold or ""]
+        for other in others[:_SHOWN_ROBOTS]
+    ]
+    return Table(columns=["robot", "kind", "hold"], rows=rows) if rows else None

@@ -1,0 +1,226 @@
+"""A recording as questions are asked of it: opened anew for each, migrated where needed."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+import time
+from collections.abc import Generator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+from webots_mcp import settlement
+from webots_mcp.connection import Role, connect
+from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.errors import (
+    DatabaseError,
+    NoDatabaseError,
+    NothingRecordedError,
+    SchemaTooOldError,
+)
+from webots_mcp.schema import require_current, schema_version
+from webots_mcp.store.queue import any_unfinished
+from webots_mcp.store.robots import Robot, resolve_robot
+from webots_mcp.store.runs import Run, current_run, fetch_run
+from webots_mcp.store.sessions import Session
+from webots_mcp.store.states import State, newest_state
+from webots_mcp.store.status import Status, judge, stopped_for
+
+GETTING_STARTED: Final = (
+    "Add three lines to a controller: 'from webots_mcp import MCPBridge', "
+    "'bridge = MCPBridge(robot)', and in its loop 'bridge.publish({...}); bridge.get_command()'; "
+    "then start the simulation. 'webots-mcp demo' shows it without Webots. If controllers record "
+    "elsewhere, start the server with --data-dir or --database."
+)
+
+
+@dataclass(frozen=True)
+class View:
+    """One robot, one run, now: what an answer's header is made of."""
+
+    connection: sqlite3.Connection
+    robot: Robot
+    run: Run | None
+    is_current: bool
+    now_s: float
+
+    @property
+    def session(self) -> Session | None:
+        """The robot's latest session."""
+        return self.robot.session
+
+    @cached_property
+    def state(self) -> State | None:
+        """The newest state of the run."""
+        return newest_state(self.connection, self.run.id) if self.run else None
+
+    @cached_property
+    def status(self) -> Status:
+        """Whether time is moving in this run."""
+        if self.is_current or self.run is None:
+            return judge(self.connection, self.session, self.run, self.now_s)
+        ended_s = self.run.ended_wall_time_s or self.run.last_wall_time_s
+        why = f"this is an earlier run; it ended by {self.run.end_reason or 'an unknown cause'}"
+        return Status(stopped_for(self.now_s - ended_s), why)
+
+    def header(self) -> dict[str, Any]:
+        """The fields that every answer begins with."""
+        newest = self.state
+        return {
+            "robot": self.robot.name,
+            "run_id": self.run.id if self.run else None,
+            "sim_time_s": round(newest.sim_time_s, 4) if newest else None,
+            "age_s": self.age_s(newest.wall_time_s) if newest else None,
+            "status": self.status.text,
+            "why": self.status.why,
+        }
+
+    def age_s(self, wall_time_s: float) -> float:
+        """How long ago that was."""
+        return round(max(self.now_s - wall_time_s, 0.0), 2)
+
+    def require_run(self) -> Run:
+        """The run.
+
+        Raises:
+            NothingRecordedError: The robot's controller has begun none.
+        """
+        if self.run is None:
+            raise NothingRecordedError(f"robot {self.robot.name!r} has no run recorded yet")
+        return self.run
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A database, the folder of its pictures, and whether the asker may write.
+
+    Nothing is created here: without a database every question is answered with how to get one.
+    """
+
+    database: Database
+    data_dir: Path
+    read_only: bool = False
+    _migrating: threading.Lock = field(default_factory=threading.Lock, repr=False)
+
+    @contextmanager
+    def reader(self) -> Generator[sqlite3.Connection]:
+        """A connection of its own that cannot write."""
+        with self._opened("reader") as connection:
+            yield connection
+
+    @contextmanager
+    def writer(self) -> Generator[sqlite3.Connection]:
+        """A connection of its own that waits up to 5 s for the write lock."""
+        with self._opened("writer") as connection:
+            yield connection
+
+    @contextmanager
+    def view(self, robot: str | None = None, run_id: int | None = None) -> Generator[View]:
+        """Look at a robot (the only live one if none is named) and at its current or that run.
+
+        Raises:
+            NothingRecordedError: There is no database, or no robot in it.
+            InvalidInputError: There is no such robot or run, or several robots are possible.
+        """
+        with self.reader() as connection:
+            yield look(connection, robot, run_id)
+
+    def settle(self) -> None:
+        """Say what became of commands that nobody alive will finish, unless `read_only`."""
+        if self.read_only:
+            return
+        with self.writer() as connection:
+            if any_unfinished(connection):
+                settlement.settle(connection, time.time())
+
+    @contextmanager
+    def _opened(self, role: Role) -> Generator[sqlite3.Connection]:
+        try:
+            with closing(self._open(role)) as connection:
+                yield connection
+        except sqlite3.Error as error:
+            raise DatabaseError(_explain(error, self.database)) from error
+
+    def _open(self, role: Role) -> sqlite3.Connection:
+        try:
+            connection = connect(self.database, role)
+        except NoDatabaseError as error:
+            raise NoDatabaseError(f"{error}. {GETTING_STARTED}") from error
+        try:
+            self._require_ours(connection)
+        except SchemaTooOldError:
+            connection.close()
+            self._migrate()
+            return connect(self.database, role)
+        except BaseException:
+            connection.close()
+            raise
+        return connection
+
+    def _require_ours(self, connection: sqlite3.Connection) -> None:
+        if schema_version(connection) == 0:
+            raise NoDatabaseError(
+                f"the database at {name_of(self.database)} is empty: no controller has recorded "
+                f"there yet. {GETTING_STARTED}"
+            )
+        require_current(connection)
+
+    def _migrate(self) -> None:
+        """Bring an older schema forward, once; importing Alembic costs a second."""
+        if self.read_only:
+            raise SchemaTooOldError(
+                f"the database at {name_of(self.database)} has an older schema, and what only "
+                "reads does not migrate it: run 'webots-mcp migrate'"
+            )
+        from webots_mcp.store.migrate import upgrade
+
+        with self._migrating:
+            upgrade(self.database)
+
+
+def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None = None) -> View:
+    """A view over an open connection; see `Recording.view`."""
+    now_s = time.time()
+    if robot is None and run_id is not None:
+        robot = _owner(connection, fetch_run(connection, run_id))
+    try:
+        chosen = resolve_robot(connection, robot, now_s)
+    except NothingRecordedError as error:
+        raise NothingRecordedError(f"{error}. {GETTING_STARTED}") from error
+    return view_of(connection, chosen, run_id, now_s)
+
+
+def view_of(connection: sqlite3.Connection, robot: Robot, run_id: int | None, now_s: float) -> View:
+    """A view of a robot that is already known."""
+    current = current_run(connection, robot.id)
+    run = current if run_id is None else fetch_run(connection, run_id, robot.id)
+    return View(connection, robot, run, run == current, now_s)
+
+
+def _owner(connection: sqlite3.Connection, run: Run) -> str:
+    row = connection.execute("SELECT name FROM robot WHERE id = ?", (run.robot_id,)).fetchone()
+    return str(row[0])
+
+
+def name_of(database: Database) -> str:
+    """The database as a person knows it."""
+    return "(in memory)" if isinstance(database, MemoryDatabase) else str(database)
+
+
+def _explain(error: sqlite3.Error, database: Database) -> str:
+    """What a person can do about it."""
+    text, name = str(error), name_of(database)
+    if "locked" in text:
+        return (
+            f"the database at {name} stayed locked by another process: ask again; if it lasts, "
+            "look for a program that holds a transaction open (a sqlite3 shell?)"
+        )
+    if "malformed" in text or "not a database" in text:
+        return (
+            f"the database at {name} is damaged ({text}): the bridge moves such a file aside at "
+            "its next start; 'sqlite3 FILE .recover' can save rows from it"
+        )
+    return f"the database at {name} cannot be used: {text}; check free space and permissions"

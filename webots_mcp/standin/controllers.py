@@ -1,7 +1,7 @@
 """The controllers of a world: which program each robot runs, and how far it is."""
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -60,7 +60,7 @@ class Controller:
     file: Path | None
     process: ControllerProcess | None = None
     starts: int = 0
-    """How often a process was started for this robot in this world."""
+    """How often a process was started for the robot."""
     connection: "Connection | None" = None
     has_left: bool = False
     """Whether the present process has closed its connection."""
@@ -173,8 +173,15 @@ class Controller:
         self.launch.on_exit()
 
 
-def controllers_of(simulator: Simulator, launch: Launch) -> list[Controller]:
-    """A controller for each robot of the world."""
-    return [
-        Controller(robot, launch, launch.file_of(robot, simulator)) for robot in simulator.robots
-    ]
+def controllers_of(
+    simulator: Simulator, launch: Launch, before: Iterable[Controller]
+) -> list[Controller]:
+    """A controller for each robot of the world; those of the world before are kept by name."""
+    known = {controller.name: controller for controller in before}
+    controllers: list[Controller] = []
+    for robot in simulator.robots:
+        file = launch.file_of(robot, simulator)
+        controller = known.get(robot.name) or Controller(robot, launch, file)
+        controller.robot, controller.file, controller.process = robot, file, None
+        controllers.append(controller)
+    return controllers

@@ -59,11 +59,11 @@ class Runner:
     def __init__(
         self,
         simulator: Simulator,
-        controllers_for: Callable[[Simulator], list[Controller]],
+        controllers_for: Callable[[Simulator, list[Controller]], list[Controller]],
         notify: Callable[[], None],
     ) -> None:
         self.simulator = simulator
-        self.controllers = controllers_for(simulator)
+        self.controllers = controllers_for(simulator, [])
         self.token = secrets.token_hex(16)
         self.exit_status: int | None = None
         self._controllers_for = controllers_for
@@ -268,7 +268,7 @@ class Runner:
         try:
             world = load_world(path)
             self.simulator = Simulator(world, self.simulator.mode, self.simulator.log)
-            self.controllers = self._controllers_for(self.simulator)
+            self.controllers = self._controllers_for(self.simulator, self.controllers)
         except WorldError as error:
             self.simulator.log(f"ERROR: {error}; the world stays as it was")
             self.simulator.reset()

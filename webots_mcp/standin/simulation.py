@@ -83,7 +83,7 @@ class Simulation:
         )
         self._runner = Runner(
             Simulator(load_world(world), _MODES[mode], self._print),
-            lambda simulator: controllers_of(simulator, launch),
+            lambda simulator, before: controllers_of(simulator, launch, before),
             self._notice,
         )
         self._thread = threading.Thread(target=self._runner.run, name="simulation", daemon=True)

@@ -1,0 +1,217 @@
+"""What sensors show, when, and what their wrappers refuse."""
+
+from __future__ import annotations
+
+import ctypes
+from math import inf, isnan, nan
+from pathlib import Path
+from typing import Any
+
+import pytest
+from controller import GPS, Camera, DistanceSensor, Lidar, Motor, Node
+
+from tests.standin.placing import place
+from webots_mcp.standin import InProcessSupervisor
+
+STEP_MS = 16
+
+
+@pytest.fixture
+def robot() -> InProcessSupervisor:
+    return InProcessSupervisor()
+
+
+def enabled(robot: InProcessSupervisor, name: str, period_ms: int = STEP_MS) -> Any:
+    device = robot.getDevice(name)
+    device.enable(period_ms)
+    return device
+
+
+def steps(robot: InProcessSupervisor, count: int) -> None:
+    for _ in range(count):
+        assert robot.step(STEP_MS) == 0
+
+
+def test_devices_come_in_the_order_of_the_scene_tree(robot: InProcessSupervisor) -> None:
+    names = [robot.getDeviceByIndex(i).getName() for i in range(robot.getNumberOfDevices())]
+    assert names == [
+        *("left wheel motor", "left wheel sensor", "right wheel motor", "right wheel sensor"),
+        *("ds_left", "ds_right", "camera", "gps", "inertial unit", "lidar"),
+    ]
+    assert [*robot.devices] == names
+    assert isinstance(robot.devices["gps"], GPS)
+    assert robot.getDevice("gps") is robot.devices["gps"]
+    assert robot.getDevice("gps").getNodeType() == Node.GPS != Node.LIDAR
+    assert {type(device).__module__.split(".")[0] for device in robot.devices.values()} == {
+        "controller"
+    }
+
+
+def test_a_missing_device_is_none_and_a_line(
+    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    assert robot.getDevice("missing") is None
+    assert '"missing"' in capfd.readouterr().err
+    with pytest.raises(KeyError, match="rover"):
+        robot.getDeviceByIndex(99)
+    assert capfd.readouterr().err
+
+
+def test_the_first_value_comes_when_the_period_has_passed(robot: InProcessSupervisor) -> None:
+    gps, wheel = enabled(robot, "gps", 64), enabled(robot, "left wheel sensor", 64)
+    for _ in range(3):
+        steps(robot, 1)
+        assert all(isnan(value) for value in gps.getValues())
+        assert isnan(wheel.getValue())
+        assert isnan(gps.getSpeed())
+    steps(robot, 1)
+    assert gps.getValues() == pytest.approx([-1.2, 0.0, 0.09])
+    assert wheel.getValue() == 0.0
+
+
+def test_an_inertial_unit_shows_plausible_nonsense_first(robot: InProcessSupervisor) -> None:
+    unit = enabled(robot, "inertial unit")
+    assert unit.getRollPitchYaw() != [0.0, 0.0, 0.0]
+    steps(robot, 1)
+    assert unit.getRollPitchYaw() == [0.0, 0.0, 0.0]
+    assert unit.getQuaternion() == [0.0, 0.0, 0.0, 1.0]
+
+
+def test_a_disabled_sensor_keeps_its_value_and_complains_each_time(
+    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    gps = enabled(robot, "gps")
+    steps(robot, 1)
+    gps.disable()
+    steps(robot, 5)
+    assert gps.getSamplingPeriod() == 0
+    assert gps.getValues() == gps.getValues() == pytest.approx([-1.2, 0.0, 0.09])
+    assert capfd.readouterr().err.count("called for a disabled device") == 2
+
+
+def test_a_device_made_by_name_enables_the_sensor_of_the_whole_process(
+    robot: InProcessSupervisor,
+) -> None:
+    gps = GPS("gps")
+    assert gps is not robot.getDevice("gps")
+    assert robot.getDevice("gps").getSamplingPeriod() == STEP_MS
+
+
+def test_a_distance_sensor_looks_along_its_ray(robot: InProcessSupervisor) -> None:
+    sensor: DistanceSensor = enabled(robot, "ds_left")
+    place(robot, 1.44, 1.5, -0.4)  # the left eye looks 0.4 rad to the left: straight east
+    steps(robot, 1)
+    eye_x = 1.44 + 0.06 * 0.92106 + 0.04 * 0.38942
+    assert sensor.getValue() == pytest.approx(2.0 - eye_x, abs=1e-4)
+    assert (sensor.getMinValue(), sensor.getMaxValue()) == (0.0, 1.0)
+    place(robot, -1.2, 0.0)
+    steps(robot, 1)
+    assert sensor.getValue() == 1.0
+
+
+def test_gps_and_speed_follow_the_robot(robot: InProcessSupervisor) -> None:
+    gps: GPS = enabled(robot, "gps")
+    for side in ("left", "right"):
+        motor: Motor = robot.getDevice(f"{side} wheel motor")
+        motor.setPosition(inf)
+        motor.setVelocity(5.0)
+    steps(robot, 50)
+    assert gps.getSpeed() == pytest.approx(0.2)
+    assert gps.getSpeedVector() == pytest.approx([0.2, 0.0, 0.0])
+    assert gps.getValues()[0] == pytest.approx(-1.2 + 0.2 * 0.8)
+
+
+def test_the_lidar_sees_walls_and_nothing_beyond_its_range(robot: InProcessSupervisor) -> None:
+    lidar: Lidar = enabled(robot, "lidar", 2 * STEP_MS)
+    steps(robot, 1)
+    assert not lidar.range_image
+    with pytest.raises(ValueError, match="NULL pointer"):
+        lidar.getRangeImage()
+    steps(robot, 1)
+    ranges = lidar.getRangeImage()
+    assert lidar.range_image[3] == pytest.approx(ranges[3])
+    assert len(ranges) == lidar.getHorizontalResolution() == 180
+    assert ranges[45] == pytest.approx(2.0, abs=0.01)  # left: the wall in the north
+    assert ranges[0] == pytest.approx(0.8, abs=0.01)  # behind: the wall in the west
+    assert min(ranges) > 0.1
+    place(robot, -1.9, -1.9, 0.78)
+    steps(robot, 2)
+    assert lidar.getRangeImage()[90] == inf  # the diagonal is longer than 3.5 m
+
+
+def test_a_level_lidar_looks_over_what_is_low(robot: InProcessSupervisor) -> None:
+    lidar: Lidar = enabled(robot, "lidar")
+    sensor: DistanceSensor = enabled(robot, "ds_left")
+    place(robot, -0.3 - 0.5, 0.9 - 0.04, -0.4)  # the crate is 12 cm high, the lidar at 14
+    steps(robot, 1)
+    assert sensor.getValue() < 0.5
+    assert lidar.getRangeImage()[90 - 11] > 0.5
+
+
+def test_a_camera_shows_what_is_in_front_of_it(robot: InProcessSupervisor) -> None:
+    camera: Camera = enabled(robot, "camera")
+    with pytest.raises(ValueError, match="NULL pointer"):
+        camera.getImage()
+    place(robot, 0.2, -0.6)  # the green pillar is ahead
+    steps(robot, 1)
+    image = camera.getImage()
+    assert isinstance(image, bytes)
+    assert len(image) == 4 * 160 * 120
+    middle = [get(image, 160, 80, 60) for get in (Camera.imageGetRed, Camera.imageGetGreen)]
+    assert middle[1] > 2 * middle[0]
+    assert image[:4] == bytes((230, 191, 153, 255))  # blue, green, red, alpha of the sky
+    assert len(camera.getImageArray()) == 160
+    camera.disable()
+    with pytest.raises(ValueError, match="NULL pointer"):
+        camera.getImage()
+
+
+def test_a_camera_writes_its_picture_itself(robot: InProcessSupervisor, tmp_path: Path) -> None:
+    camera: Camera = enabled(robot, "camera")
+    steps(robot, 1)
+    assert camera.saveImage(str(tmp_path / "x.png"), 90) == 0
+    assert (tmp_path / "x.png").read_bytes().startswith(b"\x89PNG")
+    assert camera.saveImage(str(tmp_path / "x.txt"), 90) == -1
+
+
+def test_a_picture_shows_the_moment_it_was_taken(robot: InProcessSupervisor) -> None:
+    camera: Camera = enabled(robot, "camera", 4 * STEP_MS)
+    steps(robot, 4)
+    first = camera.getImage()
+    place(robot, 0.2, -0.6)
+    steps(robot, 1)
+    assert camera.getImage() == first
+    steps(robot, 3)
+    assert camera.getImage() != first
+
+
+def test_motors_tell_what_was_commanded(
+    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    motor: Motor = robot.getDevice("left wheel motor")
+    assert motor.getVelocity() == motor.getMaxVelocity() == 12.0
+    motor.setVelocity(-1.0)  # the target position is finite
+    assert "negative" in capfd.readouterr().err
+    motor.setPosition(inf)
+    motor.setVelocity(-1)
+    assert (motor.getVelocity(), motor.getTargetPosition()) == (-1.0, inf)
+    motor.setVelocity(nan)
+    assert "NaN" in capfd.readouterr().err
+    assert motor.target_velocity == -1.0
+    sensor = motor.getPositionSensor()
+    assert sensor is not None
+    assert sensor.getName() == "left wheel sensor"
+    with pytest.raises(TypeError):
+        motor.setVelocity("1")  # type: ignore[arg-type]
+
+
+def test_integers_have_to_be_integers_and_texts_texts(robot: InProcessSupervisor) -> None:
+    assert isinstance(robot.getBasicTimeStep(), float)
+    with pytest.raises(ctypes.ArgumentError):
+        robot.step(robot.getBasicTimeStep())  # type: ignore[arg-type]
+    with pytest.raises(ctypes.ArgumentError):
+        robot.getDevice("gps").enable(16.0)
+    with pytest.raises(TypeError):
+        robot.exportImage(Path("x.png"), 90)  # type: ignore[arg-type]
+    assert robot.step() == 0
+    assert robot.getTime() == robot.time == 0.016

@@ -1,0 +1,411 @@
+"""Controllers as real processes: how they start, wait, end and start again."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.standin.conftest import WriteController
+from webots_mcp.standin import Mode, Simulation, StandInError, WorldError
+from webots_mcp.standin.in_process import DEFAULT_WORLD
+
+LOOP = """
+while robot.step(16) != -1:
+    pass
+print("ended")
+"""
+
+
+def fast(world: Path) -> Simulation:
+    return Simulation(world, mode="fast")
+
+
+def has_line(simulation: Simulation, text: str) -> bool:
+    return any(text in line for line in simulation.console)
+
+
+def test_a_controller_drives_its_robot_and_prints_to_the_console(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller("drive(5, 5)\nprint('off we go', flush=True)", LOOP)
+    lines: list[str] = []
+    with Simulation(world, mode="fast", console=lines.append) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 1.0)
+        assert simulation.robot("rover").position[0] > -1.1
+        assert "[rover] off we go" in simulation.console
+    assert "[rover] ended" in lines
+    assert lines[-1] == "INFO: 'rover' controller exited successfully."
+    assert simulation.controller("rover").exit_code == 0
+
+
+def test_a_controller_runs_where_and_as_webots_would_run_it(
+    world: Path, write_controller: WriteController
+) -> None:
+    text = world.read_text(encoding="utf-8")
+    world.write_text(
+        text.replace('controller "rover"', 'controller "rover" controllerArgs ["a b" "c"]'),
+        encoding="utf-8",
+    )
+    file = write_controller(
+        """
+        import os, sys
+        print("argv", sys.argv)
+        print("cwd", os.getcwd())
+        print("name", os.environ["WEBOTS_ROBOT_NAME"], os.environ["PYTHONIOENCODING"])
+        print("instance", os.path.isdir(os.environ["WEBOTS_INSTANCE_PATH"]))
+        print("own", os.environ["MY_SETTING"])
+        print("module", Supervisor.__module__, robot.getDevice("gps").__class__.__module__)
+        print("paths", robot.getWorldPath(), robot.getProjectPath())
+        """,
+        LOOP,
+    )
+    with Simulation(world, mode="fast", environment={"MY_SETTING": "yes"}) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0)
+        console = [line.removeprefix("[rover] ") for line in simulation.console]
+    assert "argv ['rover.py', 'a b', 'c']" in console
+    assert f"cwd {file.parent}" in console
+    assert "name rover UTF-8" in console
+    assert "instance True" in console
+    assert "own yes" in console
+    assert "module controller.supervisor controller.sensors" in console
+    assert f"paths {world} {world.parent.parent}" in console
+
+
+def test_a_person_pauses_steps_and_resumes(world: Path, write_controller: WriteController) -> None:
+    write_controller(LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0.1)
+        simulation.pause()
+        stopped_s = simulation.time_s
+        simulation.step()
+        simulation.wait_for(lambda: simulation.time_s > stopped_s)
+        assert simulation.mode is Mode.PAUSE
+        assert simulation.time_s == pytest.approx(stopped_s + 0.016)
+        simulation.resume()
+        simulation.wait_for(lambda: simulation.time_s > stopped_s + 0.1)
+        assert simulation.mode is Mode.REAL_TIME
+
+
+def test_real_time_is_as_fast_as_the_clock(world: Path, write_controller: WriteController) -> None:
+    write_controller(LOOP)
+    with Simulation(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0)
+        began_s, simulated_s = time.monotonic(), simulation.time_s
+        simulation.wait_for(lambda: simulation.time_s > simulated_s + 0.5)
+        assert time.monotonic() - began_s == pytest.approx(0.5, abs=0.15)
+
+
+def test_in_a_pause_step_blocks_but_step_zero_and_requests_do_not(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        robot.step(16)
+        robot.simulationSetMode(robot.SIMULATION_MODE_PAUSE)
+        print("zero", robot.step(0), robot.getFromDef("ROVER").getDef())
+        print("began", flush=True)
+        print("returned", robot.step(16), robot.simulationGetMode())
+        """,
+        LOOP,
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "began"))
+        assert has_line(simulation, "zero 0 ROVER")
+        assert simulation.time_s == pytest.approx(0.016)
+        assert not has_line(simulation, "returned")
+        simulation.fast()
+        simulation.wait_for(lambda: has_line(simulation, "returned 0 2"))
+
+
+def test_synchronous_robots_wait_for_each_other(
+    world: Path, write_controller: WriteController
+) -> None:
+    second = 'Robot { name "second" controller "second" supervisor TRUE }'
+    world.write_text(world.read_text(encoding="utf-8") + second, encoding="utf-8")
+    write_controller(LOOP)
+    write_controller(
+        """
+        from pathlib import Path
+        for _ in range(5):
+            robot.step(32)
+        print("holding", flush=True)
+        while not Path("go").exists():
+            robot.step(0)
+        """,
+        LOOP,
+        name="second",
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "holding"))
+        simulation.wait_for(lambda: simulation.robot("rover").remaining_ms == 16.0)
+        assert simulation.time_s == pytest.approx(0.16)
+        (world.parent.parent / "controllers" / "second" / "go").touch()
+        simulation.wait_for(lambda: simulation.time_s > 0.5)
+
+
+def test_the_world_goes_on_without_a_controller_that_crashed(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller("drive(5, 5)\nrobot.step(160)\nraise RuntimeError('broken')")
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 1.0)
+        simulation.wait_for(lambda: simulation.controller("rover").exit_code == 1)
+        assert has_line(simulation, "[rover] RuntimeError: broken")
+        simulation.wait_for(lambda: has_line(simulation, "exited with status: 1"))
+        simulation.reset()
+        simulation.wait_for(lambda: simulation.controller("rover").starts == 2)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_killed_controller_is_gone_and_the_world_goes_on(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0.1)
+        controller = simulation.controller("rover")
+        controller.kill()
+        simulation.wait_for(lambda: controller.exit_code == -9)
+        gone_s = simulation.time_s
+        simulation.wait_for(lambda: simulation.time_s > gone_s + 1.0)
+        assert not controller.is_connected
+
+
+def test_a_supervisors_reload_ends_the_controller_and_starts_it_again(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        print("time", robot.getTime())
+        robot.step(160)
+        robot.worldReload()
+        print("step", robot.step(16), flush=True)
+        robot.getFromDef("ROVER")  # ends the process: no `finally`, no atexit
+        print("never")
+        """
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.controller("rover").starts >= 3, timeout_s=20)
+        console = simulation.console
+    assert "[rover] step -1" in console
+    assert "[rover] never" not in console
+    assert "INFO: 'rover' controller exited successfully." in console
+    assert console.count("[rover] time 0.0") >= 2
+
+
+def test_a_supervisors_reset_does_not_end_the_controller(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        robot.step(160)
+        robot.simulationReset()
+        robot.step(16)
+        print("after", robot.getTime(), flush=True)
+        """,
+        LOOP,
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "after 0.016"))
+        assert simulation.controller("rover").starts == 1
+
+
+def test_a_reset_by_hand_starts_controllers_again(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller("drive(5, 5)", LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 1.0)
+        simulation.pause()
+        simulation.reset()
+        assert simulation.time_s == 0.0
+        assert simulation.robot("rover").position == (-1.2, 0.0, 0.04)
+        simulation.fast()
+        simulation.wait_for(lambda: simulation.time_s > 1.0)
+        assert simulation.controller("rover").starts == 2
+        assert has_line(simulation, "[rover] ended")
+
+
+def test_a_reload_reads_the_world_file_again(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0)
+        text = world.read_text(encoding="utf-8")
+        world.write_text(text.replace("-1.2 0 0.04", "1.2 0 0.04"), encoding="utf-8")
+        simulation.reload()
+        assert simulation.robot("rover").position == (1.2, 0.0, 0.04)
+        world.write_text("broken", encoding="utf-8")
+        simulation.reload()
+        assert has_line(simulation, "the world stays as it was")
+        simulation.wait_for(lambda: simulation.time_s > 0.1)
+
+
+def test_a_controller_that_does_not_end_is_terminated(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        while robot.step(16) != -1:
+            pass
+        print("deaf", flush=True)
+        import time
+        time.sleep(60)
+        """
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0)
+    assert has_line(simulation, "Forced termination")
+    assert simulation.controller("rover").exit_code not in (None, 0)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_signal_ends_a_controller_without_any_cleanup(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        import atexit, signal
+        atexit.register(print, "cleanup", flush=True)
+        """,
+        LOOP,
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0)
+        controller = simulation.controller("rover")
+        assert controller.pid is not None
+        os.kill(controller.pid, 15)
+        simulation.wait_for(lambda: controller.exit_code == -15)
+    assert not has_line(simulation, "cleanup")
+
+
+def test_a_world_loaded_in_pause_starts_its_controllers_with_the_first_step(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller("print('started', flush=True)", LOOP)
+    with Simulation(world, mode="pause") as simulation:
+        simulation.pause()
+        assert simulation.controller("rover").pid is None
+        simulation.step()
+        simulation.wait_for(lambda: simulation.time_s == pytest.approx(0.016))
+        simulation.wait_for(lambda: has_line(simulation, "started"))
+
+
+def test_quitting_gives_the_simulation_its_exit_status(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller("robot.step(16)\nrobot.simulationQuit(7)", LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: not simulation.is_running)
+    assert simulation.exit_status == 7
+    assert has_line(simulation, "[rover] ended")
+    with pytest.raises(StandInError, match="has ended"):
+        simulation.pause()
+
+
+def test_a_robot_without_synchronization_is_told_how_late_it_is(
+    world: Path, write_controller: WriteController
+) -> None:
+    world.write_text(
+        world.read_text(encoding="utf-8").replace(
+            "supervisor TRUE", "supervisor TRUE synchronization FALSE"
+        ),
+        encoding="utf-8",
+    )
+    write_controller(
+        """
+        robot.step(16)
+        began = robot.getTime()
+        while robot.getTime() < began + 1.0:
+            robot.step(0)
+        print("late", robot.step(16) > 500, robot.getSynchronization(), flush=True)
+        """,
+        LOOP,
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "late True False"))
+
+
+def test_a_second_robot_object_is_half_made(world: Path, write_controller: WriteController) -> None:
+    write_controller(
+        """
+        second = Robot()
+        try:
+            second.getDevice("gps")
+        except AttributeError as error:
+            first = Robot.created is robot
+            print("half made", second.step(16), second.getTime(), first, flush=True)
+        """,
+        LOOP,
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "half made 0 0.016 True"))
+        assert has_line(simulation, "Only one instance of the Robot class")
+
+
+def test_a_program_of_ones_own_can_be_an_extern_controller(
+    world: Path, write_controller: WriteController
+) -> None:
+    file = write_controller("robot.step(160)\nprint(robot.getTime())")
+    text = world.read_text(encoding="utf-8")
+    world.write_text(text.replace('"rover"\n  super', '"<extern>"\n  super'), encoding="utf-8")
+    with fast(world) as simulation:
+        environment = simulation.environment_of("rover")
+        assert simulation.time_s == 0.0  # the world waits for it
+        done = subprocess.run(
+            [sys.executable, str(file)], env=environment, capture_output=True, text=True, check=True
+        )
+        assert done.stdout == "0.16\n"
+        refused = subprocess.run(
+            [sys.executable, str(file)],
+            env=environment | {"WEBOTS_ROBOT_NAME": "nobody"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert "there is no robot 'nobody'" in refused.stderr
+
+
+def test_a_controller_that_no_simulation_started_says_what_to_do(
+    world: Path, write_controller: WriteController
+) -> None:
+    file = write_controller("")
+    with Simulation(world, controllers={"rover": file}) as simulation:
+        environment = simulation.environment_of("rover")
+    del environment["WEBOTS_INSTANCE_PATH"]
+    alone = subprocess.run(
+        [sys.executable, str(file)], env=environment, capture_output=True, text=True, check=False
+    )
+    assert "InProcessRobot" in alone.stderr
+
+
+def test_what_cannot_be_run_is_refused_at_once(world: Path, tmp_path: Path) -> None:
+    with pytest.raises(StandInError, match="mode has to be one of"):
+        Simulation(world, mode="quick")
+    with pytest.raises(WorldError, match="cannot read"):
+        Simulation(tmp_path / "missing.wbt")
+    double = tmp_path / "double.wbt"
+    rover = 'Robot { name "rover" }'
+    double.write_text(DEFAULT_WORLD.read_text(encoding="utf-8") + rover, encoding="utf-8")
+    with pytest.raises(WorldError, match="two robots have the name 'rover'"):
+        Simulation(double)
+
+
+def test_a_missing_controller_is_a_warning(world: Path) -> None:
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0.1)
+        assert has_line(simulation, "WARNING: rover: the controller")
+
+
+def test_waiting_in_vain_shows_the_console(world: Path, write_controller: WriteController) -> None:
+    write_controller("print('here I am', flush=True)", LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "here I am"))
+        with pytest.raises(TimeoutError, match="here I am"):
+            simulation.wait_for(lambda: False, timeout_s=0.1)

@@ -1,0 +1,195 @@
+"""What a supervisor may look at and change, and when it takes effect."""
+
+from __future__ import annotations
+
+from math import inf, isnan
+from pathlib import Path
+
+import pytest
+from controller import Field, Node
+
+from webots_mcp.standin import InProcessSupervisor, Mode
+from webots_mcp.standin.in_process import DEFAULT_WORLD
+
+STEP_MS = 16
+
+
+@pytest.fixture
+def robot() -> InProcessSupervisor:
+    return InProcessSupervisor()
+
+
+def test_the_scene_tree_can_be_walked(robot: InProcessSupervisor) -> None:
+    children = robot.getRoot().getField("children")
+    assert children is not None
+    nodes = [children.getMFNode(i) for i in range(children.getCount())]
+    assert [node.getDef() for node in nodes if node and node.getType() == Node.ROBOT] == ["ROVER"]
+    last = children.getMFNode(-1)
+    assert last == robot.getSelf()
+    assert last is not None and last.getTypeName() == last.getBaseTypeName() == "Robot"
+    assert last.getParentNode() == robot.getRoot()
+    assert robot.getFromId(last.getId()) == last
+    assert robot.getFromDef("NOBODY") is None
+    lidar = robot.getFromDevice(robot.getDevice("lidar").tag)
+    assert lidar is not None and lidar.getType() == Node.LIDAR
+
+
+def test_fields_have_types_and_values(robot: InProcessSupervisor) -> None:
+    node = robot.getSelf()
+    name, place = node.getField("name"), node.getField("translation")
+    assert name is not None and place is not None
+    assert name.getSFString() == name.value == "rover"
+    assert (place.getType(), place.getTypeName()) == (Field.SF_VEC3F, "SFVec3f")
+    assert place.getSFVec3f() == [-1.2, 0.0, 0.04]
+    assert place.getCount() == -1
+    supervisor = node.getField("supervisor")
+    assert supervisor is not None and supervisor.getSFBool() == 1
+    assert node.getField("colour") is None
+    assert node.getNumberOfFields() > 5
+
+
+def test_fields_refuse_values_of_the_wrong_type(
+    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    place = robot.getSelf().getField("translation")
+    assert place is not None
+    place.setSFVec3f((0.0, 0.0, 0.0))  # type: ignore[arg-type]
+    place.setSFVec3f([0.0, 0.0])
+    place.setSFFloat(1.0)
+    assert place.getSFVec3f() == [-1.2, 0.0, 0.04]
+    assert capfd.readouterr().err.count("wrong type or length") == 2
+
+
+def test_a_field_that_was_set_reads_new_before_the_world_follows(
+    robot: InProcessSupervisor,
+) -> None:
+    node = robot.getSelf()
+    place = node.getField("translation")
+    assert place is not None
+    place.setSFVec3f([1, 0, 0.04])  # type: ignore[list-item]
+    assert place.getSFVec3f() == [1.0, 0.0, 0.04]
+    assert node.getPosition() == [-1.2, 0.0, 0.04]
+    robot.step(0)
+    assert node.getPosition() == [1.0, 0.0, 0.04]
+
+
+def test_a_node_tells_place_and_velocity(robot: InProcessSupervisor) -> None:
+    for side in ("left", "right"):
+        robot.getDevice(f"{side} wheel motor").setPosition(inf)
+        robot.getDevice(f"{side} wheel motor").setVelocity(5.0)
+    robot.step(10 * STEP_MS)
+    node = robot.getSelf()
+    assert node.getVelocity() == pytest.approx([0.2, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert node.getOrientation() == [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
+    assert node.getPose()[3] == node.getPosition()[0] == pytest.approx(-1.2 + 0.2 * 0.16)
+    wheel = robot.getFromDef("ROVER.LEFT_WHEEL")
+    assert wheel is not None and wheel.getPosition()[1] == pytest.approx(0.075)
+    root = robot.getRoot()
+    assert all(isnan(value) for value in root.getPosition() + root.getVelocity())
+
+
+def test_a_reset_acts_at_the_end_of_the_next_step(robot: InProcessSupervisor) -> None:
+    gps, wheel = robot.getDevice("gps"), robot.getDevice("left wheel sensor")
+    gps.enable(4 * STEP_MS)
+    wheel.enable(STEP_MS)
+    motors = [robot.getDevice(f"{side} wheel motor") for side in ("left", "right")]
+    for motor in motors:
+        motor.setPosition(inf)
+        motor.setVelocity(5.0)
+    robot.step(50 * STEP_MS)
+    robot.simulationReset()
+    assert robot.getTime() == pytest.approx(0.8)
+    robot.step(STEP_MS)
+    assert robot.getTime() == pytest.approx(0.016)
+    assert gps.getValues()[0] == pytest.approx(-1.2)  # due at once
+    robot.step(10 * STEP_MS)
+    assert wheel.getValue() == 0.0  # the motors hold
+    assert motors[0].getVelocity() == 5.0  # and report what they were told
+    for motor in motors:
+        motor.setPosition(inf)
+        motor.setVelocity(5.0)
+    robot.step(10 * STEP_MS)
+    assert wheel.getValue() == pytest.approx(0.8)
+
+
+def test_nothing_is_reset_while_paused(robot: InProcessSupervisor) -> None:
+    robot.step(STEP_MS)
+    robot.simulationSetMode(robot.SIMULATION_MODE_PAUSE)
+    robot.simulationReset()
+    robot.step(0)
+    assert robot.getTime() == pytest.approx(0.016)
+
+
+def test_any_other_number_than_a_mode_pauses(robot: InProcessSupervisor) -> None:
+    assert robot.simulationGetMode() == robot.SIMULATION_MODE_FAST
+    robot.simulationSetMode(7)
+    assert robot.simulationGetMode() == robot.SIMULATION_MODE_PAUSE
+    robot.simulation_mode = robot.SIMULATION_MODE_REAL_TIME
+    assert robot.simulation.mode is Mode.REAL_TIME
+
+
+def test_custom_data_written_by_the_field_reaches_the_robot(robot: InProcessSupervisor) -> None:
+    robot.setCustomData("mine")
+    field = robot.getSelf().getField("customData")
+    assert field is not None and field.getSFString() == ""
+    robot.step(STEP_MS)
+    assert field.getSFString() == "mine"
+    field.setSFString("yours")
+    robot.step(STEP_MS)
+    assert robot.getCustomData() == "yours"
+
+
+def test_a_picture_is_written_with_the_next_step_or_at_once_when_paused(
+    robot: InProcessSupervisor, tmp_path: Path
+) -> None:
+    running, paused = tmp_path / "running.png", tmp_path / "paused.jpg"
+    robot.setLabel(1, "hello", 0.1, 0.1, 0.05, 0xFF0000)
+    robot.exportImage(str(running), 90)
+    assert not running.exists()
+    robot.step(STEP_MS)
+    assert running.read_bytes().startswith(b"\x89PNG")
+    robot.simulationSetMode(robot.SIMULATION_MODE_PAUSE)
+    robot.exportImage(str(paused), 90)
+    assert paused.read_bytes().startswith(b"\xff\xd8")
+
+
+def test_a_picture_that_fails_is_a_line_in_the_console_only(
+    robot: InProcessSupervisor, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    robot.exportImage(str(tmp_path / "missing" / "x.png"), 90)
+    robot.exportImage(str(tmp_path / "x.gif"), 90)
+    assert robot.step(STEP_MS) == 0
+    assert [line.startswith("ERROR: cannot export") for line in robot.simulation.console] == [
+        True,
+        True,
+    ]
+    robot.exportImage(str(tmp_path / "x.png"), 101)
+    assert "quality 101" in capfd.readouterr().err
+
+
+def test_between_the_halves_of_a_step_requests_are_refused(
+    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    robot.stepBegin(STEP_MS)
+    assert robot.getFromDef("ROVER") is None
+    assert "step_begin" in capfd.readouterr().err
+    assert robot.stepEnd() == 0
+    assert robot.getFromDef("ROVER") is not None
+
+
+def test_without_rights_every_call_complains_and_gives_a_default(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    world = tmp_path / "plain.wbt"
+    text = DEFAULT_WORLD.read_text(encoding="utf-8").replace("supervisor TRUE", "supervisor FALSE")
+    world.write_text(text, encoding="utf-8")
+    robot = InProcessSupervisor(world=world)
+    assert robot.getSupervisor() is False
+    assert robot.getFromDef("ROVER") is None
+    assert capfd.readouterr().err.count("Error: ") == 2
+    node = robot.getSelf()
+    assert node
+    assert all(isnan(value) for value in node.getPosition())
+    robot.simulationSetMode(robot.SIMULATION_MODE_PAUSE)
+    assert robot.simulationGetMode() == robot.SIMULATION_MODE_FAST
+    assert robot.step(STEP_MS) == 0

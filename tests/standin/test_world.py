@@ -1,0 +1,92 @@
+"""Worlds are read as Webots reads them, or refused with a line number."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from webots_mcp.standin import WorldError
+from webots_mcp.standin.in_process import DEFAULT_WORLD
+from webots_mcp.standin.world import World, load_world
+
+HEADER = "#VRML_SIM R2023b utf8\n"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "worlds" / "arena.wbt"
+
+
+def loaded(text: str, tmp_path: Path) -> World:
+    path = tmp_path / "small.wbt"
+    path.write_text(HEADER + text, encoding="utf-8")
+    return load_world(path)
+
+
+def test_the_arena_is_read_with_types_and_defaults() -> None:
+    world = load_world(DEFAULT_WORLD)
+    rover = world.find("ROVER")
+    assert rover is not None
+    assert rover.fields["translation"] == [-1.2, 0.0, 0.04]
+    assert rover.fields["supervisor"] is True
+    assert rover.fields["synchronization"] is True  # not in the file
+    assert world.basic_time_step_ms == 16.0
+    assert world.title == "Arena"
+    sensor = world.find("ROVER.DS_LEFT")
+    assert sensor is not None
+    assert sensor.fields["lookupTable"] == [[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]]
+
+
+def test_a_use_is_the_node_of_its_def() -> None:
+    world = load_world(DEFAULT_WORLD)
+    east, west = world.find("WALL_EAST"), world.find("WALL_WEST")
+    assert east is not None and west is not None
+    assert east.fields["children"][0] is west.fields["children"][0]
+
+
+def test_nested_places_add_up(tmp_path: Path) -> None:
+    world = loaded(
+        """WorldInfo {}
+        Pose { translation 1 0 0 rotation 0 0 1 1.5707963 children [
+          DEF INNER Pose { translation 1 0 0 } ] }""",
+        tmp_path,
+    )
+    inner = world.find("INNER")
+    assert inner is not None
+    frame = world.frame_of(inner)
+    assert frame is not None
+    assert frame.translation == pytest.approx((1.0, 1.0, 0.0), abs=1e-6)
+    assert frame.yaw_rad == pytest.approx(1.5707963)
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "message"),
+    [
+        ("WorldInfo {\n  title 5\n}", 2, "title has to be SFString"),
+        ("WorldInfo {}\nSolid { translation 1 2 }", 3, "translation has to be SFVec3f"),
+        ("WorldInfo {}\nSolid {\n", 3, "ends in the middle"),
+        ("WorldInfo {}\nUSE NOBODY", 3, "before any DEF NOBODY"),
+        ("WorldInfo {}\nE-puck {}", 3, "does not know E-puck nodes"),
+        ('EXTERNPROTO "x.proto"\nWorldInfo {}', 2, "base nodes"),
+        ("WorldInfo {}\nSolid { children ] }", 3, "children has no value"),
+        ("Solid {}", 1, "no WorldInfo"),
+        ("WorldInfo { basicTimeStep 0 }", 2, "positive"),
+    ],
+)
+def test_a_bad_world_is_refused_with_its_line(
+    text: str, line: int, message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(WorldError, match=message) as caught:
+        loaded(text, tmp_path)
+    if "title" not in text:
+        assert f"line {line}:" in str(caught.value)
+
+
+def test_a_file_that_is_no_world_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "no.wbt"
+    path.write_text("hello", encoding="utf-8")
+    with pytest.raises(WorldError, match="a world begins with"):
+        load_world(path)
+    with pytest.raises(WorldError, match="cannot read the world"):
+        load_world(tmp_path / "missing.wbt")
+
+
+def test_the_built_in_arena_is_the_example() -> None:
+    assert DEFAULT_WORLD.read_text(encoding="utf-8") == EXAMPLE.read_text(encoding="utf-8")

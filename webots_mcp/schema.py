@@ -16,6 +16,12 @@ from webots_mcp.errors import ForeignDatabaseError, SchemaTooNewError, SchemaToo
 
 SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
 
+# One statement, so one moment: another starter may be making the tables right now.
+_STAMPS: Final = (
+    "SELECT (SELECT application_id FROM pragma_application_id), "
+    "(SELECT user_version FROM pragma_user_version), (SELECT count(*) FROM sqlite_master)"
+)
+
 
 def schema_version(connection: sqlite3.Connection) -> int:
     """The schema version of a database of ours; 0 for an empty file.
@@ -24,11 +30,9 @@ def schema_version(connection: sqlite3.Connection) -> int:
         ForeignDatabaseError: The file holds tables of another application.
         sqlite3.DatabaseError: The file is no database, or is damaged.
     """
-    application_id = int(connection.execute("PRAGMA application_id").fetchone()[0])
-    version = int(connection.execute("PRAGMA user_version").fetchone()[0])
-    tables = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+    application_id, version, tables = connection.execute(_STAMPS).fetchone()
     if application_id == APPLICATION_ID:
-        return version
+        return int(version)
     if tables:
         raise ForeignDatabaseError(
             f"this SQLite database belongs to another application (application_id "

@@ -7,6 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 from webots_mcp.connection import connect
+from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.schema import create_schema, require_current
 from webots_mcp.store.migrate import downgrade, upgrade
 
@@ -28,7 +29,7 @@ def test_a_database_of_the_first_schema_comes_forward_with_its_data(tmp_path: Pa
     for statement in FIRST_DATA:
         connection.execute(statement)
 
-    assert upgrade(file) == (1, 2)
+    assert upgrade(file) == (1, SCHEMA_VERSION)
 
     require_current(connection)
     assert connection.execute("SELECT data FROM state").fetchall() == [('{"x": 1}',)]
@@ -38,7 +39,7 @@ def test_a_database_of_the_first_schema_comes_forward_with_its_data(tmp_path: Pa
 
 def test_going_back_deletes_only_what_the_older_schema_lacks(tmp_path: Path) -> None:
     file = tmp_path / "webots.db"
-    upgrade(file)
+    upgrade(file, "0002")
     connection = connect(file, "writer")
     for statement in FIRST_DATA:
         connection.execute(statement)

@@ -69,10 +69,14 @@ class Batch:
             yield from columns.values()
 
 
-def odd_names(odd: str | None) -> set[str]:
-    """The signals that a row's `odd` is about: by their own name, or by an item of their array."""
+def odd_names(odd: str | None) -> dict[str, str]:
+    """What was odd (nan, inf, ...) by signal: by its own name, or by an item of its array."""
     if odd is None:
-        return set()
-    paths = cast("dict[str, str]", json.loads(odd))
-    arrays = {path.rpartition(".")[0] for path in paths if "." in path}
-    return {*paths, *(f"{array}.{reduction}" for array in arrays for reduction in REDUCTIONS)}
+        return {}
+    reasons: dict[str, str] = {}
+    for path, reason in cast("dict[str, str]", json.loads(odd)).items():
+        reasons[path] = reason
+        array, _, item = path.rpartition(".")
+        if item.isdecimal():
+            reasons.update((f"{array}.{reduction}", reason) for reduction in REDUCTIONS)
+    return reasons

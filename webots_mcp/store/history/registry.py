@@ -16,7 +16,7 @@ from webots_mcp.store.history.summary import usable_numbers
 MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
 
 _OF_ROBOT: Final = (
-    "SELECT id, robot_id, name, kind, unit, path, reduce FROM signal WHERE robot_id = ?"
+    "SELECT id, robot_id, name, kind, unit, path, reduce FROM signal WHERE robot_id = ? ORDER BY id"
 )
 _ADD: Final = (
     "INSERT INTO signal (robot_id, name, kind, unit, path, reduce, first_seen_wall_time_s, "
@@ -39,6 +39,7 @@ class Signal:
         id: In the register; None for one that was seen only in rows after the watermark.
         path: For `json_extract(state.data, path)`.
         reduce: None, or how the long array at `path` becomes one number.
+        mixed: Its array was at times long enough to be reduced.
     """
 
     id: int | None
@@ -48,6 +49,12 @@ class Signal:
     unit: str | None
     path: str
     reduce: str | None
+    mixed: bool = False
+
+    @property
+    def needs_decoding(self) -> bool:
+        """Whether `json_extract` alone would not give the same as `flatten`."""
+        return self.reduce is not None or self.mixed
 
     @property
     def is_number(self) -> bool:
@@ -58,7 +65,16 @@ class Signal:
 def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, Signal]:
     """The signals of a robot in the register, by name."""
     rows = connection.execute(_OF_ROBOT, (robot_id,)).fetchall()
-    return {row[2]: Signal(*row) for row in rows}
+    return by_name([Signal(*row) for row in rows])
+
+
+def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
+    """The signals by name, with what they tell about each other."""
+    arrays = tuple({f"{signal.path}[" for signal in signals if signal.reduce})
+    return {
+        signal.name: replace(signal, mixed=True) if signal.path.startswith(arrays) else signal
+        for signal in signals
+    }
 
 
 def seen_in(column: BatchColumn, known: Kind = "null") -> Kind:

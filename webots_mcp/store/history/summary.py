@@ -22,7 +22,7 @@ class Summary(NamedTuple):
     """Fields in the order of the rollup's columns; the numbers are None where there are none.
 
     Attributes:
-        rows: State rows that held the signal.
+        rows: State rows that held the signal; where rows were read as columns, all of them.
         present: Of them with a value.
         changes: Values unlike the one before, within the stretch.
         squares: Sum of squared deviations from the mean.
@@ -82,12 +82,12 @@ def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = 
 
     The squares are summed in a second pass over the deviations from the mean (T. F. Chan, G. H.
     Golub, R. J. LeVeque, "Algorithms for computing the sample variance", The American
-    Statistician 37, 1983): no cancellation where the mean is large. Text only counts.
+    Statistician 37, 1983): no cancellation where the mean is large. Of text only the times.
     """
     rows = len(values)
-    times, numbers = usable_numbers(times, values)
+    number_times, numbers = usable_numbers(times, values)
     if not numbers:
-        return Summary(rows, sum(value is not None for value in values))
+        return _without_numbers(times, values)
     total = math.fsum(numbers)
     mean = total / len(numbers)
     deviations = [number - mean for number in numbers]
@@ -97,18 +97,25 @@ def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = 
         len(numbers),
         sum(map(ne, numbers, numbers[1:])),
         numbers[0],
-        times[0],
+        number_times[0],
         numbers[-1],
-        times[-1],
+        number_times[-1],
         low,
-        times[numbers.index(low)],
+        number_times[numbers.index(low)],
         high,
-        times[numbers.index(high)],
+        number_times[numbers.index(high)],
         total,
         math.fsum(map(mul, deviations, deviations)),
         math.fsum(map(math.sin, numbers)) if angle else None,
         math.fsum(map(math.cos, numbers)) if angle else None,
     )
+
+
+def _without_numbers(times: Sequence[float], values: Sequence[Value]) -> Summary:
+    held = [time for time, value in zip(times, values, strict=True) if value is not None]
+    if not held:
+        return Summary(len(values))
+    return Summary(len(values), len(held), first_sim_time_s=held[0], last_sim_time_s=held[-1])
 
 
 def usable_numbers(
@@ -146,7 +153,7 @@ def merge(parts: Sequence[Summary]) -> Summary:
     rows = sum(part.rows for part in parts)
     filled = [part for part in parts if part.sum is not None]
     if not filled:
-        return Summary(rows, sum(part.present for part in parts))
+        return _merged_without_numbers(rows, [part for part in parts if part.present])
     count = sum(part.present for part in filled)
     total = math.fsum(_column(filled, "sum"))
     low = min(filled, key=attrgetter("min"))
@@ -169,6 +176,14 @@ def merge(parts: Sequence[Summary]) -> Summary:
         _sum_where_angle(filled, "sines"),
         _sum_where_angle(filled, "cosines"),
     )
+
+
+def _merged_without_numbers(rows: int, held: Sequence[Summary]) -> Summary:
+    if not held:
+        return Summary(rows)
+    first_s, last_s = held[0].first_sim_time_s, held[-1].last_sim_time_s
+    present = sum(part.present for part in held)
+    return Summary(rows, present, first_sim_time_s=first_s, last_sim_time_s=last_s)
 
 
 def _merged_squares(parts: Sequence[Any], mean: float) -> float:

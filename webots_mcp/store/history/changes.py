@@ -1,0 +1,91 @@
+"""Text and boolean signals as the points at which they change, and the time in each value."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+from webots_mcp.store.history.columns import read_columns
+from webots_mcp.store.history.deadline import Deadline
+from webots_mcp.store.history.ranges import Segment
+from webots_mcp.store.history.registry import Signal
+from webots_mcp.store.history.rollup import watermark
+from webots_mcp.store.history.tiers import rows_after
+
+_CHANGES: Final = (
+    "SELECT sim_time_s, value FROM change WHERE run_id = ? AND signal_id = ? AND sim_time_s < ? "
+    "ORDER BY state_id"
+)
+
+
+class Point(NamedTuple):
+    """From `sim_time_s` on the signal had this value."""
+
+    sim_time_s: float
+    value: str | bool | None
+
+
+def change_points(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+) -> dict[str, list[Point]]:
+    """The change points of text and boolean signals in a segment, at any length of it.
+
+    The first point is the value in force when the segment begins; its time may lie before. They
+    come from the change table, and from the rows after the watermark until the deadline.
+    """
+    points = {signal.name: _stored(connection, segment, signal) for signal in signals}
+    mark = watermark(connection)
+    before_end = Segment(segment.run_id, float("-inf"), segment.end_s)
+    late = rows_after(connection, before_end, mark)
+    if late is not None and signals:
+        columns = read_columns(connection, late, signals, deadline, after_id=mark)
+        for signal in signals:
+            new = zip(columns.times, columns.values[signal.name], strict=True)
+            _append_changes(points[signal.name], new)
+    return {name: _from(found, segment.start_s) for name, found in points.items()}
+
+
+def _stored(connection: sqlite3.Connection, segment: Segment, signal: Signal) -> list[Point]:
+    if signal.id is None:
+        return []
+    rows = connection.execute(_CHANGES, (segment.run_id, signal.id, segment.end_s))
+    if signal.kind == "bool":
+        return [Point(time_s, None if value is None else value == "true") for time_s, value in rows]
+    return [Point(time_s, value) for time_s, value in rows]
+
+
+def _append_changes(points: list[Point], rows: Iterable[tuple[float, object]]) -> None:
+    for time_s, value in rows:
+        assert value is None or isinstance(value, (str, bool))
+        if not points or points[-1].value != value:
+            points.append(Point(time_s, value))
+
+
+def _from(points: list[Point], start_s: float) -> list[Point]:
+    """Without the points that were over when the segment began."""
+    started = sum(point.sim_time_s <= start_s for point in points)
+    return points[max(0, started - 1) :]
+
+
+def time_by_value(points: Sequence[Point], start_s: float, end_s: float) -> dict[str, float]:
+    """Simulated seconds in each value within [start_s, end_s), the longest first.
+
+    Between two rows the value of the earlier one is in force; null counts as "null".
+    """
+    seconds: dict[str, float] = {}
+    for point, after in pairwise([*points, Point(end_s, None)]):
+        begin_s, stop_s = max(point.sim_time_s, start_s), min(after.sim_time_s, end_s)
+        if stop_s > begin_s:
+            key = spelled(point.value)
+            seconds[key] = seconds.get(key, 0.0) + stop_s - begin_s
+    return dict(sorted(seconds.items(), key=lambda item: -item[1]))
+
+
+def spelled(value: str | bool | None) -> str:
+    """A value as a name: true, false, null, or the text."""
+    return value if isinstance(value, str) else {True: "true", False: "false", None: "null"}[value]

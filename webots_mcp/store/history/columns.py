@@ -1,0 +1,174 @@
+"""Reading state rows as columns: one list of times, and one list of values per signal."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from webots_mcp.store.history.batch import odd_names
+from webots_mcp.store.history.deadline import Deadline
+from webots_mcp.store.history.leaves import Value, flatten, parse, shown
+from webots_mcp.store.history.ranges import Segment
+from webots_mcp.store.history.registry import Signal
+
+RAW_ROWS: Final = 30_000  # 2 to 3 us each: what a question may read without rollups
+MAX_EXTRACTED: Final = 12  # beyond, decoding the whole row in Python is faster than json_extract
+
+_IN_SEGMENT: Final = (
+    "FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
+    "AND wall_time_s >= ? AND wall_time_s < ? AND id > ?"
+)
+_FEWER_THAN: Final = (
+    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? "
+    "AND sim_time_s < ? LIMIT ?)"
+)
+_CHUNK_ROWS: Final = 2000
+
+
+@dataclass
+class Columns:
+    """State rows of one run, in order.
+
+    Attributes:
+        values: Per signal one value per row; None where the row has none.
+        odd: Per signal, how often each value that JSON cannot hold ("nan", "inf") stood there.
+        cut: The deadline passed; the rows after the last one were not read.
+    """
+
+    run_id: int
+    ids: list[int] = field(default_factory=list[int])
+    times: list[float] = field(default_factory=list[float])
+    walls: list[float] = field(default_factory=list[float])
+    values: dict[str, list[Value]] = field(default_factory=dict[str, list[Value]])
+    odd: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])
+    cut: bool = False
+
+    def slice(self, start: int, end: int) -> Columns:
+        """The rows [start, end) of these; what was odd in them is not known any more."""
+        values = {name: column[start:end] for name, column in self.values.items()}
+        part = (self.ids[start:end], self.times[start:end], self.walls[start:end])
+        return Columns(self.run_id, *part, values)
+
+
+def exceeds(connection: sqlite3.Connection, segment: Segment, rows: int = RAW_ROWS) -> bool:
+    """Whether a segment has more rows than that; looks at no more index entries than that."""
+    bounds = (segment.run_id, segment.start_s, segment.end_s, rows + 1)
+    return bool(connection.execute(_FEWER_THAN, bounds).fetchone()[0] > rows)
+
+
+def read_columns(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+    *,
+    after_id: int = 0,
+    limit: int = -1,
+) -> Columns:
+    """Read the rows of a segment, in order, until the deadline.
+
+    Args:
+        connection: Any.
+        segment: Which rows.
+        signals: Which values of them; none for times only.
+        deadline: After it no further rows are read, and the answer says that it was cut.
+        after_id: Only rows with greater ids: those after the watermark, or after a page.
+        limit: At most so many rows; -1 for all.
+    """
+    columns = Columns(segment.run_id, values={signal.name: [] for signal in signals})
+    decode = len(signals) > MAX_EXTRACTED or any(signal.needs_decoding for signal in signals)
+    read = _read_decoded if decode else _read_extracted
+    bounds = (segment.run_id, segment.start_s, segment.end_s)
+    parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id, limit)
+    try:
+        read(connection, signals, parameters, columns, deadline)
+    except sqlite3.OperationalError:
+        if not deadline.passed:
+            raise
+        columns.cut = True
+    for signal in signals:
+        columns.values[signal.name] = _cleaned(signal, columns.values[signal.name])
+    return columns
+
+
+def _read_extracted(
+    connection: sqlite3.Connection,
+    signals: Sequence[Signal],
+    parameters: tuple[object, ...],
+    columns: Columns,
+    deadline: Deadline,
+) -> None:
+    extracts = "".join(", json_extract(data, ?)" for _ in signals)
+    query = f"SELECT id, sim_time_s, wall_time_s, odd{extracts} {_IN_SEGMENT}"
+    paths = tuple(signal.path for signal in signals)
+    for chunk in _chunks(connection, query, (*paths, *parameters), columns, deadline):
+        read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
+        _extend(columns, signals, read[:3], read[3])
+        for signal, column in zip(signals, read[4:], strict=True):
+            columns.values[signal.name].extend(column)
+
+
+def _read_decoded(
+    connection: sqlite3.Connection,
+    signals: Sequence[Signal],
+    parameters: tuple[object, ...],
+    columns: Columns,
+    deadline: Deadline,
+) -> None:
+    query = f"SELECT id, sim_time_s, wall_time_s, odd, data {_IN_SEGMENT}"
+    for chunk in _chunks(connection, query, parameters, columns, deadline):
+        read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
+        leaves = [flatten(parse(data)) for data in read[4]]
+        _extend(columns, signals, read[:3], read[3])
+        for signal in signals:
+            name = signal.name
+            columns.values[name].extend([row.get(name) for row in leaves])
+
+
+def _chunks(
+    connection: sqlite3.Connection,
+    query: str,
+    parameters: tuple[object, ...],
+    columns: Columns,
+    deadline: Deadline,
+) -> Iterator[list[Any]]:
+    cursor = connection.execute(f"{query} ORDER BY sim_time_s, id LIMIT ?", parameters)
+    while chunk := cursor.fetchmany(_CHUNK_ROWS):
+        yield chunk
+        if deadline.passed and len(chunk) == _CHUNK_ROWS:
+            columns.cut = True
+            return
+
+
+def _extend(
+    columns: Columns,
+    signals: Sequence[Signal],
+    heads: Sequence[tuple[Any, ...]],
+    odds: Sequence[str | None],
+) -> None:
+    for column, read in zip((columns.ids, columns.times, columns.walls), heads, strict=True):
+        column.extend(read)
+    if any(odds):
+        for odd in filter(None, odds):
+            _count_odd(columns, signals, odd)
+
+
+def _count_odd(columns: Columns, signals: Sequence[Signal], odd: str) -> None:
+    reasons = odd_names(odd)
+    for signal in signals:
+        if signal.name in reasons:
+            columns.odd.setdefault(signal.name, Counter())[reasons[signal.name]] += 1
+
+
+def _cleaned(signal: Signal, values: list[Value]) -> list[Value]:
+    """Every value of the type that the signal's kind promises; the same from SQL and Python."""
+    if signal.kind == "text":
+        return [shown(value) for value in values]
+    if signal.kind == "bool":
+        return [None if value is None else value in (1, True) for value in values]
+    if str in set(map(type, values)):
+        return [None if isinstance(value, str) else value for value in values]
+    return values

@@ -1,0 +1,270 @@
+"""The one place where time ranges are defined.
+
+A range is half-open, [start, end), and given in one of three ways:
+
+- in simulation seconds of one run (`start_s`, `end_s`; either may be left out, then the range
+  reaches to the run's first row, or up to and with its newest),
+- in seconds back from a run's newest row (`last_s`; that row is in),
+- in wall time (`wall_start`, `wall_end`: ISO 8601 or Unix seconds), across the runs of a robot.
+
+Without `run_id` the run is the robot's newest. Simulation time begins again in each run, so a
+range over several runs is one segment per run.
+"""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Final, Literal
+
+from webots_mcp.errors import InvalidRangeError, NothingRecordedError
+from webots_mcp.store.history.subject import Subject, find_subject
+
+_FIRST: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
+_NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"
+_RUNS_IN: Final = (
+    "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s < ? "
+    "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) ORDER BY id"
+)
+_WALL_UP_TO: Final = (  # of the last row at or before a simulation time
+    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_WALL_FROM: Final = (  # of the first row at or after a simulation time
+    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? "
+    "ORDER BY sim_time_s, id LIMIT 1"
+)
+_BISECTIONS: Final = 60
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The part of a range that lies in one run: [start_s, end_s) of simulation time.
+
+    The limits in wall time matter where simulation time stood still (a paused simulation).
+    """
+
+    run_id: int
+    start_s: float
+    end_s: float
+    wall_start_s: float = -math.inf
+    wall_end_s: float = math.inf
+
+    @property
+    def bounded_by_wall(self) -> bool:
+        """Whether rows of the same simulation time may be partly outside."""
+        return math.isfinite(self.wall_start_s) or math.isfinite(self.wall_end_s)
+
+
+@dataclass(frozen=True)
+class TimeRange:
+    """A range that was found in the recording.
+
+    Attributes:
+        segments: One per run, in the order of the runs.
+        notes: What the asker should know: where the range reaches outside the recording.
+    """
+
+    robot_id: int
+    robot: str
+    segments: tuple[Segment, ...]
+    clock: Literal["simulation", "wall"]
+    notes: tuple[str, ...] = ()
+
+
+def resolve_range(
+    connection: sqlite3.Connection,
+    *,
+    robot: str | None = None,
+    run_id: int | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    last_s: float | None = None,
+    wall_start: float | str | None = None,
+    wall_end: float | str | None = None,
+) -> TimeRange:
+    """Find what a range means in the recording.
+
+    Raises:
+        InvalidRangeError: Reversed, empty, not finite, or given in two ways at once.
+        UnknownRobotError, AmbiguousRobotError, UnknownRunError: As they say.
+        NothingRecordedError: The run has no state row yet.
+    """
+    _reject_contradictions(start_s, end_s, last_s, wall_start, wall_end)
+    if wall_start is None and wall_end is None:
+        subject = find_subject(connection, robot, run_id)
+        return _in_simulation_time(connection, subject, start_s, end_s, last_s)
+    walls = (parse_wall_time(wall_start, -math.inf), parse_wall_time(wall_end, math.inf))
+    _require_order(*walls, "wall_start", "wall_end")
+    subject = find_subject(connection, robot, run_id)
+    return _in_wall_time(connection, subject, run_id, *walls)
+
+
+def _reject_contradictions(
+    start_s: float | None,
+    end_s: float | None,
+    last_s: float | None,
+    wall_start: float | str | None,
+    wall_end: float | str | None,
+) -> None:
+    simulation = start_s is not None or end_s is not None
+    wall = wall_start is not None or wall_end is not None
+    if simulation + wall + (last_s is not None) > 1:
+        raise InvalidRangeError(
+            "the range is given in two ways: use start_s and end_s (simulation time), or last_s, "
+            "or wall_start and wall_end"
+        )
+    if last_s is not None and not 0 < last_s < math.inf:
+        raise InvalidRangeError(f"last_s={last_s} must be a number of seconds above 0")
+    for name, value in (("start_s", start_s), ("end_s", end_s)):
+        if value is not None and not math.isfinite(value):
+            raise InvalidRangeError(f"{name}={value} must be a finite number of seconds")
+
+
+def _require_order(start_s: float, end_s: float, start_name: str, end_name: str) -> None:
+    if start_s >= end_s:
+        what = "empty" if start_s == end_s else "reversed"
+        raise InvalidRangeError(
+            f"the range is {what}: {start_name}={start_s:g} must be less than {end_name}={end_s:g}"
+        )
+
+
+def parse_wall_time(value: float | str | None, default_s: float = math.nan) -> float:
+    """Unix seconds of a wall time, given as such or in ISO 8601.
+
+    Without an offset ISO times are local times of this machine.
+
+    Raises:
+        InvalidRangeError: Neither a finite number nor ISO 8601.
+    """
+    if value is None:
+        return default_s
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = _iso_seconds(str(value))
+    if not math.isfinite(seconds):
+        raise InvalidRangeError(f"{value!r} is no finite time in Unix seconds")
+    return seconds
+
+
+def _iso_seconds(text: str) -> float:
+    try:
+        return datetime.fromisoformat(text.strip().replace("Z", "+00:00")).timestamp()
+    except (ValueError, OverflowError, OSError) as error:
+        raise InvalidRangeError(
+            f"{text!r} is no time: give Unix seconds or ISO 8601 such as 2026-05-04T13:30:00+02:00"
+        ) from error
+
+
+def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
+    """Simulation times of a run's first and newest row; None without any."""
+    first = connection.execute(_FIRST, (run_id,)).fetchone()[0]
+    return None if first is None else (first, connection.execute(_NEWEST, (run_id,)).fetchone()[0])
+
+
+def just_after(time_s: float) -> float:
+    """The end of a half-open range that holds `time_s` as its last moment."""
+    return math.nextafter(time_s, math.inf)
+
+
+def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
+    """All rows of a run; None without any."""
+    bounds = recorded_bounds(connection, run_id)
+    return Segment(run_id, bounds[0], just_after(bounds[1])) if bounds else None
+
+
+def _in_simulation_time(
+    connection: sqlite3.Connection,
+    subject: Subject,
+    start_s: float | None,
+    end_s: float | None,
+    last_s: float | None,
+) -> TimeRange:
+    run_id = subject.run_id
+    bounds = recorded_bounds(connection, run_id)
+    if bounds is None:
+        raise NothingRecordedError(
+            f"run {run_id} of robot {subject.robot!r} has no state row yet: its controller has "
+            "not published, or not often enough to be recorded"
+        )
+    first_s, newest_s = bounds
+    if last_s is not None:
+        start_s = newest_s - last_s
+    start = first_s if start_s is None else start_s
+    # An end that is left out holds the newest row, also where the start lies beyond it.
+    end = just_after(max(newest_s, start)) if end_s is None else end_s
+    _require_order(start, end, "start_s", "end_s")
+    segment = Segment(run_id, start, end)
+    notes = _notes_outside(segment, first_s, newest_s)
+    return TimeRange(subject.robot_id, subject.robot, (segment,), "simulation", notes)
+
+
+def _notes_outside(segment: Segment, first_s: float, newest_s: float) -> tuple[str, ...]:
+    run = f"run {segment.run_id}"
+    if segment.end_s <= first_s:
+        return (f"no row: the range ends before the first row of {run} at {first_s:g} s",)
+    if segment.start_s > newest_s:
+        return (f"no row: the range begins after the newest row of {run} at {newest_s:g} s",)
+    notes: list[str] = []
+    if segment.start_s < first_s:
+        notes.append(f"the recording of {run} begins at {first_s:g} s, within the range")
+    if segment.end_s > just_after(newest_s):
+        notes.append(f"the recording of {run} ends at {newest_s:g} s, within the range")
+    return tuple(notes)
+
+
+def _in_wall_time(
+    connection: sqlite3.Connection,
+    subject: Subject,
+    run_id: int | None,
+    wall_start_s: float,
+    wall_end_s: float,
+) -> TimeRange:
+    found = connection.execute(_RUNS_IN, (subject.robot_id, wall_end_s, wall_start_s)).fetchall()
+    runs = [run for (run,) in found if run_id in (None, run)]
+    cuts = (_cut(connection, run, wall_start_s, wall_end_s) for run in runs)
+    segments = tuple(segment for segment in cuts if segment is not None)
+    notes = () if segments else (f"no row of robot {subject.robot!r} in that wall time",)
+    return TimeRange(subject.robot_id, subject.robot, segments, "wall", notes)
+
+
+def _cut(
+    connection: sqlite3.Connection, run_id: int, wall_start_s: float, wall_end_s: float
+) -> Segment | None:
+    """The part of a run in [wall_start_s, wall_end_s): wall time rises with simulation time."""
+    bounds = recorded_bounds(connection, run_id)
+    if bounds is None:
+        return None
+
+    def wall_s(query: str, time_s: float) -> float:
+        return float(connection.execute(query, (run_id, time_s)).fetchone()[0])
+
+    def begun(time_s: float) -> bool:
+        return wall_s(_WALL_UP_TO, time_s) >= wall_start_s
+
+    def over(time_s: float) -> bool:
+        return wall_s(_WALL_FROM, time_s) >= wall_end_s
+
+    first_s, newest_s = bounds
+    if not begun(newest_s) or over(first_s):
+        return None
+    start_s = first_s if begun(first_s) else _turn(first_s, newest_s, begun)[1]
+    last_s = _turn(first_s, newest_s, over)[0] if over(newest_s) else newest_s
+    return Segment(run_id, start_s, just_after(last_s), wall_start_s, wall_end_s)
+
+
+def _turn(
+    before_s: float, after_s: float, has_turned: Callable[[float], bool]
+) -> tuple[float, float]:
+    """The last time before and the first after something turned from false to true."""
+    for _ in range(_BISECTIONS):
+        middle_s = (before_s + after_s) / 2
+        if has_turned(middle_s):
+            after_s = middle_s
+        else:
+            before_s = middle_s
+    return before_s, after_s

@@ -1,0 +1,226 @@
+"""Which signals there are, and which of them a question means."""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+import sqlite3
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.store.history.batch import Batch, BatchColumn
+from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.history.leaves import Kind, Value, flatten, parse
+from webots_mcp.store.history.registry import MAX_SIGNALS, Signal, by_name, registered, unregistered
+from webots_mcp.store.history.rollup import watermark
+from webots_mcp.store.history.subject import Subject, find_subject
+from webots_mcp.store.history.summary import Summary, summarise
+
+SAMPLED_ROWS: Final = 200  # newest rows not yet rolled up that are searched for new names
+
+_NEWEST_ROWS: Final = (
+    "SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE run_id = ? "
+    "ORDER BY sim_time_s DESC, id DESC"
+)
+_TOTALS: Final = (
+    "SELECT signal_id, sum(rows), sum(present), min(first_sim_time_s), max(last_sim_time_s), "
+    "min(min), max(max) FROM rollup WHERE run_id = ? GROUP BY signal_id"
+)
+
+
+@dataclass(frozen=True)
+class SignalInfo:
+    """What is known of a signal in a run (or a part of it).
+
+    Attributes:
+        rows: State rows that held it; `null_share` of them without a value.
+        first_s: Simulation time of the first value; `last_s` of the last one.
+        last: The value in the run's newest row; None where that has none.
+    """
+
+    name: str
+    kind: Kind
+    unit: str | None
+    rows: int
+    null_share: float
+    first_s: float | None
+    last_s: float | None
+    last: Value
+    min: float | None
+    max: float | None
+
+
+@dataclass(frozen=True)
+class SignalList:
+    """The signals of a run.
+
+    Attributes:
+        total: How many match, of which `signals` are the first.
+        notes: What the asker should know.
+    """
+
+    robot: str
+    run_id: int
+    signals: tuple[SignalInfo, ...]
+    total: int
+    notes: tuple[str, ...]
+
+
+def catalogue(connection: sqlite3.Connection, subject: Subject) -> dict[str, Signal]:
+    """Every signal of the subject's robot: the registered, and those in the run's newest rows."""
+    known = registered(connection, subject.robot_id)
+    batch = _unrolled_sample(connection, subject)
+    found = [unregistered(column) for column in batch.columns() if column.name not in known]
+    new = [signal for signal in found if signal is not None]
+    return by_name([*known.values(), *new]) if new else known
+
+
+def _unrolled_sample(connection: sqlite3.Connection, subject: Subject) -> Batch:
+    """The run's newest rows after the watermark."""
+    mark = watermark(connection)
+    batch = Batch()
+    for state_id, *row in connection.execute(_NEWEST_ROWS, (subject.run_id,)):
+        if state_id <= mark or batch.rows == SAMPLED_ROWS:
+            break
+        batch.add(state_id, subject.robot_id, subject.run_id, *row)
+    return batch
+
+
+def resolve_signals(known: dict[str, Signal], names: Sequence[str]) -> list[Signal]:
+    """The signals that the names mean, in the order of the names.
+
+    A name may hold `*` (any characters, also dots). The name of a branch means all below it:
+    `pose` is `pose.*`.
+
+    Raises:
+        UnknownSignalError: A name or pattern meets nothing; the text offers near ones.
+        InvalidInputError: No name is given.
+    """
+    if not names:
+        raise InvalidInputError("no signal is named; give names or patterns such as 'pose.*'")
+    found: dict[str, Signal] = {}
+    for name in names:
+        meant = list(_meant(known, name))
+        if not meant:
+            raise UnknownSignalError(_unknown(known, name))
+        found.update((signal.name, signal) for signal in meant)
+    return list(found.values())
+
+
+def _meant(known: dict[str, Signal], name: str) -> Iterable[Signal]:
+    if name in known:
+        return (known[name],)
+    pattern = name if "*" in name else f"{name}.*"
+    escaped = pattern.replace("[", "[[]").replace("?", "[?]")
+    return (known[each] for each in known if fnmatch.fnmatchcase(each, escaped))
+
+
+def _unknown(known: dict[str, Signal], name: str) -> str:
+    if not known:
+        return f"no signal {name!r}: no state row with values has been recorded yet"
+    near = difflib.get_close_matches(name.replace("*", ""), known, 5, 0.5)
+    parts = name.replace("*", "").lower().split(".")
+    near += [each for each in known if parts[-1] and parts[-1] in each.lower()]
+    offer = list(dict.fromkeys(near))[:5] or list(known)[:10]
+    return f"no signal {name!r} is recorded; there is {', '.join(offer)} ({len(known)} in all)"
+
+
+def list_signals(
+    connection: sqlite3.Connection,
+    *,
+    robot: str | None = None,
+    run_id: int | None = None,
+    pattern: str = "*",
+    limit: int = 100,
+    deadline_s: float = QUESTION_DEADLINE_S,
+) -> SignalList:
+    """List the signals of a run, by name, with what is known of their values.
+
+    Args:
+        connection: Any.
+        robot: Whose; may be left out where only one is meant.
+        run_id: Which run; None for the robot's newest.
+        pattern: Which names, with `*`.
+        limit: At most so many.
+        deadline_s: After it, rows that are not rolled up yet are left out, and a note says so.
+
+    Raises:
+        UnknownSignalError: The pattern meets no name.
+        UnknownRobotError, AmbiguousRobotError, UnknownRunError, NothingRecordedError: As they say.
+    """
+    subject = find_subject(connection, robot, run_id)
+    stored = _stored(connection, subject.run_id)
+    late, notes = _late(connection, subject, deadline_s)
+    known = registered(connection, subject.robot_id)
+    new = [signal for column in late.values() if (signal := unregistered(column))]
+    known = {**{signal.name: signal for signal in new}, **known}
+    there = {name: signal for name, signal in known.items() if signal.id in stored or name in late}
+    matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
+    matching.sort(key=lambda signal: signal.name)
+    newest = _newest_values(connection, subject.run_id)
+    infos = tuple(
+        _info(signal, stored.get(signal.id), late.get(signal.name), newest.get(signal.name))
+        for signal in matching[:limit]
+    )
+    if len(known) >= MAX_SIGNALS:
+        notes.append(f"only the first {MAX_SIGNALS} names of a robot are kept")
+    return SignalList(subject.robot, subject.run_id, infos, len(matching), tuple(notes))
+
+
+def _stored(connection: sqlite3.Connection, run_id: int) -> dict[int | None, Summary]:
+    """What the rollups of a run come to, by signal id, as far as a list shows it."""
+    totals: dict[int | None, Summary] = {}
+    for signal_id, rows, present, first_s, last_s, low, high in connection.execute(
+        _TOTALS, (run_id,)
+    ):
+        times = {"first_sim_time_s": first_s, "last_sim_time_s": last_s}
+        totals[signal_id] = Summary(rows, present, **times, min=low, max=high)
+    return totals
+
+
+def _late(
+    connection: sqlite3.Connection, subject: Subject, deadline_s: float
+) -> tuple[dict[str, BatchColumn], list[str]]:
+    """The run's rows after the watermark, newest first, until the deadline."""
+    mark = watermark(connection)
+    batch = Batch()
+    limit = Deadline(connection, deadline_s)
+    notes: list[str] = []
+    for state_id, *row in connection.execute(_NEWEST_ROWS, (subject.run_id,)):
+        if state_id <= mark:
+            break
+        if limit.passed:
+            notes.append(f"rows up to {row[0]:g} s are not counted: they are not rolled up yet")
+            break
+        batch.add(state_id, subject.robot_id, subject.run_id, *row)
+    return {column.name: column for column in batch.columns()}, notes
+
+
+def _newest_values(connection: sqlite3.Connection, run_id: int) -> dict[str, Value]:
+    row = connection.execute(f"{_NEWEST_ROWS} LIMIT 1", (run_id,)).fetchone()
+    return flatten(parse(row[3])) if row else {}
+
+
+def _info(
+    signal: Signal, stored: Summary | None, late: BatchColumn | None, last: Value
+) -> SignalInfo:
+    parts = [stored] if stored else []
+    if late is not None:
+        _, times, values = zip(*reversed(late.points), strict=True)
+        parts.append(summarise(times, values))
+    rows = sum(part.rows for part in parts)
+    held = [part for part in parts if part.present]
+    return SignalInfo(
+        name=signal.name,
+        kind=signal.kind,
+        unit=signal.unit,
+        rows=rows,
+        null_share=1 - sum(part.present for part in parts) / rows,
+        first_s=held[0].first_sim_time_s if held else None,
+        last_s=held[-1].last_sim_time_s if held else None,
+        last=last,
+        min=min((part.min for part in held if part.min is not None), default=None),
+        max=max((part.max for part in held if part.max is not None), default=None),
+    )

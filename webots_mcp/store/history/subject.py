@@ -1,0 +1,47 @@
+"""Which robot and which run a question is about."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from dataclasses import dataclass
+from typing import Final
+
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.store.robots import resolve_robot
+from webots_mcp.store.runs import current_run, fetch_run
+
+_NAME: Final = "SELECT name FROM robot WHERE id = ?"
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A robot, and the run that is meant unless a question is about all of them."""
+
+    robot_id: int
+    robot: str
+    run_id: int
+
+
+def find_subject(
+    connection: sqlite3.Connection, robot: str | None = None, run_id: int | None = None
+) -> Subject:
+    """The run that was named, or the newest run of the robot that was named or is the only one.
+
+    Raises:
+        UnknownRobotError, AmbiguousRobotError: As they say.
+        UnknownRunError: There is no such run, or it is another robot's.
+        NothingRecordedError: No robot, or no run of it, has been recorded.
+    """
+    if run_id is not None and robot is None:
+        robot_id = fetch_run(connection, run_id).robot_id
+        return Subject(robot_id, connection.execute(_NAME, (robot_id,)).fetchone()[0], run_id)
+    found = resolve_robot(connection, robot, time.time())
+    if run_id is not None:
+        return Subject(found.id, found.name, fetch_run(connection, run_id, found.id).id)
+    run = current_run(connection, found.id)
+    if run is None:
+        raise NothingRecordedError(
+            f"robot {found.name!r} has no run yet: its controller never recorded"
+        )
+    return Subject(found.id, found.name, run.id)

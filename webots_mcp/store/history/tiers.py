@@ -1,0 +1,110 @@
+"""Any stretch of a run in pieces of 10 s: rollups where they are complete, rows at the edges.
+
+However long the stretch, counts and extremes are exact: the rollups give the whole buckets inside,
+the state rows what is cut off at both ends, and what came after the watermark.
+"""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import groupby
+from typing import Final
+
+from webots_mcp.store.history.columns import Columns, read_columns
+from webots_mcp.store.history.deadline import Deadline
+from webots_mcp.store.history.ranges import Segment
+from webots_mcp.store.history.registry import Signal
+from webots_mcp.store.history.rollup import BUCKET_S, bucket_of, buckets, watermark
+from webots_mcp.store.history.summary import Summary, merge, summarise
+
+_FIRST_AFTER: Final = "SELECT sim_time_s FROM state WHERE id > ? AND run_id = ? ORDER BY id LIMIT 1"
+
+
+class Pieces:
+    """A stretch of a run in buckets of 10 s; parts of a bucket are added in order of time.
+
+    Attributes:
+        cut_at_s: Where the deadline stopped the reading of rows; None if it did not.
+    """
+
+    def __init__(self, signals: Sequence[Signal]) -> None:
+        self.cut_at_s: float | None = None
+        self._signals = signals
+        self._parts: dict[str, defaultdict[int, list[Summary]]] = {
+            signal.name: defaultdict(list) for signal in signals
+        }
+
+    def add_rows(self, columns: Columns) -> None:
+        """Add state rows."""
+        if columns.cut:
+            self.cut_at_s = columns.times[-1] if columns.times else math.inf
+        start = 0
+        for bucket, times in groupby(columns.times, bucket_of):
+            end = start + len(list(times))
+            for signal in self._signals:
+                values = columns.values[signal.name][start:end]
+                summary = summarise(columns.times[start:end], values, angle=signal.kind == "angle")
+                self._parts[signal.name][bucket].append(summary)
+            start = end
+
+    def add_rollups(self, connection: sqlite3.Connection, run_id: int, span: range) -> None:
+        """Add the stored rollups of those buckets."""
+        for signal in self._signals:
+            if signal.id is None:
+                continue
+            parts = self._parts[signal.name]
+            for bucket, summary in buckets(connection, run_id, signal.id, span.start, span.stop):
+                parts[bucket].append(summary)
+
+    def of(self, name: str) -> list[tuple[int, Summary]]:
+        """The buckets of a signal that have rows, in order."""
+        return [(bucket, merge(parts)) for bucket, parts in sorted(self._parts[name].items())]
+
+    def whole(self, name: str) -> Summary:
+        """The summary of the whole stretch."""
+        parts = [summary for _, summary in self.of(name)]
+        return merge(parts) if parts else Summary()
+
+
+def read_pieces(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+) -> Pieces:
+    """Read a stretch of any length; only rows that are not in a whole rollup are looked at."""
+    pieces = Pieces(signals)
+    span = _whole_buckets(segment)
+    if not span:
+        pieces.add_rows(read_columns(connection, segment, signals, deadline))
+        return pieces
+    start_s, end_s = span.start * BUCKET_S, span.stop * BUCKET_S
+    head, foot = replace(segment, end_s=start_s), replace(segment, start_s=end_s)
+    middle = replace(segment, start_s=start_s, end_s=end_s)
+    mark = watermark(connection)
+    pieces.add_rows(read_columns(connection, head, signals, deadline))
+    pieces.add_rollups(connection, segment.run_id, span)
+    if (late := rows_after(connection, middle, mark)) is not None:
+        pieces.add_rows(read_columns(connection, late, signals, deadline, after_id=mark))
+    pieces.add_rows(read_columns(connection, foot, signals, deadline))
+    return pieces
+
+
+def rows_after(connection: sqlite3.Connection, segment: Segment, mark: int) -> Segment | None:
+    """The part of a segment whose rows have ids above the watermark; None without any."""
+    first = connection.execute(_FIRST_AFTER, (mark, segment.run_id)).fetchone()
+    if first is None or first[0] >= segment.end_s:
+        return None
+    return replace(segment, start_s=max(segment.start_s, first[0]))
+
+
+def _whole_buckets(segment: Segment) -> range:
+    """The buckets that lie wholly inside."""
+    first = math.ceil(segment.start_s / BUCKET_S)
+    if segment.bounded_by_wall and first == bucket_of(segment.start_s):
+        first += 1  # time may have stood still right there, partly before the range
+    return range(first, bucket_of(segment.end_s))

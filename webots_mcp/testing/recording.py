@@ -1,0 +1,191 @@
+"""What a robot recorded, as a test asks about it."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+import sys
+from collections.abc import Generator
+from contextlib import closing, contextmanager
+from typing import Any, Final
+
+from webots_mcp.connection import Role, connect
+from webots_mcp.contract import Database
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.schema import schema_version
+from webots_mcp.store.events import Event, events_after
+from webots_mcp.store.history.columns import read_columns
+from webots_mcp.store.history.deadline import Deadline
+from webots_mcp.store.history.ranges import whole_run
+from webots_mcp.store.history.registry import Signal, registered
+from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.history.signals import resolve_signals
+from webots_mcp.store.history.subject import Subject, find_subject
+from webots_mcp.store.logs import LEVELS, LogFilter, LogLine, newest_lines
+from webots_mcp.store.queue import CommandQueue, commands_since
+from webots_mcp.store.runs import runs_since
+from webots_mcp.store.states import fetch_states, state_ids_after
+from webots_mcp.store.window import Window
+from webots_mcp.testing.commands import RecordedCommand
+from webots_mcp.testing.signals import RecordedSignal
+
+COMMAND_TIME_TO_LIVE_S: Final = 60.0  # a test on a busy machine is slower than a person
+_NO_LIMIT: Final = -1
+
+
+class Recording:
+    """A database of a test, read anew with each question.
+
+    Questions are about the newest run of the only robot; `robot` and `runs` narrow that down.
+    """
+
+    def __init__(
+        self, database: Database, *, robot: str | None = None, run_id: int | None = None
+    ) -> None:
+        """Nothing is opened yet: the robot may begin to record later.
+
+        Args:
+            database: A file, or a database in memory.
+            robot: Whose recording; None for the only robot's.
+            run_id: Which run; None for the newest at the time of the question.
+        """
+        self.database = database
+        self._robot = robot
+        self._run_id = run_id
+
+    def robot(self, name: str) -> Recording:
+        """What the robot of that name recorded."""
+        return Recording(self.database, robot=name)
+
+    def runs(self) -> list[Recording]:
+        """The recording of each run of the robot, oldest first: a reset begins the next one."""
+        with self._subject() as (connection, subject):
+            runs = runs_since(connection, subject.robot_id, 0)
+        return [Recording(self.database, robot=subject.robot, run_id=run.id) for run in runs]
+
+    # -- what was published --------------------------------------------------------------------
+
+    def signal(self, name: str) -> RecordedSignal:
+        """The signal with this dotted name: `mode`, `pose.0`, `sensors.front`.
+
+        Raises:
+            UnknownSignalError: It was never published; the text offers near names.
+            InvalidInputError: The name means several signals.
+            NoDatabaseError, NothingRecordedError: Nothing has been recorded yet.
+        """
+        found = self.signals(name)
+        if len(found) > 1:
+            names = ", ".join(signal.name for signal in found[:10])
+            raise InvalidInputError(
+                f"{name!r} means {len(found)} signals: {names}; name one, or loop over "
+                f"signals({name!r})"
+            )
+        return found[0]
+
+    def signals(self, pattern: str = "*") -> list[RecordedSignal]:
+        """The signals of the run whose names match, with `*` for any characters.
+
+        Raises:
+            UnknownSignalError: None matches.
+            NoDatabaseError, NothingRecordedError: Nothing has been recorded yet.
+        """
+        self._roll_up()
+        with self._subject() as (connection, subject):
+            meant = resolve_signals(registered(connection, subject.robot_id), [pattern])
+            return self._read(connection, subject, meant)
+
+    def states(self) -> list[dict[str, Any]]:
+        """What was published, row by row; "nan", "inf" and the like where JSON holds null."""
+        with self._subject() as (connection, subject):
+            ids = state_ids_after(connection, subject.run_id, 0, -math.inf)
+            return [state.value() for state in fetch_states(connection, ids)]
+
+    # -- what happened -------------------------------------------------------------------------
+
+    def events(self, kind: str | None = None) -> list[Event]:
+        """What the bridge noticed in the run, in order: all, or those of a kind (`pause`, ...)."""
+        with self._subject() as (connection, subject):
+            found = events_after(connection, subject.run_id, 0, _NO_LIMIT)
+        return [event for event in found if kind in (None, event.kind)]
+
+    def logs(self, level: str = "debug", text: str = "") -> list[LogLine]:
+        """The lines that were logged in the run, in order.
+
+        Args:
+            level: `debug`, `info`, `warning` or `error`: this one and those above it.
+            text: Part of the line.
+
+        Raises:
+            InvalidInputError: There is no such level.
+        """
+        if level not in LEVELS:
+            raise InvalidInputError(f"no log level {level!r}; there is {', '.join(LEVELS)}")
+        with self._subject() as (connection, subject):
+            window = Window(-math.inf, math.inf)
+            asked = LogFilter(subject.run_id, window, text, lowest_level=level)
+            return newest_lines(connection, asked, _NO_LIMIT)
+
+    # -- commands ------------------------------------------------------------------------------
+
+    def commands(self, action: str | None = None) -> list[RecordedCommand]:
+        """The commands to the robot, oldest first: all, or those of an action."""
+        with self._subject() as (connection, subject):
+            found = commands_since(connection, subject.robot_id, -math.inf)
+        kept = [command for command in found if action in (None, command.action)]
+        return [RecordedCommand(self.database, command.id) for command in kept]
+
+    def send(self, action: str, /, **params: Any) -> RecordedCommand:
+        """Send the robot a command; it runs in the controller's next `get_command()`.
+
+        Args:
+            action: Built in (`pause`, `reset`, ...) or registered by the controller.
+            params: Its parameters: plain JSON.
+
+        Raises:
+            NoDatabaseError, NothingRecordedError: The robot's bridge was not started yet.
+        """
+        with self._subject("writer") as (connection, subject):
+            command = CommandQueue(connection).enqueue(
+                subject.robot_id,
+                action,
+                params,
+                time_to_live_s=COMMAND_TIME_TO_LIVE_S,
+                requested_by="test",
+            )
+        return RecordedCommand(self.database, command.id)
+
+    # -- inside --------------------------------------------------------------------------------
+
+    @contextmanager
+    def _subject(self, role: Role = "reader") -> Generator[tuple[sqlite3.Connection, Subject]]:
+        with closing(self._connect(role)) as connection:
+            yield connection, find_subject(connection, self._robot, self._run_id)
+
+    def _connect(self, role: Role) -> sqlite3.Connection:
+        connection = connect(self.database, role)
+        if schema_version(connection) == 0:
+            connection.close()
+            raise NothingRecordedError(
+                "no bridge has opened this database yet: make an MCPBridge on it, or let the "
+                "simulation run first"
+            )
+        return connection
+
+    def _roll_up(self) -> None:
+        """Enter every signal that was ever published into the register."""
+        with closing(self._connect("writer")) as connection:
+            roll(connection, sys.maxsize)
+
+    def _read(
+        self, connection: sqlite3.Connection, subject: Subject, signals: list[Signal]
+    ) -> list[RecordedSignal]:
+        run = f"run {subject.run_id} of robot {subject.robot!r}"
+        segment = whole_run(connection, subject.run_id)
+        if segment is None:
+            raise NothingRecordedError(f"{run} has no state row: was publish() called?")
+        columns = read_columns(connection, segment, signals, Deadline(connection, math.inf))
+        return [RecordedSignal(signal.name, run, columns, self._state) for signal in signals]
+
+    def _state(self, state_id: int) -> str:
+        with closing(self._connect("reader")) as connection:
+            return next(fetch_states(connection, [state_id])).data

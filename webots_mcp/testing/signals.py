@@ -1,0 +1,190 @@
+"""A signal as a test sees it: every recorded value, and what it never may have been."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+from typing import Final
+
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.store.history.columns import Columns
+from webots_mcp.store.history.leaves import Value
+from webots_mcp.store.history.summary import usable_numbers
+
+_SHOWN_STATE_CHARACTERS: Final = 500
+
+
+class RecordedSignal:
+    """One signal of one run, row by row.
+
+    A row is what one `publish` recorded: with a `throttle_interval` above 1 there is none for the
+    calls in between. A row without a value counts as None: the signal was not in it, was None, or
+    could not be held (NaN, infinity).
+    """
+
+    def __init__(
+        self, name: str, run: str, columns: Columns, state_of: Callable[[int], str]
+    ) -> None:
+        """Made by `Recording.signal`.
+
+        Args:
+            name: Dotted.
+            run: How messages name the run.
+            columns: The rows, with the values of this signal among them.
+            state_of: The JSON text of the state row with that id.
+        """
+        self.name = name
+        self._run = run
+        self._columns = columns
+        self._values: Sequence[Value] = columns.values[name]
+        self._state_of = state_of
+
+    def __repr__(self) -> str:
+        return f"<signal {self.name!r} of {self._run}: {len(self._values)} rows>"
+
+    def values(self) -> list[Value]:
+        """The value in each row, in order."""
+        return list(self._values)
+
+    def times_s(self) -> list[float]:
+        """The simulation time of each row, in seconds."""
+        return list(self._columns.times)
+
+    def changes(self) -> list[Value]:
+        """The values without those that equal the one before: `["cruise", "turn", "cruise"]`."""
+        later = [after for before, after in pairwise(self._values) if after != before]
+        return [*self._values[:1], *later]
+
+    @property
+    def first(self) -> Value:
+        """The value in the first row."""
+        return self._values[0]
+
+    @property
+    def last(self) -> Value:
+        """The value in the newest row."""
+        return self._values[-1]
+
+    def min(self) -> float:
+        """The smallest number.
+
+        Raises:
+            NothingRecordedError: No row holds a number.
+        """
+        return min(self._numbers())
+
+    def max(self) -> float:
+        """The largest number.
+
+        Raises:
+            NothingRecordedError: No row holds a number.
+        """
+        return max(self._numbers())
+
+    def at(self, time_s: float) -> Value:
+        """The value in force at a simulation time: that of the newest row up to then.
+
+        Raises:
+            NothingRecordedError: The first row is younger.
+        """
+        row = sum(time <= time_s for time in self._columns.times) - 1
+        if row < 0:
+            first_s = self._columns.times[0]
+            raise NothingRecordedError(
+                f"{self._run} has no row up to {time_s:g} s: the first is at {first_s:g} s"
+            )
+        return self._values[row]
+
+    def first_time_s(self, value: Value) -> float:
+        """The simulation time of the first row with this value.
+
+        Raises:
+            NothingRecordedError: There is none; the text tells which values there are.
+        """
+        if value in self._values:
+            return self._columns.times[self._values.index(value)]
+        seen = ", ".join(map(repr, list(dict.fromkeys(self._values))[:10]))
+        raise NothingRecordedError(
+            f"{self.name} was never {value!r} in the {len(self._values)} rows of {self._run}; "
+            f"it was {seen}"
+        )
+
+    def duration_s(self, value: Value) -> float:
+        """For how many simulated seconds it had this value; each row counts up to the next."""
+        steps = pairwise(self._columns.times)
+        return sum(
+            after_s - before_s
+            for (before_s, after_s), held in zip(steps, self._values, strict=False)
+            if held == value
+        )
+
+    def assert_never(self, value: Value) -> None:
+        """Fail if a row holds this value.
+
+        Raises:
+            AssertionError: With when, how often, and the whole state at the first time.
+        """
+        __tracebackhide__ = True
+        bad = [row for row, held in enumerate(self._values) if held == value]
+        self._fail_at(bad, f"was {value!r}", bad[0] if bad else 0)
+
+    def assert_never_below(self, limit: float) -> None:
+        """Fail if a row holds a number under the limit, or none holds a number.
+
+        Raises:
+            AssertionError: With when, how often, how far, and the whole state at the first time.
+        """
+        __tracebackhide__ = True
+        self._assert_each(lambda number: number < limit, f"fell below {limit:g}", min)
+
+    def assert_never_above(self, limit: float) -> None:
+        """Fail if a row holds a number over the limit, or none holds a number.
+
+        Raises:
+            AssertionError: With when, how often, how far, and the whole state at the first time.
+        """
+        __tracebackhide__ = True
+        self._assert_each(lambda number: number > limit, f"rose above {limit:g}", max)
+
+    def _assert_each(
+        self,
+        is_bad: Callable[[float], bool],
+        what: str,
+        worst_of: Callable[[list[float]], float],
+    ) -> None:
+        __tracebackhide__ = True
+        rows, numbers = usable_numbers(range(len(self._values)), self._values)
+        if not numbers:
+            raise AssertionError(f"{self._no_number()}, so nothing shows that it never {what}")
+        bad = {
+            int(row): number for row, number in zip(rows, numbers, strict=True) if is_bad(number)
+        }
+        worst = worst_of(list(bad.values())) if bad else 0.0
+        self._fail_at(list(bad), what, next((row for row in bad if bad[row] == worst), 0))
+
+    def _fail_at(self, bad: Sequence[int], what: str, worst: int) -> None:
+        __tracebackhide__ = True
+        if not bad:
+            return
+        times, values, first = self._columns.times, self._values, bad[0]
+        lines = [f"{self.name} {what} in {len(bad)} of {len(values)} rows of {self._run}"]
+        lines += [f"first at {times[first]:g} s: {_shown(values[first])}"]
+        if worst != first:
+            lines += [f"furthest at {times[worst]:g} s: {_shown(values[worst])}"]
+        state = self._state_of(self._columns.ids[first])
+        cut = " ..." if len(state) > _SHOWN_STATE_CHARACTERS else ""
+        lines += [f"the state at {times[first]:g} s: {state[:_SHOWN_STATE_CHARACTERS]}{cut}"]
+        raise AssertionError("\n  ".join(lines))
+
+    def _numbers(self) -> Sequence[float]:
+        _, numbers = usable_numbers(self._columns.times, self._values)
+        if not numbers:
+            raise NothingRecordedError(self._no_number())
+        return numbers
+
+    def _no_number(self) -> str:
+        return f"{self.name} holds no number in the {len(self._values)} rows of {self._run}"
+
+
+def _shown(value: Value) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else repr(value)

@@ -159,7 +159,8 @@ def test_controllers_that_start_at_once_on_a_missing_database_all_come_up(
     processes = [script(STARTER, data_dir) for _ in range(5)]
     for process in processes:
         assert process.stdout is not None and process.stdin is not None
-        assert process.stdout.readline() == "ready\n"
+        if process.stdout.readline() != "ready\n":
+            pytest.fail(process.communicate()[1])
     for process in processes:
         assert process.stdin is not None
         process.stdin.write("go\n")
@@ -207,7 +208,8 @@ def test_of_many_claimers_exactly_one_gets_each_command(script: Script, filed: R
     processes = [script(CLAIMER, filed.database) for _ in range(6)]
     for process in processes:
         assert process.stdout is not None
-        assert process.stdout.readline() == "ready\n"
+        if process.stdout.readline() != "ready\n":
+            pytest.fail(process.communicate()[1])
     for process in processes:
         assert process.stdin is not None
         process.stdin.write("go\n")

@@ -14,12 +14,8 @@ from pathlib import Path
 import pytest
 
 from tests.standin.conftest import WriteController
+from tests.standin.running import LOOP
 
-LOOP = """
-while robot.step(16) != -1:
-    pass
-print("ended")
-"""
 COMMAND = [sys.executable, "-m", "webots_mcp.standin"]
 
 

@@ -36,6 +36,8 @@ def test_a_step_in_a_paused_simulation_raises_instead_of_waiting_for_ever() -> N
     robot.simulation.pause()
     with pytest.raises(WouldBlockError, match="resume"):
         robot.step(STEP_MS)
+    with pytest.raises(WouldBlockError, match="negative"):
+        robot.step(-1)
     assert robot.step(0) == 0
     robot.simulation.resume()
     assert robot.step(STEP_MS) == 0

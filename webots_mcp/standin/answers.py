@@ -186,6 +186,12 @@ class SupervisorRequests:
             if robot.node is self._world.nodes[node_id]:
                 robot.vehicle.stop()
 
+    def on_node_restart_controller(self, node_id: int) -> None:
+        """Ends a robot's controller and starts it again."""
+        node = self._world.nodes[node_id]
+        if node.type_name == "Robot":
+            self._simulator.wanted = Wanted("restart", robot=node.fields["name"])
+
     def _body_around(self, node: Node | None) -> Body | None:
         bodies = {body.node: body for body in self._simulator.arena.bodies}
         while node is not None and node not in bodies:

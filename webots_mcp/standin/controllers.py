@@ -4,13 +4,10 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from webots_mcp.standin.connection import Connection
 from webots_mcp.standin.process import ControllerProcess
 from webots_mcp.standin.simulator import Robot, Simulator
-
-if TYPE_CHECKING:
-    from webots_mcp.standin.runner import Connection
 
 _NOBODY = ("", "<none>", "void", "<generic>")
 _EXTERN = "<extern>"
@@ -61,7 +58,7 @@ class Controller:
     process: ControllerProcess | None = None
     starts: int = 0
     """How often a process was started for the robot."""
-    connection: "Connection | None" = None
+    connection: Connection | None = None
     has_left: bool = False
     """Whether the present process has closed its connection."""
     _was_told: bool = field(default=False, repr=False)

@@ -23,6 +23,8 @@ from webots_mcp.standin.world import load_world
 DEFAULT_WORLD = Path(__file__).parent / "arena.wbt"
 """A 4 m x 4 m arena with a few obstacles and one two-wheeled robot, "rover"."""
 
+_LONGEST_STEP_MS = 1 << 31
+
 
 class InProcessSimulation:
     """A world that the robots of this process move themselves, step by step.
@@ -96,7 +98,7 @@ class InProcessSimulation:
     def reset(self) -> None:
         """Resets the world; controllers are ended, a new robot object may take their place."""
         with self._changed:
-            self._end_controllers()
+            self._end(self._links)
             self._simulator.reset()
 
     def reload(self) -> None:
@@ -107,7 +109,7 @@ class InProcessSimulation:
         """Ends the simulation: every `step` returns -1."""
         with self._changed:
             self.exit_status = status
-            self._end_controllers()
+            self._end(self._links)
 
     def _set_mode(self, mode: Mode) -> None:
         with self._changed:
@@ -116,13 +118,13 @@ class InProcessSimulation:
 
     def _load(self, path: Path) -> None:
         with self._changed:
-            self._end_controllers()
+            self._end(self._links)
             self._simulator = Simulator(load_world(path), self.mode, self.console.append)
 
-    def _end_controllers(self) -> None:
-        for link in self._links:
+    def _end(self, links: "list[_LocalLink]") -> None:
+        for link in links:
             link.quit()
-        self._links.clear()
+        self._links = [link for link in self._links if link not in links]
         self._changed.notify_all()
 
     # Controllers ---------------------------------------------------------------------------------
@@ -190,6 +192,8 @@ class InProcessSimulation:
         self._simulator.wanted = None
         if wanted.action == "quit":
             self.quit(wanted.status)
+        elif wanted.action == "restart":
+            self._end([link for link in self._links if link.robot.name == wanted.robot])
         else:
             self._load(Path(wanted.path) if wanted.path else self._simulator.world.path)
 
@@ -208,6 +212,10 @@ class _LocalLink:
         robot.forget_controller()
 
     def send(self, message: Message) -> None:
+        if message[0] == "step" and message[1] > _LONGEST_STEP_MS:
+            raise WouldBlockError(
+                "a negative time step asks for 2**32 ms: step() would never return"
+            )
         if not self._ended:
             self.simulation.take(self, message)
         elif not self.replies:

@@ -13,9 +13,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from controller.wire import Inbox, Message, pack
+from controller.wire import Message
 
 from webots_mcp.standin.answers import answer, description, step_over
+from webots_mcp.standin.connection import Connection
 from webots_mcp.standin.controllers import Controller
 from webots_mcp.standin.errors import StandInError, WorldError
 from webots_mcp.standin.simulator import Mode, Simulator
@@ -25,32 +26,6 @@ _PATIENCE_S = 1.0
 """How long Webots waits for a controller to ask for something, and then for it to exit."""
 _MAX_LAG_S = 0.1
 """Real time that is lost is caught up with at most so much."""
-
-
-class Connection:
-    """The socket of one controller."""
-
-    def __init__(self, stream: socket.socket) -> None:
-        stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.stream = stream
-        self.inbox = Inbox()
-        self.controller: Controller | None = None
-
-    def send(self, message: Message) -> None:
-        """Sends an answer; a controller that is gone is noticed when its socket is read."""
-        with suppress(OSError):
-            self.stream.sendall(pack(message))
-
-    def receive(self) -> list[Message] | None:
-        """The messages that have arrived; None if the controller is gone."""
-        try:
-            data = self.stream.recv(1 << 16)
-        except OSError:
-            data = b""
-        if not data:
-            return None
-        self.inbox.feed(data)
-        return [*iter(self.inbox.take, None)]
 
 
 class Runner:
@@ -68,10 +43,11 @@ class Runner:
         self.exit_status: int | None = None
         self._controllers_for = controllers_for
         self._notify = notify
+        self._admitted: dict[Connection, Controller] = {}
         self._calls: deque[tuple[Callable[[], Any], Future[Any]]] = deque()
         self._steps_asked = 0
         self._due_s = 0.0
-        self._ending = False
+        self._ending: list[Controller] = []
         self._over = False
         self._selector: selectors.BaseSelector
         self._bell_rope: socket.socket
@@ -185,10 +161,10 @@ class Runner:
             self._forget(connection)
             return
         for message in messages:
-            if connection.controller is None:
-                self._admit(connection, message)
+            if controller := self._admitted.get(connection):
+                self._serve(connection, controller, message)
             else:
-                self._serve(connection, connection.controller, message)
+                self._admit(connection, message)
 
     def _admit(self, connection: Connection, message: Message) -> None:
         _, token, name = message
@@ -198,13 +174,13 @@ class Runner:
         elif controller.connection is not None:
             connection.send(("refused", f"robot {name!r} has a controller already"))
         else:
-            controller.connection, connection.controller = connection, controller
+            controller.connection, self._admitted[connection] = connection, controller
             controller.robot.forget_controller()
             connection.send(("welcome", description(self.simulator, controller.robot)))
             self._notify()
 
     def _serve(self, connection: Connection, controller: Controller, message: Message) -> None:
-        if self._ending:
+        if controller in self._ending:
             controller.tell_to_quit()
             return
         reply = answer(self.simulator, controller.robot, message)
@@ -216,9 +192,8 @@ class Runner:
     def _forget(self, connection: Connection) -> None:
         self._selector.unregister(connection.stream)
         connection.stream.close()
-        if controller := connection.controller:
-            controller.connection, connection.controller = None, None
-            controller.has_left = True
+        if controller := self._admitted.pop(connection, None):
+            controller.connection, controller.has_left = None, True
             controller.robot.forget_controller()
             self._notify()
 
@@ -226,21 +201,21 @@ class Runner:
         for controller in self.controllers:
             controller.start()
 
-    def _end_controllers(self) -> None:
+    def _end(self, controllers: list[Controller]) -> None:
         """As Webots does it: a second to ask, a second to exit, then by force."""
-        self._ending = True
-        for controller in self.controllers:
+        self._ending = controllers
+        for controller in controllers:
             if controller.robot.remaining_ms is not None:
                 controller.tell_to_quit()
-        self._listen_until(lambda: not any(c.has_to_be_told for c in self.controllers))
-        for controller in self.controllers:
+        self._listen_until(lambda: not any(c.has_to_be_told for c in controllers))
+        for controller in controllers:
             controller.tell_to_quit()
-        self._listen_until(lambda: not any(c.is_leaving for c in self.controllers))
-        for controller in self.controllers:
+        self._listen_until(lambda: not any(c.is_leaving for c in controllers))
+        for controller in controllers:
             controller.end()
             if connection := controller.connection:
                 self._forget(connection)
-        self._ending = False
+        self._ending = []
 
     # A person's hands, to be used through `call` -------------------------------------------------
 
@@ -257,14 +232,14 @@ class Runner:
 
     def reset(self) -> None:
         """Resets the world and starts all controllers again."""
-        self._end_controllers()
+        self._end(self.controllers)
         self.simulator.reset()
         self._start_controllers()
         self._notify()
 
     def load(self, path: Path) -> None:
         """Reads a world and starts its controllers; a bad world is named and the old one stays."""
-        self._end_controllers()
+        self._end(self.controllers)
         try:
             world = load_world(path)
             self.simulator = Simulator(world, self.simulator.mode, self.simulator.log)
@@ -293,12 +268,18 @@ class Runner:
             return
         if wanted.action == "quit":
             self.quit(wanted.status)
+        elif wanted.action == "restart":
+            self._restart(next(c for c in self.controllers if c.name == wanted.robot))
         else:
             self.load(Path(wanted.path) if wanted.path else self.simulator.world.path)
 
+    def _restart(self, controller: Controller) -> None:
+        self._end([controller])
+        controller.start()
+
     def _shut_down(self) -> None:
         self.exit_status = self.exit_status or 0
-        self._end_controllers()
+        self._end(self.controllers)
         for key in [*self._selector.get_map().values()]:
             key.fileobj.close()  # type: ignore[union-attr]
         self._selector.close()

@@ -1,7 +1,7 @@
 """The simulation itself: robots, time and modes; no messages, no processes, no sockets.
 
 Whoever drives a `Simulator` makes the physics steps (`advance`) and carries out what the
-simulation wants done to itself (`wanted`: reload, load, quit).
+simulation wants done to itself (`wanted`).
 """
 
 from collections.abc import Callable
@@ -31,8 +31,9 @@ class Wanted(NamedTuple):
     """What a controller asked to be done to the whole simulation."""
 
     action: str
-    """`reload`, `load` or `quit`."""
+    """`reload`, `load`, `restart` (one controller) or `quit`."""
     path: str = ""
+    robot: str = ""
     status: int = 0
 
 

@@ -143,6 +143,10 @@ class Node(metaclass=_NodeTypes):
         """Linear and angular velocity: six numbers."""
         return self.getVelocity()
 
+    def restartController(self) -> None:
+        """Ends the controller of this Robot node and starts it again."""
+        self._session.ask("node_restart_controller", self._id)
+
     def resetPhysics(self) -> None:
         """Takes the node's speed away."""
         self._session.ask("node_reset_physics", self._id)

@@ -14,7 +14,7 @@ from .device import Device
 from .lidar import Lidar
 from .motor import Motor
 from .sensors import GPS, DistanceSensor, InertialUnit, PositionSensor
-from .session import CUSTOM_DATA_TAG, Link, Session
+from .session import Link, Session
 from .socket_link import SocketLink
 
 _DEVICE_CLASSES: dict[str, type[Device]] = {
@@ -162,8 +162,7 @@ class Robot:
 
     def setCustomData(self, data: str) -> None:
         """Sets the `customData` field with the next step."""
-        self._session.custom_data = text(data)
-        self._session.change(CUSTOM_DATA_TAG, "customData", data)
+        self._session.set_custom_data(text(data))
 
     @property
     def custom_data(self) -> str:

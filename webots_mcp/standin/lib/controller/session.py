@@ -66,6 +66,10 @@ class Session:
         with self.lock:
             self._changes[tag, setting] = value
 
+    def set_custom_data(self, data: str) -> None:
+        """Like `change`, but without the lock: this does not wait for a step to end."""
+        self.custom_data = self._changes[CUSTOM_DATA_TAG, "customData"] = data
+
     def enable(self, tag: int, period_ms: int) -> None:
         """Sets a sampling period; 0 disables."""
         self.change(tag, "period", period_ms)

@@ -1,0 +1,176 @@
+"""Controllers as real processes: how they end, and how they start again."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from tests.standin.conftest import WriteController
+from tests.standin.running import LOOP, fast, has_line
+from webots_mcp.standin import StandInError
+
+
+def test_the_world_goes_on_without_a_controller_that_crashed(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller("drive(5, 5)\nrobot.step(160)\nraise RuntimeError('broken')")
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 1.0)
+        simulation.wait_for(lambda: simulation.controller("rover").exit_code == 1)
+        assert has_line(simulation, "[rover] RuntimeError: broken")
+        simulation.wait_for(lambda: has_line(simulation, "exited with status: 1"))
+        simulation.reset()
+        simulation.wait_for(lambda: simulation.controller("rover").starts == 2)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_killed_controller_is_gone_and_the_world_goes_on(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0.1)
+        controller = simulation.controller("rover")
+        controller.kill()
+        simulation.wait_for(lambda: controller.exit_code == -9)
+        gone_s = simulation.time_s
+        simulation.wait_for(lambda: simulation.time_s > gone_s + 1.0)
+        assert not controller.is_connected
+
+
+def test_a_supervisors_reload_ends_the_controller_and_starts_it_again(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        print("time", robot.getTime())
+        robot.step(160)
+        robot.worldReload()
+        print("step", robot.step(16), flush=True)
+        robot.getFromDef("ROVER")  # ends the process: no `finally`, no atexit
+        print("never")
+        """
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.controller("rover").starts >= 3, timeout_s=20)
+        console = simulation.console
+    assert "[rover] step -1" in console
+    assert "[rover] never" not in console
+    assert "INFO: 'rover' controller exited successfully." in console
+    assert console.count("[rover] time 0.0") >= 2
+
+
+def test_a_supervisors_reset_does_not_end_the_controller(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        robot.step(160)
+        robot.simulationReset()
+        robot.step(16)
+        print("after", robot.getTime(), flush=True)
+        """,
+        LOOP,
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "after 0.016"))
+        assert simulation.controller("rover").starts == 1
+
+
+def test_a_reset_by_hand_starts_controllers_again(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller("drive(5, 5)", LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 1.0)
+        simulation.pause()
+        simulation.reset()
+        assert simulation.time_s == 0.0
+        assert simulation.robot("rover").position == (-1.2, 0.0, 0.04)
+        simulation.fast()
+        simulation.wait_for(lambda: simulation.time_s > 1.0)
+        assert simulation.controller("rover").starts == 2
+        assert has_line(simulation, "[rover] ended")
+
+
+def test_a_reload_reads_the_world_file_again(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0)
+        text = world.read_text(encoding="utf-8")
+        world.write_text(text.replace("-1.2 0 0.04", "1.2 0 0.04"), encoding="utf-8")
+        simulation.reload()
+        assert simulation.robot("rover").position == (1.2, 0.0, 0.04)
+        world.write_text("broken", encoding="utf-8")
+        simulation.reload()
+        assert has_line(simulation, "the world stays as it was")
+        simulation.wait_for(lambda: simulation.time_s > 0.1)
+
+
+def test_a_controller_that_does_not_end_is_terminated(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        while robot.step(16) != -1:
+            pass
+        print("deaf", flush=True)
+        import time
+        time.sleep(60)
+        """
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0)
+    assert has_line(simulation, "Forced termination")
+    assert simulation.controller("rover").exit_code not in (None, 0)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_a_signal_ends_a_controller_without_any_cleanup(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        import atexit, signal
+        atexit.register(print, "cleanup", flush=True)
+        """,
+        LOOP,
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0)
+        controller = simulation.controller("rover")
+        assert controller.pid is not None
+        os.kill(controller.pid, 15)
+        simulation.wait_for(lambda: controller.exit_code == -15)
+    assert not has_line(simulation, "cleanup")
+
+
+def test_quitting_gives_the_simulation_its_exit_status(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller("robot.step(16)\nrobot.simulationQuit(7)", LOOP)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: not simulation.is_running)
+    assert simulation.exit_status == 7
+    assert has_line(simulation, "[rover] ended")
+    with pytest.raises(StandInError, match="has ended"):
+        simulation.pause()
+
+
+def test_a_supervisor_restarts_the_controller_of_another_robot(
+    world: Path, write_controller: WriteController
+) -> None:
+    second = 'Robot { name "second" controller "second" supervisor TRUE }'
+    world.write_text(world.read_text(encoding="utf-8") + second, encoding="utf-8")
+    write_controller("print('began', robot.getTime() > 0, flush=True)", LOOP)
+    write_controller(
+        "robot.step(160)\nrobot.getFromDef('ROVER').restartController()", LOOP, name="second"
+    )
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "[rover] began True"))
+        assert simulation.controller("rover").starts == 2
+        assert simulation.controller("second").starts == 1

@@ -1,5 +1,5 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 2;
+PRAGMA user_version = 3;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
@@ -84,7 +84,7 @@ CREATE TABLE run (
 	end_reason TEXT /* finished, reset, reload, crashed, replaced */, 
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows, as of last_wall_time_s */, 
 	label TEXT, 
-	note TEXT, 
+	note TEXT, keep INTEGER /* 1: retention deletes nothing of this run */ DEFAULT 0 NOT NULL, purged_rows INTEGER /* of the rows, those that retention has deleted */ DEFAULT 0 NOT NULL, 
 	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
 	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE
 );
@@ -192,4 +192,141 @@ CREATE TABLE watermark (
 	state_id INTEGER NOT NULL, 
 	PRIMARY KEY (name)
 );
-INSERT INTO alembic_version (version_num) VALUES ('0002');
+CREATE VIEW robot_now AS
+/* The newest state of each robot and how old it is. Lengths and angles as published. */
+SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.5) * 86400.0 - wall_time_s, 1) AS age_s,
+  coalesce(
+    json_extract(j, '$.pose[0]'),
+    json_extract(j, '$.pose.x'),
+    json_extract(j, '$.position[0]'),
+    json_extract(j, '$.position.x'),
+    json_extract(j, '$.gps[0]'),
+    json_extract(j, '$.gps.x'),
+    json_extract(j, '$.x')) AS x_m,
+  coalesce(
+    json_extract(j, '$.pose[1]'),
+    json_extract(j, '$.pose.y'),
+    json_extract(j, '$.position[1]'),
+    json_extract(j, '$.position.y'),
+    json_extract(j, '$.gps[1]'),
+    json_extract(j, '$.gps.y'),
+    json_extract(j, '$.y')) AS y_m,
+  CASE json_array_length(j, '$.pose')
+    WHEN 3 THEN json_extract(j, '$.pose[2]')
+    WHEN 4 THEN json_extract(j, '$.pose[3]')
+    WHEN 6 THEN json_extract(j, '$.pose[5]')
+    ELSE coalesce(
+    json_extract(j, '$.pose.yaw'),
+    json_extract(j, '$.pose.theta'),
+    json_extract(j, '$.pose.heading'),
+    json_extract(j, '$.yaw'),
+    json_extract(j, '$.theta'),
+    json_extract(j, '$.heading'))
+  END AS yaw_rad,
+  CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode')
+    WHEN json_type(j, '$.state') = 'text' THEN json_extract(j, '$.state') END AS mode,
+  data, odd
+FROM (
+  SELECT r.name AS robot, u.id AS run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd,
+    u.end_reason, CASE WHEN json_valid(s.data) THEN s.data END AS j
+  FROM robot r
+  LEFT JOIN run u ON u.id = (SELECT max(id) FROM run WHERE robot_id = r.id)
+  LEFT JOIN state s ON s.id = (
+    SELECT id FROM state WHERE run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1)
+);
+CREATE VIEW robot_trajectory AS
+/* Where each robot was and in which mode, row by row: ask with run_id = ... and a time. */
+SELECT (
+  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = s.run_id) AS robot,
+  s.run_id, s.id AS state_id, s.sim_time_s,
+  strftime('%Y-%m-%d %H:%M:%f', s.wall_time_s, 'unixepoch') AS utc,
+  coalesce(
+    json_extract(j, '$.pose[0]'),
+    json_extract(j, '$.pose.x'),
+    json_extract(j, '$.position[0]'),
+    json_extract(j, '$.position.x'),
+    json_extract(j, '$.gps[0]'),
+    json_extract(j, '$.gps.x'),
+    json_extract(j, '$.x')) AS x_m,
+  coalesce(
+    json_extract(j, '$.pose[1]'),
+    json_extract(j, '$.pose.y'),
+    json_extract(j, '$.position[1]'),
+    json_extract(j, '$.position.y'),
+    json_extract(j, '$.gps[1]'),
+    json_extract(j, '$.gps.y'),
+    json_extract(j, '$.y')) AS y_m,
+  CASE json_array_length(j, '$.pose')
+    WHEN 3 THEN json_extract(j, '$.pose[2]')
+    WHEN 4 THEN json_extract(j, '$.pose[3]')
+    WHEN 6 THEN json_extract(j, '$.pose[5]')
+    ELSE coalesce(
+    json_extract(j, '$.pose.yaw'),
+    json_extract(j, '$.pose.theta'),
+    json_extract(j, '$.pose.heading'),
+    json_extract(j, '$.yaw'),
+    json_extract(j, '$.theta'),
+    json_extract(j, '$.heading'))
+  END AS yaw_rad,
+  CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode')
+    WHEN json_type(j, '$.state') = 'text' THEN json_extract(j, '$.state') END AS mode, s.odd
+FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
+CREATE VIEW robot_run AS
+/* Runs: how long in simulation and in wall time, how fast, what is left of the rows. */
+SELECT r.name AS robot, u.id AS run_id, u.label, strftime('%Y-%m-%d %H:%M:%f', u.started_wall_time_s, 'unixepoch') AS started_utc,
+  round(u.last_sim_time_s - u.started_sim_time_s, 3) AS duration_s,
+  round(u.last_wall_time_s - u.started_wall_time_s, 3) AS wall_duration_s,
+  round((u.last_sim_time_s - u.started_sim_time_s)
+    / nullif(u.last_wall_time_s - u.started_wall_time_s, 0), 3) AS real_time_factor,
+  u.rows, u.purged_rows,
+  round(u.rows / nullif(u.last_sim_time_s - u.started_sim_time_s, 0), 2) AS rows_per_s,
+  u.start_reason, u.end_reason, u.keep, u.note, u.world, s.controller, s.controller_sha256,
+  s.git_commit, u.session_id
+FROM run u JOIN robot r ON r.id = u.robot_id JOIN session s ON s.id = u.session_id;
+CREATE VIEW robot_command AS
+/* Commands: how long each waited to be claimed (or waits), and how long it ran (or runs). */
+SELECT r.name AS robot, c.id AS command_id, c.action, c.params, c.status,
+  strftime('%Y-%m-%d %H:%M:%f', c.created_wall_time_s, 'unixepoch') AS created_utc,
+  round(coalesce(c.claimed_wall_time_s, c.finished_wall_time_s, (julianday('now') - 2440587.5) * 86400.0)
+    - c.created_wall_time_s, 3) AS waiting_s,
+  round(coalesce(c.finished_wall_time_s, (julianday('now') - 2440587.5) * 86400.0) - c.claimed_wall_time_s, 3) AS running_s,
+  c.claimed_sim_time_s, c.finished_sim_time_s,
+  round(c.finished_sim_time_s - c.claimed_sim_time_s, 3) AS running_sim_s,
+  c.result, c.error, c.requested_by, c.session_id
+FROM command c JOIN robot r ON r.id = c.robot_id;
+CREATE VIEW robot_event AS
+/* Events: what changed (name, from_value, to_value), resets, pauses, dropped rows. */
+SELECT (
+  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = e.run_id) AS robot,
+  e.run_id, e.id AS event_id, e.sim_time_s,
+  strftime('%Y-%m-%d %H:%M:%f', e.wall_time_s, 'unixepoch') AS utc, e.kind, e.name,
+  json_extract(j, '$.from') AS from_value, json_extract(j, '$.to') AS to_value, e.data
+FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM event) e;
+CREATE VIEW robot_log AS
+/* Log lines with their simulation time. */
+SELECT (
+  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = l.run_id) AS robot,
+  l.run_id, l.id AS log_id, l.sim_time_s,
+  strftime('%Y-%m-%d %H:%M:%f', l.wall_time_s, 'unixepoch') AS utc, l.level, l.source, l.message
+FROM log l;
+CREATE VIEW robot_period AS
+/* How long a text or flag of the state kept a value. Signals that never changed have none. */
+SELECT (
+  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = p.run_id) AS robot,
+  p.run_id, p.name AS signal, p.value, p.start_s,
+  coalesce(p.next_s, u.last_sim_time_s) AS end_s,
+  round(coalesce(p.next_s, u.last_sim_time_s) - p.start_s, 3) AS duration_s
+FROM (
+  SELECT run_id, name, value, start_s,
+    lead(start_s) OVER (PARTITION BY run_id, name ORDER BY start_s, id) AS next_s
+  FROM (
+    SELECT run_id, name, id, sim_time_s AS start_s,
+      CASE WHEN json_valid(data) THEN json_extract(data, '$.to') END AS value
+    FROM event WHERE kind = 'change'
+    UNION ALL
+    SELECT e.run_id, e.name, min(e.id) - 1, v.started_sim_time_s,
+      CASE WHEN json_valid(e.data) THEN json_extract(e.data, '$.from') END
+    FROM event e JOIN run v ON v.id = e.run_id WHERE e.kind = 'change' GROUP BY e.run_id, e.name
+  )
+) p JOIN run u ON u.id = p.run_id;
+INSERT INTO alembic_version (version_num) VALUES ('0003');

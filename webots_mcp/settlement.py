@@ -29,7 +29,7 @@ END_SESSION: Final = (
 # Judged from outside: the rows are counted, because the dead process could not say how many.
 END_RUNS: Final = (
     "UPDATE run SET ended_wall_time_s = last_wall_time_s, end_reason = :reason, "
-    "rows = (SELECT count(*) FROM state WHERE run_id = run.id) "
+    "rows = purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
     "WHERE session_id = :id AND ended_wall_time_s IS NULL"
 )
 _OPEN_SESSIONS: Final = (

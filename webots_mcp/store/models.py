@@ -116,6 +116,8 @@ class Run(SQLModel, table=True):
     rows: int = _count("state rows, as of last_wall_time_s")
     label: str | None = _text()
     note: str | None = _text()
+    keep: bool = _count("1: retention deletes nothing of this run")
+    purged_rows: int = _count("of the rows, those that retention has deleted")
 
 
 class State(SQLModel, table=True):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import sqlite3
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
@@ -34,6 +35,15 @@ HEARTBEAT_INTERVAL_S: Final = 0.5  # how often a session says that its loop is a
 HEARTBEAT_LATE_S: Final = 2.0  # a session silent for longer is not looping
 ISSUED_TIME_TO_LIVE_S: Final = 60.0  # how long a reload may take until it counts as lost
 MAX_STEPS: Final = 100_000
+
+
+def host_name() -> str:
+    """This machine's name, as sessions are entered and judged by it."""
+    if sys.platform != "win32":
+        return os.uname().nodename
+    import socket  # only where needed: it is a tenth of the bridge's import time
+
+    return socket.gethostname()
 
 
 class MemoryDatabase:

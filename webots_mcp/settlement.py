@@ -6,12 +6,11 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import os
-import socket
 import sqlite3
 import sys
 from typing import Any, Final
 
-from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S
+from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, host_name
 
 EXPIRE: Final = (
     "UPDATE command SET status = 'expired', finished_wall_time_s = :now, "
@@ -55,7 +54,7 @@ def settle(connection: sqlite3.Connection, now_s: float) -> None:
     """
     connection.execute(EXPIRE, {"now": now_s})
     for session_id, pid, host, reloading in connection.execute(_OPEN_SESSIONS).fetchall():
-        if host == socket.gethostname() and not process_alive(pid):
+        if host == host_name() and not process_alive(pid):
             end_session(connection, session_id, "reload" if reloading else "crashed")
     for command_id, issued_s in connection.execute(_CLAIMED_BY_ENDED).fetchall():
         if issued_s is None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import sqlite3
 import time
 from collections.abc import Callable
@@ -67,6 +66,8 @@ class Control:
                 f"action {action!r} cannot be registered: choose a name that is not empty and "
                 f"not built in ({', '.join(BUILT_IN_ACTIONS)})"
             )
+        import inspect  # only here: it would be a fifth of the bridge's import time
+
         if not callable(handler) or inspect.iscoroutinefunction(handler):
             raise TypeError(f"the handler of {action!r} must be a plain function, not {handler!r}")
         self._handlers[action] = handler

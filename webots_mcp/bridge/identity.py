@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
-import socket
 import sqlite3
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
+
+from webots_mcp.contract import host_name
 
 
 class Identity(NamedTuple):
@@ -40,7 +40,7 @@ def identify(robot: Any, supervisor: bool, version: str) -> Identity:
         world=str(robot.getWorldPath()) if hasattr(robot, "getWorldPath") else None,
         basic_time_step_ms=float(robot.getBasicTimeStep()),
         pid=os.getpid(),
-        host=socket.gethostname(),
+        host=host_name(),
         instance=_instance(),
         controller=str(controller) if controller else None,
         controller_sha256=_sha256(controller) if controller else None,
@@ -66,14 +66,26 @@ def _devices(robot: Any) -> dict[str, Any]:
 
 def _instance() -> str:
     """Which Webots this is: its own temporary folder, else the process that started this one."""
-    return os.environ.get("WEBOTS_INSTANCE_PATH") or f"{socket.gethostname()}:{os.getppid()}"
+    return os.environ.get("WEBOTS_INSTANCE_PATH") or f"{host_name()}:{os.getppid()}"
 
 
 def _sha256(file: Path) -> str | None:
     try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
+        return _sha256_of(file.read_bytes())
     except OSError:
         return None
+
+
+def _sha256_of(data: bytes) -> str:
+    """By the interpreter's own module: hashlib brings OpenSSL in, for 5 ms and 4 MB more."""
+    for name in ("_sha2", "_sha256"):  # since Python 3.12, and before it
+        try:
+            return __import__(name).sha256(data).hexdigest()
+        except ImportError:  # noqa: PERF203
+            continue
+    import hashlib
+
+    return hashlib.sha256(data).hexdigest()
 
 
 def _git_commit(folder: Path) -> str | None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import socket
 import sqlite3
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.contract import HEARTBEAT_LATE_S
+from webots_mcp.contract import HEARTBEAT_LATE_S, host_name
 from webots_mcp.settlement import process_alive
 
 # A session on another host, whose process cannot be asked, counts as dead after this silence.
@@ -59,7 +58,7 @@ class Session:
         """On this host its process tells; on another only its heartbeat can."""
         if self.ended_wall_time_s is not None:
             return False
-        if self.host == socket.gethostname():
+        if self.host == host_name():
             return process_alive(self.pid)
         return now_s - self.last_seen_wall_time_s < REMOTE_SILENCE_S
 

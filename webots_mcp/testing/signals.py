@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.store.history.columns import Columns
@@ -42,7 +42,7 @@ class RecordedSignal:
     def __repr__(self) -> str:
         return f"<signal {self.name!r} of {self._run}: {len(self._values)} rows>"
 
-    def values(self) -> list[Value]:
+    def values(self) -> list[Any]:
         """The value in each row, in order."""
         return list(self._values)
 
@@ -50,18 +50,18 @@ class RecordedSignal:
         """The simulation time of each row, in seconds."""
         return list(self._columns.times)
 
-    def changes(self) -> list[Value]:
+    def changes(self) -> list[Any]:
         """The values without those that equal the one before: `["cruise", "turn", "cruise"]`."""
         later = [after for before, after in pairwise(self._values) if after != before]
         return [*self._values[:1], *later]
 
     @property
-    def first(self) -> Value:
+    def first(self) -> Any:
         """The value in the first row."""
         return self._values[0]
 
     @property
-    def last(self) -> Value:
+    def last(self) -> Any:
         """The value in the newest row."""
         return self._values[-1]
 
@@ -81,7 +81,7 @@ class RecordedSignal:
         """
         return max(self._numbers())
 
-    def at(self, time_s: float) -> Value:
+    def at(self, time_s: float) -> Any:
         """The value in force at a simulation time: that of the newest row up to then.
 
         Raises:

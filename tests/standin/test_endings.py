@@ -19,7 +19,7 @@ def test_the_world_goes_on_without_a_controller_that_crashed(
     with fast(world) as simulation:
         simulation.wait_for(lambda: simulation.time_s > 1.0)
         simulation.wait_for(lambda: simulation.controller("rover").exit_code == 1)
-        assert has_line(simulation, "[rover] RuntimeError: broken")
+        simulation.wait_for(lambda: has_line(simulation, "[rover] RuntimeError: broken"))
         simulation.wait_for(lambda: has_line(simulation, "exited with status: 1"))
         simulation.reset()
         simulation.wait_for(lambda: simulation.controller("rover").starts == 2)

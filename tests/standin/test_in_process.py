@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -136,3 +138,15 @@ def test_another_world_is_loaded_after_the_next_step(tmp_path: Path) -> None:
     assert robot.step(STEP_MS) == 0
     assert robot.step(STEP_MS) == -1
     assert InProcessRobot(world=robot.simulation).getBasicTimeStep() == 8.0
+
+
+def test_another_controller_package_in_the_process_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "controller.py").touch()
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import controller\n"
+    done = subprocess.run(
+        [sys.executable, "-c", code + "import webots_mcp.standin"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert "another package named controller is loaded" in done.stderr

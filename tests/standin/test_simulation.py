@@ -23,7 +23,7 @@ def test_a_controller_drives_its_robot_and_prints_to_the_console(
     with Simulation(world, mode="fast", console=lines.append) as simulation:
         simulation.wait_for(lambda: simulation.time_s > 1.0)
         assert simulation.robot("rover").position[0] > -1.1
-        assert "[rover] off we go" in simulation.console
+        simulation.wait_for(lambda: "[rover] off we go" in simulation.console)
     assert "[rover] ended" in lines
     assert lines[-1] == "INFO: 'rover' controller exited successfully."
     assert simulation.controller("rover").exit_code == 0
@@ -51,7 +51,7 @@ def test_a_controller_runs_where_and_as_webots_would_run_it(
         LOOP,
     )
     with Simulation(world, mode="fast", environment={"MY_SETTING": "yes"}) as simulation:
-        simulation.wait_for(lambda: simulation.time_s > 0)
+        simulation.wait_for(lambda: has_line(simulation, "paths "))
         console = [line.removeprefix("[rover] ") for line in simulation.console]
     assert "argv ['rover.py', 'a b', 'c']" in console
     assert f"cwd {file.parent}" in console
@@ -183,7 +183,7 @@ def test_a_second_robot_object_is_half_made(world: Path, write_controller: Write
     )
     with fast(world) as simulation:
         simulation.wait_for(lambda: has_line(simulation, "half made 0 0.016 True"))
-        assert has_line(simulation, "Only one instance of the Robot class")
+        simulation.wait_for(lambda: has_line(simulation, "Only one instance of the Robot class"))
 
 
 def test_a_program_of_ones_own_can_be_an_extern_controller(

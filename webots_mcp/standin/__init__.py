@@ -4,6 +4,10 @@ It is not Webots and does not try to be: a flat arena with upright boxes, cylind
 robots on two driven wheels, seven kinds of devices. What it does reproduce is how Webots treats
 controllers: processes, blocking, pause, reset, reload, and what each call returns or refuses.
 
+Simpler than in Webots: robots are discs where they touch something; what has Physics is pushed
+along without turning or rolling on; rays are level; there is no noise, no gravity and no torque;
+worlds are made of base nodes, without PROTOs.
+
 Controllers run unchanged: `from controller import Robot` finds the stand-in's `controller` package
 in their processes. Importing this package makes it importable here as well.
 
@@ -17,6 +21,12 @@ from pathlib import Path
 LIBRARY = Path(__file__).parent / "lib"
 """The folder that holds the `controller` package; it belongs in front of PYTHONPATH."""
 
+_loaded = sys.modules.get("controller")
+if _loaded is not None and str(LIBRARY) not in str(_loaded.__file__):
+    raise ImportError(
+        f"another package named controller is loaded, from {_loaded.__file__}: import "
+        "webots_mcp.standin before it, or leave Webots' own out of PYTHONPATH"
+    )
 if str(LIBRARY) not in sys.path:
     sys.path.insert(0, str(LIBRARY))
 

@@ -20,11 +20,11 @@ import anyio
 from mcp import Client, StdioServerParameters
 from mcp.types import CallToolResult, ImageContent, TextContent
 
-from webots_mcp.bundled import bundled
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.standin import Simulation
+from webots_mcp.standin.in_process import DEFAULT_WORLD
 
 DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
 _ROBOT: Final = "rover"
@@ -56,9 +56,8 @@ def run(data_dir: Path = DEFAULT_DATA_DIR, *, keep: bool = False) -> None:
     Raises:
         NothingRecordedError: The controller did not come up.
     """
-    world = bundled("examples") / "worlds" / "arena.wbt"
-    _say(f"Starting {world.name} on the stand-in simulator (this is not Webots) ...")
-    with Simulation(world, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
+    _say(f"Starting {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
+    with Simulation(DEFAULT_WORLD, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
         _wait_for_rows(simulation, data_dir)
         anyio.run(_converse, data_dir)
         _tell_where(data_dir)

@@ -11,7 +11,6 @@ from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.standin.world import World, load_world
 
 HEADER = "#VRML_SIM R2023b utf8\n"
-EXAMPLE = Path(__file__).parents[2] / "examples" / "worlds" / "arena.wbt"
 
 
 def loaded(text: str, tmp_path: Path) -> World:
@@ -86,7 +85,3 @@ def test_a_file_that_is_no_world_is_refused(tmp_path: Path) -> None:
         load_world(path)
     with pytest.raises(WorldError, match="cannot read the world"):
         load_world(tmp_path / "missing.wbt")
-
-
-def test_the_built_in_arena_is_the_example() -> None:
-    assert DEFAULT_WORLD.read_text(encoding="utf-8") == EXAMPLE.read_text(encoding="utf-8")

@@ -9,6 +9,7 @@ from controller.robot import Robot
 from controller.supervisor import Supervisor
 from controller.wire import Message
 
+from webots_mcp.bundled import bundled
 from webots_mcp.standin.answers import answer, description, step_over
 from webots_mcp.standin.errors import (
     ControllerEndedError,
@@ -20,7 +21,7 @@ from webots_mcp.standin.simulator import Mode, Simulator, Wanted
 from webots_mcp.standin.simulator import Robot as SimulatedRobot
 from webots_mcp.standin.world import load_world
 
-DEFAULT_WORLD = Path(__file__).parent / "arena.wbt"
+DEFAULT_WORLD = bundled("examples") / "worlds" / "arena.wbt"
 """A 4 m x 4 m arena with a few obstacles and one two-wheeled robot, "rover"."""
 
 _LONGEST_STEP_MS = 1 << 31

@@ -144,13 +144,13 @@ def main() -> None:
     bridge = MCPBridge(robot)
     bridge.register_command("set_speed", rover.set_speed)
     bridge.register_command("turn_to", rover.turn_to)
-    bridge.on_reload(lambda: bridge.log("the world is about to be reloaded"))
-    picture_s, mode = 0.0, rover.mode
+    bridge.on_reload(lambda: bridge.log("the world was reset or reloaded"))
+    next_picture_s, mode = 1.0, rover.mode
 
     while robot.step(rover.time_step) != -1:
         if robot.getTime() < rover.time_s:  # a reset: the motors hold until told again
             rover.start()
-            picture_s = 0.0
+            next_picture_s = 1.0
         state = rover.sense()
         rover.decide()
         rover.act()
@@ -159,9 +159,9 @@ def main() -> None:
         if rover.mode != mode:
             bridge.log(f"{mode} -> {rover.mode}", level="warning" if rover.stuck else "info")
             mode = rover.mode
-        if rover.time_s - picture_s > PICTURE_EVERY_S:
+        if rover.time_s > next_picture_s:
             bridge.save_camera_frame(rover.camera)
-            picture_s = rover.time_s
+            next_picture_s = rover.time_s + PICTURE_EVERY_S
 
 
 if __name__ == "__main__":

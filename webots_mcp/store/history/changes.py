@@ -14,6 +14,8 @@ from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.rollup import watermark
 from webots_mcp.store.history.tiers import rows_after
 
+MOST_VALUES: Final = 20
+
 _CHANGES: Final = (
     "SELECT sim_time_s, value FROM change WHERE run_id = ? AND signal_id = ? AND sim_time_s < ? "
     "ORDER BY state_id"
@@ -84,6 +86,11 @@ def time_by_value(points: Sequence[Point], start_s: float, end_s: float) -> dict
             key = spelled(point.value)
             seconds[key] = seconds.get(key, 0.0) + stop_s - begin_s
     return dict(sorted(seconds.items(), key=lambda item: -item[1]))
+
+
+def longest_values(points: Sequence[Point], start_s: float, end_s: float) -> dict[str, float]:
+    """The same for at most 20 values: a text that is no mode has too many."""
+    return dict(list(time_by_value(points, start_s, end_s).items())[:MOST_VALUES])
 
 
 def spelled(value: str | bool | None) -> str:

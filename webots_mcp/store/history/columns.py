@@ -84,7 +84,8 @@ def read_columns(
     bounds = (segment.run_id, segment.start_s, segment.end_s)
     parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id, limit)
     try:
-        read(connection, signals, parameters, columns, deadline)
+        with deadline.interrupting(connection):
+            read(connection, signals, parameters, columns, deadline)
     except sqlite3.OperationalError:
         if not deadline.passed:
             raise

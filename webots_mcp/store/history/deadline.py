@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 import time
-from types import TracebackType
+from collections.abc import Generator
 from typing import Final
 
 QUESTION_DEADLINE_S: Final = 2.0
@@ -12,16 +13,9 @@ _STEPS_PER_LOOK: Final = 20_000  # of SQLite's virtual machine: about 0.5 ms
 
 
 class Deadline:
-    """Interrupts the connection's statements once the time is over.
+    """When a question has to be answered with what is known by then."""
 
-    An interrupted statement raises `sqlite3.OperationalError`; who reads in chunks keeps what came
-    before and says that it was cut (`passed` tells a deadline from another error). A connection
-    has one progress handler: deadlines do not nest on it.
-    """
-
-    def __init__(self, connection: sqlite3.Connection, limit_s: float = QUESTION_DEADLINE_S):
-        self.limit_s = limit_s
-        self._connection = connection
+    def __init__(self, limit_s: float = QUESTION_DEADLINE_S) -> None:
         self._until_s = time.monotonic() + limit_s
 
     @property
@@ -29,14 +23,15 @@ class Deadline:
         """Whether the time is over."""
         return time.monotonic() >= self._until_s
 
-    def __enter__(self) -> Deadline:
-        self._connection.set_progress_handler(lambda: self.passed, _STEPS_PER_LOOK)
-        return self
+    @contextlib.contextmanager
+    def interrupting(self, connection: sqlite3.Connection) -> Generator[None]:
+        """Interrupt the connection's statements once the time is over.
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._connection.set_progress_handler(None, 0)
+        An interrupted statement raises `sqlite3.OperationalError`; `passed` tells it from other
+        errors. A connection has one progress handler, so these blocks do not nest.
+        """
+        connection.set_progress_handler(lambda: self.passed, _STEPS_PER_LOOK)
+        try:
+            yield
+        finally:
+            connection.set_progress_handler(None, 0)

@@ -69,11 +69,10 @@ def query_rows(
     signals = signals_of(connection, time_range, names)
     parts: list[Columns] = []
     room = limit + 1  # one more, to know whether there is a next page
-    with Deadline(connection, deadline_s) as deadline:
-        for segment in time_range.segments:
-            rest = rows_after(connection, segment, after_id)
-            if rest is None or room == 0 or deadline.passed:
-                continue
+    deadline = Deadline(deadline_s)
+    for segment in time_range.segments:
+        rest = rows_after(connection, segment, after_id)
+        if rest is not None and room > 0 and not any(part.cut for part in parts):
             parts.append(
                 read_columns(connection, rest, signals, deadline, after_id=after_id, limit=room)
             )

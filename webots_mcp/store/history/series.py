@@ -11,7 +11,7 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.history.buckets import Table, Tier, tabulate
-from webots_mcp.store.history.changes import Point, change_points, time_by_value
+from webots_mcp.store.history.changes import Point, change_points, longest_values
 from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.history.gaps import Gap
 from webots_mcp.store.history.ranges import Segment, TimeRange, recorded_bounds
@@ -22,7 +22,6 @@ from webots_mcp.store.history.summary import Summary, merge
 
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
-MOST_VALUES: Final = 20  # of a text signal whose times are told
 
 _NEWEST_WALL: Final = (
     "SELECT wall_time_s FROM state WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
@@ -140,12 +139,11 @@ def query_history(
         raise InvalidInputError(f"max_points={max_points} must be from 1 to {MOST_POINTS}")
     signals = signals_of(connection, time_range, names)
     total_s = sum(segment.end_s - segment.start_s for segment in time_range.segments)
-    with Deadline(connection, deadline_s) as deadline:
-        runs = [
-            _run_history(connection, segment, signals, share, deadline)
-            for segment in time_range.segments
-            for share in [_share(max_points, segment, total_s)]
-        ]
+    deadline = Deadline(deadline_s)
+    runs = [
+        _run_history(connection, segment, signals, _share(max_points, segment, total_s), deadline)
+        for segment in time_range.segments
+    ]
     return History(time_range.robot, tuple(runs), time_range.notes)
 
 
@@ -220,7 +218,5 @@ def _columns(signal: Signal, table: Table) -> NumberColumns:
 def _change_columns(
     signal: Signal, points: list[Point], segment: Segment, newest_s: float, max_points: int
 ) -> ChangeColumns:
-    end_s = min(segment.end_s, newest_s)
-    seconds = time_by_value(points, segment.start_s, end_s)
-    longest = dict(list(seconds.items())[:MOST_VALUES])
-    return ChangeColumns(signal.name, signal.kind, points[-max_points:], len(points), longest)
+    seconds = longest_values(points, segment.start_s, min(segment.end_s, newest_s))
+    return ChangeColumns(signal.name, signal.kind, points[-max_points:], len(points), seconds)

@@ -186,7 +186,7 @@ def _late(
     """The run's rows after the watermark, newest first, until the deadline."""
     mark = watermark(connection)
     batch = Batch()
-    limit = Deadline(connection, deadline_s)
+    limit = Deadline(deadline_s)
     notes: list[str] = []
     for state_id, *row in connection.execute(_NEWEST_ROWS, (subject.run_id,)):
         if state_id <= mark:

@@ -51,11 +51,16 @@ class Pieces:
                 self._parts[signal.name][bucket].append(summary)
             start = end
 
-    def add_rollups(self, connection: sqlite3.Connection, run_id: int, span: range) -> None:
-        """Add the stored rollups of those buckets."""
+    def add_rollups(
+        self, connection: sqlite3.Connection, run_id: int, span: range, deadline: Deadline
+    ) -> None:
+        """Add the stored rollups of those buckets, signal by signal until the deadline."""
         for signal in self._signals:
             if signal.id is None:
                 continue
+            if deadline.passed:
+                self.cut_at_s = span.start * BUCKET_S
+                return
             parts = self._parts[signal.name]
             for bucket, summary in buckets(connection, run_id, signal.id, span.start, span.stop):
                 parts[bucket].append(summary)
@@ -87,7 +92,7 @@ def read_pieces(
     middle = replace(segment, start_s=start_s, end_s=end_s)
     mark = watermark(connection)
     pieces.add_rows(read_columns(connection, head, signals, deadline))
-    pieces.add_rollups(connection, segment.run_id, span)
+    pieces.add_rollups(connection, segment.run_id, span, deadline)
     if (late := rows_after(connection, middle, mark)) is not None:
         pieces.add_rows(read_columns(connection, late, signals, deadline, after_id=mark))
     pieces.add_rows(read_columns(connection, foot, signals, deadline))

@@ -1,0 +1,186 @@
+"""What a numeric signal does over a stretch of time: its slope, swing, spikes and rest.
+
+Each function takes times that do not fall and as many values, all finite numbers.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from operator import mul
+from typing import Final
+
+TIME_BINS: Final = 8
+DEAD_BAND: Final = 0.3  # standard deviations about the mean within which noise may cross it
+MOST_IRREGULAR: Final = 0.4  # coefficient of variation of the half periods of an oscillation
+LEAST_CROSSINGS: Final = 4
+SPIKE_SCORE: Final = 8.0  # 3.5 is the usual; here thousands of values are looked at at once
+MOST_SPIKES_SHARE: Final = 0.001  # more than that are noise
+FLAT_BAND: Final = 0.005  # of the range: what moves less is at rest
+
+
+@dataclass(frozen=True)
+class Line:
+    """The straight line of least squares; `r2` is the share of the variance it explains."""
+
+    slope_per_s: float
+    r2: float
+
+
+@dataclass(frozen=True)
+class Oscillation:
+    """A regular swing about the mean.
+
+    Attributes:
+        crossings: How often the mean was crossed.
+        amplitude: Median of the largest deviation in each half period.
+    """
+
+    crossings: int
+    period_s: float
+    amplitude: float
+
+
+@dataclass(frozen=True)
+class Spike:
+    """One value far from both of its neighbours."""
+
+    sim_time_s: float
+    value: float
+
+
+def fit_line(times: Sequence[float], values: Sequence[float]) -> Line | None:
+    """Least squares: slope = S_tv / S_tt, r2 = S_tv**2 / (S_tt * S_vv), sums about the means.
+
+    N. R. Draper, H. Smith, Applied Regression Analysis (3rd ed. 1998), sections 1.2 and 1.3. None
+    where time stood still; r2 is 0 for a constant.
+    """
+    if len(values) < 2:
+        return None
+    time_mean, mean = math.fsum(times) / len(times), math.fsum(values) / len(values)
+    dt = [time - time_mean for time in times]
+    dv = [value - mean for value in values]
+    stt, stv, svv = sum(map(mul, dt, dt)), sum(map(mul, dt, dv)), sum(map(mul, dv, dv))
+    if stt == 0:
+        return None
+    return Line(stv / stt, min(1.0, stv * stv / (stt * svv)) if svv > 0 else 0.0)
+
+
+def find_oscillation(
+    times: Sequence[float], values: Sequence[float], mean: float, deviation: float
+) -> tuple[int, Oscillation | None]:
+    """Crossings of the mean, and the oscillation that they make if they come regularly.
+
+    A crossing counts when the value leaves a band of 0.3 standard deviations about the mean on the
+    other side (a Schmitt trigger), so that noise about the mean makes none. Regular means: at
+    least four, at intervals whose standard deviation is at most 0.4 of their mean; noise of any
+    colour comes out near 1.
+    """
+    if deviation == 0:
+        return 0, None
+    moments, peaks = _crossings(times, values, mean, DEAD_BAND * deviation)
+    halves = [after - before for before, after in pairwise(moments)]
+    if len(moments) < LEAST_CROSSINGS:
+        return len(moments), None
+    half_s = statistics.fmean(halves)
+    if half_s <= 0 or statistics.pstdev(halves) > MOST_IRREGULAR * half_s:
+        return len(moments), None
+    return len(moments), Oscillation(len(moments), 2 * half_s, statistics.median(peaks))
+
+
+def _crossings(
+    times: Sequence[float], values: Sequence[float], mean: float, band: float
+) -> tuple[list[float], list[float]]:
+    """Times at which the value changed sides, and the largest deviation between each two."""
+    low, high = mean - band, mean + band
+    moments: list[float] = []
+    peaks: list[float] = []
+    side, peak = 0, 0.0
+    for time, value in zip(times, values, strict=True):
+        if low < value < high:
+            continue
+        now = 1 if value > mean else -1
+        if now != side:
+            if side:
+                moments.append(time)
+                peaks.append(peak)
+            side, peak = now, 0.0
+        peak = max(peak, abs(value - mean))
+    return moments, peaks[1:] or peaks
+
+
+def find_spikes(times: Sequence[float], values: Sequence[float]) -> list[Spike]:
+    """Single values that stand out from both neighbours, while those agree with each other.
+
+    s = value - mean of both neighbours, judged by the modified z-score 0.6745 * s / MAD(s), and
+    where that MAD is 0 by s / (1.2533 * mean |s|): B. Iglewicz, D. C. Hoaglin, How to Detect and
+    Handle Outliers (1993). A step is no spike, because its neighbours differ. Where more than one
+    in a thousand values (and more than three) stand out, none is told: that is how the signal is.
+    """
+    if len(values) < 5:
+        return []
+    middle = [b - (a + c) / 2 for a, b, c in zip(values, values[1:], values[2:], strict=False)]
+    sizes = sorted(map(abs, middle))
+    mad = sizes[len(sizes) // 2]
+    limit = SPIKE_SCORE * (mad / 0.6745 if mad > 0 else 1.2533 * sum(sizes) / len(sizes))
+    if limit == 0 or sizes[-1] <= limit:
+        return []
+    found = [
+        Spike(times[index + 1], values[index + 1])
+        for index, size in enumerate(middle)
+        if abs(size) > limit and abs(values[index + 2] - values[index]) < abs(size) / 2
+    ]
+    return found if len(found) <= max(3, MOST_SPIKES_SHARE * len(values)) else []
+
+
+def flat_since(times: Sequence[float], values: Sequence[float]) -> float | None:
+    """Since when the value has stayed within 0.5 % of its range; None if not for 10 % of the time.
+
+    A signal that never changed is flat since its first value.
+    """
+    span = max(values) - min(values)
+    last, limit = values[-1], FLAT_BAND * span
+    index = len(values) - 1
+    while index > 0 and abs(values[index - 1] - last) <= limit:
+        index -= 1
+    whole_s = times[-1] - times[0]
+    return times[index] if span == 0 or times[-1] - times[index] >= 0.1 * whole_s else None
+
+
+def time_effect(times: Sequence[float], values: Sequence[float]) -> float:
+    """The share of the variance that lies between eight equal stretches of time, 0 to 1.
+
+    The correlation ratio eta squared (R. A. Fisher, Statistical Methods for Research Workers,
+    1925, section 44): near 0 for steady noise and for a swing that is short beside the stretch,
+    1 where all change is slow, whether it goes one way or comes back.
+    """
+    mean = math.fsum(values) / len(values)
+    total = math.fsum((value - mean) ** 2 for value in values)
+    width_s = (times[-1] - times[0]) / TIME_BINS
+    if total == 0 or width_s == 0:
+        return 0.0
+    borders = [bisect_left(times, times[0] + width_s * index) for index in range(TIME_BINS)]
+    between = 0.0
+    for start, end in pairwise([*borders, len(values)]):
+        if end > start:
+            between += (end - start) * (math.fsum(values[start:end]) / (end - start) - mean) ** 2
+    return min(1.0, between / total)
+
+
+def unwrap(angles: Sequence[float]) -> list[float]:
+    """Angles without the jumps of a full turn, as if turns were counted.
+
+    Each step is taken as the shorter way round (K. Itoh, Analysis of the phase unwrapping
+    algorithm, Applied Optics 21, 1982).
+    """
+    turned: list[float] = []
+    offset = 0.0
+    for index, angle in enumerate(angles):
+        if index and abs(step := angle - angles[index - 1]) > math.pi:
+            offset -= math.copysign(2 * math.pi, step)
+        turned.append(angle + offset)
+    return turned

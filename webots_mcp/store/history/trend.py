@@ -1,0 +1,179 @@
+"""One numeric signal over a range: its trend, and what a person would notice."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final, Literal
+
+from webots_mcp.store.history.registry import Signal
+from webots_mcp.store.history.shapes import (
+    Line,
+    Oscillation,
+    Spike,
+    find_oscillation,
+    fit_line,
+    flat_since,
+    time_effect,
+    unwrap,
+)
+from webots_mcp.store.history.summary import Summary, summarise
+
+STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
+TOLD_MISSING_SHARE: Final = 0.001
+
+Shape = Literal["constant", "rising", "falling", "oscillating", "resting", "varying"]
+Monotonic = Literal["rising", "falling"]
+
+
+@dataclass(frozen=True)
+class Trend:
+    """A numeric signal over a range.
+
+    Attributes:
+        summary: Count, first, last, extremes with their times, mean, deviation.
+        mean: Of an angle the circular mean.
+        deviation: Standard deviation; of an angle that of the unwrapped angle.
+        monotonic: "rising", "falling" (never the other way, and not constant), or None.
+        crossings: Of the mean, by more than noise.
+        flat_since_s: Since when it rests; None if it does not.
+        spikes: Values that stand out from both neighbours; None where rows were not looked at.
+        missing_share: Rows without a value.
+        change: How much it changed with time, 0 to 2: the share of its variance that is slow
+            (`time_effect`) times its range in units of its largest magnitude. Free of units.
+        says: What a person would notice.
+    """
+
+    name: str
+    kind: str
+    unit: str | None
+    summary: Summary
+    mean: float | None
+    deviation: float | None
+    slope_per_s: float | None
+    r2: float | None
+    shape: Shape
+    monotonic: Monotonic | None
+    crossings: int
+    oscillation: Oscillation | None
+    flat_since_s: float | None
+    spikes: tuple[Spike, ...] | None
+    missing_share: float
+    change: float
+    says: str
+
+
+def judge(
+    signal: Signal,
+    summary: Summary,
+    times: Sequence[float],
+    numbers: Sequence[float],
+    spikes: list[Spike] | None,
+) -> Trend:
+    """Put together what the summary tells and what the course of the numbers tells.
+
+    Args:
+        signal: Whose trend.
+        summary: Of the whole range.
+        times: Of the numbers.
+        numbers: The values, or the means of buckets; at least one.
+        spikes: None where only buckets were looked at.
+    """
+    angle = signal.kind == "angle"
+    course = unwrap(numbers) if angle else numbers
+    inner = summarise(times, course)
+    line = fit_line(times, course)
+    crossings, swing = find_oscillation(times, course, inner.mean or 0.0, inner.deviation or 0.0)
+    monotonic = _monotonic(course)
+    rest_s = flat_since(times, course)
+    shape = _shape(summary, line, monotonic, swing, rest_s)
+    trend = Trend(
+        name=signal.name,
+        kind=signal.kind,
+        unit=signal.unit,
+        summary=summary,
+        mean=summary.direction if angle else summary.mean,
+        deviation=inner.deviation if angle else summary.deviation,
+        slope_per_s=line.slope_per_s if line else None,
+        r2=line.r2 if line else None,
+        shape=shape,
+        monotonic=monotonic,
+        crossings=crossings,
+        oscillation=swing,
+        flat_since_s=rest_s,
+        spikes=None if spikes is None else tuple(spikes),
+        missing_share=1 - summary.present / summary.rows,
+        change=_change(summary, times, course),
+        says="",
+    )
+    return replace(trend, says="; ".join(_remarks(trend)))
+
+
+def _monotonic(values: Sequence[float]) -> Monotonic | None:
+    if values[0] == values[-1]:
+        return None
+    rising = values[-1] > values[0]
+    if any((b < a) if rising else (b > a) for a, b in pairwise(values)):
+        return None
+    return "rising" if rising else "falling"
+
+
+def _shape(
+    summary: Summary,
+    line: Line | None,
+    monotonic: Monotonic | None,
+    swing: Oscillation | None,
+    rest_s: float | None,
+) -> Shape:
+    if summary.min == summary.max:
+        return "constant"
+    if swing is not None:
+        return "oscillating"
+    if monotonic is not None:
+        return monotonic
+    if line is not None and line.r2 >= STRAIGHT_R2:
+        return "rising" if line.slope_per_s > 0 else "falling"
+    return "resting" if rest_s is not None else "varying"
+
+
+def _change(summary: Summary, times: Sequence[float], course: Sequence[float]) -> float:
+    assert summary.min is not None and summary.max is not None
+    largest = max(abs(summary.min), abs(summary.max))
+    if largest == 0:
+        return 0.0
+    return time_effect(times, course) * (summary.max - summary.min) / largest
+
+
+def _remarks(trend: Trend) -> Iterator[str]:
+    summary, unit = trend.summary, f" {trend.unit}" if trend.unit else ""
+    yield _course(trend, unit)
+    if trend.flat_since_s is not None and trend.shape not in ("constant", "oscillating"):
+        yield f"flat at {summary.last:.4g} since {trend.flat_since_s:.6g} s"
+    if trend.spikes:
+        largest = max(trend.spikes, key=lambda spike: abs(spike.value - (trend.mean or 0.0)))
+        yield (
+            f"{len(trend.spikes)} spike{'s' if len(trend.spikes) > 1 else ''}, the largest "
+            f"{largest.value:.4g} at {largest.sim_time_s:.6g} s"
+        )
+    if trend.missing_share > TOLD_MISSING_SHARE:
+        yield f"no value in {100 * trend.missing_share:.3g} % of the rows"
+
+
+def _course(trend: Trend, unit: str) -> str:
+    summary = trend.summary
+    if trend.shape == "constant":
+        return f"constant at {summary.last:.4g}{unit}"
+    if trend.oscillation is not None:
+        return (
+            f"swings by {trend.oscillation.amplitude:.3g}{unit} about {trend.mean or 0.0:.4g} "
+            f"every {trend.oscillation.period_s:.3g} s"
+        )
+    if trend.shape in ("rising", "falling"):
+        verb = "rises" if trend.shape == "rising" else "falls"
+        slope = f" ({trend.slope_per_s:.3g}{unit}/s)" if trend.slope_per_s is not None else ""
+        return f"{verb} from {summary.first:.4g} to {summary.last:.4g}{unit}{slope}"
+    low, high = f"{summary.min:.4g}", f"{summary.max:.4g}"
+    return f"between {low} (at {summary.min_sim_time_s:.6g} s) and {high}{unit} " + (
+        f"(at {summary.max_sim_time_s:.6g} s)"
+    )

@@ -60,6 +60,21 @@ def test_a_loop_that_steps_under_command_is_running(recorded: Recorded) -> None:
     assert status_of(recorded.robot(now=NOW, hold="stepping")).text == "running"
 
 
+def test_a_pause_counts_from_its_instant_not_from_the_next_heartbeat(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW - 0.2)
+    robot.now = NOW
+    robot.event(1.0, "pause", None, {"command_id": 1})
+    assert status_of(robot).text == "paused"
+
+
+def test_a_resume_counts_from_its_instant_not_from_the_next_heartbeat(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW - 0.2, hold="paused", moved_wall_time_s=NOW - 100)
+    robot.now = NOW
+    robot.event(1.0, "pause", None, {"command_id": 1})
+    robot.event(1.0, "resume", None, {"command_id": 2})
+    assert status_of(robot).text == "running"
+
+
 def test_a_hold_whose_heartbeat_stopped_is_no_pause_any_more(recorded: Recorded) -> None:
     robot = recorded.robot(now=NOW, hold="paused", moved_wall_time_s=NOW - 5)
     status = status_of(robot, after_s=30)

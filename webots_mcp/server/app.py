@@ -14,7 +14,6 @@ from webots_mcp import __version__
 from webots_mcp.contract import Database
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.server.boundary import register
-from webots_mcp.store.recording import Recording
 from webots_mcp.server.tools.commands import CommandTools
 from webots_mcp.server.tools.control import ControlTools
 from webots_mcp.server.tools.logs import LogTools
@@ -23,6 +22,7 @@ from webots_mcp.server.tools.pictures import PictureTools
 from webots_mcp.server.tools.state import StateTools
 from webots_mcp.server.tools.world import WorldTools
 from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.recording import Recording
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "

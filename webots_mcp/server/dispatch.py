@@ -13,10 +13,11 @@ from anyio import to_thread
 
 from webots_mcp.contract import BUILT_IN_ACTIONS, HEARTBEAT_LATE_S
 from webots_mcp.errors import UnknownActionError
-from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.shortening import RESULT_BUDGET, cut_text, shorten
 from webots_mcp.store.queue import Command, CommandQueue, fetch_command
+from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.status import SILENT
 
 Report = Callable[[float, float, str], Awaitable[None]]
 
@@ -173,7 +174,7 @@ def _why_unclaimed(view: View) -> str:
     if session.last_poll_wall_time_s is None:
         return "the controller's loop never calls bridge.get_command(): add that line to its loop"
     if not session.heartbeat_is_fresh(view.now_s):
-        return view.status.why or "its loop is silent"
+        return view.status.why or SILENT
     silent_s = view.now_s - session.last_poll_wall_time_s
     if silent_s > HEARTBEAT_LATE_S:
         return f"its loop runs, but last called bridge.get_command() {silent_s:.0f} s ago"

@@ -44,8 +44,8 @@ class SensorsAnswer(Answer):
     odd: dict[str, str] | None = Field(
         default=None, description="Values that JSON cannot hold: path to nan, inf, ..."
     )
-    not_published: dict[str, str] | None = Field(
-        default=None, description="Sensor devices that the state does not mention: name to class."
+    unnamed_devices: dict[str, str] | None = Field(
+        default=None, description="Sensor devices by whose name nothing is published."
     )
     shortened: str | None = None
 

@@ -27,7 +27,7 @@ def sensor_devices(devices: dict[str, str]) -> dict[str, str]:
     return {name: kind for name, kind in devices.items() if kind not in _NO_SENSORS}
 
 
-def unpublished(sensors: dict[str, Any], devices: dict[str, str]) -> dict[str, str]:
+def unnamed_devices(sensors: dict[str, Any], devices: dict[str, str]) -> dict[str, str]:
     """The sensor devices whose name appears nowhere among the published values."""
     published = set(_keys(sensors))
     return {name: kind for name, kind in sensor_devices(devices).items() if name not in published}

@@ -68,15 +68,23 @@ class View:
 
     def header(self) -> dict[str, Any]:
         """The fields that every answer begins with."""
-        newest = self.state
+        sim_time_s, wall_time_s = self._newest_times()
         return {
             "robot": self.robot.name,
             "run_id": self.run.id if self.run else None,
-            "sim_time_s": round(newest.sim_time_s, 4) if newest else None,
-            "age_s": self.age_s(newest.wall_time_s) if newest else None,
+            "sim_time_s": None if sim_time_s is None else round(sim_time_s, 4),
+            "age_s": None if wall_time_s is None else self.age_s(wall_time_s),
             "status": self.status.text,
             "why": self.status.why,
         }
+
+    def _newest_times(self) -> tuple[float, float] | tuple[None, None]:
+        """Of the newest state; before the first one, of the run's last sign of life."""
+        if self.state is not None:
+            return self.state.sim_time_s, self.state.wall_time_s
+        if self.run is not None:
+            return self.run.last_sim_time_s, self.run.last_wall_time_s
+        return None, None
 
     def age_s(self, wall_time_s: float) -> float:
         """How long ago that was."""

@@ -14,6 +14,14 @@ NEVER_SEEN: Final = "never seen"
 RUNNING: Final = "running"
 PAUSED: Final = "paused"
 
+# A hold is noted as an event at the instant; the heartbeat tells of it only at its next beat.
+# What came after the beat has at least its simulation time, which bounds the search to the index.
+_HOLD_SINCE_BEAT: Final = (
+    "SELECT e.kind FROM run r JOIN event e ON e.run_id = r.id AND e.sim_time_s >= :sim_time_s "
+    "WHERE r.session_id = :session_id AND e.wall_time_s > :beat_s "
+    "AND e.kind IN ('pause', 'resume') ORDER BY e.id DESC LIMIT 1"
+)
+
 _STILL_MOVING_S: Final = 1.0
 _SLOWEST_STILL_MOVING_S: Final = 15.0
 
@@ -23,7 +31,7 @@ _ENDED: Final = {
     "crashed": "its controller process is gone without having finished (killed or crashed)",
     "replaced": "a newer session took its place",
 }
-_SILENT: Final = (
+SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
     "breakpoint, another controller looping, or an extern controller missing; from inside the "
     "simulation these look alike"
@@ -67,12 +75,14 @@ def judge(
         return _stopped(session, now_s, _ENDED.get(session.end_reason or "crashed"))
     if holder := _holder(connection, session, now_s):
         return Status(PAUSED, None if holder is session else _held_elsewhere(connection, holder))
+    fresh = session.heartbeat_is_fresh(now_s)
+    if fresh and _hold_since_beat(connection, session) == "resume":
+        return Status(RUNNING)
     if session.moved_wall_time_s is None:
         return _stopped(session, now_s, _NOT_STARTED)
     if now_s - session.moved_wall_time_s <= _still_moving_s(connection, run):
         return Status(RUNNING)
-    fresh = session.heartbeat_is_fresh(now_s)
-    return _stopped(session, now_s, _STANDING if fresh else _SILENT)
+    return _stopped(session, now_s, _STANDING if fresh else SILENT)
 
 
 def stopped_for(seconds: float) -> str:
@@ -88,9 +98,25 @@ def _stopped(session: Session, now_s: float, why: str | None) -> Status:
 def _holder(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:
     """The session whose bridge holds the loop: one that is held freezes its whole simulation."""
     for candidate in (session, *companions(connection, session, now_s)):
-        if candidate.hold == PAUSED and candidate.heartbeat_is_fresh(now_s):
+        if candidate.heartbeat_is_fresh(now_s) and _is_holding(connection, candidate):
             return candidate
     return None
+
+
+def _is_holding(connection: sqlite3.Connection, session: Session) -> bool:
+    since = _hold_since_beat(connection, session)
+    return session.hold == PAUSED if since is None else since == "pause"
+
+
+def _hold_since_beat(connection: sqlite3.Connection, session: Session) -> str | None:
+    """`pause` or `resume`, whichever happened last since the session's heartbeat."""
+    values = {
+        "session_id": session.id,
+        "sim_time_s": session.sim_time_s or 0.0,
+        "beat_s": session.last_seen_wall_time_s,
+    }
+    row = connection.execute(_HOLD_SINCE_BEAT, values).fetchone()
+    return row[0] if row else None
 
 
 def _held_elsewhere(connection: sqlite3.Connection, holder: Session) -> str:

@@ -12,10 +12,10 @@ from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.server.boundary import ACTS, READS, reporter, tool
 from webots_mcp.server.dispatch import Dispatcher, Request, shown_result
 from webots_mcp.server.parameters import Cursor, RobotName, TimeoutS
-from webots_mcp.store.recording import Recording, View
 from webots_mcp.server.results import CommandAnswer, CommandsAnswer, Table
 from webots_mcp.server.shortening import DETAIL_BUDGET, cut_text, shorten
 from webots_mcp.store.queue import Command, list_commands
+from webots_mcp.store.recording import Recording, View
 
 Status = Literal["pending", "claimed", "done", "failed", "expired", "cancelled", "lost"]
 

@@ -15,8 +15,8 @@ from webots_mcp.server.boundary import ACTS, RESTARTS, reporter, tool
 from webots_mcp.server.dispatch import Dispatcher, Request
 from webots_mcp.server.keyboard import press_reset
 from webots_mcp.server.parameters import RobotName, TimeoutS
-from webots_mcp.store.recording import Recording
 from webots_mcp.server.results import CommandAnswer
+from webots_mcp.store.recording import Recording
 
 Control = Literal["pause", "resume", "fast", "step", "reset", "reload"]
 

@@ -8,10 +8,10 @@ from pydantic import Field
 
 from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.parameters import Cursor, EndS, LastS, RobotName, RunId, StartS
-from webots_mcp.store.recording import Recording, View
 from webots_mcp.server.results import LogsAnswer, Table
 from webots_mcp.server.shortening import cut_text
 from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, count_lines, newest_lines
+from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.window import resolve_window
 
 LOG_COLUMNS: Final = ("sim_time_s", "level", "message")

@@ -16,7 +16,6 @@ from pydantic import Field
 
 from webots_mcp.server.boundary import READS, reporter, tool
 from webots_mcp.server.parameters import RobotName
-from webots_mcp.store.recording import Recording, View
 from webots_mcp.server.results import MonitorAnswer, Table
 from webots_mcp.server.shortening import DETAIL_BUDGET, cut_text, round_number, shorten
 from webots_mcp.server.tools.commands import COMMAND_COLUMNS, command_row
@@ -25,6 +24,7 @@ from webots_mcp.server.watching import Watched, evenly
 from webots_mcp.store.events import Event, events_after, newest_event_id
 from webots_mcp.store.logs import lines_after, newest_log_id
 from webots_mcp.store.queue import commands_since
+from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.runs import Run, runs_since
 from webots_mcp.store.states import fetch_states, newest_state_id, state_ids_after
 

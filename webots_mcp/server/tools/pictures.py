@@ -13,10 +13,10 @@ from webots_mcp.server.boundary import ACTS, READS, reporter, tool
 from webots_mcp.server.dispatch import Dispatcher, Request
 from webots_mcp.server.parameters import RobotName, RunId, TimeoutS
 from webots_mcp.server.pictures import load_picture
-from webots_mcp.store.recording import Recording, View
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.shortening import compact_json
 from webots_mcp.store.images import camera_names, inside, newest_camera_image
+from webots_mcp.store.recording import Recording, View
 
 _WAIT_S: Final = 15.0
 

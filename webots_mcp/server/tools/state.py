@@ -9,9 +9,8 @@ from pydantic import Field
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.parameters import RobotName, RunId
-from webots_mcp.store.recording import Recording, View
 from webots_mcp.server.results import FullStateAnswer, SensorsAnswer, StateAnswer, Table
-from webots_mcp.server.sensing import sensor_part, unpublished
+from webots_mcp.server.sensing import sensor_part, unnamed_devices
 from webots_mcp.server.shortening import (
     DETAIL_BUDGET,
     FULL_BUDGET,
@@ -20,6 +19,7 @@ from webots_mcp.server.shortening import (
     shorten,
 )
 from webots_mcp.store.events import newest_events
+from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.sessions import fetch_session
 from webots_mcp.store.states import State, select
 
@@ -75,12 +75,12 @@ class StateTools:
             state = view.state.value()
             sensors = sensor_part(state, view.robot.devices)
             short = shorten(sensors)
-            missing = unpublished(sensors, view.robot.devices)
+            missing = unnamed_devices(sensors, view.robot.devices)
             return SensorsAnswer(
                 **view.header(),
                 sensors=short.value,
                 odd=_odd_in(view.state, sensors),
-                not_published=dict(list(missing.items())[:_SHOWN_DEVICES]) or None,
+                unnamed_devices=dict(list(missing.items())[:_SHOWN_DEVICES]) or None,
                 shortened=short.rule,
                 hint=None if sensors else _no_sensors(state),
             )

@@ -8,9 +8,9 @@ from typing import Any, Final
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.parameters import RobotName, RunId
-from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, view_of
 from webots_mcp.server.results import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.server.shortening import cut_text, round_number
+from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, view_of
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.runs import Run, count_runs
 from webots_mcp.store.sessions import Session, companions, fetch_session

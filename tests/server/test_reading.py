@@ -1,0 +1,350 @@
+"""Tools that read: what they answer, and what they say when there is nothing to answer."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from PIL import Image
+
+from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
+from tests.server.test_surface import READING
+from tests.store.recorded import Recorded
+from webots_mcp.bridge.encoding import encode
+from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.store.migrate import upgrade
+
+pytestmark = pytest.mark.anyio
+
+DEFAULT_LIMIT = 8_000  # characters: about 2,000 tokens
+DATA_TOOLS = sorted(READING - {"webots_get_camera", "webots_monitor"})
+
+
+async def test_every_answer_names_robot_run_time_age_and_status(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    robot.state(12.34567, {"x": 1}, at=time.time() - 0.5)
+    async with connect() as client:
+        for tool in DATA_TOOLS:
+            answer = await ask(client, tool)
+            header = [answer[name] for name in ("robot", "run_id", "sim_time_s", "status")]
+            assert header == ["rover", robot.run_id, 12.3457, "running"], tool
+            assert 0.4 < answer["age_s"] < 5
+
+
+async def test_the_header_tells_the_time_before_the_first_state(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot()
+    async with connect() as client:
+        answer = await ask(client, "webots_get_robot_state")
+    assert answer["sim_time_s"] == 0.0
+    assert "bridge.publish" in answer["hint"]
+
+
+async def test_without_a_database_every_reading_tool_says_how_to_get_one(
+    connect: Connect, file: Path
+) -> None:
+    async with connect() as client:
+        for tool in DATA_TOOLS:
+            answer = await ask(client, tool)
+            assert answer["status"] == "never seen"
+            for word in (str(file), "MCPBridge", "webots-mcp demo", "--data-dir"):
+                assert word in answer["hint"], tool
+        assert "MCPBridge" in text_of(await client.call_tool("webots_get_camera", {}))
+        assert "MCPBridge" in text_of(await client.call_tool("webots_monitor", {}))
+    assert not file.exists()
+
+
+async def test_an_empty_file_and_an_empty_database_are_nothing_recorded_either(
+    connect: Connect, file: Path
+) -> None:
+    file.touch()
+    async with connect() as client:
+        assert "is empty" in (await ask(client, "webots_list_robots"))["hint"]
+        Recorded(file).close()
+        assert "MCPBridge" in (await ask(client, "webots_list_robots"))["hint"]
+
+
+async def test_a_database_that_appears_later_is_found(connect: Connect, file: Path) -> None:
+    async with connect() as client:
+        assert (await ask(client, "webots_get_robot_state"))["status"] == "never seen"
+        recorded = Recorded(file)
+        recorded.robot().state(1.0, {"x": 1})
+        assert (await ask(client, "webots_get_robot_state"))["state"] == {"x": 1}
+        recorded.close()
+
+
+async def test_several_live_robots_are_listed_until_one_is_named(
+    connect: Connect, recorded: Recorded
+) -> None:
+    for name in ("rover", "crane"):
+        recorded.robot(name).state(1.0, {"i am": name})
+    async with connect() as client:
+        assert "'rover' (Supervisor, live)" in await fail(client, "webots_get_robot_state")
+        answer = await ask(client, "webots_get_robot_state", robot="crane")
+        assert answer["state"] == {"i am": "crane"}
+        assert "did you mean 'crane'" in await fail(client, "webots_get_robot_state", robot="crne")
+        rows = (await ask(client, "webots_list_robots"))["robots"]["rows"]
+        assert [row[0] for row in rows] == ["rover", "crane"]
+
+
+async def test_an_earlier_run_can_be_read_and_is_named_as_such(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    robot.state(5.0, {"x": 5})
+    robot.end_run("reset")
+    first = robot.run_id
+    robot.begin_run("reset")
+    robot.state(1.0, {"x": 1})
+    async with connect() as client:
+        answer = await ask(client, "webots_get_robot_state", run_id=first)
+        assert (answer["state"], answer["sim_time_s"]) == ({"x": 5}, 5.0)
+        assert answer["status"].startswith("stopped")
+        assert "earlier run; it ended by reset" in answer["why"]
+        assert "no run 77" in await fail(client, "webots_get_robot_state", run_id=77)
+
+
+async def test_the_state_is_rounded_and_long_arrays_are_summarised(
+    connect: Connect, recorded: Recorded
+) -> None:
+    lidar = [5.0 + i for i in range(180)]
+    lidar[7] = 0.123456
+    recorded.robot().state(1.0, {"pose": [1.23456, -2.0], "lidar": lidar})
+    async with connect() as client:
+        answer = await ask(client, "webots_get_robot_state")
+    assert answer["state"]["pose"] == [1.235, -2.0]
+    assert answer["state"]["lidar"]["argmin"] == 7
+    assert "arrays over 16 items" in answer["shortened"]
+    assert "webots_get_full_state" in answer["hint"]
+
+
+async def test_odd_values_are_recognisable(connect: Connect, recorded: Recorded) -> None:
+    lidar = [float("inf")] * 40 + [0.5] * 140
+    encoded = encode({"front": float("nan"), "lidar": lidar, "x": 1.0})
+    robot = recorded.robot()
+    robot.state(1.0, json.loads(encoded.text), encoded.odd)
+    async with connect() as client:
+        answer = await ask(client, "webots_get_sensors")
+    assert answer["sensors"]["front"] == "nan"
+    assert answer["sensors"]["lidar"]["inf"] == 40
+    assert answer["odd"]["front"] == "nan"
+    assert "x" not in answer["sensors"]
+    assert answer["unnamed_devices"] == {"eye": "Camera"}
+
+
+async def test_a_state_without_sensors_says_where_to_look(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot().state(1.0, {"x": 1.0})
+    async with connect() as client:
+        answer = await ask(client, "webots_get_sensors")
+    assert answer["sensors"] == {}
+    assert "webots_get_robot_state" in answer["hint"]
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        {"lidar": [0.1 * i for i in range(180)], "pose": [1.0, 2.0, 3.0]},
+        {"text": "x" * 1_000_000},
+        {f"key {i}": {"value": i * 1.234567, "text": "y" * 50} for i in range(10_000)},
+        {"grid": [[float(i * j) for i in range(200)] for j in range(200)]},
+    ],
+    ids=["lidar", "long text", "1 MB of keys", "grid"],
+)
+async def test_answers_stay_short_whatever_is_published(
+    connect: Connect, recorded: Recorded, state: dict[str, Any]
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, state)
+    robot.beat(actions=json.dumps({f"action {i}": "z" * 5000 for i in range(100)}))
+    for i in range(100):
+        robot.log(1.0, f"{i} " + "w" * 10_000, "warning")
+        robot.event(1.0, "change", "text", {"from": "v" * 5000, "to": "u" * 5000})
+    async with connect() as client:
+        for tool in DATA_TOOLS:
+            characters = len(json.dumps(await ask(client, tool)))
+            limit = 28_000 if tool == "webots_get_full_state" else 12_000
+            assert characters < limit, tool
+
+
+async def test_a_part_of_the_state_comes_whole_in_pages(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot().state(1.0, {"sensors": {"lidar": [i + 0.123456 for i in range(180)]}})
+    async with connect() as client:
+        path = "sensors.lidar"
+        page = await ask(client, "webots_get_full_state", path=path, limit=100)
+        assert page["state"][:2] == [0.123456, 1.123456]
+        assert (page["total"], page["next_offset"]) == (180, 100)
+        rest = await ask(client, "webots_get_full_state", path=path, offset=100)
+        assert len(rest["state"]) == 80
+        assert "next_offset" not in rest
+        assert "there are ['lidar']" in await fail(
+            client, "webots_get_full_state", path="sensors.lidr"
+        )
+
+
+async def test_the_full_state_has_events_and_the_recorders_health(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot(rows_waiting=3, rows_dropped=2, last_error="disk full")
+    robot.state(1.0, {"x": 0.123456789})
+    robot.event(0.5, "change", "mode", {"from": "a", "to": "b"})
+    async with connect() as client:
+        answer = await ask(client, "webots_get_full_state")
+    assert answer["state"] == {"x": 0.123456789}
+    assert answer["events"]["rows"] == [[0.5, "change", "mode", {"from": "a", "to": "b"}]]
+    health = answer["recorder"]
+    assert (health["rows_waiting"], health["rows_dropped"]) == (3, 2)
+    assert health["last_error"] == "disk full"
+    assert health["controller_sha256"] == "a" * 64
+
+
+async def test_the_world_is_described_with_its_companions(
+    connect: Connect, recorded: Recorded
+) -> None:
+    rover = recorded.robot("rover")
+    recorded.robot("referee")
+    for i in range(5):
+        rover.state(i * 1.0, {}, at=rover.now + i * 0.5)
+    async with connect() as client:
+        answer = await ask(client, "webots_get_world_info", robot="rover")
+    assert answer["world"].endswith("arena.wbt")
+    assert answer["basic_time_step_ms"] == 16.0
+    assert answer["real_time_factor"] == 2.0
+    assert answer["run"]["rows"] == 5
+    assert answer["companions"]["rows"] == [["referee", "Supervisor", ""]]
+    assert answer["controller"]["file"].endswith("rover.py")
+
+
+async def test_log_lines_are_paged_towards_older_ones(connect: Connect, recorded: Recorded) -> None:
+    robot = recorded.robot()
+    for i in range(120):
+        robot.log(i * 1.0, f"line {i}", "error" if i % 10 == 0 else "info")
+    async with connect() as client:
+        newest = await ask(client, "webots_get_logs")
+        assert [row[2] for row in newest["lines"]["rows"]][-1] == "line 119"
+        assert (len(newest["lines"]["rows"]), newest["matching"]) == (50, 120)
+        older = await ask(client, "webots_get_logs", cursor=newest["cursor"])
+        assert older["lines"]["rows"][-1][2] == "line 69"
+        errors = await ask(client, "webots_get_logs", level="error", start_s=50, end_s=100)
+        assert [row[0] for row in errors["lines"]["rows"]] == [50.0, 60.0, 70.0, 80.0, 90.0]
+        nothing = await ask(client, "webots_get_logs", filter_text="collision")
+        assert "leave out filter_text" in nothing["hint"]
+        assert "less than end_s" in await fail(client, "webots_get_logs", start_s=5, end_s=5)
+
+
+async def test_a_camera_frame_comes_as_a_picture_with_its_age(
+    connect: Connect, recorded: Recorded, file: Path
+) -> None:
+    robot = recorded.robot()
+    robot.state(2.0, {})
+    (file.parent / "camera").mkdir()
+    Image.new("RGB", (160, 120), "red").save(file.parent / "camera" / "1.png")
+    robot.image(1.5, "camera/1.png")
+    async with connect() as client:
+        result = await client.call_tool("webots_get_camera", {})
+        caption = json.loads(text_of(result))
+        assert (caption["camera"], caption["picture_sim_time_s"]) == ("eye", 1.5)
+        assert caption["picture_age_s"] >= 0
+        assert [picture.mime_type for picture in pictures_of(result)] == ["image/png"]
+        other = await client.call_tool("webots_get_camera", {"camera": "left"})
+        assert "['eye']" in text_of(other)
+
+
+async def test_a_big_picture_is_scaled_and_the_original_named(
+    connect: Connect, recorded: Recorded, file: Path
+) -> None:
+    Image.new("RGB", (3000, 1500), "blue").save(file.parent / "big.png")
+    recorded.robot().image(1.0, "big.png", width=3000, height=1500)
+    async with connect() as client:
+        result = await client.call_tool("webots_get_camera", {})
+    assert pictures_of(result)[0].mime_type == "image/jpeg"
+    assert "1000 x 500 of 3000 x 1500" in text_of(result)
+    assert "big.png" in text_of(result)
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("gone.png", "the file is gone"),
+        ("text.png", "cannot be shown"),
+        ("../../etc/passwd", "outside the data folder"),
+    ],
+)
+async def test_a_picture_that_cannot_be_shown_says_why(
+    connect: Connect, recorded: Recorded, file: Path, path: str, said: str
+) -> None:
+    (file.parent / "text.png").write_text("no picture")
+    recorded.robot().image(1.0, path)
+    async with connect() as client:
+        assert said in text_of(await client.call_tool("webots_get_camera", {}))
+
+
+async def test_a_controller_that_saves_no_frames_is_told_how_to(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot()
+    async with connect() as client:
+        assert "save_camera_frame" in text_of(await client.call_tool("webots_get_camera", {}))
+
+
+async def test_a_file_that_is_no_database_is_a_clear_error(connect: Connect, file: Path) -> None:
+    file.write_text("certainly no database, " * 100)
+    async with connect() as client:
+        assert "is not a database" in await fail(client, "webots_list_robots")
+
+
+async def test_a_database_of_another_application_is_left_alone(
+    connect: Connect, file: Path
+) -> None:
+    with sqlite3.connect(file) as other:
+        other.execute("CREATE TABLE contact (name TEXT)")
+    other.close()
+    async with connect() as client:
+        assert "another application" in await fail(client, "webots_list_robots")
+
+
+async def test_a_damaged_database_is_a_clear_error(
+    connect: Connect, recorded: Recorded, file: Path
+) -> None:
+    recorded.robot()
+    recorded.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+    recorded.close()
+    data = file.read_bytes()
+    file.write_bytes(data[:4096] + b"\xff" * (len(data) - 4096))
+    async with connect() as client:
+        assert "damaged" in await fail(client, "webots_list_robots")
+
+
+async def test_a_database_of_a_newer_version_is_a_clear_error(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
+    async with connect() as client:
+        assert "pip install --upgrade" in await fail(client, "webots_list_robots")
+
+
+async def test_an_older_database_is_migrated_once_by_the_server(
+    connect: Connect, file: Path
+) -> None:
+    upgrade(file, "0001")
+    async with connect() as client:
+        assert (await ask(client, "webots_list_robots"))["status"] == "never seen"
+    connection = sqlite3.connect(file)
+    assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+    connection.close()
+
+
+async def test_a_read_only_server_does_not_migrate(connect: Connect, file: Path) -> None:
+    upgrade(file, "0001")
+    async with connect(read_only=True) as client:
+        assert "webots-mcp migrate" in await fail(client, "webots_list_robots")

@@ -1,0 +1,132 @@
+"""The whole way: a real client, a real server, a real bridge, a robot of the stand-in."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from mcp import Client
+
+from tests.server.conftest import Connect, Driver, ask, fail, pictures_of, text_of
+
+pytestmark = pytest.mark.anyio
+
+
+async def control(client: Client, command: str, **arguments: object) -> dict[str, object]:
+    return await ask(client, "webots_simulation_control", command=command, **arguments)
+
+
+async def test_pause_step_and_resume_say_what_happened(connect: Connect, driver: Driver) -> None:
+    async with connect() as client:
+        paused = await control(client, "pause")
+        assert (paused["outcome"], paused["status"]) == ("done", "paused")
+        before = (await ask(client, "webots_get_robot_state"))["state"]["steps"]
+
+        stepped = await control(client, "step", steps=5)
+        assert (stepped["outcome"], stepped["status"]) == ("done", "paused")
+        after = (await ask(client, "webots_get_robot_state"))["state"]["steps"]
+        assert after - before == 5
+
+        resumed = await control(client, "resume")
+        assert (resumed["outcome"], resumed["status"]) == ("done", "running")
+        assert driver.is_alive()
+
+
+async def test_a_reset_begins_a_new_run(connect: Connect, driver: Driver) -> None:
+    async with connect() as client:
+        first = (await ask(client, "webots_get_robot_state"))["run_id"]
+        answer = await ask(client, "webots_world_reset")
+        assert answer["outcome"] == "done"
+        assert answer["run_id"] == answer["result"]["run_id"] > first
+        assert answer["status"] == "running"
+        earlier = await ask(client, "webots_get_world_info", run_id=first)
+        assert earlier["run"]["ended_by"] == "reset"
+    assert driver.is_alive()
+
+
+async def test_a_custom_action_answers_or_fails_with_its_own_words(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        actions = (await ask(client, "webots_list_commands"))["actions"]
+        assert actions["set_speed"] == "Set the speed: `speed` in rad/s."
+        answer = await ask(client, "webots_send_command", action="set_speed", params={"speed": 3.5})
+        assert answer["result"] == {"speed": 3.5}
+        assert driver.speed == 3.5
+        failed = json.loads(await fail(client, "webots_send_command", action="break_down"))
+        assert "the gear is gone" in failed["error"]
+        again = await ask(client, "webots_reset_controller_state")
+        assert again["result"] == {"callbacks": 1}
+        assert driver.speed == 1.0
+
+
+async def test_a_screenshot_is_a_picture_with_a_caption(
+    connect: Connect, driver: Driver, file: Path
+) -> None:
+    async with connect() as client:
+        result = await client.call_tool("webots_take_screenshot", {})
+    caption = json.loads(text_of(result))
+    assert caption["outcome"] == "done"
+    assert len(pictures_of(result)) == 1
+    assert Path(caption["file"]).is_file()
+    assert Path(caption["file"]).is_relative_to(file.parent)
+    assert driver.is_alive()
+
+
+async def test_watching_reports_what_was_recorded_meanwhile(
+    connect: Connect, driver: Driver
+) -> None:
+    reports: list[str] = []
+
+    async def on_progress(progress: float, total: float | None, message: str | None) -> None:
+        assert total is not None
+        assert progress <= total
+        reports.append(message or "")
+
+    answer: dict[str, Any] = {}
+    async with connect() as client, anyio.create_task_group() as tasks:
+        tasks.start_soon(_steer, client, driver)
+        arguments = {"duration_s": 2}
+        watch = client.call_tool("webots_monitor", arguments, progress_callback=on_progress)
+        answer |= json.loads(text_of(await watch))
+    assert answer["rows"] > 10
+    assert answer["movement"]["position"] == ["pose.0", "pose.1"]
+    assert answer["movement"]["distance"] > 0
+    changes = [row[1:] for row in answer["changes"]["rows"]]
+    assert ["mode", "turn", "cruise"] in changes
+    assert "pause" in [name for name, *_ in changes]
+    assert {row[0] for row in answer["signals"]["rows"]} == {"pose.0", "steps"}
+    assert [row[1] for row in answer["commands"]["rows"]] == ["pause", "resume"]
+    assert [row[2] for row in answer["logs"]["rows"]] == ["too close"]
+    assert all(report.startswith("rover: ") for report in reports)
+
+
+async def _steer(client: Client, driver: Driver) -> None:
+    await anyio.sleep(0.7)
+    driver.bridge.log("too close", level="warning")
+    driver.bridge.log("all is well")
+    await control(client, "pause")
+    await control(client, "resume")
+
+
+async def test_watching_a_paused_robot_says_that_nothing_was_recorded_and_why(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        await control(client, "pause")
+        answer = await ask(client, "webots_monitor", duration_s=1)
+        assert answer["rows"] == 0
+        assert "paused" in answer["hint"]
+        assert driver.is_alive()
+
+
+async def test_a_read_only_server_watches_beside_one_that_steers(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as steering, connect(read_only=True) as watching:
+        await control(steering, "pause")
+        assert (await ask(watching, "webots_get_robot_state"))["status"] == "paused"
+        assert driver.is_alive()

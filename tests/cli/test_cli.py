@@ -1,0 +1,229 @@
+"""The console commands, run as a person runs them."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.store.recorded import Recorded, RecordedRobot
+from webots_mcp.cli import COMMANDS, main
+from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.store.follow import Follower
+from webots_mcp.store.migrate import upgrade
+from webots_mcp.store.queue import CommandQueue
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Iterator[Recorded]:
+    recording = Recorded(tmp_path / "webots.db")
+    yield recording
+    recording.close()
+
+
+@pytest.fixture
+def rover(recorded: Recorded) -> RecordedRobot:
+    robot = recorded.robot(rows_waiting=4, rows_dropped=1, last_error="disk full")
+    robot.state(1.5, {"mode": "cruise"})
+    return robot
+
+
+def run(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-m", "webots_mcp", *arguments],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONUNBUFFERED": "1"},
+    )
+
+
+@pytest.mark.parametrize("name", [None, *(command.name for command in COMMANDS)])
+def test_every_command_explains_itself(
+    name: str | None, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([name, "--help"] if name else ["--help"])
+    assert ended.value.code == 0
+    text = capsys.readouterr().out
+    assert "usage: webots-mcp" in text
+    for command in COMMANDS if name is None else ():
+        assert command.name in text
+
+
+def test_help_imports_nothing_heavy() -> None:
+    program = (
+        "import sys, contextlib\nfrom webots_mcp.cli import main\n"
+        "with contextlib.suppress(SystemExit): main(['--help'])\n"
+        "heavy = {'mcp', 'pydantic', 'sqlmodel', 'alembic', 'PIL'} & set(sys.modules)\n"
+        "print(heavy, file=sys.stderr)"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.stderr.strip() == "set()"
+
+
+def test_an_unknown_command_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["fly"])
+    assert ended.value.code == 2
+    assert "invalid choice" in capsys.readouterr().err
+
+
+def test_status_tells_what_runs_and_what_could_not_be_recorded(
+    rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["status", "--data-dir", str(tmp_path)]) == 0
+    text = capsys.readouterr().out
+    for words in (
+        str(tmp_path / "webots.db"),
+        f"{rover.name} (Supervisor): running",
+        "simulation time 1.500 s",
+        "rows waiting 4, dropped 1",
+        "last error: disk full",
+    ):
+        assert words in text
+
+
+def test_status_as_json_holds_the_same(
+    rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["status", "--json", "--database", str(tmp_path / "webots.db")]) == 0
+    robot = json.loads(capsys.readouterr().out)["robots"][0]
+    assert (robot["robot"], robot["live"], robot["run_id"]) == (rover.name, True, rover.run_id)
+    assert (robot["status"], robot["rows_dropped"]) == ("running", 1)
+
+
+@pytest.mark.parametrize("arguments", [["status"], ["tail"], ["migrate"]])
+def test_without_a_database_one_line_says_so_and_the_exit_code_is_2(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*arguments, "--data-dir", str(tmp_path)]) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("webots-mcp: no database at")
+    assert said.err.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_is_no_database_is_one_line_and_exit_code_2(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "notes.txt"
+    file.write_text("certainly no database, " * 100)
+    assert main(["status", "--database", str(file)]) == 2
+    assert "not a database" in capsys.readouterr().err
+
+
+def test_the_tail_ends_with_the_newest_lines_of_every_kind(
+    rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rover.now += 1
+    rover.log(2.0, "two\nlines", "warning")
+    rover.now += 1
+    rover.event(3.0, "change", "mode", {"from": "cruise", "to": "turn"})
+    queue = CommandQueue(rover.connection, clock=lambda: rover.now + 1)
+    command = queue.enqueue(rover.id, "go", {"x": 1})
+    queue.cancel(command.id, "why not")
+    assert main(["tail", "--no-follow", "--data-dir", str(tmp_path)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(maxsplit=2)[1] for line in lines] == ["rover"] * 5
+    for line, words in zip(
+        lines,
+        ('{"mode": "cruise"}', r"two\nlines", "change mode", 'go {"x": 1}', "go cancelled why not"),
+        strict=True,
+    ):
+        assert words in line
+
+
+def test_the_tail_of_one_robot_leaves_out_the_others(
+    recorded: Recorded,
+    rover: RecordedRobot,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    recorded.robot("crane").log(1.0, "not mine")
+    arguments = ["tail", "--no-follow", "--data-dir", str(tmp_path)]
+    assert main([*arguments, "--robot", rover.name]) == 0
+    assert "not mine" not in capsys.readouterr().out
+    assert main([*arguments, "--robot", "rovr"]) == 2
+    assert "did you mean 'rover'" in capsys.readouterr().err
+    assert main([*arguments, "-n", "0"]) == 0
+    assert capsys.readouterr().out == ""
+    assert main([*arguments, "--interval", "0"]) == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for a child there")
+def test_the_tail_follows_until_ctrl_c_and_ends_cleanly(
+    rover: RecordedRobot, tmp_path: Path
+) -> None:
+    with run("tail", "--interval", "0.05", "--data-dir", str(tmp_path)) as process:
+        assert process.stdout is not None
+        assert "cruise" in process.stdout.readline()
+        rover.log(2.0, "it goes on", "error")
+        assert "it goes on" in process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=10)
+    assert (process.returncode, out, err) == (0, "", "")
+
+
+def test_a_follower_sees_each_line_once(rover: RecordedRobot) -> None:
+    follower = Follower(rover.connection)
+    assert [line.kind for line in follower.look()] == ["state"]
+    assert follower.look() == []
+    command = CommandQueue(rover.connection).enqueue(rover.id, "go")
+    assert [line.text for line in follower.look()] == [f"#{command.id} go {{}}"]
+    CommandQueue(rover.connection).cancel(command.id, "no")
+    assert [line.text for line in follower.look()] == [f"#{command.id} go cancelled no"]
+    assert follower.look() == []
+
+
+def test_a_reader_that_has_seen_enough_ends_the_tail_quietly(
+    rover: RecordedRobot, tmp_path: Path
+) -> None:
+    with run("tail", "--interval", "0.02", "--data-dir", str(tmp_path)) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.stdout.close()
+        deadline = time.monotonic() + 10
+        while process.poll() is None and time.monotonic() < deadline:
+            rover.log(2.0, "into the void")
+        assert process.stderr is not None
+        assert (process.wait(timeout=1), process.stderr.read()) == (0, "")
+
+
+def test_an_old_database_is_migrated_with_its_data(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "webots.db"
+    upgrade(file, "0001")
+    assert main(["status", "--database", str(file)]) == 2
+    assert "webots-mcp migrate" in capsys.readouterr().err
+    assert main(["migrate", "--database", str(file)]) == 0
+    assert f"schema 1, now {SCHEMA_VERSION}" in capsys.readouterr().out
+    with closing(sqlite3.connect(file)) as connection:
+        assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+
+
+def test_an_unknown_revision_is_bad_input(
+    rover: RecordedRobot, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["migrate", "--revision", "7777", "--data-dir", str(tmp_path)]) == 2
+    assert "7777" in capsys.readouterr().err
+    assert rover.run_id
+
+
+def test_the_server_keeps_stdout_for_the_protocol(tmp_path: Path) -> None:
+    with run("serve", "--data-dir", str(tmp_path)) as process:
+        out, err = process.communicate("", timeout=20)
+    assert (process.returncode, out) == (0, "")
+    assert "Traceback" not in err

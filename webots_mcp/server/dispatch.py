@@ -171,10 +171,10 @@ def _why_unclaimed(view: View) -> str:
     session = view.session
     if session is None or not view.robot.live:
         return f"no live controller: {view.status.why or 'it was never seen'}; start it first"
-    if session.last_poll_wall_time_s is None:
-        return "the controller's loop never calls bridge.get_command(): add that line to its loop"
     if not session.heartbeat_is_fresh(view.now_s):
         return view.status.why or SILENT
+    if session.last_poll_wall_time_s is None:
+        return "the controller's loop never calls bridge.get_command(): add that line to its loop"
     silent_s = view.now_s - session.last_poll_wall_time_s
     if silent_s > HEARTBEAT_LATE_S:
         return f"its loop runs, but last called bridge.get_command() {silent_s:.0f} s ago"

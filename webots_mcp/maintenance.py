@@ -24,8 +24,10 @@ from webots_mcp.errors import WebotsMCPError
 from webots_mcp.schema import require_current
 
 INTERVAL_S: Final = 1.0
+HURRIED_INTERVAL_S: Final = 0.25  # while the log grows fast: a long one takes long to copy
 LEASE_S: Final = 5.0
 WAL_LIMIT_BYTES: Final = 1_000_000
+FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
 
 # Taken when free, ours already, or (by a server) held by a bridge; the row counts as changed in
 # each of these cases and in no other.
@@ -64,12 +66,13 @@ class Maintainer(threading.Thread):
         self._connection: sqlite3.Connection | None = None
         self._ending = threading.Event()
         self._held_before = False
+        self._interval_s = HURRIED_INTERVAL_S
         self._data_version = -1
         self._complained = ""
 
     def run(self) -> None:
         """Tick until stopped; trouble with the file ends a tick, never the thread."""
-        while not self._ending.wait(INTERVAL_S):
+        while not self._ending.wait(self._interval_s):
             self._tick_safely()
         self._give_back()
 
@@ -90,6 +93,7 @@ class Maintainer(threading.Thread):
 
     def tick(self) -> bool:
         """One round of work; True if this maintainer holds the lease."""
+        self._interval_s = INTERVAL_S
         if self._on_tick is not None:
             self._on_tick()
         if not self._database.exists():
@@ -125,17 +129,26 @@ class Maintainer(threading.Thread):
         outranked = holder.startswith("bridge ") and self._holder.startswith("server ")
         if holder != self._holder and until_s >= now and not outranked:
             return False
+        if not holder:  # it was free: there is no checkpoint of another's to wait for
+            self._held_before = True
         values = {"holder": self._holder, "until": now + LEASE_S, "now": now}
         return connection.execute(TAKE_LEASE, values).rowcount > 0
 
     def _checkpoint(self, connection: sqlite3.Connection) -> None:
-        """Copy the log back and cut it, if it is long and grew since the last time."""
+        """Copy the log back and cut it, if it is long and grew since the last time.
+
+        Cutting takes the write lock, and rows wait meanwhile: most is copied before, without it.
+        """
         log = Path(f"{self._database}-wal")
-        if not log.exists() or log.stat().st_size < WAL_LIMIT_BYTES:
+        log_bytes = log.stat().st_size if log.exists() else 0
+        if log_bytes > FAST_GROWTH_BYTES:
+            self._interval_s = HURRIED_INTERVAL_S
+        if log_bytes < WAL_LIMIT_BYTES:
             return
         version = int(connection.execute("PRAGMA data_version").fetchone()[0])
         if version != self._data_version:
             self._data_version = version
+            connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
     def _give_back(self) -> None:

@@ -1,0 +1,98 @@
+"""How much of a recording is kept: the one place that states it."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.runs import fetch_run
+
+# A run that a person named, described or marked is not retention's to judge.
+KEPT: Final = "(keep <> 0 OR coalesce(label, '') <> '' OR coalesce(note, '') <> '')"
+_MARK: Final = "UPDATE run SET keep = ? WHERE id = ?"
+
+
+@dataclass(frozen=True)
+class Limit:
+    """How much of one kind is kept; None is no limit. What is oldest goes first.
+
+    Attributes:
+        size_bytes: About so much on the disk.
+        rows: So many rows.
+        age_s: So long after they were written, in wall time.
+        spared_rows: Of a current run so many of its newest rows stay, whatever the others say.
+    """
+
+    size_bytes: int | None = None
+    rows: int | None = None
+    age_s: float | None = None
+    spared_rows: int = 10_000
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value is not None and not 0 <= value < math.inf:
+                raise InvalidInputError(f"{field.name}={value} must be 0 or more, and finite")
+
+    @property
+    def limits(self) -> bool:
+        """Whether it states any limit."""
+        return (self.size_bytes, self.rows, self.age_s) != (None, None, None)
+
+    def is_exceeded(
+        self, *, size_bytes: float, rows: float, age_s: float, times: float = 1
+    ) -> bool:
+        """Whether one of these is more than so many times its limit."""
+        found = ((size_bytes, self.size_bytes), (rows, self.rows), (age_s, self.age_s))
+        return any(limit is not None and value > times * limit for value, limit in found)
+
+
+@dataclass(frozen=True)
+class Retention:
+    """The limits of each kind of row.
+
+    They hold for the whole database, over all robots. Finished runs lose their oldest rows first,
+    in the order in which the runs began; then current ones (a robot's newest, or one that has not
+    ended). Runs with a label, a note or `keep` lose nothing and do not count.
+
+    Attributes:
+        state: The full rows. They go only after they were rolled up.
+        rollup: Rollups and change points; of whole runs, after the last of their state rows.
+        log: Log lines.
+        event: Events; its age also holds for finished commands.
+        image: Pictures, with their files.
+        outlive: When this many times the limits of `state` was recorded after a run, or it ended
+            that many times their age ago, all that is left of it goes, and with the last run of
+            that time the commands. 0 keeps runs for ever.
+    """
+
+    state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)
+    rollup: Limit = Limit()
+    log: Limit = Limit(size_bytes=100_000_000)
+    event: Limit = Limit(size_bytes=100_000_000)
+    image: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50)
+    outlive: float = 10.0
+
+    def __post_init__(self) -> None:
+        if not (self.outlive == 0 or 1 <= self.outlive < math.inf):
+            raise InvalidInputError(f"outlive={self.outlive} must be 1 or more, or 0 for ever")
+
+
+DEFAULT: Final = Retention()
+
+
+def mark_kept(connection: sqlite3.Connection, run_ids: Sequence[int], *, keep: bool = True) -> None:
+    """Let retention keep these runs for good, or no longer; all of them or, on an error, none.
+
+    Raises:
+        UnknownRunError: There is no such run.
+    """
+    for run_id in run_ids:
+        fetch_run(connection, run_id)
+    connection.execute("BEGIN IMMEDIATE")
+    connection.executemany(_MARK, [(int(keep), run_id) for run_id in run_ids])
+    connection.execute("COMMIT")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sqlite3
 import threading
 from collections import defaultdict
@@ -91,7 +90,7 @@ def _computed(rows: Rows) -> dict[tuple[str, int], Summary]:
     points: defaultdict[tuple[str, int], list[tuple[float, Any]]] = defaultdict(list)
     for time_s, published in rows:
         for name, value in flatten(json.loads(json.dumps(published))).items():
-            points[name, math.floor(time_s / BUCKET_S)].append((time_s, value))
+            points[name, int(time_s // BUCKET_S)].append((time_s, value))
     return {
         key: summarise(*zip(*pairs, strict=True), angle=key[0] == "yaw")
         for key, pairs in points.items()

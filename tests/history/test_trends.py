@@ -31,7 +31,7 @@ numbers = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=50)
 @given(numbers)
 def test_the_fitted_line_is_that_of_the_statistics_module(values: list[float]) -> None:
     times = [0.5 * index for index in range(len(values))]
-    line = fit_line(times, values)
+    line = fit_line(times, values, statistics.fmean(values))
     assert line is not None
     expected = statistics.linear_regression(times, values)
     assert line.slope_per_s == pytest.approx(expected.slope, abs=1e-6, rel=1e-6)
@@ -83,9 +83,14 @@ def test_a_spike_is_found_and_a_step_is_none() -> None:
 def test_slow_change_counts_and_noise_does_not() -> None:
     noise = random.Random(3)
     times = [float(index) for index in range(800)]
-    assert time_effect(times, [noise.gauss(0, 1) for _ in times]) < 0.05
-    assert time_effect(times, [float(index) for index in range(800)]) > 0.9
-    assert time_effect(times, [1.0] * 800) == 0.0
+
+    def effect(values: list[float]) -> float:
+        mean = statistics.fmean(values)
+        return time_effect(times, values, mean, sum((value - mean) ** 2 for value in values))
+
+    assert effect([noise.gauss(0, 1) for _ in times]) < 0.05
+    assert effect(times) > 0.9
+    assert effect([1.0] * 800) == 0.0
 
 
 def test_flat_since_is_the_begin_of_the_rest() -> None:

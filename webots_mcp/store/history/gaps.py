@@ -23,9 +23,10 @@ _TIMES: Final = (  # answered by the index alone
 # One signal that is in every row tells how many rows a bucket has, and its first and last time.
 _BUCKETS: Final = (
     "SELECT bucket, rows, first_sim_time_s, last_sim_time_s FROM rollup "
-    "WHERE run_id = ? AND bucket >= ? AND bucket < ? AND signal_id = "
-    "(SELECT signal_id FROM rollup WHERE run_id = ? GROUP BY signal_id "
-    "ORDER BY sum(present) DESC LIMIT 1) ORDER BY bucket"
+    "WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = (SELECT id "
+    "FROM signal s WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND EXISTS "
+    "(SELECT 1 FROM rollup WHERE run_id = :run AND signal_id = s.id) "
+    "ORDER BY s.rows - s.null_rows DESC LIMIT 1) ORDER BY bucket"
 )
 
 
@@ -91,12 +92,11 @@ def _stretches(
 ) -> Iterator[tuple[Sequence[float], bool]]:
     """Times in order: the ends of each bucket that is complete, all times of another."""
     run_id, reached_s, looked = segment.run_id, segment.start_s, 0
-    first, end = bucket_of(segment.start_s) + 1, bucket_of(segment.end_s)
-    for bucket, rows, first_s, last_s in connection.execute(
-        _BUCKETS, (run_id, first, end, run_id)
-    ).fetchall():
+    span = {"first": bucket_of(segment.start_s) + 1, "end": bucket_of(segment.end_s)}
+    found = connection.execute(_BUCKETS, {"run": run_id, **span}).fetchall()
+    for bucket, rows, first_s, last_s in found:
         start_s, end_s = bucket * BUCKET_S, (bucket + 1) * BUCKET_S
-        if head := _times(connection, run_id, reached_s, start_s):
+        if start_s > reached_s and (head := _times(connection, run_id, reached_s, start_s)):
             yield head, False
         complete = rows >= BUCKET_S / interval_s - 2 or looked >= _MOST_BUCKETS
         looked += not complete

@@ -52,7 +52,7 @@ def flatten(state: dict[str, Any]) -> dict[str, Value]:
 
     Arrays of more than 16 items become `name.count`, `.min`, `.max`, `.mean` and `.argmin` (of
     their numbers; `count` and `argmin` of all items). Where two leaves share a name (a key that
-    holds a dot), the first counts.
+    holds a dot), the last counts.
     """
     leaves: dict[str, Value] = {}
     _spread("", state.items(), leaves)
@@ -61,17 +61,15 @@ def flatten(state: dict[str, Any]) -> dict[str, Value]:
 
 def _spread(prefix: str, items: Iterable[tuple[str, Any]], leaves: dict[str, Value]) -> None:
     for key, value in items:
-        name = prefix + key
-        kind = cast("type[object]", type(value))
+        kind = value.__class__
         if kind is dict:
-            _spread(f"{name}.", value.items(), leaves)
+            _spread(f"{prefix}{key}.", value.items(), leaves)
         elif kind is not list:
-            if name not in leaves:
-                leaves[name] = value
+            leaves[prefix + key] = value
         elif len(value) <= LONGEST_SPREAD_ARRAY:
-            _spread(f"{name}.", zip(_INDEXES, value, strict=False), leaves)
+            _spread(f"{prefix}{key}.", zip(_INDEXES, value, strict=False), leaves)
         else:
-            _reduce(name, value, leaves)
+            _reduce(prefix + key, value, leaves)
 
 
 def _reduce(name: str, array: list[Any], leaves: dict[str, Value]) -> None:
@@ -85,7 +83,7 @@ def _reduce(name: str, array: list[Any], leaves: dict[str, Value]) -> None:
         None if low is None else array.index(low),
     )
     for reduction, value in zip(REDUCTIONS, reduced, strict=True):
-        leaves.setdefault(f"{name}.{reduction}", value)
+        leaves[f"{name}.{reduction}"] = value
 
 
 def places(state: dict[str, Any]) -> dict[str, Place]:
@@ -104,13 +102,13 @@ def _locate(name: str, path: str, value: Any, found: dict[str, Place]) -> None:
         for key, item in cast("dict[str, Any]", value).items():
             _locate(prefix + key, f"{path}.{_step(key)}", item, found)
     elif not isinstance(value, list):
-        found.setdefault(name, Place(path, None))
+        found[name] = Place(path, None)
     elif len(cast("list[Any]", value)) <= LONGEST_SPREAD_ARRAY:
         for index, item in enumerate(cast("list[Any]", value)):
             _locate(f"{prefix}{index}", f"{path}[{index}]", item, found)
     else:
         for reduction in REDUCTIONS:
-            found.setdefault(prefix + reduction, Place(path, reduction))
+            found[prefix + reduction] = Place(path, reduction)
 
 
 def _step(key: str) -> str:

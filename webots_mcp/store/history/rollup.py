@@ -7,10 +7,9 @@ last state row that is in: ids are given under the write lock, so a row never co
 
 from __future__ import annotations
 
-import math
 import sqlite3
+from bisect import bisect_left
 from collections.abc import Iterator
-from itertools import groupby
 from typing import Final, NamedTuple
 
 from webots_mcp.store.history.batch import Batch, BatchColumn
@@ -154,9 +153,12 @@ def _store(connection: sqlite3.Connection, batch: Batch) -> None:
 
 
 def _store_buckets(connection: sqlite3.Connection, signal: Signal, column: BatchColumn) -> None:
-    for bucket, points in groupby(column.points, lambda point: bucket_of(point[1])):
-        _, times, values = zip(*points, strict=True)
-        summary = summarise(times, values, angle=signal.kind == "angle")
+    _, times, values = zip(*column.points, strict=True)
+    end = 0
+    while (start := end) < len(times):
+        bucket = bucket_of(times[start])
+        end = bisect_left(times, (bucket + 1) * BUCKET_S, start)
+        summary = summarise(times[start:end], values[start:end], angle=signal.kind == "angle")
         key = (column.run_id, signal.id, bucket)
         before = connection.execute(_BUCKET, key).fetchone()
         whole = merge([Summary._make(before), summary]) if before else summary
@@ -175,4 +177,4 @@ def _store_changes(connection: sqlite3.Connection, signal: Signal, column: Batch
 
 def bucket_of(sim_time_s: float) -> int:
     """The number of the bucket that holds that time."""
-    return math.floor(sim_time_s / BUCKET_S)
+    return int(sim_time_s // BUCKET_S)  # exact, which floor of a rounded quotient is not

@@ -1,6 +1,7 @@
 """What a numeric signal does over a stretch of time: its slope, swing, spikes and rest.
 
-Each function takes times that do not fall and as many values, all finite numbers.
+Each function takes times that do not fall and as many values, all finite numbers; the mean and the
+sum of squared deviations are those of the values.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ class Spike:
     value: float
 
 
-def fit_line(times: Sequence[float], values: Sequence[float]) -> Line | None:
+def fit_line(times: Sequence[float], values: Sequence[float], mean: float) -> Line | None:
     """Least squares: slope = S_tv / S_tt, r2 = S_tv**2 / (S_tt * S_vv), sums about the means.
 
     N. R. Draper, H. Smith, Applied Regression Analysis (3rd ed. 1998), sections 1.2 and 1.3. None
@@ -61,13 +62,13 @@ def fit_line(times: Sequence[float], values: Sequence[float]) -> Line | None:
     """
     if len(values) < 2:
         return None
-    time_mean, mean = math.fsum(times) / len(times), math.fsum(values) / len(values)
+    time_mean = math.fsum(times) / len(times)
     dt = [time - time_mean for time in times]
     dv = [value - mean for value in values]
     stt, stv, svv = sum(map(mul, dt, dt)), sum(map(mul, dt, dv)), sum(map(mul, dv, dv))
     if stt == 0:
         return None
-    return Line(stv / stt, min(1.0, stv * stv / (stt * svv)) if svv > 0 else 0.0)
+    return Line(stv / stt, min(1.0, stv / stt * (stv / svv)) if svv > 0 else 0.0)
 
 
 def find_oscillation(
@@ -109,7 +110,8 @@ def _crossings(
                 moments.append(time)
                 peaks.append(peak)
             side, peak = now, 0.0
-        peak = max(peak, abs(value - mean))
+        if (size := abs(value - mean)) > peak:
+            peak = size
     return moments, peaks[1:] or peaks
 
 
@@ -151,24 +153,24 @@ def flat_since(times: Sequence[float], values: Sequence[float]) -> float | None:
     return times[index] if span == 0 or times[-1] - times[index] >= 0.1 * whole_s else None
 
 
-def time_effect(times: Sequence[float], values: Sequence[float]) -> float:
+def time_effect(
+    times: Sequence[float], values: Sequence[float], mean: float, squares: float
+) -> float:
     """The share of the variance that lies between eight equal stretches of time, 0 to 1.
 
     The correlation ratio eta squared (R. A. Fisher, Statistical Methods for Research Workers,
     1925, section 44): near 0 for steady noise and for a swing that is short beside the stretch,
     1 where all change is slow, whether it goes one way or comes back.
     """
-    mean = math.fsum(values) / len(values)
-    total = math.fsum((value - mean) ** 2 for value in values)
     width_s = (times[-1] - times[0]) / TIME_BINS
-    if total == 0 or width_s == 0:
+    if squares == 0 or width_s == 0:
         return 0.0
     borders = [bisect_left(times, times[0] + width_s * index) for index in range(TIME_BINS)]
     between = 0.0
     for start, end in pairwise([*borders, len(values)]):
         if end > start:
-            between += (end - start) * (math.fsum(values[start:end]) / (end - start) - mean) ** 2
-    return min(1.0, between / total)
+            between += (end - start) * (sum(values[start:end]) / (end - start) - mean) ** 2
+    return min(1.0, between / squares)
 
 
 def unwrap(angles: Sequence[float]) -> list[float]:

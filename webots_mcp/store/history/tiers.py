@@ -21,7 +21,10 @@ from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.rollup import BUCKET_S, bucket_of, buckets, watermark
 from webots_mcp.store.history.summary import Summary, merge, summarise
 
-_FIRST_AFTER: Final = "SELECT sim_time_s FROM state WHERE id > ? AND run_id = ? ORDER BY id LIMIT 1"
+# By ids, from the watermark on: the + keeps SQLite from sorting all rows of the run instead.
+_FIRST_AFTER: Final = (
+    "SELECT sim_time_s FROM state WHERE id > ? AND +run_id = ? ORDER BY id LIMIT 1"
+)
 
 
 class Pieces:

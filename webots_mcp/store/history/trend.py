@@ -82,9 +82,10 @@ def judge(
     """
     angle = signal.kind == "angle"
     course = unwrap(numbers) if angle else numbers
-    inner = summarise(times, course)
-    line = fit_line(times, course)
-    crossings, swing = find_oscillation(times, course, inner.mean or 0.0, inner.deviation or 0.0)
+    inner = summary if len(course) == summary.present and not angle else summarise(times, course)
+    mean = inner.mean or 0.0
+    line = fit_line(times, course, mean)
+    crossings, swing = find_oscillation(times, course, mean, inner.deviation or 0.0)
     monotonic = _monotonic(course)
     rest_s = flat_since(times, course)
     shape = _shape(summary, line, monotonic, swing, rest_s)
@@ -104,7 +105,7 @@ def judge(
         flat_since_s=rest_s,
         spikes=None if spikes is None else tuple(spikes),
         missing_share=1 - summary.present / summary.rows,
-        change=_change(summary, times, course),
+        change=time_effect(times, course, mean, inner.squares or 0.0) * _relative_range(summary),
         says="",
     )
     return replace(trend, says="; ".join(_remarks(trend)))
@@ -137,12 +138,10 @@ def _shape(
     return "resting" if rest_s is not None else "varying"
 
 
-def _change(summary: Summary, times: Sequence[float], course: Sequence[float]) -> float:
+def _relative_range(summary: Summary) -> float:
     assert summary.min is not None and summary.max is not None
     largest = max(abs(summary.min), abs(summary.max))
-    if largest == 0:
-        return 0.0
-    return time_effect(times, course) * (summary.max - summary.min) / largest
+    return (summary.max - summary.min) / largest if largest else 0.0
 
 
 def _remarks(trend: Trend) -> Iterator[str]:

@@ -26,6 +26,7 @@ from webots_mcp.schema import require_current
 INTERVAL_S: Final = 1.0
 HURRIED_INTERVAL_S: Final = 0.25  # while the log grows fast: a long one takes long to copy
 LEASE_S: Final = 5.0
+WAL_RESET_FIXED: Final = (3, 51, 3)
 WAL_LIMIT_BYTES: Final = 1_000_000
 FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
 
@@ -137,7 +138,9 @@ class Maintainer(threading.Thread):
     def _checkpoint(self, connection: sqlite3.Connection) -> None:
         """Copy the log back and cut it, if it is long and grew since the last time.
 
-        Cutting takes the write lock, and rows wait meanwhile: most is copied before, without it.
+        Cutting takes the write lock, and rows wait meanwhile. Where SQLite has no WAL-reset bug,
+        most is copied before without the lock; a checkpoint that starts without it, while a commit
+        restarts the log, is what the bug needs.
         """
         log = Path(f"{self._database}-wal")
         log_bytes = log.stat().st_size if log.exists() else 0
@@ -148,7 +151,8 @@ class Maintainer(threading.Thread):
         version = int(connection.execute("PRAGMA data_version").fetchone()[0])
         if version != self._data_version:
             self._data_version = version
-            connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+            if sqlite3.sqlite_version_info >= WAL_RESET_FIXED:
+                connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
     def _give_back(self) -> None:

@@ -12,7 +12,7 @@ import os
 import shlex
 import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from pathlib import Path
 from typing import Any, Final
 
@@ -95,7 +95,7 @@ async def _converse(data_dir: Path) -> None:
 
 
 @contextlib.asynccontextmanager
-async def _client(data_dir: Path) -> AsyncIterator[Client]:
+async def _client(data_dir: Path) -> AsyncGenerator[Client, None]:
     """A client on a server of its own; the server's log stays out of the conversation."""
     server = StdioServerParameters(
         command=sys.executable,

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Final
 
 import sqlalchemy
 from alembic import command
 from alembic.config import Config
+from sqlalchemy import event
 from sqlalchemy.pool import StaticPool
 
 from webots_mcp.bundled import bundled
@@ -53,12 +54,12 @@ def downgrade(database: Database, revision: str = "base") -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def _alembic(database: Database) -> Iterator[tuple[Config, sqlite3.Connection]]:
+def _alembic(database: Database) -> Generator[tuple[Config, sqlite3.Connection], None, None]:
     """An Alembic configuration bound to one connection whose transactions lock at once."""
     connection = connect(database, "writer", create=True)
     engine = sqlalchemy.create_engine("sqlite://", creator=lambda: connection, poolclass=StaticPool)
     # Two starters: the second waits here, then finds the newer revision and has nothing to do.
-    sqlalchemy.event.listen(engine, "begin", _begin_immediate)
+    event.listen(engine, "begin", _begin_immediate)
     try:
         with engine.connect() as bound:
             config = Config()

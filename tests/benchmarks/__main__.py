@@ -1,0 +1,80 @@
+"""Runs the benchmarks and prints one table."""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import os
+import platform
+import sqlite3
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from tests.benchmarks.registry import Bench, Benchmark, all_benchmarks
+from tests.benchmarks.table import Section, render
+
+_QUICK = 0.12
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Returns 0 however fast or slow everything was; 2 for a name that does not exist."""
+    benchmarks = all_benchmarks()
+    options = _parser([b.name for b in benchmarks]).parse_args(arguments)
+    chosen = [b for b in benchmarks if not options.only or b.name in options.only]
+    started_s, load = time.monotonic(), _load()
+    sections = [
+        _run(benchmark, _QUICK if options.quick else 1.0, f"{number}/{len(chosen)}")
+        for number, benchmark in enumerate(chosen, 1)
+    ]
+    _show("")
+    print(render(sections))
+    print(f"\n{_machine()}; load {load} before, {_load()} after")
+    print(f"{time.monotonic() - started_s:.0f} s" + (", --quick" if options.quick else ""))
+    return 0
+
+
+def _run(benchmark: Benchmark, effort: float, number: str) -> Section:
+    def say(text: str) -> None:
+        _show(f"[{number}] {benchmark.name}: {text}")
+
+    say("...")
+    with tempfile.TemporaryDirectory(prefix="webots-mcp-bench-") as folder:
+        return benchmark.run(Bench(Path(folder), effort, say))
+
+
+def _show(text: str) -> None:
+    """Progress in one line of a terminal; nothing in a pipe."""
+    if sys.stderr.isatty():
+        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+
+def _machine() -> str:
+    encoder = "orjson installed" if importlib.util.find_spec("orjson") else "no orjson"
+    python = f"{platform.python_implementation()} {platform.python_version()}"
+    system = f"{platform.system()} {platform.machine()}, {os.cpu_count()} cores"
+    return f"{python}, SQLite {sqlite3.sqlite_version}, {encoder}; {system}"
+
+
+def _load() -> str:
+    """How busy the machine was in the last minute, where the system tells."""
+    return f"{os.getloadavg()[0]:.1f}" if hasattr(os, "getloadavg") else "unknown"
+
+
+def _parser(names: list[str]) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="smaller counts: under a minute")
+    parser.add_argument(
+        "--only",
+        action="append",
+        choices=names,
+        metavar="NAME",
+        help=f"only this one, may be repeated: {', '.join(names)}",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,129 @@
+"""Calls in a row: what each costs with everything in the processor's caches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+from tests.benchmarks.measuring import Samples, alternate, ratio, time_calls
+from tests.benchmarks.registry import Bench, NotMeasurableError, benchmark
+from tests.benchmarks.rover import Rover
+from tests.benchmarks.states import make_states
+from tests.benchmarks.table import Line, Target, duration
+from tests.benchmarks.ways import BridgeWay, JsonFiles, RawSqlite, Way
+
+_BLOCKS = 40
+_CALLS = 200
+
+
+@benchmark("publish", "publish(), recorded, calls in a row")
+def measure_publish(bench: Bench) -> Iterable[Line]:
+    yield from _publish(bench, orjson=False)
+    try:
+        yield from _publish(bench, orjson=True)
+    except NotMeasurableError:
+        return
+
+
+def _publish(bench: Bench, *, orjson: bool) -> Iterable[Line]:
+    encoder = "orjson" if orjson else "standard library JSON"
+    bench.say(encoder)
+    robot, folder = Rover(), bench.place(encoder)
+    ways: dict[str, Way] = {
+        "bridge": BridgeWay(robot, folder, orjson=orjson),
+        "files": JsonFiles(folder),
+        "raw": RawSqlite(folder),
+    }
+    taken = _take_turns(bench, {name: _publishing(way, robot) for name, way in ways.items()})
+    for way in ways.values():
+        way.close()
+    ours, files, raw = taken["bridge"], taken["files"], taken["raw"]
+    yield Line(
+        f"p50, {encoder}",
+        duration(ours.p50),
+        f"JSON file {duration(files.p50)}",
+        ratio(ours, files),
+        target=None if orjson else Target(0.15),
+    )
+    yield Line(
+        f"p50, {encoder}",
+        duration(ours.p50),
+        f"raw sqlite3 + json.dumps {duration(raw.p50)}",
+        ratio(ours, raw),
+        target=None if orjson else Target(1.6),
+    )
+    yield Line(
+        f"p99.9, {encoder}",
+        duration(ours.p999),
+        f"JSON file {duration(files.p999)}",
+        ours.p999 / files.p999,
+    )
+
+
+def _publishing(way: Way, robot: Rover) -> Callable[[], list[float]]:
+    states = make_states()
+
+    def call(i: int) -> None:
+        robot.step(8)
+        way.publish(states[i % len(states)])
+
+    def run_block() -> list[float]:
+        way.begin()
+        return time_calls(call, _CALLS)
+
+    return run_block
+
+
+@benchmark("throttled", "publish(), a call that is not recorded")
+def measure_throttled(bench: Bench) -> Iterable[Line]:
+    robot, state = Rover(), make_states(1)[0]
+    way = BridgeWay(robot, bench.folder, every=1_000_000_000)
+
+    def call(_: int) -> None:
+        robot.step(8)
+        way.publish(state)
+
+    empty = {"call": lambda: time_calls(call, 5000), "none": lambda: time_calls(robot.step, 5000)}
+    taken = _take_turns(bench, empty)
+    way.close()
+    cost_us = 1e6 * (taken["call"].p50 - taken["none"].p50)
+    yield Line(
+        "p50", duration(taken["call"].p50), "minus the empty call", cost_us, "us", Target(2.0)
+    )
+
+
+@benchmark("poll", "get_command() with nothing to do, calls in a row")
+def measure_poll(bench: Bench) -> Iterable[Line]:
+    robot = Rover()
+    ways: dict[str, Way] = {
+        "bridge": BridgeWay(robot, bench.folder),
+        "files": JsonFiles(bench.folder),
+        "raw": RawSqlite(bench.folder),
+    }
+    taken = _take_turns(bench, {name: _polling(way, robot) for name, way in ways.items()})
+    for way in ways.values():
+        way.close()
+    ours = taken["bridge"]
+    for name, label in (("files", "exists, open, json.load"), ("raw", "indexed SELECT")):
+        yield Line(
+            "p50",
+            duration(ours.p50),
+            f"{label} {duration(taken[name].p50)}",
+            ratio(ours, taken[name]),
+            target=Target(0.3) if name == "files" else None,
+        )
+
+
+def _polling(way: Way, robot: Rover) -> Callable[[], list[float]]:
+    def call(_: int) -> None:
+        robot.step(8)
+        way.get_command()
+
+    return lambda: time_calls(call, 1000)
+
+
+def _take_turns(
+    bench: Bench, contenders: dict[str, Callable[[], list[float]]]
+) -> dict[str, Samples]:
+    blocks = bench.count(_BLOCKS, least=2)
+    taken = alternate(contenders, blocks)
+    return {name: Samples(durations) for name, durations in taken.items()}

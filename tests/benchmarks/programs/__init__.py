@@ -1,0 +1,1 @@
+"""What has to run in a process of its own."""

@@ -16,11 +16,13 @@ from tests.server.test_surface import READING
 from tests.store.recorded import Recorded
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.server.shortening import compact_json
 from webots_mcp.store.migrate import upgrade
 
 pytestmark = pytest.mark.anyio
 
 DEFAULT_LIMIT = 8_000  # characters: about 2,000 tokens
+FULL_LIMIT = 22_000
 DATA_TOOLS = sorted(READING - {"webots_get_camera", "webots_monitor"})
 
 
@@ -170,8 +172,8 @@ async def test_answers_stay_short_whatever_is_published(
         robot.event(1.0, "change", "text", {"from": "v" * 5000, "to": "u" * 5000})
     async with connect() as client:
         for tool in DATA_TOOLS:
-            characters = len(json.dumps(await ask(client, tool)))
-            limit = 28_000 if tool == "webots_get_full_state" else 12_000
+            characters = len(compact_json(await ask(client, tool)))
+            limit = FULL_LIMIT if tool == "webots_get_full_state" else DEFAULT_LIMIT
             assert characters < limit, tool
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Callable
 from pathlib import Path
 
+import anyio
 import pytest
 from mcp import Client
 
@@ -49,11 +51,19 @@ async def test_a_person_who_pauses_in_webots_is_one_of_the_reasons_told(
     simulation.wait_for(lambda: has_states(filed), 20)
     async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
         simulation.pause()
+        await _until_nothing_comes(filed)
         text = await fail(client, "webots_simulation_control", command="resume", timeout_s=3)
         answer = json.loads(text)
         assert answer["outcome"] == "cancelled"
         assert "paused by hand in Webots" in answer["hint"]
         assert answer["status"].startswith("stopped")
+
+
+async def _until_nothing_comes(filed: Recording) -> None:
+    """Until the controller's loop is surely inside the step that does not return."""
+    with anyio.fail_after(10):
+        while time.time() - filed.rows("SELECT max(wall_time_s) FROM state")[0] < 0.5:
+            await anyio.sleep(0.02)
 
 
 async def test_a_controller_that_was_killed_is_no_longer_running(

@@ -31,8 +31,10 @@ def test_what_was_left_out_is_said_and_what_fits_is_unchanged(value: Any) -> Non
         assert short.value == value
 
 
-def test_numbers_have_four_significant_digits_at_a_glance_and_all_of_them_whole() -> None:
-    assert shorten([0.000123456, 123456.0, 7]).value == [0.0001235, 123500.0, 7]
+def test_numbers_are_rounded_at_a_glance_and_exact_when_whole() -> None:
+    assert shorten([0.000123456, -1.23456, 123456.78912, 7]).value == [
+        0.0001235, -1.235, 123456.789, 7,
+    ]  # fmt: skip
     assert shorten([0.000123456], levels=WHOLE).value == [0.000123456]
 
 

@@ -14,7 +14,7 @@ from anyio import to_thread
 from webots_mcp.contract import BUILT_IN_ACTIONS, HEARTBEAT_LATE_S
 from webots_mcp.errors import UnknownActionError
 from webots_mcp.server.results import CommandAnswer
-from webots_mcp.server.shortening import RESULT_BUDGET, cut_text, shorten
+from webots_mcp.server.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
 from webots_mcp.store.queue import Command, CommandQueue, fetch_command
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.status import SILENT
@@ -128,8 +128,10 @@ class Dispatcher:
 
 
 def shown_result(command: Command, budget: int = RESULT_BUDGET) -> Any:
-    """The result of a command, shortened."""
-    return None if command.result is None else shorten(command.decoded_result(), budget).value
+    """The result of a command; its numbers are exact, what is long is shortened."""
+    return (
+        None if command.result is None else shorten(command.decoded_result(), budget, WHOLE).value
+    )
 
 
 def _require_action(view: View, action: str) -> None:

@@ -148,7 +148,7 @@ class CommandsAnswer(Answer):
     cursor: int | None = Field(
         default=None, description="Ask again with this cursor for older ones."
     )
-    actions: dict[str, str] | None = Field(
+    actions: dict[str, Any] | None = Field(
         default=None, description="The controller's own actions with their docstrings."
     )
     built_in: list[str] | None = None

@@ -13,6 +13,7 @@ RESULT_BUDGET: Final = 3_200
 DETAIL_BUDGET: Final = 320
 
 _DIGITS: Final = 4
+_DECIMALS: Final = 3
 _ODD_NUMBERS: Final = ("nan", "inf", "-inf")
 
 
@@ -61,8 +62,8 @@ def shorten(value: Any, budget: int = STATE_BUDGET, levels: Sequence[Limits] = G
     """Make a JSON value fit `budget` characters of compact JSON.
 
     Long arrays of numbers become `{"count", "min", "max", "mean", "argmin"}`, the names that the
-    same array's signals have. With the levels `GLANCE` numbers are rounded to 4 significant
-    digits, which is the stated default and not reported; with `WHOLE` they are exact.
+    same array's signals have. With the levels `GLANCE` numbers are rounded (see
+    `round_number`), which is the stated default and not reported; with `WHOLE` they are exact.
     """
     for limits in levels:
         shortener = _Shortener(limits)
@@ -78,8 +79,11 @@ def compact_json(value: Any) -> str:
 
 
 def round_number(value: float) -> float:
-    """A number with 4 significant digits."""
-    return float(f"{value:.{_DIGITS}g}")
+    """A number with 4 significant digits, but never coarser than a thousandth.
+
+    So a time of 1234.567 s and a position far from the origin keep what moves.
+    """
+    return round(value, _DECIMALS) if abs(value) >= 1 else float(f"{value:.{_DIGITS}g}")
 
 
 def cut_text(text: str, longest: int) -> str:

@@ -23,7 +23,7 @@ COMMAND_COLUMNS: Final = (
     "id", "action", "params", "outcome", "asked_ago_s", "took_s", "result", "error",
 )  # fmt: skip
 _WAIT_S: Final = 10.0
-_SHOWN_ACTIONS: Final = 40
+_ACTIONS_BUDGET: Final = 2_400
 _LONGEST_TEXT: Final = 200
 
 
@@ -104,10 +104,7 @@ def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
     )
 
 
-def _actions(view: View) -> dict[str, str]:
+def _actions(view: View) -> dict[str, Any]:
     """The registered actions; a controller that registers none sees commands in its loop."""
     actions = view.session.actions if view.session else {}
-    return {
-        cut_text(name, _LONGEST_TEXT): cut_text(str(text), _LONGEST_TEXT)
-        for name, text in list(actions.items())[:_SHOWN_ACTIONS]
-    }
+    return dict(shorten(actions, _ACTIONS_BUDGET).value)

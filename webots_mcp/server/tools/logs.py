@@ -16,7 +16,7 @@ from webots_mcp.store.window import resolve_window
 
 LOG_COLUMNS: Final = ("sim_time_s", "level", "message")
 _LONGEST_MESSAGE: Final = 500
-_BUDGET: Final = 7_000
+_BUDGET: Final = 6_000
 
 Level = Literal["debug", "info", "warning", "error"]
 

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, cast
 
 import anyio
 from anyio import to_thread
@@ -160,12 +160,12 @@ def _changes(watched: Watched, events: list[Event]) -> Table | None:
 def _event_row(event: Event) -> list[Any] | None:
     if event.kind not in _CHANGE_KINDS:
         return None
-    details = event.details()
+    at, details = round(event.sim_time_s, 3), event.details()
     if event.kind == "change" and isinstance(details, dict):
-        short = shorten(details, DETAIL_BUDGET).value
-        name = (event.name or "")[:_LONGEST_NAME]
-        return [round(event.sim_time_s, 3), name, short.get("from"), short.get("to")]
-    return [round(event.sim_time_s, 3), event.kind, None, shorten(details, DETAIL_BUDGET).value]
+        change = cast("dict[str, Any]", details)
+        before, after = (shorten(change.get(end), DETAIL_BUDGET).value for end in ("from", "to"))
+        return [at, (event.name or "")[:_LONGEST_NAME], before, after]
+    return [at, event.kind, None, shorten(details, DETAIL_BUDGET).value]
 
 
 def _signals(watched: Watched) -> Table | None:

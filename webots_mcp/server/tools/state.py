@@ -27,10 +27,10 @@ _PUBLISH: Final = (
     "nothing was published in this run yet: call bridge.publish({...}) in the controller's loop "
     "(every 5th call is recorded, or each one with force=True)"
 )
-_EVENTS: Final = 20
+_EVENTS: Final = 10
 _SHOWN_ODD: Final = 20
 _SHOWN_DEVICES: Final = 30
-_ERROR_CHARACTERS: Final = 500
+_ERROR_CHARACTERS: Final = 300
 
 PagePath = Annotated[
     str,

@@ -49,7 +49,7 @@ class State:
         """The published dict, with "nan", "inf" and the like where JSON has to say null."""
         value = cast("dict[str, Any]", json.loads(self.data))
         for path, kind in self.odd_paths().items():
-            _name_replaced(value, path.split("."), kind)
+            put_back(value, path.split("."), kind)
         return value
 
     def odd_paths(self) -> dict[str, str]:
@@ -133,19 +133,19 @@ def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
     raise InvalidInputError(f"path {path!r}: {parts[0]!r} asks for a part of a single value")
 
 
-def _name_replaced(value: Any, parts: list[str], kind: str) -> None:
-    """Put the kind where null stands for a replaced value; a value that was kept stays.
+def put_back(value: Any, parts: list[str], replaced: object) -> None:
+    """Put what was replaced (or its kind) where null stands for it; a value that was kept stays.
 
     The last part `*` stands for every null in an array.
     """
     if parts == ["*"] and isinstance(value, list):
-        value[:] = [kind if item is None else item for item in cast("list[Any]", value)]
+        value[:] = [replaced if item is None else item for item in cast("list[Any]", value)]
         return
     try:
         key, taken = _key(value, parts, "")
     except InvalidInputError:  # the path leads to what was replaced as a whole
         return
     if taken < len(parts):
-        _name_replaced(value[key], parts[taken:], kind)
+        put_back(value[key], parts[taken:], replaced)
     elif value[key] is None:
-        value[key] = kind
+        value[key] = replaced

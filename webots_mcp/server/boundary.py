@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Awaitable, Callable, Generator, Iterator
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, ParamSpec, TypeVar, cast, get_type_hints
 
@@ -90,10 +89,9 @@ def _wrap(method: Callable[..., Any], empty: Callable[[str], Any]) -> Callable[.
     @functools.wraps(method)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         try:
-            with _tool_errors():
-                return _as_result(method(*args, **kwargs))
-        except NothingRecordedError as error:
-            return _as_result(empty(str(error)))
+            return _as_result(method(*args, **kwargs))
+        except WebotsMCPError as error:
+            return _as_result(_answer_error(error, empty))
 
     return wrapper
 
@@ -102,23 +100,18 @@ def _wrap_async(method: Callable[..., Any], empty: Callable[[str], Any]) -> Call
     @functools.wraps(method)
     async def wrapper(*args: Any, **kwargs: Any) -> Any:
         try:
-            with _tool_errors():
-                return _as_result(await method(*args, **kwargs))
-        except NothingRecordedError as error:
-            return _as_result(empty(str(error)))
+            return _as_result(await method(*args, **kwargs))
+        except WebotsMCPError as error:
+            return _as_result(_answer_error(error, empty))
 
     return wrapper
 
 
-@contextmanager
-def _tool_errors() -> Generator[None]:
+def _answer_error(error: WebotsMCPError, empty: Callable[[str], Any]) -> Any:
     """Our errors tell the model what to do; any other is a defect and stays on the server."""
-    try:
-        yield
-    except (NoDatabaseError, NothingRecordedError) as error:
-        raise NothingRecordedError(str(error)) from error
-    except WebotsMCPError as error:
-        raise ToolError(str(error)) from error
+    if isinstance(error, (NoDatabaseError, NothingRecordedError)):
+        return empty(str(error))
+    raise ToolError(str(error)) from error
 
 
 def _empty_answer(method: Callable[..., Any], annotations: ToolAnnotations) -> Callable[[str], Any]:

@@ -59,12 +59,11 @@ class Dispatcher:
             NothingRecordedError: There is no robot to ask.
         """
         started_s = time.monotonic()
-        command = await self.settle(request, report)
+        command = await self._send(request, report)
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
 
-    async def settle(self, request: Request, report: Report) -> Command:
-        """Like `ask`, but returns the command itself."""
+    async def _send(self, request: Request, report: Report) -> Command:
         command = await to_thread.run_sync(self._enqueue, request)
         try:
             return await self._watch(command.id, request.timeout_s, report)
@@ -129,9 +128,9 @@ class Dispatcher:
 
 def shown_result(command: Command, budget: int = RESULT_BUDGET) -> Any:
     """The result of a command; its numbers are exact, what is long is shortened."""
-    return (
-        None if command.result is None else shorten(command.decoded_result(), budget, WHOLE).value
-    )
+    if command.result is None:
+        return None
+    return shorten(command.decoded_result(), budget, WHOLE).value
 
 
 def _require_action(view: View, action: str) -> None:

@@ -183,10 +183,18 @@ class Recording:
                 f"the database at {name_of(self.database)} has an older schema, and what only "
                 "reads does not migrate it: run 'webots-mcp migrate'"
             )
+        from sqlalchemy.exc import SQLAlchemyError
+
         from webots_mcp.store.migrate import upgrade
 
         with self._migrating:
-            upgrade(self.database)
+            try:
+                upgrade(self.database)
+            except SQLAlchemyError as error:
+                raise DatabaseError(
+                    f"the database at {name_of(self.database)} could not be migrated: {error}; "
+                    "stop what uses it and run 'webots-mcp migrate'"
+                ) from error
 
 
 def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None = None) -> View:

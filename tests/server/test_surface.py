@@ -25,6 +25,9 @@ READING = {
     "webots_get_logs",
     "webots_monitor",
     "webots_list_commands",
+    "webots_list_signals",
+    "webots_query_history",
+    "webots_get_trends",
 }
 ACTING = {
     "webots_take_screenshot",

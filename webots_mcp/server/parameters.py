@@ -26,5 +26,43 @@ TimeoutS = Annotated[
     float, Field(ge=0.1, le=600, description="How long to wait for the outcome, wall seconds.")
 ]
 Cursor = Annotated[
-    int | None, Field(ge=0, description="From the previous answer, to continue with older ones.")
+    int | None, Field(ge=0, description="From the previous answer, to go on where it ended.")
+]
+Since = Annotated[
+    float | str | None,
+    Field(
+        description="From this wall time on, across runs: ISO 8601 or Unix seconds. Instead of "
+        "simulation times."
+    ),
+]
+Until = Annotated[
+    float | str | None, Field(description="Up to, not including, this wall time; see since.")
+]
+Names = Annotated[
+    list[str],
+    Field(
+        min_length=1,
+        max_length=50,
+        description="Signal names (webots_list_signals); 'pose' means all below it, '*' any text.",
+    ),
+]
+AnyNames = Annotated[
+    list[str] | None,
+    Field(max_length=50, description="Signal names, as webots_list_signals has them; all if none."),
+]
+MaxPoints = Annotated[
+    int | None,
+    Field(
+        ge=1,
+        le=500,
+        description="At most so many buckets (with raw: rows); by default as many as fit.",
+    ),
+]
+ShownLimit = Annotated[
+    int | None,
+    Field(ge=1, le=500, description="At most so many; by default as many as a short answer holds."),
+]
+Limit = Annotated[int, Field(ge=1, le=500, description="At most so many.")]
+RunIds = Annotated[
+    list[int], Field(max_length=20, description="Runs by their ids (webots_list_runs).")
 ]

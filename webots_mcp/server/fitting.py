@@ -1,0 +1,102 @@
+"""Answers about long recordings that stay short: rounded numbers, and as many rows as fit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Final, TypeVar
+
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.server.results import Answer, Table
+from webots_mcp.server.shortening import (
+    DETAIL_BUDGET,
+    compact_json,
+    cut_text,
+    round_number,
+    shorten,
+)
+from webots_mcp.store.recording import View
+
+BUDGET: Final = 6_600  # characters of JSON, of the 8,000 that are 2,000 tokens; the header has 600
+LARGE_BUDGET: Final = 40_000  # where the asker said how much: clients put longer answers aside
+LONGEST_NAME: Final = 80
+_DECIMALS: Final = 3
+_LONGEST_NOTE: Final = 300
+_MOST_NOTES: Final = 5
+
+_A = TypeVar("_A", bound=Answer)
+_T = TypeVar("_T")
+
+
+def answer_about(view: View, model: type[_A], find: Callable[[], dict[str, Any]]) -> _A:
+    """The header with what was found; where nothing was recorded, with the reason as the hint."""
+    answer: dict[str, Any] = view.header()
+    try:
+        answer |= find()
+    except NothingRecordedError as error:
+        answer["hint"] = str(error)
+    return model(**answer)
+
+
+def figure(value: float | None) -> float | None:
+    """A number as it is shown; None where there is none, or none that JSON could hold."""
+    return None if value is None or not math.isfinite(value) else round_number(value)
+
+
+def seconds(time_s: float | None) -> float | None:
+    """A simulation time as it is shown: to the millisecond."""
+    return None if time_s is None or not math.isfinite(time_s) else round(time_s, _DECIMALS)
+
+
+def figures(values: Sequence[float | None]) -> list[float | None]:
+    """A column of numbers as they are shown."""
+    return [figure(value) for value in values]
+
+
+def shown(value: Any) -> Any:
+    """A value of any kind, rounded, and cut where it is long."""
+    return shorten(value, DETAIL_BUDGET).value
+
+
+def short_name(name: str | None) -> str | None:
+    """A name; an absurdly long one is cut."""
+    return name and cut_text(name, LONGEST_NAME)
+
+
+def size_of(answer: Any) -> int:
+    """Characters of an answer, or a part of it, as the model reads it."""
+    return len(compact_json(answer))
+
+
+def fitting(items: Sequence[_T], budget: int = BUDGET) -> list[_T]:
+    """The first items whose JSON fits the budget, at least one."""
+    kept: list[_T] = []
+    for item in items:
+        budget -= size_of(item) + 1
+        if budget < 0 and kept:
+            break
+        kept.append(item)
+    return kept
+
+
+def table(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | None:
+    """A table, or None without rows."""
+    return Table(columns=list(columns), rows=list(rows)) if rows else None
+
+
+def without_empty(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | None:
+    """A table without the columns that have no value in any row."""
+    kept = [index for index in range(len(columns)) if any(row[index] is not None for row in rows)]
+    return table([columns[index] for index in kept], [[row[i] for i in kept] for row in rows])
+
+
+def notes_of(notes: Sequence[str]) -> list[str] | None:
+    """The notes of an answer; None without any."""
+    return [cut_text(note, _LONGEST_NOTE) for note in notes[:_MOST_NOTES]] or None
+
+
+def some(names: Sequence[str], most: int = 10) -> str:
+    """The first names, and how many more there are."""
+    more = len(names) - most
+    shown_names = ", ".join(cut_text(name, LONGEST_NAME) for name in names[:most])
+    return shown_names + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,128 @@
+"""What the tools about the past answer: columns and tables, with the header of every answer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, Field
+
+from webots_mcp.server.results import Answer, Table
+
+
+class NotedAnswer(Answer):
+    """An answer about a range of time, with what there is to know about that range."""
+
+    notes: list[str] | None = Field(
+        default=None, description="Where the range reaches outside the recording, and the like."
+    )
+
+
+class SignalsAnswer(NotedAnswer):
+    """The signals of a run."""
+
+    signals: Table | None = None
+    total: int | None = Field(default=None, description="How many match.")
+    cursor: int | None = Field(default=None, description="Ask again with this cursor for more.")
+
+
+class NumberSeries(BaseModel):
+    """A numeric signal: one item per bucket in each list, null where it has no value."""
+
+    unit: str | None = None
+    value: list[float | None] | None = Field(
+        default=None, description="Where every bucket is one row; then there is nothing else."
+    )
+    constant: float | None = Field(
+        default=None, description="The same in every bucket; then there is nothing else."
+    )
+    min: list[float | None] | None = None
+    max: list[float | None] | None = None
+    mean: list[float | None] | None = None
+    last: list[float | None] | None = None
+    count: list[int] | None = Field(
+        default=None, description="Values per bucket, where they are not those of the run."
+    )
+    whole: list[float | None] | None = Field(
+        default=None, description="Over the range: min, at (s), max, at (s), mean."
+    )
+    odd: dict[str, int] | None = Field(
+        default=None, description="How often nan, inf, ... stood there."
+    )
+
+
+class ChangeSeries(BaseModel):
+    """A text or boolean signal: its values, each with the time from which on it had it."""
+
+    since_s: list[float | None]
+    value: list[str | bool | None]
+    total: int | None = Field(default=None, description="How many changes, if not all are shown.")
+    time_by_value_s: dict[str, float]
+
+
+class RunSeries(BaseModel):
+    """The part of an answer that is about one run."""
+
+    run_id: int
+    start_s: float | None
+    end_s: float | None
+    step_s: float | None = Field(
+        default=None, description="Length of a bucket, s; missing where each bucket is one row."
+    )
+    sim_time_s: list[float | None] | None = Field(default=None, description="Begin of each bucket.")
+    count: list[int] | None = Field(default=None, description="Values per bucket.")
+    numbers: dict[str, NumberSeries] | None = None
+    states: dict[str, ChangeSeries] | None = None
+    rows: int | None = None
+    gaps: list[list[float | None]] | None = Field(
+        default=None, description="[from, to] where no row was recorded."
+    )
+    gap_count: int | None = Field(default=None, description="How many, if not all are shown.")
+    cut_at_s: float | None = Field(
+        default=None, description="Reading took too long: from here on rows are missing."
+    )
+
+
+class RowColumns(BaseModel):
+    """Rows as they were recorded, as columns."""
+
+    run_id: list[int] | None = Field(default=None, description="Where it is not the header's.")
+    sim_time_s: list[float | None]
+    signals: dict[str, list[Any]]
+    odd: dict[str, dict[str, int]] | None = None
+
+
+class HistoryAnswer(NotedAnswer):
+    """Signals over a range."""
+
+    runs: list[RunSeries] | None = None
+    raw: RowColumns | None = None
+    cursor: int | None = Field(
+        default=None, description="With raw: ask again with this cursor for the next rows."
+    )
+
+
+class RunTrendTables(BaseModel):
+    """The trends of one run."""
+
+    run_id: int
+    start_s: float | None
+    end_s: float | None
+    rows: int
+    resolution_s: float | None = Field(
+        default=None, description="Shape, slope and crossings come from means of so many seconds."
+    )
+    numbers: Table | None = Field(default=None, description="What changed most is first.")
+    total: int = Field(description="Numeric signals with values.")
+    constant: int | None = Field(default=None, description="How many of all never changed.")
+    states: Table | None = Field(default=None, description="Text and flags.")
+    states_total: int | None = None
+    silent: str | None = Field(default=None, description="Signals without a value in the range.")
+    cut_at_s: float | None = Field(
+        default=None, description="Reading took too long: from here on rows are missing."
+    )
+
+
+class TrendsAnswer(NotedAnswer):
+    """What each signal did over a range."""
+
+    runs: list[RunTrendTables] | None = None

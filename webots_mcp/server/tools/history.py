@@ -1,0 +1,262 @@
+"""The tool that shows signals over time."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any, Final
+
+from pydantic import Field
+
+from webots_mcp.server.boundary import READS, tool
+from webots_mcp.server.bounds import Bounds
+from webots_mcp.server.fitting import (
+    BUDGET,
+    LARGE_BUDGET,
+    answer_about,
+    figure,
+    figures,
+    notes_of,
+    seconds,
+    short_name,
+    shown,
+    size_of,
+    some,
+)
+from webots_mcp.server.history_results import (
+    ChangeSeries,
+    HistoryAnswer,
+    NumberSeries,
+    RowColumns,
+    RunSeries,
+)
+from webots_mcp.server.parameters import (
+    Cursor,
+    EndS,
+    LastS,
+    MaxPoints,
+    Names,
+    RobotName,
+    RunId,
+    Since,
+    StartS,
+    Until,
+)
+from webots_mcp.store.history.pages import Page, query_rows
+from webots_mcp.store.history.ranges import TimeRange
+from webots_mcp.store.history.series import (
+    DEFAULT_POINTS,
+    ChangeColumns,
+    NumberColumns,
+    RunHistory,
+    query_history,
+    signals_of,
+)
+from webots_mcp.store.recording import Recording, View
+
+_SHOWN_GAPS: Final = 10
+_CELL_CHARACTERS: Final = 28  # of a bucket of a numeric signal: min, max, mean and last
+_SIGNAL_CHARACTERS: Final = 160  # of a signal, beside its buckets
+
+
+class HistoryTools:
+    """Signals over a stretch of time."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    @tool("Query the history", READS)
+    def webots_query_history(
+        self,
+        signals: Names,
+        last_s: LastS = None,
+        start_s: StartS = None,
+        end_s: EndS = None,
+        since: Since = None,
+        until: Until = None,
+        max_points: MaxPoints = None,
+        raw: Annotated[
+            bool, Field(description="The rows as they are, exact, in pages, instead of buckets.")
+        ] = False,
+        cursor: Cursor = None,
+        robot: RobotName = None,
+        run_id: RunId = None,
+    ) -> HistoryAnswer:
+        """Signals over time, by default the whole run: min, max, mean, last per bucket.
+
+        No extreme is averaged away; empty buckets are null, gaps are listed. Text and flags come as
+        the points at which they changed. For "what happened" webots_get_trends is shorter.
+        """
+        bounds = Bounds(last_s, start_s, end_s, since, until)
+        with self._recording.view(robot, run_id) as view:
+
+            def find() -> dict[str, Any]:
+                asked = bounds.resolve(view, run_id)
+                if raw:
+                    return _page(view, asked, signals, max_points, cursor or 0)
+                return _series(view, asked, signals, max_points)
+
+            return answer_about(view, HistoryAnswer, find)
+
+
+def _series(
+    view: View, asked: TimeRange, names: Sequence[str], max_points: int | None
+) -> dict[str, Any]:
+    """As many buckets as were asked for, or as fit; fewer where the answer would be too long."""
+    budget = BUDGET if max_points is None else LARGE_BUDGET
+    points = min(max_points or DEFAULT_POINTS, _likely_points(view, asked, names, budget))
+    while True:
+        history = query_history(view.connection, asked, names, max_points=points)
+        runs = [_run_series(run) for run in history.runs if run.rows != 0]
+        size = _size(runs)
+        if size <= budget or points == 1:
+            break
+        points = max(1, int(points * 0.9 * budget / size))
+    hints = [hint for run in runs if (hint := _drop_signals(run, budget // len(runs)))]
+    if max_points is not None and points < max_points:
+        hints.append(f"{points} points instead of {max_points} fit: ask for fewer signals for more")
+    hints += [] if runs else ["no row in that range: leave the range out, or see notes"]
+    notes = notes_of(history.notes)
+    return {"runs": runs or None, "notes": notes, "hint": "; ".join(hints) or None}
+
+
+def _likely_points(view: View, asked: TimeRange, names: Sequence[str], budget: int) -> int:
+    signals = signals_of(view.connection, asked, names)
+    numbers = sum(signal.is_number for signal in signals)
+    room = budget - _SIGNAL_CHARACTERS * len(signals)
+    return max(1, room // (_CELL_CHARACTERS * max(numbers, 1)))
+
+
+def _size(runs: Sequence[RunSeries]) -> int:
+    return size_of([run.model_dump(mode="json", exclude_none=True) for run in runs])
+
+
+def _drop_signals(run: RunSeries, budget: int) -> str | None:
+    """Leave out the last signals where not even one point of each fits; says which."""
+    left_out: list[str] = []
+    for name in [*list(run.states or {})[:0:-1], *list(run.numbers or {})[:0:-1]]:
+        if _size([run]) <= budget:
+            break
+        left_out.append(name)
+        (run.states if run.states and name in run.states else run.numbers or {}).pop(name)
+    if not left_out:
+        return None
+    return f"left out of run {run.run_id}: {some(left_out[::-1])}; ask for them alone"
+
+
+def _run_series(run: RunHistory) -> RunSeries:
+    counts = _usual_counts(run.numbers)
+    rows_only = run.step_s is None
+    return RunSeries(
+        run_id=run.run_id,
+        start_s=seconds(run.start_s),
+        end_s=seconds(run.end_s),
+        step_s=run.step_s,
+        sim_time_s=[seconds(time_s) for time_s in run.sim_time_s] if run.numbers else None,
+        count=None if rows_only else counts,
+        numbers={
+            str(short_name(columns.name)): _number_series(columns, counts, rows_only=rows_only)
+            for columns in run.numbers
+        }
+        or None,
+        states={str(short_name(columns.name)): change_series(columns) for columns in run.changes}
+        or None,
+        rows=run.rows,
+        gaps=[[seconds(gap.start_s), seconds(gap.end_s)] for gap in run.gaps[:_SHOWN_GAPS]] or None,
+        gap_count=len(run.gaps) if len(run.gaps) > _SHOWN_GAPS else None,
+        cut_at_s=seconds(run.cut_at_s),
+    )
+
+
+def _usual_counts(numbers: Sequence[NumberColumns]) -> list[int] | None:
+    """How many values the buckets of most signals have."""
+    counts = Counter(tuple(columns.count) for columns in numbers)
+    return list(counts.most_common(1)[0][0]) if counts else None
+
+
+def _number_series(
+    columns: NumberColumns, counts: list[int] | None, *, rows_only: bool
+) -> NumberSeries:
+    odd = columns.odd or None
+    if rows_only:
+        return NumberSeries(unit=columns.unit, value=figures(columns.last), odd=odd)
+    whole = columns.whole
+    if whole.min == whole.max and columns.count == counts:
+        return NumberSeries(unit=columns.unit, constant=figure(whole.min), odd=odd)
+    return NumberSeries(
+        unit=columns.unit,
+        min=figures(columns.min),
+        max=figures(columns.max),
+        mean=figures(columns.mean),
+        last=figures(columns.last),
+        count=None if columns.count == counts else columns.count,
+        whole=[
+            figure(whole.min),
+            seconds(whole.min_sim_time_s),
+            figure(whole.max),
+            seconds(whole.max_sim_time_s),
+            figure(whole.direction if columns.kind == "angle" else whole.mean),
+        ],
+        odd=odd,
+    )
+
+
+def change_series(columns: ChangeColumns) -> ChangeSeries:
+    """A text or a flag as columns."""
+    return ChangeSeries(
+        since_s=[seconds(point.sim_time_s) for point in columns.points],
+        value=[shown(point.value) for point in columns.points],
+        total=columns.total if columns.total > len(columns.points) else None,
+        time_by_value_s={
+            shown(value): round(duration_s, 3)
+            for value, duration_s in columns.time_by_value_s.items()
+        },
+    )
+
+
+def _page(
+    view: View, asked: TimeRange, names: Sequence[str], limit: int | None, after_id: int
+) -> dict[str, Any]:
+    page = query_rows(
+        view.connection, asked, names, limit=limit or DEFAULT_POINTS, after_id=after_id
+    )
+    budget = BUDGET if limit is None else LARGE_BUDGET
+    rows = _most(lambda rows: size_of(_row_columns(page, rows, view).model_dump()), page, budget)
+    cursor = page.ids[rows - 1] if 0 < rows < len(page.ids) else page.cursor
+    return {
+        "raw": _row_columns(page, rows, view),
+        "cursor": cursor,
+        "notes": notes_of(page.notes),
+        "hint": f"{rows} rows: go on with cursor" if cursor else _no_rows(rows, after_id),
+    }
+
+
+def _no_rows(rows: int, after_id: int) -> str | None:
+    if rows:
+        return None
+    return "no rows after that cursor" if after_id else "no row in that range"
+
+
+def _most(size: Callable[[int], int], page: Page, budget: int) -> int:
+    """How many of the page's first rows fit the budget; at least one."""
+    rows = len(page.ids)
+    while rows > 1 and (now := size(rows)) > budget:
+        rows = max(1, min(rows - 1, int(rows * budget / now)))
+    return rows
+
+
+def _row_columns(page: Page, rows: int, view: View) -> RowColumns:
+    """The first rows; numbers as they were recorded."""
+    run_ids = page.run_ids[:rows]
+    here = view.run.id if view.run else None
+    return RowColumns(
+        run_id=None if set(run_ids) <= {here} else run_ids,
+        sim_time_s=list(page.sim_time_s[:rows]),
+        signals={
+            str(short_name(name)): [
+                shown(value) if isinstance(value, str) else value for value in values[:rows]
+            ]
+            for name, values in page.values.items()
+        },
+        odd=page.odd or None,
+    )

@@ -1,0 +1,99 @@
+"""The tool that lists what was recorded."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final
+
+from pydantic import Field
+
+from webots_mcp.server.boundary import READS, tool
+from webots_mcp.server.fitting import (
+    answer_about,
+    figure,
+    fitting,
+    notes_of,
+    seconds,
+    short_name,
+    shown,
+    without_empty,
+)
+from webots_mcp.server.history_results import SignalsAnswer
+from webots_mcp.server.parameters import Cursor, Limit, RobotName, RunId
+from webots_mcp.store.history.signals import SignalInfo, list_signals
+from webots_mcp.store.recording import Recording, View
+
+SIGNAL_COLUMNS: Final = (
+    "signal", "kind", "unit", "last", "min", "max", "first_s", "last_s", "null_share",
+)  # fmt: skip
+
+
+class SignalTools:
+    """Which signals there are."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    @tool("List the signals", READS)
+    def webots_list_signals(
+        self,
+        pattern: Annotated[
+            str, Field(max_length=200, description="Only these names; '*' stands for any text.")
+        ] = "*",
+        limit: Limit = 100,
+        cursor: Cursor = None,
+        robot: RobotName = None,
+        run_id: RunId = None,
+    ) -> SignalsAnswer:
+        """The dotted names of all that was published in a run: kind, last value, range, nulls.
+
+        Arrays of more than 16 items are kept as .count, .min, .max, .mean and .argmin.
+        """
+        with self._recording.view(robot, run_id) as view:
+            return answer_about(
+                view, SignalsAnswer, lambda: _found(view, pattern, limit, cursor or 0)
+            )
+
+
+def signal_row(info: SignalInfo) -> list[Any]:
+    """A signal as a row under `SIGNAL_COLUMNS`."""
+    return [
+        short_name(info.name),
+        info.kind,
+        info.unit,
+        shown(info.last if info.kind != "bool" or info.last is None else bool(info.last)),
+        figure(info.min),
+        figure(info.max),
+        seconds(info.first_s),
+        seconds(info.last_s),
+        figure(info.null_share),
+    ]
+
+
+def _found(view: View, pattern: str, limit: int, start: int) -> dict[str, Any]:
+    found = list_signals(
+        view.connection,
+        robot=view.robot.name,
+        run_id=view.require_run().id,
+        pattern=pattern,
+        limit=start + limit,
+    )
+    rows = fitting([signal_row(info) for info in found.signals[start:]])
+    end = start + len(rows)
+    more = end < found.total
+    return {
+        "signals": without_empty(SIGNAL_COLUMNS, rows),
+        "total": found.total,
+        "cursor": end if more else None,
+        "notes": notes_of(found.notes),
+        "hint": _hint(start, end, found.total),
+    }
+
+
+def _hint(start: int, end: int, total: int) -> str | None:
+    if total == 0:
+        return "no state row with values was recorded in this run yet"
+    if start >= total:
+        return f"there are only {total}: leave cursor out"
+    return (
+        f"{end - start} of {total}: go on with cursor, or narrow pattern" if end < total else None
+    )

@@ -66,7 +66,7 @@ def _state(
         "mode": mode,
         "stuck": mode == "cruise" and speed_m_s == 0,
         "time_s": time_s,
-        "pose": [round(x, 5), round(math.sin(phase / 9), 5), round(math.sin(phase), 5)],
+        "pose": [round(x, 5), round(math.sin(x), 5), round(math.sin(x * 3), 5)],
         "wheels": {"left": round(5 * speed_m_s, 3), "right": round(5 * speed_m_s + 0.1, 3)},
         "ds": [round(0.5 + 0.4 * math.sin(phase + i) + noise.gauss(0, 0.01), 5) for i in range(8)],
         "imu": {axis: round(noise.gauss(0, 0.1), 5) for axis in ("roll", "pitch", "yaw")},

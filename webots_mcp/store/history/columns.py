@@ -91,7 +91,7 @@ def read_columns(
             raise
         columns.cut = True
     for signal in signals:
-        columns.values[signal.name] = _cleaned(signal, columns.values[signal.name])
+        columns.values[signal.name] = cleaned(signal, columns.values[signal.name])
     return columns
 
 
@@ -164,7 +164,7 @@ def _count_odd(columns: Columns, signals: Sequence[Signal], odd: str) -> None:
             columns.odd.setdefault(signal.name, Counter())[reasons[signal.name]] += 1
 
 
-def _cleaned(signal: Signal, values: list[Value]) -> list[Value]:
+def cleaned(signal: Signal, values: list[Value]) -> list[Value]:
     """Every value of the type that the signal's kind promises; the same from SQL and Python."""
     if signal.kind == "text":
         return [shown(value) for value in values]

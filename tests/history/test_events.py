@@ -1,0 +1,199 @@
+"""Events are found where the story of the recording has them, and nowhere else."""
+
+from __future__ import annotations
+
+import math
+import random
+import sqlite3
+from typing import Any
+
+import pytest
+
+from tests.history.recording import WALL_START_S
+from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.store.history import columns
+from webots_mcp.store.history.event import EventOptions, Threshold
+from webots_mcp.store.history.events import Events, find_events
+from webots_mcp.store.history.jolts import find_jumps, find_to_and_fro
+from webots_mcp.store.history.ranges import resolve_range
+
+
+@pytest.fixture(params=["rows", "rollups"])
+def tier(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    if request.param == "rollups":
+        monkeypatch.setattr(columns.exceeds, "__defaults__", (100,))
+    return request.param
+
+
+def ask(connection: sqlite3.Connection, kind: Any, *, bounds: Any = None, **options: Any) -> Events:
+    given: dict[str, Any] = bounds or {"run_id": 1}
+    found = resolve_range(connection, **given)
+    return find_events(connection, found, EventOptions(kinds=(kind,), **options), limit=200)
+
+
+def is_unrolled(events: Events) -> bool:
+    """A long range without rollups is not searched for these, and the answer admits it."""
+    return any("not rolled up yet" in note for note in events.notes)
+
+
+def spans(events: Events) -> list[tuple[float, float]]:
+    return [(round(event.start_s, 1), round(event.end_s, 1)) for event in events.events]
+
+
+def test_a_robot_that_should_move_and_does_not_is_stuck(
+    rover: sqlite3.Connection, tier: str
+) -> None:
+    (stuck,) = ask(rover, "stuck").events
+    slack = 0.2 if tier == "rows" else 0.9
+    assert stuck.start_s == pytest.approx(40.0, abs=slack)
+    assert stuck.end_s == pytest.approx(52.0, abs=slack)
+    assert stuck.details["x_m"] == pytest.approx(8.0, abs=0.02)
+    assert stuck.details["mode"] == "cruise" and stuck.details["commanded"] == 0.2
+    assert stuck.around["mode"] == "cruise"
+    assert stuck.wall_time_s == pytest.approx(WALL_START_S + 20.0, abs=0.5)
+
+
+def test_standing_in_a_mode_that_rests_is_not_stuck(rover: sqlite3.Connection) -> None:
+    moving = ask(rover, "stuck", commanded="target", moving_modes=("back_up",), min_commanded=9.0)
+    assert moving.events == ()
+
+
+def test_mode_changes_have_their_duration(rover: sqlite3.Connection, tier: str) -> None:
+    events = ask(rover, "change", signals=("mode",)).events
+    assert [(e.start_s, e.end_s, e.details["after"]) for e in events] == [
+        (52.0, 60.0, "back_up"), (60.0, 95.0, "avoid"), (95.0, pytest.approx(119.9), "cruise"),
+    ]  # fmt: skip
+    assert events[-1].ongoing and not events[0].ongoing
+
+
+def test_a_gap_is_an_event(rover: sqlite3.Connection, tier: str) -> None:
+    assert spans(ask(rover, "gap")) == [(89.9, 95.0)]
+
+
+def test_a_silent_sensor_is_found(rover: sqlite3.Connection, tier: str) -> None:
+    events = ask(rover, "silent")
+    if is_unrolled(events):
+        return
+    assert [event.name for event in events.events] == ["sensors.front"]
+    assert spans(events) == [(100.0, 103.9)]
+
+
+def test_a_flat_signal_is_found(rover: sqlite3.Connection) -> None:
+    events = ask(rover, "flat", signals=("pose.0", "battery_v", "target"), flat_s=5.0)
+    assert [event.name for event in events.events] == ["pose.0"]
+    assert spans(events) == [(40.0, 52.0)]
+
+
+def test_a_crossed_threshold_lasts_as_long_as_it_holds(
+    rover: sqlite3.Connection, tier: str
+) -> None:
+    far = Threshold("pose.0", above=7.5, for_s=5.0)
+    assert spans(ask(rover, "threshold", thresholds=(far,))) == [(37.6, 56.9), (75.1, 119.9)]
+    never = Threshold("pose.0", above=7.5, for_s=50.0)
+    assert ask(rover, "threshold", thresholds=(never,)).events == ()
+    low = Threshold("battery_v", below=12.5)
+    assert spans(ask(rover, "threshold", thresholds=(low,))) == [(100.1, 119.9)]
+
+
+def test_a_jump_of_the_position_is_found(rover: sqlite3.Connection) -> None:
+    jumps = [e for e in ask(rover, "jump").events if e.name == "position"]
+    assert [(jump.start_s, jump.details["distance_m"]) for jump in jumps] == [
+        (110.0, pytest.approx(1.0, abs=0.05))
+    ]
+
+
+def test_a_spike_is_a_jump_there_and_back(rover: sqlite3.Connection, tier: str) -> None:
+    events = ask(rover, "jump", signals=("ir",))
+    if is_unrolled(events):
+        return
+    (jump,) = events.events[:1]
+    assert (jump.name, jump.start_s) == ("ir", 70.0)
+    assert jump.end_s == pytest.approx(70.1)
+
+
+def test_a_swinging_heading_is_an_oscillation(rover: sqlite3.Connection) -> None:
+    (swing,) = ask(rover, "oscillation").events
+    assert swing.name == "heading"
+    assert (swing.start_s, swing.end_s) == (
+        pytest.approx(60.5, abs=0.2), pytest.approx(89.5, abs=0.2),
+    )  # fmt: skip
+    assert swing.details["period_s"] == pytest.approx(2.0, rel=0.02)
+    assert swing.details["amplitude"] == pytest.approx(0.5, rel=0.05)
+
+
+def test_commands_logs_and_notices_are_on_the_same_clock(rover: sqlite3.Connection) -> None:
+    (command,) = ask(rover, "command").events
+    assert (command.name, command.start_s, command.end_s) == ("set_speed", 20.0, 20.1)
+    assert command.details["status"] == "done" and command.details["result"] == 0.2
+    logs = ask(rover, "log").events
+    assert [(log.start_s, log.name) for log in logs] == [(45.0, "warning"), (104.0, "error")]
+    (noticed,) = ask(rover, "noticed").events
+    assert (noticed.start_s, noticed.details) == (61.0, {"what": "dropped", "data": {"rows": 3}})
+    (image,) = ask(rover, "image").events
+    assert image.details["path"] == "camera/1.png"
+
+
+def test_runs_begin_and_end_in_wall_time(rover: sqlite3.Connection) -> None:
+    whole = {"wall_start": WALL_START_S - 1, "wall_end": WALL_START_S + 1000}
+    events = ask(rover, "run", bounds=whole).events
+    told = [(e.run_id, e.details["what"], e.details["reason"]) for e in events]
+    assert told == [
+        (1, "began", "start"), (1, "ended", "reset"), (2, "began", "reset"),
+        (2, "ended", "crashed"), (3, "began", "start"), (3, "ended", "finished"),
+    ]  # fmt: skip
+
+
+def test_everything_at_once_is_in_order_and_counted(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, run_id=1)
+    events = find_events(rover, found, limit=200)
+    walls = [event.wall_time_s for event in events.events]
+    assert walls == sorted(walls)
+    assert sum(events.totals.values()) == len(events.events)
+    assert events.totals["change"] == 5
+
+
+def test_a_limit_keeps_rare_kinds_and_says_what_is_left_out(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, run_id=1)
+    events = find_events(rover, found, limit=12)
+    assert len(events.events) <= 12
+    kinds = {event.kind for event in events.events}
+    assert {"stuck", "gap", "command", "run"} <= kinds
+    assert "left out" in events.notes[-1]
+
+
+def test_a_run_that_is_only_cruising_has_no_trouble(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, run_id=3)
+    events = find_events(rover, found, limit=200)
+    assert {event.kind for event in events.events} == {"run"}
+
+
+def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
+    with pytest.raises(InvalidInputError, match="kind"):
+        EventOptions(kinds=("stcuk",))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InvalidInputError, match="above or below"):
+        Threshold("ir")
+    with pytest.raises(InvalidInputError, match="stuck_s"):
+        EventOptions(stuck_s=0)
+    with pytest.raises(UnknownSignalError):
+        ask(rover, "stuck", mode="moood")
+    with pytest.raises(UnknownSignalError):
+        ask(rover, "threshold", thresholds=(Threshold("nothing", above=1.0),))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_neither_jumps_nor_swings(seed: int) -> None:
+    noise = random.Random(seed)
+    times = [0.1 * index for index in range(2000)]
+    values = [noise.gauss(0, 1) for _ in times]
+    assert find_jumps(times, values, 12.0) == []
+    assert list(find_to_and_fro(times, values, 6, 5.0)) == []
+
+
+def test_a_swing_within_a_drive_has_its_own_begin_and_end() -> None:
+    times = [0.05 * index for index in range(1200)]
+    values = [
+        0.4 * math.sin(2 * math.pi * time) if 20 <= time < 40 else 0.001 * time for time in times
+    ]
+    (swing,) = find_to_and_fro(times, values, 6, 5.0)
+    assert swing.start_s == pytest.approx(20.25, abs=0.1)
+    assert swing.end_s == pytest.approx(39.75, abs=0.1)

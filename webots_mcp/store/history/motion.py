@@ -1,0 +1,212 @@
+"""Where a robot is, whether it should move, and whether it does."""
+
+from __future__ import annotations
+
+import math
+import re
+import statistics
+from bisect import bisect_left
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+from webots_mcp.store.history.columns import Columns
+from webots_mcp.store.history.event import EventOptions
+from webots_mcp.store.history.leaves import Value
+from webots_mcp.store.history.registry import Signal
+from webots_mcp.store.history.signals import resolve_signals
+
+SETTLED_SHARE: Final = 0.2  # of stuck_m: within it of the stuck place is where it begins and ends
+
+_BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location", "")
+_AXES: Final = (("0", "1"), ("x", "y"), ("x_m", "y_m"))
+_MODE: Final = re.compile(r"(^|\.)(mode|state|behaviou?r|action|task|phase|status)$", re.IGNORECASE)
+_STILL: Final = re.compile(
+    r"idle|stop|wait|paus|hold|dock|charg|turn|rotat|spin|done|finish|init|ready|rest|stand|sleep",
+    re.IGNORECASE,
+)
+_COMMANDED: Final = re.compile(
+    r"(^|[._])(commanded|command|cmd|target_speed|speed|velocity|linear)([._](x|vx|m_s|mps|linear))*$",
+    re.IGNORECASE,
+)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The signals that tell about a robot's motion; None where there is none.
+
+    Attributes:
+        position: x and y in metres.
+        commanded: Speed that it should have.
+        mode: What it is doing.
+    """
+
+    position: tuple[Signal, Signal] | None
+    commanded: Signal | None
+    mode: Signal | None
+
+    @property
+    def signals(self) -> list[Signal]:
+        """All of them."""
+        return [*(self.position or ()), *filter(None, (self.commanded, self.mode))]
+
+
+@dataclass(frozen=True)
+class Stay:
+    """It stayed about one place although it should have moved."""
+
+    start_s: float
+    end_s: float
+    x_m: float
+    y_m: float
+    mode: Value
+    commanded: Value
+
+
+def find_motion(known: dict[str, Signal], options: EventOptions) -> Motion:
+    """Find the signals of motion: those that the options name, else by their names.
+
+    Raises:
+        UnknownSignalError: The options name a signal that does not exist.
+    """
+    named = [name for name in (*(options.position or ()), options.commanded, options.mode) if name]
+    if named:
+        resolve_signals(known, named)
+    mode = options.mode or _first(known, _MODE, ("text",))
+    commanded = options.commanded or _first(known, _COMMANDED, ("num",))
+    return Motion(
+        _position(known, options.position),
+        known[commanded] if commanded else None,
+        known[mode] if mode else None,
+    )
+
+
+def _position(
+    known: dict[str, Signal], named: tuple[str, str] | None
+) -> tuple[Signal, Signal] | None:
+    if named is not None:
+        return known[named[0]], known[named[1]]
+    for branch in _BRANCHES:
+        for x, y in _AXES if branch else _AXES[1:]:
+            names = (f"{branch}.{x}", f"{branch}.{y}") if branch else (x, y)
+            if all(name in known and known[name].is_number for name in names):
+                return known[names[0]], known[names[1]]
+    return None
+
+
+def _first(known: dict[str, Signal], name: re.Pattern[str], kinds: tuple[str, ...]) -> str | None:
+    """The shortest name that fits: `mode` before `arm.mode`."""
+    fitting = [each for each in known if name.search(each) and known[each].kind in kinds]
+    return min(fitting, key=len, default=None)
+
+
+def find_stays(columns: Columns, motion: Motion, options: EventOptions) -> list[Stay]:
+    """Stretches of at least `stuck_s` within `stuck_m`, through all of which it should move.
+
+    Should move: a commanded speed of at least `min_commanded`; where none is published, a mode in
+    which it should. Without either it is not known, and every stay counts.
+    """
+    if motion.position is None:
+        return []
+    x, y = (columns.values[signal.name] for signal in motion.position)
+    should = _should_move(columns, motion, options)
+    rows = [
+        index
+        for index in range(len(columns.times))
+        if type(x[index]) in (float, int) and type(y[index]) in (float, int)
+    ]
+    times = [columns.times[index] for index in rows]
+    places = [(float(x[index] or 0), float(y[index] or 0)) for index in rows]
+    wanted = [should[index] for index in rows]
+    return [
+        _stay(columns, motion, rows[start:end], times[start:end], places[start:end], options)
+        for start, end in _stretches(times, places, wanted, options)
+    ]
+
+
+def _should_move(columns: Columns, motion: Motion, options: EventOptions) -> list[bool]:
+    if motion.commanded is not None:
+        return [
+            isinstance(value, (int, float)) and abs(value) >= options.min_commanded
+            for value in columns.values[motion.commanded.name]
+        ]
+    if motion.mode is not None:
+        modes = columns.values[motion.mode.name]
+        moving = {mode: is_moving(mode, options) for mode in set(modes)}
+        return [moving[mode] for mode in modes]
+    return [True] * len(columns.times)
+
+
+def is_moving(mode: Value, options: EventOptions) -> bool:
+    """Whether a robot in that mode should move."""
+    if not isinstance(mode, str):
+        return False
+    if options.moving_modes is not None:
+        return mode in options.moving_modes
+    return not _STILL.search(mode)
+
+
+def _stretches(
+    times: Sequence[float],
+    places: Sequence[tuple[float, float]],
+    wanted: Sequence[bool],
+    options: EventOptions,
+) -> Iterable[tuple[int, int]]:
+    """Index ranges [start, end) in which every place is within `stuck_m` of the first.
+
+    Where the place `stuck_s` later is farther away, no stretch begins, and one look was enough.
+    """
+    start = 0
+    while start < len(times):
+        if not wanted[start]:
+            start += 1
+            continue
+        later = bisect_left(times, times[start] + options.stuck_s, start)
+        if later == len(times):
+            return
+        if math.dist(places[start], places[later]) > options.stuck_m:
+            start += 1
+            continue
+        end = start
+        while (
+            end < len(times)
+            and wanted[end]
+            and math.dist(places[start], places[end]) <= options.stuck_m
+        ):
+            end += 1
+        if times[end - 1] - times[start] >= options.stuck_s:
+            yield start, end
+            start = end
+        else:
+            start += 1
+
+
+def _stay(
+    columns: Columns,
+    motion: Motion,
+    rows: Sequence[int],
+    times: Sequence[float],
+    places: Sequence[tuple[float, float]],
+    options: EventOptions,
+) -> Stay:
+    """The place is the median; what came before and after it was reached is cut off."""
+    place = (statistics.median(x for x, _ in places), statistics.median(y for _, y in places))
+    limit_m = SETTLED_SHARE * options.stuck_m
+    settled = [index for index, each in enumerate(places) if math.dist(each, place) <= limit_m]
+    first, last = (settled[0], settled[-1]) if settled else (0, len(times) - 1)
+    middle = rows[(first + last) // 2]
+    mode = columns.values[motion.mode.name][middle] if motion.mode else None
+    commanded = columns.values[motion.commanded.name][middle] if motion.commanded else None
+    return Stay(times[first], times[last], *place, mode, commanded)
+
+
+def path_length(columns: Columns, position: tuple[Signal, Signal]) -> float:
+    """Metres travelled: the sum of the distances between rows that have a position."""
+    x, y = (columns.values[signal.name] for signal in position)
+    places = [
+        (float(a), float(b))
+        for a, b in zip(x, y, strict=True)
+        if isinstance(a, (int, float)) and isinstance(b, (int, float))
+    ]
+    return sum(math.dist(a, b) for a, b in pairwise(places))

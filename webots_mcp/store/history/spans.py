@@ -1,0 +1,174 @@
+"""Stretches in which something holds of one signal: beyond a threshold, without a value, flat.
+
+Short segments are read row by row. Of a long one the rollups tell for most buckets whether it
+holds throughout or not at all; only the buckets in between are read.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Final, Literal, Protocol
+
+from webots_mcp.store.history.columns import read_columns
+from webots_mcp.store.history.deadline import Deadline
+from webots_mcp.store.history.event import Threshold
+from webots_mcp.store.history.leaves import Value
+from webots_mcp.store.history.ranges import Segment
+from webots_mcp.store.history.registry import Signal
+from webots_mcp.store.history.rollup import BUCKET_S
+from webots_mcp.store.history.summary import Summary, usable_numbers
+from webots_mcp.store.history.tiers import Pieces
+
+MOSTLY: Final = 0.5  # who is silent or flat for longer than this share is so by nature
+
+
+@dataclass(frozen=True)
+class Span:
+    """From the first to the last row in a row in which it held.
+
+    Attributes:
+        key: What held: spans that touch are one only if it is the same.
+    """
+
+    start_s: float
+    end_s: float
+    key: Value
+    low: float | None = None
+    high: float | None = None
+
+
+Verdict = Literal["all", "none", "some"]
+
+
+class Condition(Protocol):
+    """What is looked for."""
+
+    @property
+    def lasting(self) -> bool:
+        """Whether it takes more than one row."""
+        ...
+
+    def of_row(self, value: Value) -> Value:
+        """None if it does not hold; else what holds, as a key."""
+        ...
+
+    def of_bucket(self, summary: Summary) -> Verdict:
+        """Whether it holds in all, none, or some rows of a bucket, as far as that is known."""
+        ...
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """Above or below a threshold."""
+
+    threshold: Threshold
+    lasting: bool = False
+
+    def of_row(self, value: Value) -> Value:
+        """True or None."""
+        held = value is not None and not isinstance(value, str) and self.threshold.holds(value)
+        return True if held else None
+
+    def of_bucket(self, summary: Summary) -> Verdict:
+        """From the extremes."""
+        if summary.min is None or summary.max is None:
+            return "none"
+        ends = {self.threshold.holds(summary.min), self.threshold.holds(summary.max)}
+        if ends == {False}:
+            return "none"
+        return "all" if ends == {True} and summary.present == summary.rows else "some"
+
+
+class Silent:
+    """Without a value."""
+
+    lasting = False
+
+    def of_row(self, value: Value) -> Value:
+        """True or None."""
+        return True if value is None else None
+
+    def of_bucket(self, summary: Summary) -> Verdict:
+        """From the counts."""
+        if summary.present == summary.rows:
+            return "none"
+        return "some" if summary.present else "all"
+
+
+class Flat:
+    """Exactly the same number as before."""
+
+    lasting = True
+
+    def of_row(self, value: Value) -> Value:
+        """The number."""
+        return value
+
+    def of_bucket(self, summary: Summary) -> Verdict:
+        """From the extremes; where it changed, its ends may still be flat."""
+        same = summary.min is not None and summary.min == summary.max
+        return "all" if same and summary.present == summary.rows else "some"
+
+
+def spans_in_rows(
+    times: Sequence[float], values: Sequence[Value], condition: Condition
+) -> Iterator[Span]:
+    """The spans in rows that were read."""
+    start = 0
+    for key, group in groupby(values, condition.of_row):
+        end = start + sum(1 for _ in group)
+        inside = start > 0 and end < len(values)  # else what comes before or after may be the same
+        if key is not None and not (condition.lasting and inside and end - start == 1):
+            _, held = usable_numbers(times[start:end], values[start:end])
+            low, high = min(held, default=None), max(held, default=None)
+            yield Span(times[start], times[end - 1], key, low, high)
+        start = end
+
+
+def spans_in_pieces(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signal: Signal,
+    pieces: Pieces,
+    condition: Condition,
+    deadline: Deadline,
+) -> Iterator[Span]:
+    """The spans in a long segment, bucket by bucket; one in between is read until the deadline.
+
+    Flat buckets are looked for whole; of the others only those next to one are read.
+    """
+    buckets = pieces.of(signal.name)
+    verdicts = [condition.of_bucket(summary) for _, summary in buckets]
+    for index, (bucket, summary) in enumerate(buckets):
+        verdict = verdicts[index]
+        near_whole = "all" in verdicts[max(0, index - 1) : index + 2]
+        part = _bucket_of(segment, bucket)
+        if verdict == "all":
+            key = condition.of_row(summary.last)
+            yield Span(part.start_s, part.end_s, key, summary.min, summary.max)
+        elif verdict == "some" and (near_whole or not isinstance(condition, Flat)):
+            columns = read_columns(connection, part, [signal], deadline)
+            yield from spans_in_rows(columns.times, columns.values[signal.name], condition)
+
+
+def _bucket_of(segment: Segment, bucket: int) -> Segment:
+    start_s = max(segment.start_s, bucket * BUCKET_S)
+    return replace(segment, start_s=start_s, end_s=min(segment.end_s, (bucket + 1) * BUCKET_S))
+
+
+def joined(spans: Iterable[Span], within_s: float) -> list[Span]:
+    """Spans of the same key that follow within that time are one."""
+    found: list[Span] = []
+    for span in spans:
+        last = found[-1] if found else None
+        if last is not None and last.key == span.key and span.start_s - last.end_s <= within_s:
+            lows = [each for each in (last.low, span.low) if each is not None]
+            highs = [each for each in (last.high, span.high) if each is not None]
+            low, high = min(lows, default=None), max(highs, default=None)
+            found[-1] = Span(last.start_s, span.end_s, span.key, low, high)
+        else:
+            found.append(span)
+    return found

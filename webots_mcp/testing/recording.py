@@ -183,7 +183,7 @@ class Recording:
         segment = whole_run(connection, subject.run_id)
         if segment is None:
             raise NothingRecordedError(f"{run} has no state row: was publish() called?")
-        columns = read_columns(connection, segment, signals, Deadline(connection, math.inf))
+        columns = read_columns(connection, segment, signals, Deadline(math.inf))
         return [RecordedSignal(signal.name, run, columns, self._state) for signal in signals]
 
     def _state(self, state_id: int) -> str:

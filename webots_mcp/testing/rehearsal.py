@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import Any, Final
-
-from controller.wire import Message
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.standin import InProcessSimulation, Mode, WouldBlockError
 from webots_mcp.standin.in_process import DEFAULT_WORLD
+
+if TYPE_CHECKING:
+    from controller.wire import Message
 
 HOLD_LIMIT_S: Final = 2.0
 

@@ -1,0 +1,20 @@
+"""Pictures of a recording: signals over time, and the way of a robot; PNG or SVG.
+
+matplotlib is imported with the first picture, never with this package.
+"""
+
+from webots_mcp.plotting.canvas import ImageFormat, Picture, Sheet, image_format_of
+from webots_mcp.plotting.question import PlotKind, plot
+from webots_mcp.plotting.signals import plot_signals
+from webots_mcp.plotting.trajectory import plot_trajectory
+
+__all__ = [
+    "ImageFormat",
+    "Picture",
+    "PlotKind",
+    "Sheet",
+    "image_format_of",
+    "plot",
+    "plot_signals",
+    "plot_trajectory",
+]

@@ -1,0 +1,130 @@
+"""A sheet to draw on, and the picture that it becomes.
+
+This package imports matplotlib inside its functions only: with the first picture.
+"""
+
+from __future__ import annotations
+
+import io
+import threading
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, get_args
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.plotting.palette import FAINT, INK
+
+ImageFormat = Literal["png", "svg"]
+
+WIDTH_PX: Final = 900
+HEIGHT_PX: Final = 500
+LEAST_PX: Final = 300
+MOST_PX: Final = 2000
+_DPI: Final = 100
+_LONGEST_NAME: Final = 24
+
+# A user's matplotlibrc must not change the pictures; what is recorded is text, never TeX.
+_STYLE: Final[dict[str, Any]] = {
+    "text.parse_math": False,
+    "font.size": 9.0,
+    "axes.titlesize": 9.0,
+    "axes.labelsize": 9.0,
+    "legend.fontsize": 8.0,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "text.color": INK,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": FAINT,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.formatter.limits": (-4, 5),
+    "legend.frameon": False,
+    "legend.handlelength": 1.6,
+    "svg.hashsalt": "webots-mcp",
+    "svg.fonttype": "none",  # text stays text: smaller, and it can be searched
+}
+_drawing = threading.Lock()  # matplotlib's settings and fonts belong to the process
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A finished picture.
+
+    Attributes:
+        data: The file's content.
+        media_type: `image/png` or `image/svg+xml`.
+        caption: What it shows, in one line.
+        notes: What is not in it, or what its reader should know.
+    """
+
+    data: bytes
+    media_type: str
+    caption: str
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """The form of a picture: its size in pixels (an SVG has 100 to the inch) and its format."""
+
+    width_px: int = WIDTH_PX
+    height_px: int = HEIGHT_PX
+    image_format: ImageFormat = "png"
+
+    def __post_init__(self) -> None:
+        for name, value in (("width_px", self.width_px), ("height_px", self.height_px)):
+            if not LEAST_PX <= value <= MOST_PX:
+                raise InvalidInputError(f"{name}={value} must be from {LEAST_PX} to {MOST_PX}")
+        if self.image_format not in get_args(ImageFormat):
+            known = " or ".join(get_args(ImageFormat))
+            raise InvalidInputError(f"a picture can be {known}, not {self.image_format!r}")
+
+
+def draw(sheet: Sheet, paint: Callable[[Any], None]) -> bytes:
+    """The content of the file that `paint` makes of an empty matplotlib `Figure`."""
+    from matplotlib import style  # 0.5 s and more, at the first picture
+    from matplotlib.figure import Figure
+
+    buffer = io.BytesIO()
+    size = (sheet.width_px / _DPI, sheet.height_px / _DPI)
+    with _drawing, style.context(["default", _STYLE]), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a box stands there
+        figure: Any = Figure(figsize=size, dpi=_DPI, layout="constrained")
+        paint(figure)
+        figure.savefig(buffer, format=sheet.image_format, metadata=_metadata(sheet))
+    return buffer.getvalue()
+
+
+def _metadata(sheet: Sheet) -> dict[str, str | None]:
+    """Without the date, the same recording gives the same file."""
+    return {"Date": None} if sheet.image_format == "svg" else {}
+
+
+def image_format_of(file: Path) -> ImageFormat:
+    """The format that a file's name asks for.
+
+    Raises:
+        InvalidInputError: Its suffix is neither .png nor .svg.
+    """
+    suffix = file.suffix.lower().removeprefix(".")
+    for known in get_args(ImageFormat):
+        if suffix == known:
+            return known
+    raise InvalidInputError(f"{file.name!r} is no picture's name: end it in .png or .svg")
+
+
+def media_type(sheet: Sheet) -> str:
+    """The media type of the sheet's format."""
+    return "image/svg+xml" if sheet.image_format == "svg" else "image/png"
+
+
+def short(name: str) -> str:
+    """A name that fits a legend, in one line: of a long one the end, which tells more."""
+    line = " ".join(name.split())
+    line = line if len(line) <= _LONGEST_NAME else f"…{line[1 - _LONGEST_NAME :]}"
+    return f" {line}" if line.startswith("_") else line  # matplotlib hides labels in "_"

@@ -1,0 +1,55 @@
+"""Events as spans: what is marked in a picture."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from typing import Final
+
+from webots_mcp.plotting.parts import Part
+from webots_mcp.plotting.spans import Lane, Span
+from webots_mcp.store.history.event import Event, EventOptions, Kind
+from webots_mcp.store.history.events import Events, find_events
+
+MOST_EVENTS: Final = 500
+MOST_LANES: Final = 5
+# What a person would look for first. Changes and gaps are drawn otherwise.
+_KINDS: Final[tuple[Kind, ...]] = (
+    "stuck", "jump", "silent", "oscillation", "log", "command", "noticed", "flat",
+)  # fmt: skip
+
+
+def event_lanes(
+    connection: sqlite3.Connection, part: Part, names: Sequence[str]
+) -> tuple[list[Lane], list[str]]:
+    """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole."""
+    options = EventOptions(kinds=_KINDS, signals=tuple(names))
+    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=())
+    kinds: list[str] = [
+        kind for kind in _KINDS if any(event.kind == kind for event in found.events)
+    ]
+    lanes = [_lane(kind, found, part) for kind in kinds[:MOST_LANES]]
+    notes = [note for note in found.notes if note not in part.notes]
+    if left_out := kinds[MOST_LANES:]:
+        notes.append(f"events left out: {', '.join(left_out)}")
+    return lanes, notes
+
+
+def _lane(kind: str, found: Events, part: Part) -> Lane:
+    events = sorted((e for e in found.events if e.kind == kind), key=lambda event: event.start_s)
+    spans = [_span(event).moved(part.origin_s) for event in events]
+    return Lane(kind, spans, ())
+
+
+def _span(event: Event) -> Span:
+    """Named by what it is about: the signal, the action, the level, or what the bridge noticed."""
+    what = event.details.get("what") if event.kind == "noticed" else event.name
+    return Span(str(what or ""), event.start_s, event.end_s)
+
+
+def stuck_mark(connection: sqlite3.Connection, part: Part, position: tuple[str, str]) -> Lane:
+    """When the robot was stuck."""
+    options = EventOptions(kinds=("stuck",), signals=position, position=position)
+    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=())
+    spans = [Span("stuck", event.start_s, event.end_s) for event in found.events]
+    return Lane(f"stuck over {options.stuck_s:g} s", spans, ())

@@ -1,0 +1,37 @@
+"""Colours that people with any kind of colour vision can tell apart.
+
+Lines and marks: M. Okabe, K. Ito, "Color Universal Design" (2008), without the yellow, which is
+too light for a line on white. Areas: P. Tol, "Colour Schemes", SRON/EPS/TN/09-002 (2021), the
+scheme "light", made for the background of labels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+from zlib import crc32
+
+LINES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+DASHES: Final = ("-", (0, (5, 1.5)), (0, (1.5, 1.2)), (0, (5, 1.5, 1.5, 1.5)))
+AREAS: Final = (
+    "#77AADD", "#EE8866", "#44BB99", "#EEDD88", "#FFAABB", "#AAAA00", "#99DDFF", "#BBCC33",
+)  # fmt: skip
+_FIRST_CHOICE: Final = 4  # of the areas; the others are each close to one of these
+OTHER: Final = "#DDDDDD"  # for what there are too many kinds of
+INK: Final = "#333333"
+FAINT: Final = "#767676"  # the lightest grey that is readable as text on white
+
+
+def area_colours(values: Iterable[str]) -> dict[str, str]:
+    """A colour for each value, from the ninth value on the same grey.
+
+    The colour hangs on the value's own text, so that "cruise" looks alike in every picture, unless
+    another value in the same one has taken it.
+    """
+    colours: dict[str, str] = {}
+    for value in sorted(set(values)):
+        first = crc32(value.encode()) % _FIRST_CHOICE
+        order = (*AREAS[first:_FIRST_CHOICE], *AREAS[:first], *AREAS[_FIRST_CHOICE:])
+        free = (colour for colour in order if colour not in colours.values())
+        colours[value] = next(free, OTHER)
+    return colours

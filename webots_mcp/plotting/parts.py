@@ -1,0 +1,146 @@
+"""What a picture is about: the runs in its ranges, each with what was recorded in it."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.plotting.canvas import short
+from webots_mcp.store.history.event import EventOptions
+from webots_mcp.store.history.motion import find_motion
+from webots_mcp.store.history.ranges import TimeRange, recorded_bounds
+from webots_mcp.store.history.registry import Signal
+from webots_mcp.store.history.series import RunHistory, query_history, signals_of
+from webots_mcp.store.history.signals import resolve_signals
+
+Known = dict[str, Signal]
+
+MOST_RUNS: Final = 4  # more lines of each signal could not be told apart
+_POINTS: Final = 260  # of 3 pixels each: narrower, and the band hides behind the line
+_LABEL: Final = "SELECT label FROM run WHERE id = ?"
+
+
+@dataclass(frozen=True)
+class Part:
+    """One run of a picture.
+
+    Attributes:
+        range: The run's part of what was asked for.
+        name: "run 3", with its label where it has one.
+        start_s: The first moment that was recorded and asked for; `end_s` the last one.
+        origin_s: The simulation time that is drawn as 0.
+    """
+
+    range: TimeRange
+    name: str
+    run: RunHistory
+    start_s: float
+    end_s: float
+    origin_s: float
+
+    @property
+    def robot(self) -> str:
+        """Whose run it is."""
+        return self.range.robot
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Where the range reaches outside the recording."""
+        return self.range.notes
+
+
+def parts_of(
+    connection: sqlite3.Connection, ranges: Sequence[TimeRange], names: Sequence[str]
+) -> list[Part]:
+    """Read the signals of each run in the ranges; several runs begin at 0 each.
+
+    Raises:
+        UnknownSignalError: A name meets nothing.
+        InvalidInputError: No name is given, or there are more than four runs.
+        NothingRecordedError: There is no row in the ranges.
+    """
+    count = sum(len(each.segments) for each in ranges)
+    if count > MOST_RUNS:
+        raise InvalidInputError(
+            f"the range holds {count} runs, and at most {MOST_RUNS} can be laid over each other: "
+            "name them by their ids"
+        )
+    parts: list[Part] = []
+    for each in ranges:
+        history = query_history(connection, each, names, max_points=_POINTS)
+        for segment, run in zip(each.segments, history.runs, strict=True):
+            alone = replace(each, segments=(segment,))
+            parts.append(_part(connection, alone, run, count > 1))
+    if not parts:
+        raise NothingRecordedError("; ".join(note for each in ranges for note in each.notes))
+    return parts
+
+
+def _part(
+    connection: sqlite3.Connection, time_range: TimeRange, run: RunHistory, overlaid: bool
+) -> Part:
+    first_s, newest_s = recorded_bounds(connection, run.run_id) or (run.start_s, run.end_s)
+    label = connection.execute(_LABEL, (run.run_id,)).fetchone()[0]
+    name = f"run {run.run_id}" + (f" “{short(label)}”" if label else "")
+    start_s, end_s = max(run.start_s, first_s), min(run.end_s, newest_s)
+    origin_s = first_s if overlaid else 0.0
+    return Part(time_range, name, run, start_s, end_s, origin_s)
+
+
+def title_of(parts: Sequence[Part]) -> str:
+    """Robots, runs and the stretch of time."""
+    robots = " and ".join(dict.fromkeys(part.robot for part in parts))
+    if len(parts) > 1:
+        return f"{robots}: {', '.join(part.name for part in parts)}"
+    (part,) = parts
+    return f"{robots}, {part.name}, {_seconds(part.start_s)} to {_seconds(part.end_s)} s"
+
+
+def _seconds(time_s: float) -> str:
+    return f"{time_s:.2f}".rstrip("0").rstrip(".")
+
+
+def known_signals(connection: sqlite3.Connection, ranges: Sequence[TimeRange]) -> Known:
+    """All signals of the robot of the last range, by name.
+
+    Raises:
+        NothingRecordedError: No range is given.
+        UnknownSignalError: No signal has been recorded.
+    """
+    if not ranges:
+        raise NothingRecordedError("no run is given: there is nothing to draw")
+    return {signal.name: signal for signal in signals_of(connection, ranges[-1], ["*"])}
+
+
+def mode_signal(known: Known, wanted: str | None) -> str | None:
+    """The text signal that colours a picture: the one wanted, else one that is named like a mode.
+
+    Raises:
+        UnknownSignalError: There is none of the wanted name.
+        InvalidInputError: The wanted signal holds numbers.
+    """
+    if wanted == "":
+        return None
+    if wanted is None:
+        mode = find_motion(known, EventOptions()).mode
+        return mode.name if mode else None
+    signal = one_signal(known, wanted)
+    if signal.is_number:
+        raise InvalidInputError(f"{wanted!r} holds numbers: a text or a flag colours a picture")
+    return signal.name
+
+
+def one_signal(known: Known, name: str) -> Signal:
+    """The one signal that a name means.
+
+    Raises:
+        UnknownSignalError: There is none.
+        InvalidInputError: There are several.
+    """
+    signal, *more = resolve_signals(known, [name])
+    if more:
+        raise InvalidInputError(f"{name!r} means {len(more) + 1} signals: name one of them")
+    return signal

@@ -1,0 +1,196 @@
+"""Signals over time as a picture: of one run, or of several laid over each other."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Final
+
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.plotting.canvas import LEAST_PX, Picture, Sheet, draw, media_type
+from webots_mcp.plotting.curves import Curve, curve_of
+from webots_mcp.plotting.marks import event_lanes
+from webots_mcp.plotting.panels import MOST_PANELS, by_scale, by_signal
+from webots_mcp.plotting.parts import Part, known_signals, mode_signal, parts_of, title_of
+from webots_mcp.plotting.spans import Lane, Span, lane_of
+from webots_mcp.plotting.timeline import Timeline, paint_timeline
+from webots_mcp.store.history.ranges import TimeRange
+
+MOST_LANES: Final = 4
+_SHOWN_NAMES: Final = 10
+
+
+def plot_signals(
+    connection: sqlite3.Connection,
+    ranges: Sequence[TimeRange],
+    names: Sequence[str],
+    *,
+    bands: str | None = None,
+    events: bool = True,
+    sheet: Sheet | None = None,
+) -> Picture:
+    """Numbers as a mean line in a min-max band, a mode behind them, flags and events below.
+
+    Signals whose units or scales do not fit one axis get panels of their own, at most three.
+    Where several runs are given they are laid over each other, each beginning at 0.
+
+    Args:
+        connection: Any.
+        ranges: From `resolve_range`; each run in them counts, four at most.
+        names: Signals, with `*`.
+        bands: The text signal behind the curves; None for the mode, where there is one; "" for
+            none. Of several runs it is drawn below, once per run.
+        events: Whether to mark what `find_events` finds; of several runs nothing is marked.
+        sheet: Size and format; None for a PNG of 900 x 500 pixels.
+
+    Raises:
+        UnknownSignalError: A name meets nothing; the text offers near ones.
+        InvalidInputError: `bands` is no text signal, or there are too many runs.
+        NothingRecordedError: None of the signals has a value in the range.
+    """
+    sheet = sheet or Sheet()
+    timeline, notes = compose_timeline(connection, ranges, names, bands=bands, events=events)
+    if not timeline.panels:
+        rows = len(timeline.lanes) + len(timeline.events)
+        sheet = replace(sheet, height_px=_height_of_rows(rows, sheet))
+    data = draw(sheet, partial(paint_timeline, timeline=timeline))
+    return Picture(data, media_type(sheet), _caption(timeline), notes)
+
+
+def compose_timeline(
+    connection: sqlite3.Connection,
+    ranges: Sequence[TimeRange],
+    names: Sequence[str],
+    *,
+    bands: str | None = None,
+    events: bool = True,
+) -> tuple[Timeline, tuple[str, ...]]:
+    """What `plot_signals` paints, and its notes; arguments and errors as there."""
+    mode = mode_signal(known_signals(connection, ranges), bands)
+    parts = parts_of(connection, ranges, [*names, *([mode] if mode else [])])
+    overlaid = len(parts) > 1
+    curves = [curve for part in parts for curve in _curves(part)]
+    panels, left_out = by_signal(curves) if overlaid else by_scale(curves)
+    behind, below = _behind_and_below(parts, mode if panels else None)
+    if not panels and not below:
+        raise NothingRecordedError(_nothing(parts))
+    marked, event_notes = ([], [])
+    if events and not overlaid:
+        drawn = [name for panel in panels for name in panel.names] or names
+        marked, event_notes = event_lanes(connection, parts[0], drawn)
+    left_out += [lane.name for lane in below[MOST_LANES:]]
+    timeline = Timeline(
+        title=title_of(parts),
+        x_label=_x_label(parts),
+        x_range=_x_range(parts),
+        panels=panels,
+        colour_by_run={part.run.run_id: part.name for part in parts} if overlaid else {},
+        bands=behind,
+        lanes=below[:MOST_LANES],
+        events=marked,
+        gaps=() if overlaid else _gaps(parts[0]),
+    )
+    return timeline, (*_notes(parts, curves), *event_notes, *_left_out(left_out))
+
+
+def _curves(part: Part) -> list[Curve]:
+    made = (curve_of(columns, part.run, part.origin_s) for columns in part.run.numbers)
+    return [curve for curve in made if curve is not None]
+
+
+def _behind_and_below(parts: Sequence[Part], mode: str | None) -> tuple[Lane | None, list[Lane]]:
+    """The mode of a single run stands behind the curves, all else in rows below."""
+    overlaid = len(parts) > 1
+    lanes = [lane for part in parts for lane in _lanes(part, overlaid)]
+    behind = next((lane for lane in lanes if lane.name == mode and not overlaid), None)
+    return behind, [lane for lane in lanes if lane is not behind]
+
+
+def _lanes(part: Part, overlaid: bool) -> list[Lane]:
+    lanes = [lane_of(columns, part.run, part.end_s) for columns in part.run.changes]
+    of_run = f", {part.name}" if overlaid else ""
+    return [
+        Lane(lane.name + of_run, [span.moved(part.origin_s) for span in lane.spans], lane.values)
+        for lane in lanes
+        if lane.spans
+    ]
+
+
+def _gaps(part: Part) -> list[Span]:
+    return [Span("", gap.start_s, gap.end_s).moved(part.origin_s) for gap in part.run.gaps]
+
+
+def _height_of_rows(rows: int, sheet: Sheet) -> int:
+    """Rows of spans alone need no more."""
+    return min(sheet.height_px, max(LEAST_PX, 130 + 50 * rows))
+
+
+def _x_range(parts: Sequence[Part]) -> tuple[float, float]:
+    start_s = min(part.start_s - part.origin_s for part in parts)
+    end_s = max(part.end_s - part.origin_s for part in parts)
+    return (start_s, end_s) if end_s > start_s else (start_s - 0.5, start_s + 0.5)
+
+
+def _x_label(parts: Sequence[Part]) -> str:
+    clock = "simulation time [s]" if len(parts) == 1 else "time since the start of the run [s]"
+    steps = {part.run.step_s for part in parts if part.run.numbers}
+    if len(steps) != 1 or None in steps:
+        return clock
+    return f"{clock}      line: mean, band: minimum to maximum of every {steps.pop():g} s"
+
+
+def _caption(timeline: Timeline) -> str:
+    shown = [name for panel in timeline.panels for name in panel.names]
+    below = [lane.name for lane in timeline.lanes]
+    behind = f" over {timeline.bands.name}" if timeline.bands else ""
+    return f"{timeline.title}: {', '.join([*shown, *below])}{behind}"
+
+
+def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
+    notes = [note for part in parts for note in part.notes]
+    drawn = {(curve.run_id, curve.name) for curve in curves}
+    for part in parts:
+        silent = [c.name for c in part.run.numbers if (part.run.run_id, c.name) not in drawn]
+        if silent:
+            notes.append(f"without a value in {part.name}: {_listed(silent)}")
+        if part.run.cut_at_s is not None:
+            notes.append(
+                f"{part.name} is drawn up to {part.run.cut_at_s:g} s only: it took too long"
+            )
+        notes += [
+            f"of {columns.total} changes of {columns.name} only the newest are shown"
+            for columns in part.run.changes
+            if columns.total > len(columns.points)
+        ]
+        notes += [
+            f"{columns.name} in {part.name} was {_counted(columns.odd)}: not drawn"
+            for columns in part.run.numbers
+            if columns.odd
+        ]
+    return list(dict.fromkeys(notes))
+
+
+def _counted(odd: dict[str, int]) -> str:
+    return ", ".join(f"{value} {count} times" for value, count in odd.items())
+
+
+def _left_out(names: Sequence[str]) -> list[str]:
+    if not names:
+        return []
+    why = f"a picture has at most {MOST_PANELS} panels and {MOST_LANES} rows"
+    return [f"left out: {_listed(names)} ({why}); ask for them alone"]
+
+
+def _listed(names: Sequence[str]) -> str:
+    unlike = list(dict.fromkeys(names))
+    more = len(unlike) - _SHOWN_NAMES
+    return ", ".join(unlike[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")
+
+
+def _nothing(parts: Sequence[Part]) -> str:
+    notes = "; ".join(note for part in parts for note in part.notes)
+    return f"nothing to draw: none of the signals has a value in {title_of(parts)}" + (
+        f" ({notes})" if notes else ""
+    )

@@ -1,0 +1,138 @@
+"""Where robots went as a picture: of one run, or of several laid over each other."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from functools import partial
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.plotting.canvas import Picture, Sheet, draw, media_type
+from webots_mcp.plotting.ground import Ground, Track, paint_ground
+from webots_mcp.plotting.marks import stuck_mark
+from webots_mcp.plotting.parts import (
+    Known,
+    Part,
+    known_signals,
+    mode_signal,
+    one_signal,
+    parts_of,
+    title_of,
+)
+from webots_mcp.plotting.path import read_path
+from webots_mcp.plotting.spans import Lane, lane_of
+from webots_mcp.store.history.event import EventOptions
+from webots_mcp.store.history.motion import find_motion
+from webots_mcp.store.history.ranges import TimeRange
+from webots_mcp.store.history.registry import Signal
+
+_FLAGS: Final = ("bumper", "collision", "collided", "contact", "touching", "stuck")
+
+
+def plot_trajectory(
+    connection: sqlite3.Connection,
+    ranges: Sequence[TimeRange],
+    position: tuple[str, str] | None = None,
+    *,
+    bands: str | None = None,
+    events: bool = True,
+    sheet: Sheet | None = None,
+) -> Picture:
+    """The way of the robot in the plane, with start, end, direction, and where it got into trouble.
+
+    Args:
+        connection: Any.
+        ranges: From `resolve_range`; each run in them counts, four at most.
+        position: The signals to the right and upwards; None finds them by their names.
+        bands: The text signal that colours the way; None for the mode, where there is one; ""
+            for the time. Of several runs each has its own colour.
+        events: Whether to mark where it was stuck and where a bumper or the like was true.
+        sheet: Size and format; None for a PNG of 900 x 500 pixels.
+
+    Raises:
+        UnknownSignalError: A name meets nothing; the text offers near ones.
+        InvalidInputError: A signal of the position is no number, or there are too many runs.
+        NothingRecordedError: No position was recorded in the range.
+    """
+    sheet = sheet or Sheet()
+    ground, notes = compose_ground(connection, ranges, position, bands=bands, events=events)
+    data = draw(sheet, partial(paint_ground, ground=ground))
+    caption = f"{ground.title}: {ground.y_label} over {ground.x_label}"
+    return Picture(data, media_type(sheet), caption, notes)
+
+
+def compose_ground(
+    connection: sqlite3.Connection,
+    ranges: Sequence[TimeRange],
+    position: tuple[str, str] | None = None,
+    *,
+    bands: str | None = None,
+    events: bool = True,
+) -> tuple[Ground, tuple[str, ...]]:
+    """What `plot_trajectory` paints, and its notes; arguments and errors as there."""
+    known = known_signals(connection, ranges)
+    x, y = _position(known, position)
+    mode = mode_signal(known, bands)
+    flags = _flags(known) if events else []
+    names = [x.name, y.name, *([mode] if mode else []), *flags]
+    parts = parts_of(connection, ranges, names)
+    tracks: list[Track] = []
+    for part in parts:
+        modes = _lane(part, mode) if len(parts) == 1 else None
+        marks = [_flagged(part, flag) for flag in flags]
+        if events:
+            marks.insert(0, stuck_mark(connection, part, (x.name, y.name)))
+        tracks.append(Track(part.name, read_path(connection, part.range, x, y), modes, marks))
+    if not any(track.path.places for track in tracks):
+        raise NothingRecordedError(f"{x.name} and {y.name} have no values in {title_of(parts)}")
+    return Ground(title_of(parts), _label(x), _label(y), tracks, mode), _notes(parts, tracks)
+
+
+def _position(known: Known, named: tuple[str, str] | None) -> tuple[Signal, Signal]:
+    if named is not None:
+        return _number(known, named[0]), _number(known, named[1])
+    position = find_motion(known, EventOptions()).position
+    if position is None:
+        raise InvalidInputError(
+            f"no position was found among the {len(known)} signals: name its two signals, x and y "
+            "(webots_list_signals lists them)"
+        )
+    return position
+
+
+def _number(known: Known, name: str) -> Signal:
+    signal = one_signal(known, name)
+    if not signal.is_number:
+        raise InvalidInputError(f"{name!r} holds no numbers: it cannot be a position")
+    return signal
+
+
+def _flags(known: Known) -> list[str]:
+    flags = [name for name in known if known[name].kind == "bool"]
+    return [name for name in flags if any(flag in name.lower() for flag in _FLAGS)]
+
+
+def _lane(part: Part, name: str | None) -> Lane | None:
+    found = (columns for columns in part.run.changes if columns.name == name)
+    lanes = (lane_of(columns, part.run, part.end_s) for columns in found)
+    return next(lanes, None)
+
+
+def _flagged(part: Part, flag: str) -> Lane:
+    lane = _lane(part, flag)
+    return Lane(flag, [span for span in lane.spans if span.value == "true"] if lane else [], ())
+
+
+def _label(signal: Signal) -> str:
+    return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
+
+
+def _notes(parts: Sequence[Part], tracks: Sequence[Track]) -> tuple[str, ...]:
+    notes = [note for part in parts for note in part.notes]
+    notes += [
+        f"{track.name}: one place every {track.path.step_s:g} s (too many rows to draw each)"
+        for track in tracks
+        if track.path.step_s is not None
+    ]
+    return tuple(dict.fromkeys(notes))

@@ -12,7 +12,6 @@ import pytest
 from PIL import Image
 
 from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
-from tests.server.test_surface import READING
 from tests.store.recorded import Recorded
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.contract import SCHEMA_VERSION
@@ -23,7 +22,15 @@ pytestmark = pytest.mark.anyio
 
 DEFAULT_LIMIT = 8_000  # characters: about 2,000 tokens
 FULL_LIMIT = 22_000
-DATA_TOOLS = sorted(READING - {"webots_get_camera", "webots_monitor"})
+DATA_TOOLS = (
+    "webots_list_robots",
+    "webots_get_world_info",
+    "webots_get_robot_state",
+    "webots_get_sensors",
+    "webots_get_full_state",
+    "webots_get_logs",
+    "webots_list_commands",
+)
 
 
 async def test_every_answer_names_robot_run_time_age_and_status(

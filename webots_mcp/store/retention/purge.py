@@ -21,6 +21,7 @@ from webots_mcp.store.retention.planning import OLD_COMMANDS, Plan, Step, plan
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
 
 BATCH_ROWS: Final = 500
+ROLLED_ROWS: Final = 100  # a batch of rolling up holds the lock longer than one of deleting
 BATCH_FILES: Final = 50
 BATCH_PAGES: Final = 200
 PAUSE_S: Final = 0.05
@@ -152,7 +153,7 @@ class _Purge:
             if not keys:
                 return  # another has deleted them
             if step.table == "state" and keys[-1][0] > watermark(self._connection):
-                roll(self._connection, BATCH_ROWS)
+                roll(self._connection, ROLLED_ROWS)
             elif self._exclusively(lambda step=step, keys=keys: self._delete(step, keys)):
                 left -= len(keys)
             yield self.purged

@@ -1,0 +1,180 @@
+"""The rows of a range, flattened: one value per dotted name."""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal, NamedTuple, cast
+
+from webots_mcp.store.history.leaves import LONGEST_SPREAD_ARRAY, parse
+from webots_mcp.store.history.ranges import Segment
+from webots_mcp.store.states import put_back
+
+Progress = Callable[[int, int], object]
+ColumnKind = Literal["null", "bool", "int", "num", "text", "numbers"]
+
+HEAD: Final = ("run_id", "state_id", "sim_time_s", "wall_time_s")
+RESERVED: Final = frozenset((*HEAD, "odd"))
+CHUNK_ROWS: Final = 2000  # read in one short transaction each: no checkpoint waits for an export
+
+_IN_SEGMENT: Final = (
+    "FROM state WHERE run_id = :run_id AND sim_time_s >= :start_s AND sim_time_s < :end_s "
+    "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s AND id <= :last_id"
+)
+_CHUNK: Final = (
+    f"SELECT id, sim_time_s, wall_time_s, data, odd {_IN_SEGMENT} "
+    "AND (sim_time_s > :start_s OR id > :after_id) ORDER BY sim_time_s, id LIMIT :limit"
+)
+_COUNT: Final = "SELECT count(*) FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
+_LAST_ID: Final = "SELECT coalesce(max(id), 0) FROM state"
+_NOT_FINITE: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+_LARGEST_INT: Final = 2**63 - 1
+_PLAIN_KINDS: Final[dict[type[object], ColumnKind]] = {
+    float: "num", str: "text", bool: "bool", type(None): "null",
+}  # fmt: skip
+
+
+class Row(NamedTuple):
+    """A state row.
+
+    Attributes:
+        head: Run, id, simulation time, wall time; as `HEAD` names them.
+        values: By dotted name. What was not finite is so again; an array of more than 16 items
+            is one value.
+        odd: Path of every value that JSON could not hold, and what it was.
+    """
+
+    head: tuple[int, int, float, float]
+    values: dict[str, Any]
+    odd: dict[str, str]
+
+
+class Column(NamedTuple):
+    """A dotted name, and what its values are: "text" also where they are of several kinds."""
+
+    name: str
+    kind: ColumnKind
+
+
+@dataclass(frozen=True)
+class Source:
+    """The rows that were there when the export began; they can be read more than once.
+
+    Attributes:
+        passes: How often they will be read, so that progress can be told.
+    """
+
+    connection: sqlite3.Connection
+    segments: Sequence[Segment]
+    last_id: int
+    total: int
+    passes: int
+    progress: Progress | None = None
+
+    @classmethod
+    def of(
+        cls,
+        connection: sqlite3.Connection,
+        segments: Sequence[Segment],
+        passes: int,
+        progress: Progress | None,
+    ) -> Source:
+        """The rows that these segments have now; ids are given in the order of writing."""
+        last_id = int(connection.execute(_LAST_ID).fetchone()[0])
+        bounds = [(part.run_id, part.start_s, part.end_s) for part in segments]
+        total = sum(connection.execute(_COUNT, bound).fetchone()[0] for bound in bounds)
+        return cls(connection, segments, last_id, total, passes, progress)
+
+    def rows(self, pass_number: int = 1) -> Iterator[Row]:
+        """All of them, run by run, in the order of simulation time."""
+        done = (pass_number - 1) * self.total
+        for segment in self.segments:
+            for chunk in self._chunks(segment):
+                for state_id, sim_time_s, wall_time_s, data, odd in chunk:
+                    head = (segment.run_id, state_id, sim_time_s, wall_time_s)
+                    yield _row(head, data, odd)
+                done += len(chunk)
+                if self.progress is not None:
+                    self.progress(done, self.total * self.passes)
+
+    def columns(self) -> list[Column]:
+        """What the rows hold, in the order in which it first appears; this reads all of them."""
+        kinds: dict[str, ColumnKind] = {}
+        for row in self.rows():
+            for name, value in row.values.items():
+                seen = _PLAIN_KINDS.get(cast("type[object]", type(value))) or _kind(value)
+                if kinds.get(name) != seen:
+                    kinds[name] = _widened(kinds.get(name, seen), seen)
+        return [Column(name, kind) for name, kind in kinds.items()]
+
+    def _chunks(self, segment: Segment) -> Iterator[list[Any]]:
+        values: dict[str, Any] = {
+            "run_id": segment.run_id, "start_s": segment.start_s, "end_s": segment.end_s,
+            "wall_start_s": segment.wall_start_s, "wall_end_s": segment.wall_end_s,
+            "last_id": self.last_id, "after_id": 0, "limit": CHUNK_ROWS,
+        }  # fmt: skip
+        while chunk := self.connection.execute(_CHUNK, values).fetchall():
+            yield chunk
+            values["after_id"], values["start_s"] = chunk[-1][:2]
+
+
+def _row(head: tuple[int, int, float, float], data: str, odd_text: str | None) -> Row:
+    state = parse(data)
+    odd = cast("dict[str, str]", json.loads(odd_text)) if odd_text else {}
+    for path, kind in odd.items():
+        if kind in _NOT_FINITE:
+            put_back(state, path.split("."), _NOT_FINITE[kind])
+    values: dict[str, Any] = {}
+    _spread("", state.items(), values)
+    for name in RESERVED.intersection(values):
+        values[f"state.{name}"] = values.pop(name)
+    return Row(head, values, odd)
+
+
+def _spread(prefix: str, items: Iterable[tuple[str, Any]], values: dict[str, Any]) -> None:
+    """As `leaves.flatten`, with which it shares the names; but a long array stays as it is."""
+    for key, value in items:
+        name = prefix + key
+        kind = cast("type[object]", type(value))
+        if kind is dict:
+            _spread(f"{name}.", value.items(), values)
+        elif kind is list and len(value) <= LONGEST_SPREAD_ARRAY:
+            _spread(f"{name}.", ((str(i), item) for i, item in enumerate(value)), values)
+        elif name not in values:
+            values[name] = value
+
+
+def _kind(value: object) -> ColumnKind:
+    if isinstance(value, int):
+        return "int" if abs(value) <= _LARGEST_INT else "text"
+    return "numbers" if _is_numbers(cast("list[Any]", value)) else "text"
+
+
+def _is_numbers(items: list[Any]) -> bool:
+    return all(
+        type(item) is float or (type(item) is int and abs(item) <= _LARGEST_INT) for item in items
+    )
+
+
+def _widened(known: ColumnKind, seen: ColumnKind) -> ColumnKind:
+    """The kind of a column that was `known` when such a value comes."""
+    if known == seen:
+        return known
+    if "null" in (known, seen):
+        return seen if known == "null" else known
+    return "num" if {known, seen} == {"int", "num"} else "text"
+
+
+def as_text(value: object) -> str | None:
+    """A value in a cell of text: numbers in the shortest form that reads back as the same."""
+    if value is None or isinstance(value, str):
+        return value
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return repr(value) if isinstance(value, (int, float)) else _compact(value)
+
+
+_compact: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).encode

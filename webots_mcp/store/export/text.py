@@ -1,0 +1,63 @@
+"""Rows as CSV and as JSON lines."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from typing import Any, BinaryIO, Final
+
+from webots_mcp.store.export.rows import HEAD, Source, as_text
+
+_SPELLED: Final = ("bool", "text", "numbers")
+_encode: Final = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
+
+
+def write_csv(source: Source, sink: BinaryIO) -> None:
+    """One line per row under a line of column names; UTF-8, lines end as in RFC 4180.
+
+    What a row lacks, or is null, is empty; flags are `true` and `false`; what was not finite is
+    `nan`, `inf` or `-inf`; a long array is its JSON text.
+    """
+    columns = source.columns()
+    names = [column.name for column in columns]
+    # The writer itself turns numbers into text, and null into nothing.
+    spelled = [i for i, column in enumerate(columns, len(HEAD)) if column.kind in _SPELLED]
+    text = io.TextIOWrapper(sink, "utf-8", newline="")
+    writer = csv.writer(text)
+    writer.writerow((*HEAD, *names))
+    for row in source.rows(pass_number=2):
+        cells: list[object] = [*row.head, *map(row.values.get, names)]
+        for i in spelled:
+            cells[i] = as_text(cells[i])
+        writer.writerow(cells)
+    text.detach()
+
+
+def write_json_lines(source: Source, sink: BinaryIO) -> None:
+    """One JSON object per row and line: what it holds by dotted name, null where it is not finite.
+
+    `odd`, where a row has it, names the path of every value that JSON cannot hold, and what it was.
+    """
+    for row in source.rows():
+        line: dict[str, Any] = dict(zip(HEAD, row.head, strict=True)) | row.values
+        if row.odd:
+            line["odd"] = row.odd
+        sink.write(_line(line))
+
+
+def _line(line: dict[str, Any]) -> bytes:
+    try:
+        text = _encode(line)
+    except ValueError:
+        text = _encode(_finite(line))
+    return f"{text}\n".encode()
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
+    return [_finite(item) for item in value] if isinstance(value, list) else value  # pyright: ignore[reportUnknownVariableType]

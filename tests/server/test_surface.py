@@ -28,6 +28,9 @@ READING = {
     "webots_list_signals",
     "webots_query_history",
     "webots_get_trends",
+    "webots_find_events",
+    "webots_get_timeline",
+    "webots_plot",
 }
 ACTING = {
     "webots_take_screenshot",

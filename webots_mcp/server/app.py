@@ -16,12 +16,15 @@ from webots_mcp.maintenance import Maintainer
 from webots_mcp.server.boundary import register
 from webots_mcp.server.tools.commands import CommandTools
 from webots_mcp.server.tools.control import ControlTools
+from webots_mcp.server.tools.events import EventTools
 from webots_mcp.server.tools.history import HistoryTools
 from webots_mcp.server.tools.logs import LogTools
 from webots_mcp.server.tools.monitor import MonitorTools
 from webots_mcp.server.tools.pictures import PictureTools
+from webots_mcp.server.tools.plot import PlotTools
 from webots_mcp.server.tools.signals import SignalTools
 from webots_mcp.server.tools.state import StateTools
+from webots_mcp.server.tools.timeline import TimelineTools
 from webots_mcp.server.tools.trends import TrendTools
 from webots_mcp.server.tools.world import WorldTools
 from webots_mcp.store.history.rollup import roll
@@ -43,6 +46,9 @@ FAMILIES: Final = (
     SignalTools,
     HistoryTools,
     TrendTools,
+    EventTools,
+    TimelineTools,
+    PlotTools,
     ControlTools,
     CommandTools,
 )

@@ -126,3 +126,26 @@ class TrendsAnswer(NotedAnswer):
     """What each signal did over a range."""
 
     runs: list[RunTrendTables] | None = None
+
+
+class EventsAnswer(NotedAnswer):
+    """What happened in a range, in order of time."""
+
+    events: Table | None = Field(
+        default=None, description="Columns with @ hold that signal's value when the event began."
+    )
+    totals: dict[str, int] | None = Field(
+        default=None, description="How many there are of each kind, shown or not."
+    )
+
+
+class TimelineAnswer(NotedAnswer):
+    """A page of what happened, in order of time."""
+
+    events: Table | None = None
+    totals: dict[str, int] | None = Field(
+        default=None, description="How many there are of each kind in the whole range."
+    )
+    cursor: str | None = Field(
+        default=None, description="Ask again with this cursor for later ones."
+    )

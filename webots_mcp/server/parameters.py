@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Final, Literal
 
 from pydantic import Field
+
+from webots_mcp.store.history.event import Kind
 
 RobotName = Annotated[
     str | None,
@@ -25,9 +27,9 @@ EndS = Annotated[float | None, Field(description="Up to, not including, this sim
 TimeoutS = Annotated[
     float, Field(ge=0.1, le=600, description="How long to wait for the outcome, wall seconds.")
 ]
-Cursor = Annotated[
-    int | None, Field(ge=0, description="From the previous answer, to go on where it ended.")
-]
+_CURSOR: Final = "From the previous answer, to go on where it ended."
+Cursor = Annotated[int | None, Field(ge=0, description=_CURSOR)]
+TextCursor = Annotated[str, Field(max_length=500, description=_CURSOR)]
 Since = Annotated[
     float | str | None,
     Field(
@@ -58,11 +60,18 @@ MaxPoints = Annotated[
         description="At most so many buckets (with raw: rows); by default as many as fit.",
     ),
 ]
+Kinds = Annotated[
+    list[Kind] | None,
+    Field(description="Only these; by default all (of the timeline: all that were stored)."),
+]
 ShownLimit = Annotated[
     int | None,
     Field(ge=1, le=500, description="At most so many; by default as many as a short answer holds."),
 ]
+Level = Literal["debug", "info", "warning", "error"]
+LogLevel = Annotated[Level, Field(description="Log lines of this level and above.")]
 Limit = Annotated[int, Field(ge=1, le=500, description="At most so many.")]
 RunIds = Annotated[
-    list[int], Field(max_length=20, description="Runs by their ids (webots_list_runs).")
+    list[int] | None,
+    Field(max_length=10, description="Several runs by their ids (webots_list_runs)."),
 ]

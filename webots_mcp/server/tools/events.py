@@ -1,0 +1,178 @@
+"""The tool that finds what happened."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Final
+
+from pydantic import Field
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.server.boundary import READS, tool
+from webots_mcp.server.bounds import Bounds
+from webots_mcp.server.fitting import (
+    BUDGET,
+    LARGE_BUDGET,
+    answer_about,
+    notes_of,
+    seconds,
+    short_name,
+    shown,
+    size_of,
+    without_empty,
+)
+from webots_mcp.server.history_results import EventsAnswer
+from webots_mcp.server.parameters import (
+    AnyNames,
+    EndS,
+    Kinds,
+    LastS,
+    LogLevel,
+    RobotName,
+    RunId,
+    ShownLimit,
+    Since,
+    StartS,
+    Until,
+)
+from webots_mcp.server.results import Table
+from webots_mcp.store.history.event import KINDS, Event, EventOptions, Kind, Threshold
+from webots_mcp.store.history.events import Events, choose, find_events
+from webots_mcp.store.history.ranges import TimeRange
+from webots_mcp.store.recording import Recording, View
+
+EVENT_COLUMNS: Final = ("kind", "run_id", "start_s", "duration_s", "ongoing", "name", "details")
+DEFAULT_LIMIT: Final = 50
+
+
+class EventTools:
+    """What happened in a stretch of time."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    @tool("Find events", READS)
+    def webots_find_events(
+        self,
+        kinds: Kinds = None,
+        signals: AnyNames = None,
+        above: Annotated[
+            float | None, Field(description="For threshold: where the signals were above this ...")
+        ] = None,
+        below: Annotated[float | None, Field(description="... or below this ...")] = None,
+        for_s: Annotated[
+            float, Field(ge=0, description="... for at least so many simulated seconds.")
+        ] = 0,
+        stuck_s: Annotated[
+            float, Field(gt=0, description="Stuck is who should move, but for so long ...")
+        ] = EventOptions.stuck_s,
+        stuck_m: Annotated[
+            float, Field(gt=0, description="... stays within so many metres.")
+        ] = EventOptions.stuck_m,
+        log_level: LogLevel = "warning",
+        last_s: LastS = None,
+        start_s: StartS = None,
+        end_s: EndS = None,
+        since: Since = None,
+        until: Until = None,
+        limit: ShownLimit = None,
+        robot: RobotName = None,
+        run_id: RunId = None,
+    ) -> EventsAnswer:
+        """What happened in a stretch of time, by default the whole run, with begin and duration.
+
+        Changed modes and flags, stuck, oscillation, jumps, thresholds, silent or flat sensors,
+        recording gaps, runs, commands, log lines, pictures: "since when, how often, in which mode".
+        """
+        bounds = Bounds(last_s, start_s, end_s, since, until)
+        thresholds = _thresholds(signals, above, below, for_s)
+        options = EventOptions(
+            kinds=_kinds(kinds, thresholds),
+            signals=tuple(signals or ("*",)),
+            thresholds=thresholds,
+            stuck_s=stuck_s,
+            stuck_m=stuck_m,
+            log_level=log_level,
+        )
+        with self._recording.view(robot, run_id) as view:
+            return answer_about(
+                view,
+                EventsAnswer,
+                lambda: _found(view, bounds.resolve(view, run_id), options, limit),
+            )
+
+
+def _thresholds(
+    signals: Sequence[str] | None, above: float | None, below: float | None, for_s: float
+) -> tuple[Threshold, ...]:
+    if above is None and below is None:
+        return ()
+    if not signals:
+        raise InvalidInputError("above and below need signals: name those that are compared")
+    return tuple(
+        Threshold(name, for_s=for_s, **limit)
+        for name in signals
+        for limit in ({"above": above}, {"below": below})
+        if None not in limit.values()
+    )
+
+
+def _kinds(kinds: Sequence[Kind] | None, thresholds: Sequence[Threshold]) -> tuple[Kind, ...]:
+    """Who gives a threshold asks about that, unless other kinds are named."""
+    if kinds and "threshold" in kinds and not thresholds:
+        raise InvalidInputError("kinds=['threshold'] needs signals, and above or below")
+    return tuple(kinds) if kinds else ("threshold",) if thresholds else KINDS
+
+
+def _found(
+    view: View, asked: TimeRange, options: EventOptions, limit: int | None
+) -> dict[str, Any]:
+    found = find_events(view.connection, asked, options, limit=limit or DEFAULT_LIMIT)
+    events, left_out = fitting_events(found, BUDGET if limit is None else LARGE_BUDGET, view)
+    hints = [f"{left_out} more left out to keep it short: ask by kinds or time"] if left_out else []
+    hints += [] if found.totals else [_why_none(options)]
+    return {
+        "events": events,
+        "totals": found.totals or None,
+        "notes": notes_of(found.notes),
+        "hint": "; ".join(hints) or None,
+    }
+
+
+def fitting_events(found: Events, budget: int, view: View) -> tuple[Table | None, int]:
+    """As many of the events as fit the budget, rare kinds whole; and how many were left out."""
+    events = list(found.events)
+    while True:
+        made = events_table(events, view)
+        size = size_of(made.rows) if made else 0
+        if size <= budget or len(events) == 1:
+            return made, len(found.events) - len(events)
+        events = choose(events, max(1, min(len(events) - 1, int(len(events) * budget / size))))
+
+
+def events_table(events: Sequence[Event], view: View) -> Table | None:
+    """Events as rows under `EVENT_COLUMNS`, and the values around them."""
+    around = list(dict.fromkeys(name for event in events for name in event.around))
+    here = view.run.id if view.run else None
+    elsewhere = any(event.run_id != here for event in events)
+    rows = [
+        [
+            event.kind,
+            event.run_id if elsewhere else None,
+            seconds(event.start_s),
+            seconds(event.duration_s) or None,
+            event.ongoing or None,
+            short_name(event.name),
+            shown(event.details) or None,
+            *(shown(event.around.get(name)) for name in around),
+        ]
+        for event in events
+    ]
+    columns = [*EVENT_COLUMNS, *(f"@{short_name(name)}" for name in around)]
+    return without_empty(columns, rows)
+
+
+def _why_none(options: EventOptions) -> str:
+    if options.thresholds:
+        return "never beyond the threshold that long: webots_get_trends tells the extremes"
+    return "nothing of these kinds in that range: widen the range, or leave kinds and signals out"

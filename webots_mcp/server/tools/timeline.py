@@ -1,0 +1,93 @@
+"""The tool that tells what happened in order, page by page."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from webots_mcp.server.boundary import READS, tool
+from webots_mcp.server.bounds import Bounds
+from webots_mcp.server.fitting import BUDGET, LARGE_BUDGET, answer_about, notes_of, size_of
+from webots_mcp.server.history_results import TimelineAnswer
+from webots_mcp.server.parameters import (
+    EndS,
+    Kinds,
+    LastS,
+    LogLevel,
+    RobotName,
+    RunId,
+    ShownLimit,
+    Since,
+    StartS,
+    TextCursor,
+    Until,
+)
+from webots_mcp.server.tools.events import events_table
+from webots_mcp.store.history.event import EventOptions
+from webots_mcp.store.history.ranges import TimeRange
+from webots_mcp.store.history.timeline import STORED, timeline
+from webots_mcp.store.recording import Recording, View
+
+DEFAULT_LIMIT: Final = 50
+
+
+class TimelineTools:
+    """What happened, in order."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    @tool("Get the timeline", READS)
+    def webots_get_timeline(
+        self,
+        kinds: Kinds = None,
+        log_level: LogLevel = "info",
+        last_s: LastS = None,
+        start_s: StartS = None,
+        end_s: EndS = None,
+        since: Since = None,
+        until: Until = None,
+        limit: ShownLimit = None,
+        cursor: TextCursor = "",
+        robot: RobotName = None,
+        run_id: RunId = None,
+    ) -> TimelineAnswer:
+        """Changes, commands, log lines, pictures, gaps, begin and end of runs in one order, paged.
+
+        By default from the start of the run on; webots_find_events also finds what nobody noted.
+        """
+        bounds = Bounds(last_s, start_s, end_s, since, until)
+        options = EventOptions(kinds=tuple(kinds or STORED), log_level=log_level)
+        with self._recording.view(robot, run_id) as view:
+            return answer_about(
+                view,
+                TimelineAnswer,
+                lambda: _found(view, bounds.resolve(view, run_id), options, limit, cursor),
+            )
+
+
+def _found(
+    view: View, asked: TimeRange, options: EventOptions, limit: int | None, cursor: str
+) -> dict[str, Any]:
+    """A page; a shorter one where it would be too long."""
+    budget = BUDGET if limit is None else LARGE_BUDGET
+    entries = limit or DEFAULT_LIMIT
+    while True:
+        page = timeline(view.connection, asked, options, limit=entries, after=cursor or None)
+        events = events_table(page.events, view)
+        size = size_of(events.rows) if events else 0
+        if size <= budget or entries == 1:
+            break
+        entries = max(1, int(entries * 0.95 * budget / size))
+    return {
+        "events": events,
+        "totals": page.totals or None,
+        "cursor": page.cursor,
+        "notes": notes_of(page.notes),
+        "hint": None if events else _why_none(cursor, bool(page.totals)),
+    }
+
+
+def _why_none(cursor: str, any_before: bool) -> str:
+    if cursor and any_before:
+        return "nothing after that cursor"
+    return "nothing of these kinds in that range: widen the range, or leave kinds out"

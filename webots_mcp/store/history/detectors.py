@@ -102,7 +102,7 @@ def flat_events(search: Search) -> Iterator[Event]:
     least_s = max(search.options.flat_s, search.view.shortest_rest_s)
     for signal in search.numbers:
         summary = search.view.summary(signal)
-        if summary.changes >= MOSTLY * summary.present > 0:
+        if MOSTLY * summary.present <= summary.changes < summary.present - 1:
             spans = search.view.spans(signal, Flat())
             yield from _flat(search, signal, spans, least_s)
 

@@ -119,7 +119,7 @@ def spans_in_rows(
     """The spans in rows that were read."""
     start = 0
     for key, group in groupby(values, condition.of_row):
-        end = start + sum(1 for _ in group)
+        end = start + len(list(group))
         inside = start > 0 and end < len(values)  # else what comes before or after may be the same
         if key is not None and not (condition.lasting and inside and end - start == 1):
             _, held = usable_numbers(times[start:end], values[start:end])

@@ -351,7 +351,7 @@ def test_importing_the_bridge_needs_nothing_but_the_standard_library(tmp_path: P
 
 def heartbeat_now(bridge: MCPBridge) -> None:
     """The next call looks after the file, as it would half a second later."""
-    bridge._next_beat_s = 0.0  # pyright: ignore[reportPrivateUsage]
+    bridge._heart._next_s = 0.0  # pyright: ignore[reportPrivateUsage]
     bridge.get_command()
 
 

@@ -83,7 +83,7 @@ class Actions:
         """Let the user's loop come round `steps` times, each with its own step, then hold."""
         steps = _whole_number(command.params, "steps", 1, MAX_STEPS)
         from_s = self._clock.sim_time_s
-        self._hold.release(command)
+        self._hold.release(command, stepping=True)
         for _ in range(steps):
             yield
         self._hold.take(command)

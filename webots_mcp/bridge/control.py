@@ -11,6 +11,7 @@ from typing import Any, Final
 from webots_mcp.bridge.actions import Actions, Progress
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.commands import Command, CommandQueue, is_busy
+from webots_mcp.bridge.heart import Heart
 from webots_mcp.bridge.hold import PUMP_INTERVAL_S, Hold
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
@@ -36,23 +37,18 @@ class Control:
         journal: Journal,
         album: Album,
         call_back: Callable[[], int],
+        heart: Heart,
     ) -> None:
         self._simulation = simulation
         self._recorder = recorder
         self._clock = clock
+        self._heart = heart
         self._queue = CommandQueue(recorder)
-        self._hold = Hold(simulation, journal)
+        self._hold = Hold(simulation, journal, heart)
         self.actions = Actions(simulation, self._queue, self._hold, clock, album, call_back)
         self._handlers: dict[str, Handler] = {}
         self._under_way: dict[Command, Progress] = {}
         self._next_poll_s = 0.0
-
-    @property
-    def hold(self) -> str | None:
-        """`paused` while the loop is held, `stepping` while it runs a counted number of steps."""
-        if self._hold.held:
-            return "paused"
-        return "stepping" if any(c.action == "step" for c in self._under_way) else None
 
     def register(self, action: str, handler: Handler) -> None:
         """Make an action of the user's own known.
@@ -74,7 +70,7 @@ class Control:
         self._recorder.actions[action] = inspect.cleandoc(getattr(handler, "__doc__", None) or "")
         self._recorder.update_actions()
 
-    def serve(self, every_round: Callable[[], object]) -> Command | None:
+    def serve(self) -> Command | None:
         """One round: what is under way, one new command, and the hold if there is one.
 
         Returns:
@@ -87,7 +83,7 @@ class Control:
         self._advance_all()
         handled = self._serve_one()
         while self._hold.held:
-            every_round()
+            self._heart.poll()
             self._hold.pump()
             self._advance_all()
             handled = self._serve_one() or handled

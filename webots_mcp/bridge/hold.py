@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.heart import Heart
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Simulation
 
@@ -18,9 +19,10 @@ class Hold:
     `get_command()`, pumps `step(0)`, and goes on serving commands there.
     """
 
-    def __init__(self, simulation: Simulation, journal: Journal) -> None:
+    def __init__(self, simulation: Simulation, journal: Journal, heart: Heart) -> None:
         self._simulation = simulation
         self._journal = journal
+        self._heart = heart
         self._mode_before = "real_time"
         self.held = False
 
@@ -32,14 +34,16 @@ class Hold:
         self._simulation.set_mode("pause")
         self.held = True
         self._journal.event("pause", {"command_id": command.id})
+        self._heart.change_hold("paused")
 
-    def release(self, command: Command, mode: str | None = None) -> None:
+    def release(self, command: Command, mode: str | None = None, *, stepping: bool = False) -> None:
         """Let the loop go on, in `mode` or in the one that it ran in before."""
         before = self._mode_before if self.held else self._simulation.mode_name
         self._simulation.set_mode(mode or ("fast" if before == "fast" else "real_time"))
         if self.held:
             self.held = False
             self._journal.event("resume", {"command_id": command.id})
+        self._heart.change_hold("stepping" if stepping else None)
 
     def pump(self) -> None:
         """Hear from Webots: it may want to quit, or a person may have pressed play."""
@@ -48,3 +52,4 @@ class Hold:
         elif not self._simulation.paused:
             self.held = False
             self._journal.event("resume", {"by": "a person or another controller, in Webots"})
+            self._heart.change_hold(None)

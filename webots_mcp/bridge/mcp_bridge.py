@@ -16,13 +16,13 @@ from webots_mcp.bridge.commands import CONFIRM_RELOAD
 from webots_mcp.bridge.control import Control, Handler
 from webots_mcp.bridge.devices import read_devices
 from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.heart import Heart
 from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
-from webots_mcp.bridge.recorder import Pulse, Recorder
+from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.contract import (
-    HEARTBEAT_INTERVAL_S,
     STRICT_VARIABLE,
     Database,
     MemoryDatabase,
@@ -136,10 +136,8 @@ class MCPBridge:
                 self._begin_run()
             if self._simulation.over:
                 return None
-            command = self._control.serve(self._beat)
-            self._last_poll_wall_s = time.time()
-            if time.monotonic() >= self._next_beat_s:
-                self._beat()
+            command = self._control.serve()
+            self._heart.poll()
             if self._simulation.over:
                 self.close()
             return command.as_dict() if command else None
@@ -308,6 +306,7 @@ class MCPBridge:
         )
         self._album = Album(self._recorder, self._clock, self.data_dir)
         self._journal = Journal(self._recorder, self._clock)
+        self._heart = Heart(self._recorder, self._clock)
         self._control = Control(
             self._simulation,
             self._recorder,
@@ -315,6 +314,7 @@ class MCPBridge:
             self._journal,
             self._album,
             self._call_back,
+            self._heart,
         )
         self._maintainer = self._start_maintainer()
 
@@ -339,8 +339,6 @@ class MCPBridge:
         self._publish_calls = self._publish_throttled = self._published = 0
         self._publish_s = self._publish_max_s = 0.0
         self._failures = 0
-        self._last_poll_wall_s: float | None = None
-        self._next_beat_s = 0.0
         registration = self._recorder.registration
         reloaded = registration is not None and registration.reloaded
         self._reload_undetected = self._reload_unfired = reloaded
@@ -364,7 +362,7 @@ class MCPBridge:
         self._reload_undetected = self._reload_unfired = True
         self._journal.event("reset")
         self._fire_reload()
-        self._beat()
+        self._heart.beat()
 
     def _record_state(self, state: Mapping[Any, Any]) -> None:
         self._fire_reload()
@@ -375,16 +373,7 @@ class MCPBridge:
         if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             for name, before, after in self._changes.look(state):
                 self._journal.event("change", {"from": before, "to": after}, name)
-        if time.monotonic() >= self._next_beat_s:
-            self._beat()
-
-    def _beat(self) -> None:
-        """Say that the loop is alive, and what it can see of time."""
-        self._next_beat_s = time.monotonic() + HEARTBEAT_INTERVAL_S
-        clock = self._clock
-        hold = self._control.hold
-        pulse = Pulse(clock.sim_time_s, self._last_poll_wall_s, clock.moved_wall_time_s, hold)
-        self._recorder.beat(pulse)
+        self._heart.beat_if_due()
 
     def _fire_reload(self) -> None:
         """Run the callbacks of `on_reload`, once for each reload or reset."""

@@ -1,0 +1,42 @@
+"""The sign of life that a controller's loop gives, by which others judge it."""
+
+from __future__ import annotations
+
+import time
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.recorder import Pulse, Recorder
+from webots_mcp.contract import HEARTBEAT_INTERVAL_S
+
+
+class Heart:
+    """Writes the session's heartbeat: a few times a second, and at once where the hold changes."""
+
+    def __init__(self, recorder: Recorder, clock: Clock) -> None:
+        self._recorder = recorder
+        self._clock = clock
+        self._next_s = 0.0
+        self._last_poll_wall_time_s: float | None = None
+        self.hold: str | None = None
+
+    def poll(self) -> None:
+        """The loop asked for commands; beat if it is time to."""
+        self._last_poll_wall_time_s = time.time()
+        self.beat_if_due()
+
+    def beat_if_due(self) -> None:
+        """Beat if the last time is long enough ago."""
+        if time.monotonic() >= self._next_s:
+            self.beat()
+
+    def beat(self) -> None:
+        """Say now that the loop is alive, and what it can see of time."""
+        self._next_s = time.monotonic() + HEARTBEAT_INTERVAL_S
+        clock, polled_s = self._clock, self._last_poll_wall_time_s
+        pulse = Pulse(clock.sim_time_s, polled_s, clock.moved_wall_time_s, self.hold)
+        self._recorder.beat(pulse)
+
+    def change_hold(self, hold: str | None) -> None:
+        """Tell at once: whoever reads the command's answer must not see the old status."""
+        self.hold = hold
+        self.beat()

@@ -42,6 +42,11 @@ class Part:
     origin_s: float
 
     @property
+    def has_rows(self) -> bool:
+        """Whether anything was recorded."""
+        return self.run.rows != 0 and self.start_s <= self.end_s
+
+    @property
     def robot(self) -> str:
         """Whose run it is."""
         return self.range.robot
@@ -74,9 +79,10 @@ def parts_of(
         for segment, run in zip(each.segments, history.runs, strict=True):
             alone = replace(each, segments=(segment,))
             parts.append(_part(connection, alone, run, count > 1))
-    if not parts:
-        raise NothingRecordedError("; ".join(note for each in ranges for note in each.notes))
-    return parts
+    if not any(part.has_rows for part in parts):
+        notes = [note for each in ranges for note in each.notes]
+        raise NothingRecordedError("; ".join(["nothing was recorded in the range", *notes]))
+    return [part for part in parts if part.has_rows]
 
 
 def _part(

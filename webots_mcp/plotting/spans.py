@@ -66,4 +66,4 @@ def _recorded(start_s: float, end_s: float, gaps: Sequence[Gap]) -> list[tuple[f
     inside = [gap for gap in gaps if start_s <= gap.start_s and gap.end_s <= end_s]
     starts = [start_s, *(gap.end_s for gap in inside)]
     ends = [*(gap.start_s for gap in inside), end_s]
-    return list(zip(starts, ends, strict=True))
+    return [(start, end) for start, end in zip(starts, ends, strict=True) if start < end]

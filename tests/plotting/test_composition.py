@@ -1,0 +1,188 @@
+"""What goes into a picture: curves, panels, bands, paths."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.plotting.conftest import Record, whole
+from webots_mcp.plotting.curves import Curve
+from webots_mcp.plotting.palette import AREAS, OTHER, area_colours
+from webots_mcp.plotting.panels import MOST_CURVES, MOST_PANELS, by_scale, by_signal
+from webots_mcp.plotting.path import Path, Place, headings, thinned
+from webots_mcp.plotting.signals import compose_timeline
+from webots_mcp.plotting.timeline import Timeline
+from webots_mcp.plotting.trajectory import compose_ground
+
+
+def timeline_of(connection: sqlite3.Connection, *names: str, **limits: Any) -> Timeline:
+    return compose_timeline(connection, [whole(connection, **limits)], names)[0]
+
+
+def only_curve(timeline: Timeline) -> Curve:
+    ((curve,),) = [panel.curves for panel in timeline.panels]
+    return curve
+
+
+def test_one_odd_row_among_a_thousand_is_in_the_band(rover: sqlite3.Connection) -> None:
+    curve = only_curve(timeline_of(rover, "ir"))
+    (spike,) = [point for point in curve.points if point[3] == 5.0]
+    assert spike[0] == pytest.approx(70, abs=0.5)
+    assert spike[1] < 2
+
+
+def test_a_line_is_broken_where_rows_or_values_are_missing(rover: sqlite3.Connection) -> None:
+    curve = only_curve(timeline_of(rover, "sensors.front"))
+    assert sum(math.isnan(time) for time, *_ in curve.points) == 2
+    assert not [t for t, *_ in curve.points if 90.5 < t < 94.5 or 100.5 < t < 103.5]
+
+
+def test_an_angle_that_goes_round_is_no_line_across_the_picture(
+    rover: sqlite3.Connection,
+) -> None:
+    curve = only_curve(timeline_of(rover, "heading", start_s=60, end_s=66))
+    means = [mean for _, mean, *_ in curve.points]
+    drawn = pairwise(means)
+    assert all(abs(after - before) < math.pi for before, after in drawn if before < 9 > after)
+    assert any(math.isnan(mean) for mean in means)
+
+
+def test_a_value_that_stands_alone_is_not_lost(record: Record) -> None:
+    connection = record(lambda t: {"n": 1.0 if t < 2 or round(t, 1) == 7 else None})
+    curve = only_curve(timeline_of(connection, "n"))
+    assert [point[0] for point in curve.lone_points] == pytest.approx([7.0])
+
+
+def test_modes_stand_behind_the_curves_and_not_where_nothing_was_recorded(
+    rover: sqlite3.Connection,
+) -> None:
+    bands = timeline_of(rover, "pose.0").bands
+    assert bands is not None
+    assert [(span.value, round(span.start_s), round(span.end_s)) for span in bands.spans] == [
+        ("cruise", 0, 52), ("back_up", 52, 60), ("avoid", 60, 90), ("cruise", 95, 120),
+    ]  # fmt: skip
+
+
+def test_more_modes_than_colours_share_a_name(record: Record) -> None:
+    connection = record(lambda t: {"mode": f"m{int(t)}", "x": t}, rows=200)
+    bands = timeline_of(connection, "x").bands
+    assert bands is not None
+    assert len(bands.values) == 8
+    assert bands.values[-1] == "others"
+
+
+def test_events_are_of_the_drawn_signals_and_of_the_robot(rover: sqlite3.Connection) -> None:
+    timeline = timeline_of(rover, "ir")
+    events = {lane.name: [span.value for span in lane.spans] for lane in timeline.events}
+    assert events["jump"] == ["ir", "position"]
+    assert events["command"] == ["set_speed"]
+    assert events["log"] == ["warning", "error"]
+    assert "oscillation" not in events  # that is the heading's
+    (stuck,) = next(lane.spans for lane in timeline.events if lane.name == "stuck")
+    assert (stuck.start_s, stuck.end_s) == pytest.approx((40, 52), abs=0.3)
+
+
+def test_a_unit_is_an_axis_and_so_is_a_scale(rover: sqlite3.Connection) -> None:
+    timeline = timeline_of(rover, "pose", "battery_v", "speed_m_s")
+    panels = [(panel.unit, panel.names) for panel in timeline.panels]
+    assert panels == [
+        (None, ["pose.0", "pose.1"]), ("V", ["battery_v"]), ("m/s", ["speed_m_s"]),
+    ]  # fmt: skip
+
+
+# Laws ---------------------------------------------------------------------------------------------
+
+NUMBERS = st.floats(-1e6, 1e6)
+
+
+@st.composite
+def curves_of_runs(draw: st.DrawFn) -> list[Curve]:
+    curves: list[Curve] = []
+    for number in draw(st.lists(st.integers(0, 30), max_size=30)):
+        unit, run_id = draw(st.sampled_from([None, "m", "rad"])), draw(st.integers(1, 2))
+        low, high = sorted((draw(NUMBERS), draw(NUMBERS)))
+        curves.append(Curve(f"s{number}", unit, run_id, (), low, high))
+    return curves
+
+
+@given(curves_of_runs())
+def test_every_curve_is_drawn_once_or_named_as_left_out(curves: list[Curve]) -> None:
+    panels, left_out = by_scale(curves)
+    drawn = [curve for panel in panels for curve in panel.curves]
+    assert sorted([*(curve.name for curve in drawn), *left_out]) == sorted(c.name for c in curves)
+    assert len(panels) <= MOST_PANELS
+    for panel in panels:
+        assert len(panel.curves) <= MOST_CURVES
+        assert {curve.unit for curve in panel.curves} == {panel.unit}
+
+
+@given(curves_of_runs())
+def test_runs_share_a_panel_per_signal(curves: list[Curve]) -> None:
+    panels, left_out = by_signal(curves)
+    assert [panel.names for panel in panels] == [[panel.names[0]] for panel in panels]
+    assert {name for panel in panels for name in panel.names} | set(left_out) == {
+        curve.name for curve in curves
+    }
+
+
+@given(st.lists(st.text(), max_size=12))
+def test_values_have_colours_of_their_own_as_long_as_there_are_any(values: list[str]) -> None:
+    colours = area_colours(values)
+    assert colours == area_colours(reversed(values))
+    own = [colour for colour in colours.values() if colour != OTHER]
+    assert len(own) == len(set(own)) == min(len(colours), len(AREAS))
+
+
+PLACES = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=60).map(
+    lambda points: [Place(float(index), x, y) for index, (x, y) in enumerate(points)]
+)
+
+
+@given(PLACES)
+def test_a_thinned_path_keeps_its_ends_and_its_shape(places: list[Place]) -> None:
+    kept = thinned(places)
+    assert (kept[0], kept[-1]) == (places[0], places[-1])
+    size = max(max(p[i] for p in places) - min(p[i] for p in places) for i in (1, 2))
+    for place in places:
+        assert min(math.dist(place[1:], near[1:]) for near in kept) <= size / 2000
+
+
+@given(PLACES, st.frozensets(st.integers(1, 59)))
+def test_the_pieces_of_a_path_are_all_of_it(places: list[Place], breaks: frozenset[int]) -> None:
+    path = Path(places, None, frozenset(index for index in breaks if index < len(places)))
+    assert [place for piece in path.pieces() for place in piece] == places
+
+
+# Trajectories -------------------------------------------------------------------------------------
+
+
+def test_a_path_is_broken_at_a_gap_and_at_a_leap(rover: sqlite3.Connection) -> None:
+    ground, _ = compose_ground(rover, [whole(rover)])
+    path = ground.tracks[0].path
+    assert [round(path.places[index].time_s) for index in sorted(path.breaks)] == [95, 110]
+
+
+def test_trouble_is_marked_where_it_was(rover: sqlite3.Connection) -> None:
+    ground, _ = compose_ground(rover, [whole(rover)])
+    (track,) = ground.tracks
+    places = {mark.name: [track.path.at(s.start_s)[1:] for s in mark.spans] for mark in track.marks}
+    assert places == {
+        "stuck over 3 s": [pytest.approx((8, 0), abs=0.05)],
+        "sensors.bumper": [pytest.approx((8, 0))],
+    }
+    without, _ = compose_ground(rover, [whole(rover)], events=False)
+    assert not without.tracks[0].marks
+
+
+def test_arrows_point_the_way_that_was_taken() -> None:
+    square = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0)]
+    path = Path([Place(i, *place) for i, place in enumerate(square)], None, frozenset())
+    found = headings(path, 4)
+    assert [heading.degrees for heading in found] == pytest.approx([0, 90, 180, -90])
+    assert headings(Path([Place(0, 1, 1)], None, frozenset()), 4) == []

@@ -1,0 +1,325 @@
+"""What a picture shows, and that everything in it can be read."""
+
+from __future__ import annotations
+
+import io
+import math
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from PIL import Image
+
+from tests.plotting.conftest import Record, whole
+from webots_mcp.errors import (
+    InvalidInputError,
+    InvalidRangeError,
+    NothingRecordedError,
+    UnknownRunError,
+    UnknownSignalError,
+)
+from webots_mcp.plotting import Picture, Sheet, image_format_of, plot, plot_signals
+from webots_mcp.plotting.canvas import draw
+from webots_mcp.plotting.ground import paint_ground
+from webots_mcp.plotting.signals import compose_timeline
+from webots_mcp.plotting.timeline import paint_timeline
+from webots_mcp.plotting.trajectory import compose_ground
+from webots_mcp.store.history.rollup import roll
+
+Ask = dict[str, Any]
+
+QUESTIONS: dict[str, Ask] = {
+    "one signal": {"signals": ["sensors.front"]},
+    "several scales": {"signals": ["pose", "heading", "speed_m_s", "battery_v", "sensors"]},
+    "everything": {"signals": ["*"]},
+    "text alone": {"signals": ["mode", "sensors.bumper"]},
+    "a part": {"signals": ["pose.0", "ir"], "start_s": 38, "end_s": 66},
+    "what changed most": {},
+    "two runs": {"signals": ["pose.0", "battery_v"], "run_ids": [1, 3]},
+    "trajectory": {"kind": "trajectory"},
+    "trajectory by time": {"kind": "trajectory", "bands": ""},
+    "two trajectories": {"kind": "trajectory", "run_ids": [1, 3]},
+}
+
+
+def ask(connection: sqlite3.Connection, **question: Any) -> Picture:
+    question.setdefault("run_ids", [1])
+    return plot(connection, **question)
+
+
+def words(picture: Picture) -> set[str]:
+    """The texts in an SVG."""
+    root = ElementTree.fromstring(picture.data)
+    texts = root.iter("{http://www.w3.org/2000/svg}text")
+    return {"".join(text.itertext()).strip() for text in texts}
+
+
+@pytest.mark.parametrize("question", QUESTIONS.values(), ids=QUESTIONS)
+def test_every_kind_of_picture_is_a_png_of_the_size_that_was_asked_for(
+    rover: sqlite3.Connection, question: Ask
+) -> None:
+    picture = ask(rover, **question)
+    assert picture.media_type == "image/png"
+    image = Image.open(io.BytesIO(picture.data))
+    image.load()
+    rows_alone = "mode" in question.get("signals", ())
+    assert image.size == (900, 480 if rows_alone else 500)
+    assert len(picture.data) < 250_000
+    assert picture.caption.startswith("rover")
+
+
+@pytest.mark.parametrize("question", QUESTIONS.values(), ids=QUESTIONS)
+def test_every_kind_of_picture_is_an_svg_that_is_the_same_each_time(
+    rover: sqlite3.Connection, question: Ask
+) -> None:
+    picture = ask(rover, **question, image_format="svg")
+    assert picture.media_type == "image/svg+xml"
+    assert len(words(picture)) > 5
+    assert picture.data == ask(rover, **question, image_format="svg").data
+
+
+def test_a_picture_names_what_it_shows(rover: sqlite3.Connection) -> None:
+    picture = ask(rover, signals=["pose.0", "heading"], image_format="svg")
+    assert words(picture) >= {
+        "rover, run 1, 0 to 119.9 s", "pose.0", "heading [rad]", "mode:", "cruise", "back_up",
+        "avoid", "nothing recorded", "stuck", "oscillation", "log", "error", "command", "set_speed",
+    }  # fmt: skip
+    steps = "simulation time [s]      line: mean, band: minimum to maximum of every 0.5 s"
+    assert " ".join(steps.split()) in {" ".join(word.split()) for word in words(picture)}
+    assert picture.caption == "rover, run 1, 0 to 119.9 s: pose.0, heading over mode"
+
+
+def test_what_could_not_be_drawn_is_said(rover: sqlite3.Connection) -> None:
+    picture = ask(rover, signals=["*"])
+    (left_out,) = [note for note in picture.notes if note.startswith("left out")]
+    assert "battery_v" in left_out and "at most 3 panels" in left_out
+    assert "sensors.front in run 1 was nan 40 times: not drawn" in picture.notes
+    blind = ask(rover, signals=["sensors.front", "ir"], start_s=100.5, end_s=103)
+    assert "without a value in run 1: sensors.front" in blind.notes
+
+
+def test_runs_are_laid_over_each_other_from_their_starts_and_named_by_their_labels(
+    record: Record,
+) -> None:
+    connection = record(lambda t: {"mode": "go", "x_m": t})
+    connection.execute("UPDATE run SET label = 'softer turns' WHERE id = 1")
+    connection.execute(
+        "INSERT INTO run (session_id, robot_id, start_reason, started_wall_time_s, "
+        "started_sim_time_s, last_wall_time_s, last_sim_time_s) VALUES (1, 1, 'reload', 0, 0, 0, 0)"
+    )
+    connection.executemany(
+        "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) VALUES (2, ?, 0, ?)",
+        [(500 + n / 10, f'{{"mode": "go", "x_m": {n / 5}}}') for n in range(100)],
+    )
+    ranges = [whole(connection, 1), whole(connection, 2)]
+    timeline, _ = compose_timeline(connection, ranges, ["x_m"])
+    assert timeline.x_range == pytest.approx((0, 9.9))
+    assert [curve.points[0][:2] for curve in timeline.panels[0].curves] == [(0, 0), (0, 0)]
+    assert timeline.bands is None
+    assert [lane.name for lane in timeline.lanes] == ["mode, run 1 “softer turns”", "mode, run 2"]
+    picture = plot(connection, "signals", ["x_m"], run_ids=[1, 2], image_format="svg")
+    assert words(picture) >= {"run 1 “softer turns”", "run 2", "x_m [m]"}
+
+
+def test_a_flag_and_a_text_below_the_curves_are_labelled_or_in_the_legend(
+    rover: sqlite3.Connection,
+) -> None:
+    picture = ask(rover, signals=["mode", "sensors.bumper"], image_format="svg", events=False)
+    assert words(picture) >= {"mode", "sensors.bumper", "cruise", "avoid", "back_up", "true"}
+
+
+def test_the_other_run_of_a_trajectory_is_told_apart_and_trouble_is_marked(
+    rover: sqlite3.Connection,
+) -> None:
+    picture = ask(rover, kind="trajectory", run_ids=[1, 3], image_format="svg")
+    assert words(picture) >= {
+        "run 1", "run 3", "start", "end", "pose.0", "pose.1", "stuck over 3 s, run 1 (1)",
+        "sensors.bumper, run 1 (1)",
+    }  # fmt: skip
+
+
+# Everything can be read ---------------------------------------------------------------------------
+
+
+def odd_names(time_s: float) -> dict[str, Any]:
+    """Names and values that a careless controller may publish."""
+    return {
+        "mode": f"a_rather_long_name_of_a_mode_number_{int(time_s) % 12}",
+        "_hidden": math.sin(time_s),
+        "costs in $ per $ spent": math.cos(time_s),
+        "a.very.deeply.nested.name.of.a.signal.that.goes.on.and.on_m_s": time_s,
+        "two   words": 3 * math.sin(time_s),
+        "距離_m": 2 + math.sin(time_s / 2),
+        "flag": int(time_s) % 2 == 0,
+        "huge": 1e9 * time_s,
+        "tiny": 1e-9 * time_s,
+        "pose": {"x": math.cos(time_s), "y": math.sin(time_s)},
+    }
+
+
+def texts_of(paint: Callable[[Any], None], sheet: Sheet) -> list[tuple[str, Any]]:
+    """Every visible text with its box in pixels, after the layout."""
+    from matplotlib.text import Text
+
+    found: list[tuple[str, Any]] = []
+
+    def paint_and_look(figure: Any) -> None:
+        paint(figure)
+        figure.draw_without_rendering()
+        unseen = {text for axes in figure.axes for text in unseen_labels(axes)}
+        texts = [text for text in figure.findobj(Text) if text.get_visible() and text not in unseen]
+        found.extend((text.get_text(), text.get_window_extent()) for text in texts)
+
+    draw(sheet, paint_and_look)
+    return [(text, box) for text, box in found if text.strip()]
+
+
+def unseen_labels(axes: Any) -> list[Any]:
+    """matplotlib keeps labels of ticks outside the axis; they are not painted."""
+    ticks = [
+        tick
+        for axis in (axes.xaxis, axes.yaxis)
+        for low, high in [sorted(axis.get_view_interval())]
+        for tick in [*axis.get_major_ticks(), *axis.get_minor_ticks()]
+        if not low <= tick.get_loc() <= high
+    ]
+    return [label for tick in ticks for label in (tick.label1, tick.label2)]
+
+
+@pytest.mark.parametrize("size", [(900, 500), (1400, 500)])
+@pytest.mark.parametrize(
+    "names", [["*"], ["mode", "flag"], ["_hidden", "two*"], ["a.very.*"]], ids=str
+)
+def test_no_text_leaves_the_picture_or_covers_another(
+    record: Record, names: list[str], size: tuple[int, int]
+) -> None:
+    connection = record(odd_names, rows=300)
+    timeline, _ = compose_timeline(connection, [whole(connection)], names)
+    assert_readable(texts_of(lambda figure: paint_timeline(figure, timeline), Sheet(*size)), size)
+
+
+def test_no_text_of_a_trajectory_leaves_the_picture_or_covers_another(record: Record) -> None:
+    connection = record(odd_names, rows=300)
+    ground, _ = compose_ground(connection, [whole(connection)])
+    texts = texts_of(lambda figure: paint_ground(figure, ground), Sheet())
+    assert_readable(texts, (900, 500))
+
+
+def assert_readable(texts: list[tuple[str, Any]], size: tuple[int, int]) -> None:
+    assert len(texts) > 5
+    for text, box in texts:
+        assert box.x0 >= 0 and box.y0 >= 0, f"{text!r} is cut off: {box}"
+        assert box.x1 <= size[0] and box.y1 <= size[1], f"{text!r} is cut off: {box}"
+    for (text, box), (other, beside) in combinations(texts, 2):
+        wide = min(box.x1, beside.x1) - max(box.x0, beside.x0)
+        high = min(box.y1, beside.y1) - max(box.y0, beside.y0)
+        assert wide < 2 or high < 2, f"{text!r} and {other!r} overlap by {wide:.0f} x {high:.0f} px"
+
+
+def test_the_process_and_its_settings_stay_as_they_were(rover: sqlite3.Connection) -> None:
+    import matplotlib
+
+    usual = ask(rover, signals=["pose.0"]).data
+    with matplotlib.rc_context({"font.size": 30, "axes.facecolor": "black", "text.usetex": True}):
+        assert ask(rover, signals=["pose.0"]).data == usual
+        assert matplotlib.rcParams["font.size"] == 30
+    assert "matplotlib.pyplot" not in sys.modules
+
+
+def test_pictures_can_be_drawn_at_the_same_time(rover: sqlite3.Connection) -> None:
+    timeline, _ = compose_timeline(rover, [whole(rover)], ["pose.0"])
+
+    def picture(_: int) -> bytes:
+        return draw(Sheet(), lambda figure: paint_timeline(figure, timeline))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert len(set(pool.map(picture, range(8)))) == 1
+
+
+@pytest.mark.parametrize("module", ["webots_mcp.server.app", "webots_mcp.plotting", "webots_mcp"])
+def test_matplotlib_waits_for_the_first_picture(module: str) -> None:
+    code = (
+        f"import sys, {module}\n"
+        "from webots_mcp import MCPBridge\n"
+        "print({'matplotlib', 'numpy'} & set(sys.modules))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "set()"
+
+
+# Long and short recordings ------------------------------------------------------------------------
+
+
+def test_a_recording_too_long_to_be_read_is_drawn_from_its_rollups(record: Record) -> None:
+    connection = record(lambda t: {"v": 3.0 if t == 160 else 12.0, "x": t, "y": 0.0}, 31_000, 0.1)
+    assert roll(connection, 100_000).done
+    timeline, _ = compose_timeline(connection, [whole(connection)], ["v", "x"])
+    (curve,) = [c for panel in timeline.panels for c in panel.curves if c.name == "v"]
+    assert min(point[2] for point in curve.points) == curve.low == 3.0
+    picture = plot(connection, "trajectory")
+    assert picture.notes == ("run 1: one place every 10 s (too many rows to draw each)",)
+
+
+@pytest.mark.parametrize("rows", [1, 2])
+def test_a_run_that_has_only_begun_is_drawn(record: Record, rows: int) -> None:
+    connection = record(lambda t: {"pose": [0.0, 0.0], "mode": "idle"}, rows=rows)
+    for kind in ("signals", "trajectory"):
+        assert plot(connection, kind, image_format="svg").data
+    assert plot(connection, "trajectory", bands="").data
+
+
+# Bad input ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("question", "error", "message"),
+    [
+        ({"signals": ["sensor.frnt"]}, UnknownSignalError, "there is sensors.front"),
+        ({"signals": ["pose"], "bands": "mod"}, UnknownSignalError, "there is mode"),
+        ({"signals": ["pose"], "bands": "ir"}, InvalidInputError, "'ir' holds numbers"),
+        ({"signals": ["pose"], "bands": "sensors"}, InvalidInputError, "means 2 signals"),
+        ({"run_ids": [77]}, UnknownRunError, "no run 77"),
+        ({"start_s": 9, "end_s": 3}, InvalidRangeError, "reversed"),
+        ({"start_s": 900}, NothingRecordedError, "begins after the newest row"),
+        ({"signals": ["sensors.front"], "start_s": 101, "end_s": 103, "bands": ""},
+         NothingRecordedError, "none of the signals has a value in rover, run 1, 101 to 103 s"),
+        ({"width_px": 12}, InvalidInputError, "width_px=12 must be from 300 to 2000"),
+        ({"image_format": "gif"}, InvalidInputError, "png or svg, not 'gif'"),
+        ({"kind": "pie"}, InvalidInputError, "there is signals, trajectory"),
+        ({"kind": "trajectory", "signals": ["pose.0"]}, InvalidInputError, "takes two signals"),
+        ({"kind": "trajectory", "signals": ["mode", "pose.0"]}, InvalidInputError, "no numbers"),
+        ({"run_ids": [], "wall_start": 0, "robot": "rovr"}, InvalidInputError, "'rover'"),
+    ],
+)  # fmt: skip
+def test_a_question_that_makes_no_sense_is_answered_with_what_there_is(
+    rover: sqlite3.Connection, question: Ask, error: type[Exception], message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        ask(rover, **question)
+
+
+def test_a_robot_without_a_position_is_asked_for_one(record: Record) -> None:
+    connection = record(lambda t: {"altitude": t})
+    with pytest.raises(InvalidInputError, match="no position was found among the 1 signals"):
+        plot(connection, "trajectory")
+
+
+def test_too_many_runs_in_one_picture_are_refused(record: Record) -> None:
+    connection = record(lambda t: {"n": t}, rows=2)
+    ranges = [whole(connection)] * 5
+    with pytest.raises(InvalidInputError, match="holds 5 runs, and at most 4"):
+        plot_signals(connection, ranges, ["n"])
+
+
+def test_the_name_of_a_file_tells_its_format() -> None:
+    assert image_format_of(Path("plot.PNG")) == "png"
+    assert image_format_of(Path("a/b.svg")) == "svg"
+    with pytest.raises(InvalidInputError, match=r"end it in \.png or \.svg"):
+        image_format_of(Path("plot.jpg"))

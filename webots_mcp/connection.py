@@ -13,6 +13,7 @@ from webots_mcp.errors import DatabaseError, NoDatabaseError
 
 Role = Literal["loop", "writer", "reader"]
 
+OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
 OPENING_TIMEOUT_MS: Final = 5000
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
 
@@ -38,9 +39,14 @@ def connect(
 
     Raises:
         NoDatabaseError: The file is missing and `create` is false.
-        DatabaseError: The folder cannot be made or the file cannot be opened.
+        DatabaseError: The folder cannot be made, the file cannot be opened, or SQLite is too old.
         sqlite3.Error: The file is no database, or is locked for longer than 5 s.
     """
+    if sqlite3.sqlite_version_info < OLDEST_SQLITE:
+        raise DatabaseError(
+            f"SQLite {sqlite3.sqlite_version} of this Python is too old, 3.38 is needed: "
+            "use a Python that was built with a newer one"
+        )
     address = database.uri if isinstance(database, MemoryDatabase) else _file_uri(database, create)
     try:
         connection = sqlite3.connect(

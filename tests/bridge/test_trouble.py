@@ -214,6 +214,18 @@ def test_an_older_schema_is_brought_forward_with_its_data(
     assert numbers(filed) == [1]
 
 
+def test_an_sqlite_that_is_too_old_is_said_and_the_robot_drives_on(
+    robot: InProcessSupervisor,
+    file: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sqlite3, "sqlite_version_info", (3, 34, 1))
+    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
+        bridge.publish({"n": 1})
+    assert "3.38 is needed" in capfd.readouterr().err
+
+
 def test_strict_mode_raises_instead(
     robot: InProcessSupervisor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from tests.benchmarks.registry import Bench, Benchmark, all_benchmarks
 from tests.benchmarks.table import Section, render
 
-_QUICK = 0.12
+_QUICK = 0.1
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -13,20 +13,21 @@ T = TypeVar("T")
 Statistic = Callable[[list[float]], float]
 
 
-def alternate(contenders: Mapping[str, Callable[[], T]], blocks: int) -> dict[str, list[T]]:
-    """Run the contenders in turn: A B A B ...; one more block in front warms up and is forgotten.
+def alternate(
+    contenders: Mapping[str, Callable[[], T]], blocks: int, *, warm_up: bool = True
+) -> dict[str, list[T]]:
+    """Run the contenders in turn: A B A B ...
 
     Args:
         contenders: Name to what runs one block and returns what it measured.
         blocks: How many blocks of each are kept.
+        warm_up: Run one more block of each in front and forget it.
     """
-    taken: dict[str, list[T]] = {name: [] for name in contenders}
-    for block in range(blocks + 1):
-        for name, run_block in contenders.items():
-            measured = run_block()
-            if block:
-                taken[name].append(measured)
-    return taken
+    if warm_up:
+        for run_block in contenders.values():
+            run_block()
+    rounds = [{name: run_block() for name, run_block in contenders.items()} for _ in range(blocks)]
+    return {name: [taken[name] for taken in rounds] for name in contenders}
 
 
 def time_calls(call: Callable[[int], object], calls: int) -> list[float]:

@@ -51,11 +51,15 @@ class BridgeWay:
         self.bridge = MCPBridge(robot, data_dir=folder, throttle_interval=every)
         self.publish = self.bridge.publish
         self.get_command = self.bridge.get_command
-        self.close = self.bridge.close
 
     def begin(self) -> None:
         """Set the encoder, which bridges of one process share."""
         use_encoder(self._encoder)
+
+    def close(self) -> None:
+        """Close the bridge, and set the encoder back."""
+        self.bridge.close()
+        use_encoder(ORJSON)
 
 
 def use_encoder(orjson: Any) -> None:

@@ -17,6 +17,7 @@ from tests.benchmarks.ways import ORJSON
 
 _HOUR_ROWS = 112_500  # 31.25 Hz
 _ROWS_PER_S = 4500
+_WARM_ROWS = 1000
 _MB = 1e6
 
 Figures = dict[str, Any]
@@ -40,9 +41,10 @@ def measure_memory(bench: Bench) -> Iterable[Line]:
 
 
 def _recording(bench: Bench, kind: str, states: Path) -> Callable[[], Figures]:
-    """A new database each time, a thousand rows."""
+    """A new database each time, some rows."""
     numbers = iter(range(1_000_000))
-    return lambda: _run(kind, states, bench.place(f"{kind} {next(numbers)}"), 1000, 2000)
+    rows = min(_WARM_ROWS, bench.count(10 * _WARM_ROWS, least=50))
+    return lambda: _run(kind, states, bench.place(f"{kind} {next(numbers)}"), rows, 2000)
 
 
 def _line(

@@ -1,0 +1,62 @@
+"""That every benchmark runs; how fast anything is, no test asks."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from tests.benchmarks.measuring import Samples, alternate, ratio
+from tests.benchmarks.registry import Bench, Benchmark, all_benchmarks
+from tests.benchmarks.states import make_states
+from tests.benchmarks.table import Line, Section, Target, render
+
+TINY = 0.001
+
+
+@pytest.mark.parametrize("benchmark", all_benchmarks(), ids=lambda benchmark: benchmark.name)
+def test_a_benchmark_yields_lines_with_figures(benchmark: Benchmark, tmp_path: Path) -> None:
+    section = benchmark.run(Bench(tmp_path, TINY, lambda text: None))
+    assert section.lines or section.skipped
+    for line in section.lines:
+        assert math.isfinite(line.measured)
+        assert line.what in render([section])
+
+
+def test_contenders_take_turns_after_a_block_that_is_forgotten() -> None:
+    order: list[str] = []
+    contenders = {name: lambda name=name: order.append(name) or len(order) for name in "ab"}
+    assert alternate(contenders, 2) == {"a": [3, 5], "b": [4, 6]}
+    assert "".join(order) == "ababab"
+
+
+def test_a_drift_that_both_share_falls_out_of_the_ratio() -> None:
+    ours, theirs = Samples.of([1, 2, 4]), Samples.of([2, 4, 8])
+    assert ratio(ours, theirs) == 0.5
+
+
+def test_a_line_says_whether_its_target_is_met_or_by_how_much_it_is_missed() -> None:
+    lines = [
+        Line("quick", "1 us", "files 10 us", 0.1, target=Target(0.15)),
+        Line("slow", "3 us", "files 10 us", 0.3, target=Target(0.15)),
+        Line("kept", "80/s", "none 100/s", 0.8, target=Target(0.85, least=True)),
+        Line("lost", "9 kills", "", 2, "rows", Target(0)),
+    ]
+    ends = [line.rsplit("  ", 1)[1] for line in render([Section("t", lines)]).splitlines()[4:]]
+    assert ends == ["met", "missed by 100%", "missed by 6%", "missed by 2"]
+
+
+def test_the_state_has_39_leaves_and_about_740_bytes() -> None:
+    import json
+
+    def leaves(value: object) -> int:
+        if isinstance(value, dict):
+            return sum(leaves(item) for item in value.values())  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        if isinstance(value, list):
+            return sum(leaves(item) for item in value)  # pyright: ignore[reportUnknownVariableType, reportUnknownArgumentType]
+        return 1
+
+    states = make_states()
+    assert {leaves(state) for state in states} == {39}
+    assert all(730 < len(json.dumps(state, separators=(",", ":"))) < 760 for state in states)

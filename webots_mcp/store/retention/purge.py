@@ -10,13 +10,14 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.errors import DatabaseError
+from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.history.rollup import roll, watermark
+from webots_mcp.store.images import inside
 from webots_mcp.store.retention.planning import OLD_COMMANDS, Plan, Step, plan
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
 
@@ -142,7 +143,7 @@ def purge(
 class _Purge:
     def __init__(self, connection: sqlite3.Connection, data_dir: Path) -> None:
         self._connection = connection
-        self._data_dir = data_dir.resolve()
+        self._data_dir = data_dir
         self._failures = 0
         self.purged = Purged()
 
@@ -187,19 +188,19 @@ class _Purge:
         if step.table == "state":
             self._connection.execute(_COUNT_PURGED, (deleted, step.owner_id))
         self._connection.execute(_FORGET_SESSION, (session,))
-        self._delete_files(path for path in paths if path and not self._first(_IN_USE, path))
-
-    def _delete_files(self, paths: Iterable[str]) -> None:
-        """Before the commit: a row that comes back without its file is found again."""
         for path in paths:
-            file = (self._data_dir / path).resolve()
-            if not file.is_relative_to(self._data_dir) or not file.is_file():
-                continue
-            try:
-                file.unlink()
-                self.purged.files += 1
-            except OSError as error:
-                self.purged.problems.append(f"{file}: {error}")
+            if path and not self._first(_IN_USE, path):
+                self._delete_file(path)
+
+    def _delete_file(self, path: str) -> None:
+        """Before the commit: a row that comes back without its file is found again."""
+        try:
+            inside(self._data_dir, path).unlink()
+            self.purged.files += 1
+        except OSError as error:
+            self.purged.problems.append(f"{path}: {error}")
+        except (InvalidInputError, NothingRecordedError):
+            pass  # a foreign path is not ours to delete, and a file that is gone need not be
 
     def _first(self, query: str, *values: object) -> Any:
         row = self._connection.execute(query, values).fetchone()

@@ -1,0 +1,314 @@
+"""The data folder of a bridge that writes JSON files becomes a run; all of it, or nothing."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from webots_mcp.connection import connect
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.schema import create_schema
+from webots_mcp.store.json_folder import import_folder
+from webots_mcp.store.json_folder.reading import read_folder
+
+NOON = datetime(2026, 5, 4, 12, 0, 0)
+STATUS = {"pose": [1.0, 2.0, 0.5], "mode": "navigate", "timestamp": "2026-05-04T12:00:00.250000"}
+
+
+class Peer:
+    """Writes what such a bridge writes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def write(self, name: str, content: str | bytes, moment: datetime = NOON) -> Path:
+        file = self.folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(content.encode() if isinstance(content, str) else content)
+        os.utime(file, (moment.timestamp(), moment.timestamp()))
+        return file
+
+    def picture(self, name: str, moment: datetime = NOON) -> Path:
+        file = self.folder / name
+        file.parent.mkdir(parents=True, exist_ok=True)
+        Image.new("RGB", (8, 6), "red").save(file)
+        os.utime(file, (moment.timestamp(), moment.timestamp()))
+        return file
+
+    def everything(self) -> None:
+        self.write("status.json", json.dumps(STATUS, indent=2))
+        self.write(
+            "logs/controller.log", "[11:59:00] start\n[11:59:30] turn\nleft\n[12:00:00] go\n"
+        )
+        self.picture("camera/frame_0000.png")
+        self.picture("camera/frame_0001.png")
+        self.picture("screenshots/shot.png")
+        command = {"action": "grasp", "force": 3, "timestamp": "2026-05-04T11:59:59"}
+        self.write("commands.json", json.dumps(command))
+
+
+@pytest.fixture
+def peer(tmp_path: Path) -> Peer:
+    return Peer(tmp_path / "peer")
+
+
+@pytest.fixture
+def data_dir(tmp_path: Path) -> Path:
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def database(data_dir: Path) -> Iterator[sqlite3.Connection]:
+    with closing(connect(data_dir / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+        yield connection
+
+
+def rows(connection: sqlite3.Connection, sql: str) -> list[Any]:
+    return connection.execute(sql).fetchall()
+
+
+def counts(connection: sqlite3.Connection) -> dict[str, int]:
+    tables = ("robot", "session", "run", "state", "log", "event", "command", "image")
+    return {table: rows(connection, f"SELECT count(*) FROM {table}")[0][0] for table in tables}
+
+
+def test_a_folder_becomes_a_finished_run(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.everything()
+    made = import_folder(database, peer.folder, data_dir, "old rover")
+    assert made == ("old rover", 1, 1, 3, 1, 3)
+    run = rows(database, "SELECT robot, started_utc, duration_s, rows, end_reason FROM robot_run")[
+        0
+    ]
+    started = datetime(2026, 5, 4, 11, 59).astimezone()
+    assert run[0] == "old rover"
+    assert datetime.fromisoformat(f"{run[1]}+00:00") == started
+    assert run[2:] == (60.25, 1, "finished")
+    assert rows(database, "SELECT robot, x_m, yaw_rad, mode FROM robot_now") == [
+        ("old rover", 1.0, 0.5, "navigate")
+    ]
+    assert rows(database, "SELECT sim_time_s, message FROM log") == [
+        (0, "start"),
+        (30, "turn\nleft"),
+        (60, "go"),
+    ]
+    assert json.loads(rows(database, "SELECT data FROM state")[0][0]) == STATUS
+
+
+def test_pictures_are_copied_and_found_by_their_rows(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.everything()
+    import_folder(database, peer.folder, data_dir, "a/b")
+    images = rows(database, "SELECT kind, path, width, height, bytes FROM image")
+    assert [image[:2] for image in images] == [
+        ("camera", "camera/a_b/frame_0000.png"),
+        ("camera", "camera/a_b/frame_0001.png"),
+        ("screenshot", "screenshots/a_b/shot.png"),
+    ]
+    for _, path, width, height, size in images:
+        assert (width, height, size) == (8, 6, (data_dir / path).stat().st_size)
+
+
+def test_a_command_that_nobody_took_is_shown_and_will_never_run(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.everything()
+    import_folder(database, peer.folder, data_dir)
+    command = rows(database, "SELECT action, params, status, error FROM command")[0]
+    assert command[:3] == ("grasp", '{"force":3}', "expired")
+    assert "never run" in command[3]
+
+
+def test_the_mark_of_a_command_that_was_taken_is_no_command(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.write("status.json", json.dumps(STATUS))
+    peer.write("commands.json", '{"action": "none", "command": "cleared", "timestamp": "0"}')
+    assert import_folder(database, peer.folder, data_dir).commands == 0
+
+
+def test_pictures_of_our_own_data_folder_stay_where_they_are(
+    database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer = Peer(data_dir)
+    peer.picture("camera/frame_0000.png")
+    import_folder(database, data_dir, data_dir)
+    assert rows(database, "SELECT path FROM image") == [("camera/frame_0000.png",)]
+    assert [file.name for file in data_dir.rglob("*.png")] == ["frame_0000.png"]
+
+
+def test_a_state_with_nan_is_stored_as_the_bridge_stores_it(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.write("status.json", '{"front": NaN, "lidar": [1.0, -Infinity], "deep": {"a": Infinity}}')
+    import_folder(database, peer.folder, data_dir)
+    data, odd, wall_s = rows(database, "SELECT data, odd, wall_time_s FROM state")[0]
+    assert json.loads(data) == {"front": None, "lidar": [1.0, None], "deep": {"a": None}}
+    assert json.loads(odd) == {"front": "nan", "lidar.1": "-inf", "deep.a": "inf"}
+    assert wall_s == NOON.timestamp()  # without a timestamp the file's own time
+
+
+def test_a_log_over_midnight_gets_its_dates_from_the_newest_state(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.write("status.json", '{"timestamp": "2026-05-04T00:00:10"}')
+    lines = "[23:59:58] a\n[00:00:01] b\n[23:59:59] c\n[00:00:11] d\n"
+    peer.write("logs/controller.log", lines, datetime(2027, 1, 1))  # copied since
+    import_folder(database, peer.folder, data_dir)
+    days = [
+        datetime.fromtimestamp(wall_s).isoformat(" ")
+        for (wall_s,) in rows(database, "SELECT wall_time_s FROM log")
+    ]
+    assert days == [
+        "2026-05-02 23:59:58",
+        "2026-05-03 00:00:01",
+        "2026-05-03 23:59:59",
+        "2026-05-04 00:00:11",
+    ]
+
+
+@settings(max_examples=60)
+@given(st.lists(st.integers(1, 86_399), min_size=1, max_size=8))
+def test_lines_less_than_a_day_apart_keep_their_distance(gaps_s: list[int]) -> None:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        moments = [NOON.timestamp()]
+        for gap_s in gaps_s:
+            moments.append(moments[-1] + gap_s)
+        text = "".join(f"[{datetime.fromtimestamp(moment):%H:%M:%S}] line\n" for moment in moments)
+        peer = Peer(Path(folder))
+        peer.write("logs/controller.log", text, datetime.fromtimestamp(moments[-1]))
+        log = read_folder(peer.folder).log
+        assert log is not None
+        assert [line.wall_time_s for line in log.read()] == moments
+
+
+def test_a_log_from_windows_is_read(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.write("logs/controller.log", "[12:00:00] Motor läuft\r\n".encode("cp1252"))
+    import_folder(database, peer.folder, data_dir)
+    assert rows(database, "SELECT message FROM log") == [("Motor läuft",)]
+
+
+def test_progress_counts_the_lines(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.write("logs/controller.log", "[12:00:00] line\n" * 2500)
+    told: list[tuple[int, int]] = []
+    import_folder(
+        database, peer.folder, data_dir, progress=lambda done, of: told.append((done, of))
+    )
+    assert told == [(1000, 2500), (2000, 2500), (2500, 2500)]
+
+
+BAD = [
+    ("status.json", '{"pose": [1, 2,\n  }', r"status\.json, line 2, column 3: no JSON"),
+    ("status.json", "", r"status\.json is empty: its controller was ended"),
+    ("status.json", "[1, 2]", r"status\.json: a state is an object, this is a list"),
+    ("status.json", b'{"a": "\xff"}', r"status\.json: no JSON"),
+    ("status.json", '{"timestamp": "yesterday"}', "timestamp 'yesterday' is no ISO 8601 time"),
+    ("logs/controller.log", "no time\n", r"controller\.log, line 1: expected '\[HH:MM:SS\]"),
+    ("logs/controller.log", "\n[12:00:00] a\n[12:61:00] b\n", r"line 3: \[12:61:00\] is no time"),
+    ("camera/frame_0000.png", b"\x89PNG\r\n\x1a\n but then not", r"frame_0000\.png is no complete"),
+    ("camera/frame_0000.png", b"", r"frame_0000\.png is no complete PNG"),
+    ("commands.json", '[{"action": "a"}, 3]', r"commands\.json: a command is an object"),
+    ("commands.json", "{", r"commands\.json, line 1, column 2"),
+]
+
+
+@pytest.mark.parametrize(("name", "content", "message"), BAD)
+def test_a_bad_file_is_named_and_nothing_is_imported(
+    peer: Peer,
+    database: sqlite3.Connection,
+    data_dir: Path,
+    name: str,
+    content: str | bytes,
+    message: str,
+) -> None:
+    peer.everything()
+    peer.write(name, content)
+    with pytest.raises(InvalidInputError, match=message):
+        import_folder(database, peer.folder, data_dir)
+    assert set(counts(database).values()) == {0}
+    assert not list(data_dir.rglob("*.png"))
+
+
+def test_a_picture_that_was_cut_off_is_refused(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    file = peer.picture("camera/frame_0000.png")
+    file.write_bytes(file.read_bytes()[:-20])
+    with pytest.raises(InvalidInputError, match="no complete PNG"):
+        import_folder(database, peer.folder, data_dir)
+
+
+def test_a_failure_half_way_takes_everything_back(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.everything()
+    peer.write("logs/controller.log", "[12:00:00] line\n" * 2000)
+
+    def fail(done: int, of: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        import_folder(database, peer.folder, data_dir, progress=fail)
+    assert set(counts(database).values()) == {0}
+    assert not list(data_dir.rglob("*.png"))
+    assert import_folder(database, peer.folder, data_dir).lines == 2000
+
+
+def test_a_folder_is_imported_once(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.everything()
+    import_folder(database, peer.folder, data_dir, "first")
+    before = counts(database)
+    with pytest.raises(InvalidInputError, match="imported before, as run 1 of robot 'first'"):
+        import_folder(database, peer.folder, data_dir, "second")
+    assert counts(database) == before
+
+
+def test_a_robots_own_recording_is_not_mixed_with_an_import(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.everything()
+    import_folder(database, peer.folder, data_dir, "rover")
+    peer.write("logs/controller.log", "[12:00:00] another\n")
+    with pytest.raises(InvalidInputError, match="choose another name with --robot"):
+        import_folder(database, peer.folder, data_dir, "rover")
+
+
+@pytest.mark.parametrize("name", ["", "  "])
+def test_a_robot_needs_a_name(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path, name: str
+) -> None:
+    peer.everything()
+    with pytest.raises(InvalidInputError, match="needs a name"):
+        import_folder(database, peer.folder, data_dir, name)
+
+
+@pytest.mark.parametrize("make", [True, False])
+def test_a_folder_without_anything_to_import_says_what_was_looked_for(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path, make: bool
+) -> None:
+    if make:
+        peer.folder.mkdir()
+    with pytest.raises(InvalidInputError, match=r"no status\.json, no logs/controller\.log"):
+        import_folder(database, peer.folder, data_dir)

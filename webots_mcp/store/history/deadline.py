@@ -23,6 +23,11 @@ class Deadline:
         """Whether the time is over."""
         return time.monotonic() >= self._until_s
 
+    @property
+    def left_s(self) -> float:
+        """Seconds that are left; 0 once it has passed."""
+        return max(0.0, self._until_s - time.monotonic())
+
     @contextlib.contextmanager
     def interrupting(self, connection: sqlite3.Connection) -> Generator[None]:
         """Interrupt the connection's statements once the time is over.

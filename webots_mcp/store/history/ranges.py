@@ -45,6 +45,11 @@ class Segment:
     """The part of a range that lies in one run: [start_s, end_s) of simulation time.
 
     The limits in wall time matter where simulation time stood still (a paused simulation).
+
+    Attributes:
+        open_start: The start is that of the first row: what was stored before it (the begin of
+            the run, a log line) is in the range as well.
+        open_end: The same at the newest row: a last log line, the end of the run.
     """
 
     run_id: int
@@ -52,6 +57,18 @@ class Segment:
     end_s: float
     wall_start_s: float = -math.inf
     wall_end_s: float = math.inf
+    open_start: bool = False
+    open_end: bool = False
+
+    @property
+    def holds_from_s(self) -> float:
+        """Where the range begins for what is not a state row."""
+        return -math.inf if self.open_start else self.start_s
+
+    @property
+    def holds_to_s(self) -> float:
+        """Where the range ends for what is not a state row."""
+        return math.inf if self.open_end else self.end_s
 
     @property
     def bounded_by_wall(self) -> bool:
@@ -174,7 +191,9 @@ def just_after(time_s: float) -> float:
 def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
     """All rows of a run; None without any."""
     bounds = recorded_bounds(connection, run_id)
-    return Segment(run_id, bounds[0], just_after(bounds[1])) if bounds else None
+    if bounds is None:
+        return None
+    return Segment(run_id, bounds[0], just_after(bounds[1]), open_start=True, open_end=True)
 
 
 def _in_simulation_time(
@@ -198,7 +217,7 @@ def _in_simulation_time(
     # An end that is left out holds the newest row, also where the start lies beyond it.
     end = just_after(max(newest_s, start)) if end_s is None else end_s
     _require_order(start, end, "start_s", "end_s")
-    segment = Segment(run_id, start, end)
+    segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
     notes = _notes_outside(segment, first_s, newest_s)
     return TimeRange(subject.robot_id, subject.robot, (segment,), "simulation", notes)
 
@@ -254,7 +273,8 @@ def _cut(
         return None
     start_s = first_s if begun(first_s) else _turn(first_s, newest_s, begun)[1]
     last_s = _turn(first_s, newest_s, over)[0] if over(newest_s) else newest_s
-    return Segment(run_id, start_s, just_after(last_s), wall_start_s, wall_end_s)
+    walls = (wall_start_s, wall_end_s)
+    return Segment(run_id, start_s, just_after(last_s), *walls, open_start=True, open_end=True)
 
 
 def _turn(

@@ -68,10 +68,10 @@ def run_events(connection: sqlite3.Connection, segment: Segment) -> Iterator[Eve
     start_s, start_wall_s, start, end_s, end_wall_s, end = connection.execute(
         _RUN, (segment.run_id,)
     ).fetchone()
-    if segment.start_s <= start_s and segment.wall_start_s <= start_wall_s:
+    if segment.holds_from_s <= start_s and segment.wall_start_s <= start_wall_s:
         details = {"what": "began", "reason": start}
         yield Event("run", segment.run_id, start_s, start_s, start_wall_s, None, details)
-    if end_wall_s is not None and end_s < segment.end_s and end_wall_s < segment.wall_end_s:
+    if end_wall_s is not None and end_s < segment.holds_to_s and end_wall_s < segment.wall_end_s:
         details = {"what": "ended", "reason": end}
         yield Event("run", segment.run_id, end_s, end_s, end_wall_s, None, details)
 
@@ -170,10 +170,10 @@ def _command(
     finished_wall_s, end_s, result, error = finished
     wall_s = created_s if claimed_s is None else claimed_s
     if start_s is None:
-        span = (segment.run_id, segment.start_s, segment.end_s, wall_s)
+        span = (segment.run_id, segment.holds_from_s, segment.holds_to_s, wall_s)
         at = connection.execute(_SIM_AT_WALL, span).fetchone()
         start_s = at[0] if at else None
-    if start_s is None or not segment.start_s <= start_s < segment.end_s:
+    if start_s is None or not segment.holds_from_s <= start_s < segment.holds_to_s:
         return None
     details: dict[str, Any] = {"id": command_id, "status": status, "params": json.loads(params)}
     if finished_wall_s is not None:
@@ -188,4 +188,4 @@ def _command(
 
 def _bounds(segment: Segment) -> tuple[float, ...]:
     walls = (segment.wall_start_s, segment.wall_end_s)
-    return (segment.run_id, segment.start_s, segment.end_s, *walls)
+    return (segment.run_id, segment.holds_from_s, segment.holds_to_s, *walls)

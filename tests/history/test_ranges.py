@@ -165,3 +165,15 @@ def test_what_was_never_recorded_is_named_as_such(
         resolve_range(empty)
     with pytest.raises(NothingRecordedError, match="no state row"):
         resolve_range(empty, robot="a")
+
+
+def test_a_wall_range_over_very_many_runs_takes_the_newest(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    session_id = recorder.session(robot_id, "x")
+    for _ in range(60):
+        recorder.run(session_id, robot_id)
+        recorder.publish(1.0, {"x": 1})
+    found = resolve_range(empty, wall_start=0.0)
+    assert [segment.run_id for segment in found.segments] == list(range(11, 61))
+    assert "newest 50 runs" in found.notes[0]

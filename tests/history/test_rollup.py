@@ -18,8 +18,11 @@ from tests.history.recording import Recorder, record_rover
 from webots_mcp.connection import connect
 from webots_mcp.contract import MemoryDatabase
 from webots_mcp.schema import create_schema
+from webots_mcp.store.history import columns
 from webots_mcp.store.history.leaves import flatten
+from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.history.rollup import BUCKET_S, forget, roll, watermark
+from webots_mcp.store.history.series import query_history
 from webots_mcp.store.history.summary import Summary, merge, summarise
 
 Rows = list[tuple[float, dict[str, Any]]]
@@ -206,3 +209,28 @@ def test_a_robot_that_invents_names_for_ever_does_not_fill_the_register(
         recorder.publish(float(index), {f"key{index}_{i}": i for i in range(100)})
     roll(empty)
     assert empty.execute("SELECT count(*) FROM signal").fetchone()[0] == 2000
+
+
+def test_answers_stay_exact_while_rows_are_rolled_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(columns.exceeds, "__defaults__", (100,))
+    file = tmp_path / "webots.db"
+    with closing(connect(file, "writer", create=True)) as writer:
+        create_schema(writer)
+        record_rover(writer)
+    roller = threading.Thread(target=_roll_slowly, args=(file,))
+    with closing(connect(file, "reader")) as reader:
+        whole = resolve_range(reader, run_id=1)
+        roller.start()
+        while roller.is_alive():
+            (run,) = query_history(reader, whole, ["battery_v", "mode"]).runs
+            assert run.numbers[0].whole.present == 1150
+            assert len(run.changes[0].points) == 4
+    roller.join()
+
+
+def _roll_slowly(file: Path) -> None:
+    with closing(connect(file, "writer")) as connection:
+        while not roll(connection, 10).done:
+            pass

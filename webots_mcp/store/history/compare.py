@@ -22,6 +22,7 @@ from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.runs import RunInfo, run_info
 from webots_mcp.store.history.sampling import MOST_SAMPLES, read_sampled
 from webots_mcp.store.history.signals import catalogue, resolve_signals
+from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.subject import Subject
 from webots_mcp.store.history.summary import Summary, merge
 from webots_mcp.store.history.tiers import read_pieces
@@ -105,6 +106,7 @@ class Comparison:
     notes: tuple[str, ...]
 
 
+@in_one_snapshot
 def compare_runs(
     connection: sqlite3.Connection,
     run_ids: Sequence[int],
@@ -137,6 +139,7 @@ def compare_runs(
     return _compare(connection, groups, names, limit, options or EventOptions(), deadline_s)
 
 
+@in_one_snapshot
 def compare_code(
     connection: sqlite3.Connection,
     *,

@@ -16,6 +16,7 @@ from webots_mcp.store.history.motion import Motion, find_motion
 from webots_mcp.store.history.ranges import Segment, TimeRange, just_after, recorded_bounds
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.signals import catalogue, resolve_signals
+from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.stored import (
     change_events,
     command_events,
@@ -52,6 +53,7 @@ class Events:
     notes: tuple[str, ...]
 
 
+@in_one_snapshot
 def find_events(
     connection: sqlite3.Connection,
     time_range: TimeRange,
@@ -93,6 +95,7 @@ def find_events(
     )
 
 
+@in_one_snapshot
 def collect(
     connection: sqlite3.Connection,
     time_range: TimeRange,

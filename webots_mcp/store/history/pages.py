@@ -15,6 +15,7 @@ from webots_mcp.store.history.leaves import Value
 from webots_mcp.store.history.ranges import TimeRange
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.series import signals_of
+from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.tiers import rows_after
 
 MOST_ROWS: Final = 1000
@@ -41,6 +42,7 @@ class Page:
     notes: tuple[str, ...]
 
 
+@in_one_snapshot
 def query_rows(
     connection: sqlite3.Connection,
     time_range: TimeRange,

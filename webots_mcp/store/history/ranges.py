@@ -27,7 +27,8 @@ _FIRST: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
 _NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"
 _RUNS_IN: Final = (
     "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s < ? "
-    "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) ORDER BY id"
+    "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) "
+    "AND (? IS NULL OR id = ?) ORDER BY id DESC LIMIT ?"
 )
 _WALL_UP_TO: Final = (  # of the last row at or before a simulation time
     "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
@@ -38,6 +39,7 @@ _WALL_FROM: Final = (  # of the first row at or after a simulation time
     "ORDER BY sim_time_s, id LIMIT 1"
 )
 _BISECTIONS: Final = 60
+MOST_RUNS: Final = 50  # that one range in wall time may hold
 
 
 @dataclass(frozen=True)
@@ -243,12 +245,14 @@ def _in_wall_time(
     wall_start_s: float,
     wall_end_s: float,
 ) -> TimeRange:
-    found = connection.execute(_RUNS_IN, (subject.robot_id, wall_end_s, wall_start_s)).fetchall()
-    runs = [run for (run,) in found if run_id in (None, run)]
-    cuts = (_cut(connection, run, wall_start_s, wall_end_s) for run in runs)
+    wanted = (subject.robot_id, wall_end_s, wall_start_s, run_id, run_id, MOST_RUNS + 1)
+    runs = [run for (run,) in connection.execute(_RUNS_IN, wanted).fetchall()]
+    cuts = (_cut(connection, run, wall_start_s, wall_end_s) for run in reversed(runs[:MOST_RUNS]))
     segments = tuple(segment for segment in cuts if segment is not None)
-    notes = () if segments else (f"no row of robot {subject.robot!r} in that wall time",)
-    return TimeRange(subject.robot_id, subject.robot, segments, "wall", notes)
+    notes = [] if segments else [f"no row of robot {subject.robot!r} in that wall time"]
+    if len(runs) > MOST_RUNS:
+        notes.append(f"only the newest {MOST_RUNS} runs in that wall time are looked at")
+    return TimeRange(subject.robot_id, subject.robot, segments, "wall", tuple(notes))
 
 
 def _cut(

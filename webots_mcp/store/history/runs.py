@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.runs import fetch_run
 
@@ -90,6 +91,7 @@ class RunList:
     cursor: int | None
 
 
+@in_one_snapshot
 def list_runs(
     connection: sqlite3.Connection,
     *,

@@ -17,6 +17,7 @@ from webots_mcp.store.history.gaps import Gap
 from webots_mcp.store.history.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.signals import catalogue, resolve_signals
+from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.subject import Subject
 from webots_mcp.store.history.summary import Summary, merge
 
@@ -111,6 +112,7 @@ class History:
     notes: tuple[str, ...]
 
 
+@in_one_snapshot
 def query_history(
     connection: sqlite3.Connection,
     time_range: TimeRange,

@@ -15,6 +15,7 @@ from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.history.leaves import Kind, Value, flatten, parse
 from webots_mcp.store.history.registry import MAX_SIGNALS, Signal, by_name, registered, unregistered
 from webots_mcp.store.history.rollup import watermark
+from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.subject import Subject, find_subject
 from webots_mcp.store.history.summary import Summary, summarise
 
@@ -127,6 +128,7 @@ def _unknown(known: dict[str, Signal], name: str) -> str:
     return f"no signal {name!r} is recorded; there is {', '.join(offer)} ({len(known)} in all)"
 
 
+@in_one_snapshot
 def list_signals(
     connection: sqlite3.Connection,
     *,

@@ -13,6 +13,7 @@ from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.history.event import Event, EventOptions, Kind
 from webots_mcp.store.history.events import collect, in_order
 from webots_mcp.store.history.ranges import TimeRange
+from webots_mcp.store.history.snapshot import in_one_snapshot
 
 STORED: Final[tuple[Kind, ...]] = ("run", "gap", "change", "command", "log", "noticed", "image")
 MOST_ENTRIES: Final = 500
@@ -36,6 +37,7 @@ class Timeline:
     notes: tuple[str, ...]
 
 
+@in_one_snapshot
 def timeline(
     connection: sqlite3.Connection,
     time_range: TimeRange,

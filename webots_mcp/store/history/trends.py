@@ -14,6 +14,7 @@ from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.rollup import BUCKET_S
 from webots_mcp.store.history.series import signals_of
 from webots_mcp.store.history.shapes import find_spikes
+from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.summary import summarise, usable_numbers
 from webots_mcp.store.history.tiers import Pieces, read_pieces
 from webots_mcp.store.history.trend import Trend, judge
@@ -70,6 +71,7 @@ class Trends:
     notes: tuple[str, ...]
 
 
+@in_one_snapshot
 def trends(
     connection: sqlite3.Connection,
     time_range: TimeRange,

@@ -9,15 +9,17 @@ from typing import Any, Final
 from webots_mcp.plotting.canvas import short
 from webots_mcp.plotting.legend import Entry, paint_legend
 from webots_mcp.plotting.palette import DASHES, FAINT, INK, LINES, area_colours
-from webots_mcp.plotting.path import Path, Place, headings, thinned
+from webots_mcp.plotting.path import Path, Place, extent, headings, thinned
 from webots_mcp.plotting.spans import Lane
 
 _ARROWS: Final = 9
+_ON_THE_SPOT: Final = 0.03  # of the size of the whole way
 _LEAST_SIZE: Final = 0.02  # of the picture, in the unit of the position
 _START: Final[dict[str, Any]] = {
     "marker": "o", "markersize": 9, "markerfacecolor": "white", "markeredgewidth": 1.8,
 }  # fmt: skip
 _END: Final[dict[str, Any]] = {"marker": "s", "markersize": 9}
+_MANY: Final = 10  # marks of a kind; more are drawn smaller
 _SHAPES: Final[tuple[dict[str, Any], ...]] = (  # the first can be seen around the others
     {"marker": "o", "markersize": 16, "markerfacecolor": "none", "markeredgewidth": 2.2},
     {"marker": "X", "markersize": 10, "markeredgecolor": "white"},
@@ -118,11 +120,18 @@ def _paint_modes(axes: Any, path: Path, modes: Lane) -> list[Entry]:
         _line(axes, piece, color=INK, linewidth=4.4)  # an edge, so that light colours are seen
         part = Path(piece, None, frozenset())
         for span in modes.spans:
-            _line(
-                axes, part.between(span.start_s, span.end_s), color=colours[span.value], linewidth=3
-            )
+            held = part.between(span.start_s, span.end_s)
+            _line(axes, held, color=colours[span.value], linewidth=3)
+            if len(held) > 1 and extent(held) < _ON_THE_SPOT * extent(path.places):
+                _dot(axes, held[-1], colours[span.value])
     shown = [(Line2D([], [], color=colours[v], linewidth=4), short(v)) for v in modes.values]
     return [(Line2D([], [], linestyle=""), f"{short(modes.name)}:"), *shown]
+
+
+def _dot(axes: Any, place: Place, colour: str) -> None:
+    """For what happened on the spot, where a line has no length."""
+    axes.plot([place.x], [place.y], marker="o", markersize=6, color=colour, markeredgecolor=INK,
+              markeredgewidth=0.6, zorder=3.5)  # fmt: skip
 
 
 def _paint_time(figure: Any, axes: Any, path: Path) -> list[Entry]:
@@ -177,7 +186,9 @@ def _paint_marks(axes: Any, track: Track, colour: str, alone: bool) -> list[Entr
             continue
         places = [track.path.at(span.start_s) for span in mark.spans]
         xs, ys = [place.x for place in places], [place.y for place in places]
-        (handle,) = axes.plot(xs, ys, linestyle="", color=colour, zorder=6, **shape)
+        size = shape["markersize"] * (0.6 if len(places) > _MANY else 1)
+        style = shape | {"linestyle": "", "color": colour, "markersize": size}
+        (handle,) = axes.plot(xs, ys, zorder=6, **style)
         whose = "" if alone else f", {track.name}"
         entries.append((handle, f"{short(mark.name)}{whose} ({len(places)})"))
     return entries

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from webots_mcp.plotting.curves import Curve
-from webots_mcp.plotting.palette import LINES
 
 MOST_PANELS: Final = 3
-MOST_CURVES: Final = len(LINES)
+MOST_CURVES: Final = 5  # more bands on top of each other are mud
 _LEAST_SHARE: Final = 0.07  # of the axis; a curve that moves less would look flat
 
 
@@ -30,9 +29,14 @@ class Panel:
         """The signals, each once."""
         return list(dict.fromkeys(curve.name for curve in self.curves))
 
-    def takes(self, curve: Curve) -> bool:
-        """Whether it fits beside the others."""
-        if len(self.curves) == MOST_CURVES or curve.unit != self.unit:
+    @property
+    def is_full(self) -> bool:
+        """Whether another curve would be one too many."""
+        return len(self.curves) == MOST_CURVES
+
+    def suits(self, curve: Curve) -> bool:
+        """Whether it has the unit and the scale of the others."""
+        if curve.unit != self.unit:
             return False
         together = [*self.curves, curve]
         height = max(each.high for each in together) - min(each.low for each in together)
@@ -45,18 +49,35 @@ def _is_visible(curve: Curve, height: float) -> bool:
 
 
 def by_scale(curves: Iterable[Curve]) -> tuple[list[Panel], list[str]]:
-    """The curves of one run in at most three panels, and the names of those left out."""
+    """The curves of one run in at most three panels, and the names of those left out.
+
+    A unit or a scale that has no panel yet comes before a second panel for one that has.
+    """
     panels: list[Panel] = []
-    left_out: list[str] = []
+    left_out: list[Curve] = []
     for curve in curves:
-        panel = next((panel for panel in panels if panel.takes(curve)), None)
-        if panel is not None:
-            panel.curves.append(curve)
-        elif len(panels) < MOST_PANELS:
-            panels.append(Panel([curve]))
+        suitable = [panel for panel in panels if panel.suits(curve)]
+        place = next((panel for panel in suitable if not panel.is_full), None)
+        if place is not None:
+            place.curves.append(curve)
+        elif suitable or len(panels) == MOST_PANELS:
+            left_out.append(curve)
         else:
-            left_out.append(curve.name)
-    return panels, left_out
+            panels.append(Panel([curve]))
+    for _ in range(len(panels), MOST_PANELS):
+        if left_out:
+            panels.append(Panel(left_out[:1]))
+            del left_out[0]
+            _fill(panels[-1], left_out)
+    return panels, [curve.name for curve in left_out]
+
+
+def _fill(panel: Panel, waiting: list[Curve]) -> None:
+    """Take from those that wait what suits."""
+    for curve in tuple(waiting):
+        if not panel.is_full and panel.suits(curve):
+            panel.curves.append(curve)
+            waiting.remove(curve)
 
 
 def by_signal(curves: Sequence[Curve]) -> tuple[list[Panel], list[str]]:

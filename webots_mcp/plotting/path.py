@@ -101,17 +101,20 @@ def _speed(before: Place, after: Place) -> float:
     return math.dist(before[1:], after[1:]) / passed_s if passed_s > 0 else 0.0
 
 
+def extent(places: Sequence[Place]) -> float:
+    """The larger side of the box around the places."""
+    xs, ys = [place.x for place in places], [place.y for place in places]
+    return max(max(xs) - min(xs), max(ys) - min(ys)) if places else 0.0
+
+
 def thinned(places: Sequence[Place]) -> list[Place]:
     """The places without those that would be painted on the same pixel as the one before."""
-    if not places:
-        return []
-    xs, ys = [place.x for place in places], [place.y for place in places]
-    least = _FINENESS * max(max(xs) - min(xs), max(ys) - min(ys))
-    kept = [places[0]]
+    least = _FINENESS * extent(places)
+    kept = list(places[:1])
     for place in places:
         if math.dist(place[1:], kept[-1][1:]) > least:
             kept.append(place)
-    return kept if kept[-1] == places[-1] else [*kept, places[-1]]
+    return [*kept, places[-1]] if kept[-1:] != list(places[-1:]) else kept
 
 
 class Heading(NamedTuple):

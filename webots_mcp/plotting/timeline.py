@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.plotting.canvas import short
+from webots_mcp.plotting.curves import Curve
 from webots_mcp.plotting.legend import Entry, paint_legend
 from webots_mcp.plotting.palette import DASHES, FAINT, INK, LINES, area_colours
 from webots_mcp.plotting.panels import Panel
@@ -73,7 +75,7 @@ def _paint_panel(axes: Any, panel: Panel, timeline: Timeline) -> None:
     for event in [span for lane in timeline.events for span in lane.spans][:_LINES_THROUGH]:
         axes.axvline(event.start_s, color=FAINT, linewidth=0.6, linestyle=(0, (1, 3)), zorder=1.5)
     handles = [
-        _paint_curve(axes, curve.points, curve.lone_points, *_pen(panel, index, timeline))
+        _paint_curve(axes, curve, *_pen(panel, index, timeline), len(panel.curves))
         for index, curve in enumerate(panel.curves)
     ]
     unit = f"[{panel.unit}]" if panel.unit else ""
@@ -95,10 +97,12 @@ def _pen(panel: Panel, index: int, timeline: Timeline) -> tuple[str, Any]:
     return LINES[index % len(LINES)], DASHES[index % len(DASHES)]
 
 
-def _paint_curve(axes: Any, points: Any, lone_points: Any, colour: str, dashes: Any) -> Any:
-    times, means, lows, highs = zip(*points, strict=True)
-    axes.fill_between(times, lows, highs, color=colour, alpha=0.25, linewidth=0, zorder=2)
-    for time, mean, low, high in lone_points:
+def _paint_curve(axes: Any, curve: Curve, colour: str, dashes: Any, neighbours: int) -> Any:
+    """The band is the fainter the more of them lie on top of each other."""
+    times, means, lows, highs = zip(*curve.points, strict=True)
+    alpha = 0.28 / math.sqrt(neighbours)
+    axes.fill_between(times, lows, highs, color=colour, alpha=alpha, linewidth=0, zorder=2)
+    for time, mean, low, high in curve.lone_points:
         axes.plot([time, time], [low, high], color=colour, alpha=0.4, linewidth=2, zorder=2)
         axes.plot([time], [mean], color=colour, marker=".", markersize=4, zorder=3)
     (line,) = axes.plot(times, means, color=colour, linestyle=dashes, linewidth=1.3, zorder=3)

@@ -27,7 +27,10 @@ ALLOWED = {
 STDLIB = {"contract", "errors", "bundled", *ALLOWED["maintenance"], "settlement", "maintenance"}
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["store"] = STDLIB | {"store"}
-ALLOWED["server"] = STDLIB | {"store", "server", "__version__"}
+ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
+ALLOWED["server"] = STDLIB | {"store", "plotting", "server", "__version__"}
+ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
+ALLOWED["pytest_plugin"] = {"contract", "standin", "testing", "MCPBridge", "MemoryDatabase"}
 
 
 def imports(file: Path) -> Iterator[str]:

@@ -291,7 +291,8 @@ SELECT r.name AS robot, c.id AS command_id, c.action, c.params, c.status,
     - c.created_wall_time_s, 3) AS waiting_s,
   round(coalesce(c.finished_wall_time_s, (julianday('now') - 2440587.5) * 86400.0) - c.claimed_wall_time_s, 3) AS running_s,
   c.claimed_sim_time_s, c.finished_sim_time_s,
-  round(c.finished_sim_time_s - c.claimed_sim_time_s, 3) AS running_sim_s,
+  CASE WHEN c.finished_sim_time_s >= c.claimed_sim_time_s /* a reset takes it back */
+    THEN round(c.finished_sim_time_s - c.claimed_sim_time_s, 3) END AS running_sim_s,
   c.result, c.error, c.requested_by, c.session_id
 FROM command c JOIN robot r ON r.id = c.robot_id;
 CREATE VIEW robot_event AS

@@ -10,7 +10,7 @@ Run 1, 20 s of simulation time, one row each 32 ms:
     15 to 20 s    cruise
 
 with a picture each 4 s, log lines at each change of mode, commands that succeed and that fail.
-Run 2, after a reset: 8 s of cruise.
+Run 2, after a reset: the same for 12 s, but nothing is published from 4 to 5.5 s.
 """
 
 from __future__ import annotations
@@ -61,8 +61,6 @@ class Rover:
         raise RuntimeError("the gripper is not mounted")
 
     def drive(self, until_s: float, commands: dict[float, Any], silent_s: tuple[float, float]):
-        for motor in self.motors:
-            motor.setPosition(math.inf)
         while self.robot.step(STEP_MS) != -1 and self.robot.getTime() < until_s:
             time_s = round(self.robot.getTime(), 3)
             self.act(time_s)
@@ -81,6 +79,7 @@ class Rover:
         self.mode = mode
         speeds = (0.0, 0.0) if 6 <= time_s < 8 else SPEEDS_RADPS[mode]
         for motor, speed in zip(self.motors, speeds, strict=True):
+            motor.setPosition(math.inf)  # a reset makes motors hold
             motor.setVelocity(speed)
 
     def state(self, time_s: float) -> dict[str, Any]:
@@ -110,6 +109,6 @@ def record(folder: Path) -> Path:
     rover = Rover(folder / "webots.db")
     rover.drive(20.0, dict(COMMANDS), (12.0, 15.0))
     rover.robot.simulationReset()
-    rover.drive(8.0, {}, (math.inf, math.inf))
+    rover.drive(12.0, {}, (4.0, 5.5))
     rover.bridge.close()
     return rover.database

@@ -11,7 +11,7 @@ from tests.benchmarks.states import make_states
 from tests.benchmarks.table import Line, Target, duration
 from tests.benchmarks.ways import BridgeWay, JsonFiles, RawSqlite, Way
 
-_BLOCKS = 40
+_BLOCKS = 30
 _WRITES = 200  # calls in a block
 _READS = 1000
 

@@ -24,12 +24,14 @@ def measure_fast_mode(bench: Bench) -> Iterable[Line]:
     beside = f"no bridge {none.p50:.0f}/s"
     for name, what, target in (
         ("bridge", "every 5th step recorded (default)", Target(0.85, least=True)),
+        ("orjson", "the same, with orjson", None),
         ("files", "the same with JSON files", None),
         ("bridge every", "every step recorded", None),
         ("files every", "the same with JSON files", None),
     ):
-        kept = ratio(taken[name], none)
-        yield Line(what, f"{taken[name].p50:.0f}/s", beside, kept, target=target)
+        if name in taken:
+            kept = ratio(taken[name], none)
+            yield Line(what, f"{taken[name].p50:.0f}/s", beside, kept, target=target)
 
 
 def _run(bench: Bench) -> dict[str, Samples]:

@@ -30,7 +30,7 @@ def measure_memory(bench: Bench) -> Iterable[Line]:
     for kind in ("bridge", "orjson") if ORJSON else ("bridge",):
         contenders[kind] = _recording(bench, kind, states)
     bench.say("small processes")
-    taken = alternate(contenders, bench.count(5))
+    taken = alternate(contenders, bench.count(3))
     if not taken["bare"][0].get("private"):
         raise NotMeasurableError("only Linux tells what is private to a process")
     yield _line("private memory (USS)", "private", taken, "bridge", Target(6))

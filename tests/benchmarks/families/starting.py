@@ -73,7 +73,7 @@ def measure_server(bench: Bench) -> Iterable[Line]:
         "one tool": lambda: anyio.run(_list_tools, one_tool_server()),
     }
     bench.say("fresh processes")
-    taken = alternate(contenders, bench.count(9), warm_up=False)
+    taken = alternate(contenders, bench.count(7), warm_up=False)
     ours, one = Samples.of(taken["ours"]), Samples.of(taken["one tool"])
     beside = f"MCPServer of one tool {duration(one.p50)}"
     yield Line("ready", duration(ours.p50), beside, ratio(ours, one), target=Target(1.3))

@@ -12,12 +12,13 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from controller import Supervisor
 
 from tests.benchmarks.measuring import alternate
 from tests.benchmarks.states import State, make_states
-from tests.benchmarks.ways import JsonFiles, use_encoder
+from tests.benchmarks.ways import ORJSON, JsonFiles, use_encoder
 from webots_mcp import MCPBridge
 
 _STEP_MS = 16
@@ -29,12 +30,11 @@ Loop = Callable[[State], object]
 def main(folder: str, blocks: int, steps: int) -> None:
     """Drive, and leave the result."""
     robot = Supervisor()
-    use_encoder(None)
     with MCPBridge(robot, folder, throttle_interval=_THROTTLE) as bridge:
-        contenders = {
-            name: _driving(robot, loop, steps)
-            for name, loop in _loops(bridge, Path(folder)).items()
-        }
+        loops = _loops(bridge, Path(folder))
+        contenders = {name: _driving(robot, loop, steps) for name, loop in loops.items()}
+        if ORJSON is not None:
+            contenders["orjson"] = _driving(robot, loops["bridge"], steps, ORJSON)
         result = alternate(contenders, blocks)
     (Path(folder) / "result.part").write_text(json.dumps(result))
     (Path(folder) / "result.part").rename(Path(folder) / "result.json")
@@ -51,10 +51,11 @@ def _loops(bridge: MCPBridge, folder: Path) -> dict[str, Loop]:
     }
 
 
-def _driving(robot: Supervisor, loop: Loop, steps: int) -> Callable[[], float]:
+def _driving(robot: Supervisor, loop: Loop, steps: int, orjson: Any = None) -> Callable[[], float]:
     states = make_states()
 
     def run_block() -> float:
+        use_encoder(orjson)
         started = time.perf_counter()
         for i in range(steps):
             robot.step(_STEP_MS)

@@ -95,12 +95,18 @@ async def test_watching_reports_what_was_recorded_meanwhile(
     assert answer["rows"] > 10
     assert answer["movement"]["position"] == ["pose.0", "pose.1"]
     assert answer["movement"]["distance"] > 0
-    changes = [row[1:] for row in answer["changes"]["rows"]]
-    assert ["mode", "turn", "cruise"] in changes
-    assert "pause" in [name for name, *_ in changes]
-    assert {row[0] for row in answer["signals"]["rows"]} == {"pose.0", "steps"}
-    assert [row[1] for row in answer["commands"]["rows"]] == ["pause", "resume"]
-    assert [row[2] for row in answer["logs"]["rows"]] == ["too close"]
+    (trend,) = answer["trends"]
+    assert trend["rows"] == answer["rows"]
+    assert {row[0] for row in trend["numbers"]["rows"]} == {"pose.0", "steps"}
+    columns, rows = answer["events"]["columns"], answer["events"]["rows"]
+    events = [dict(zip(columns, row, strict=True)) for row in rows]
+    changes = [event["details"] for event in events if event["name"] == "mode"]
+    assert {"before": "turn", "after": "cruise"} in changes
+    noticed = [event["details"]["what"] for event in events if event["kind"] == "noticed"]
+    assert noticed == ["pause", "resume"]
+    assert [e["name"] for e in events if e["kind"] == "command"] == ["pause", "resume"]
+    logs = [event["details"]["message"] for event in events if event["kind"] == "log"]
+    assert logs == ["too close"]
     assert all(report.startswith("rover: ") for report in reports)
 
 

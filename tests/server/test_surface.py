@@ -30,9 +30,13 @@ READING = {
     "webots_get_trends",
     "webots_find_events",
     "webots_get_timeline",
+    "webots_list_runs",
+    "webots_compare_runs",
     "webots_plot",
+    "webots_query_sql",
 }
 ACTING = {
+    "webots_annotate_run",
     "webots_take_screenshot",
     "webots_simulation_control",
     "webots_world_reload",

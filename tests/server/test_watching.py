@@ -1,78 +1,76 @@
-"""What a stretch of rows shows."""
+"""Windows of wall time: what the rows in them show, and how far the robot went."""
 
 from __future__ import annotations
 
-import json
-
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from webots_mcp.server.watching import Watched, evenly, find_place
-from webots_mcp.store.states import State
+from tests.server.conftest import Connect, ask
+from tests.server.story import rows_of
+from tests.store.recorded import Recorded, RecordedRobot
 
-
-def watch(*published: dict[str, object]) -> Watched:
-    watched = Watched()
-    rows = [State(i, 1, i * 0.5, 0.0, json.dumps(data), None) for i, data in enumerate(published)]
-    watched.read(rows)
-    return watched
+pytestmark = pytest.mark.anyio
 
 
-@pytest.mark.parametrize(
-    ("names", "place"),
-    [
-        ({"pose.0", "pose.1", "pose.2"}, ("pose.0", "pose.1")),
-        ({"robot.pose.x", "robot.pose.y"}, ("robot.pose.x", "robot.pose.y")),
-        ({"gps.0", "gps.1", "position.x", "position.y"}, ("position.x", "position.y")),
-        ({"sensors.gps.0", "sensors.gps.1"}, ("sensors.gps.0", "sensors.gps.1")),
-        ({"x", "y"}, ("x", "y")),
-        ({"joints.0", "joints.1", "x"}, None),
-    ],
-)
-def test_where_the_robot_is_is_found_by_name(
-    names: set[str], place: tuple[str, str] | None
+@pytest.fixture
+def rover(recorded: Recorded) -> RecordedRobot:
+    return recorded.robot()
+
+
+def drive(rover: RecordedRobot, *places: object) -> None:
+    for step, place in enumerate(places):
+        rover.state(step * 0.5, {"pose": place}, at=rover.now + step * 0.5)
+
+
+async def test_a_way_there_and_back_has_a_distance_and_no_displacement(
+    connect: Connect, rover: RecordedRobot
 ) -> None:
-    assert find_place(dict.fromkeys(sorted(names), 1.0)) == place
+    drive(rover, [0, 0], [3, 4], [0, 0])
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_s=60)
+    assert answer["movement"]["distance"] == 10.0
+    assert answer["movement"]["displacement"] == 0.0
+    assert answer["rows"] == 3
 
 
-def test_a_way_there_and_back_has_a_distance_and_no_displacement() -> None:
-    movement = watch({"pose": [0, 0]}, {"pose": [3, 4]}, {"pose": [0, 0]}).movement()
-    assert movement is not None
-    assert (movement["distance"], movement["displacement"]) == (10.0, 0.0)
+async def test_a_lost_position_does_not_count_as_a_way(
+    connect: Connect, rover: RecordedRobot
+) -> None:
+    drive(rover, [0, 0], [None, 1], [0, 1])
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_s=60)
+    assert answer["movement"]["distance"] == 1.0
 
 
-def test_a_lost_position_does_not_count_as_a_way() -> None:
-    movement = watch({"pose": [0, 0]}, {"pose": [None, 1]}, {"pose": [0, 1]}).movement()
-    assert movement is not None
-    assert movement["distance"] == 1.0
+async def test_a_robot_without_a_position_has_no_movement(
+    connect: Connect, rover: RecordedRobot
+) -> None:
+    rover.state(0.0, {"joints": [1, 2]})
+    rover.state(1.0, {"joints": [3, 4]}, at=rover.now + 1)
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_s=60)
+    assert "movement" not in answer
+    assert answer["rows"] == 2
 
 
-def test_a_jump_to_the_start_at_a_reset_is_no_way_that_was_travelled() -> None:
-    watched = watch({"pose": [0, 0]}, {"pose": [5, 0]})
-    watched.read([State(9, 2, 0.0, 0.0, '{"pose": [0, 0]}', None)])
-    assert watched.distance == 5.0
+async def test_rows_before_the_window_do_not_count_even_at_the_same_simulation_time(
+    connect: Connect, rover: RecordedRobot
+) -> None:
+    for second in range(10):
+        rover.state(5.0, {"count": second}, at=rover.now + second)
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_s=3)
+    (trend,) = answer["trends"]
+    (count,) = rows_of(trend["numbers"])
+    assert answer["rows"] == 4
+    assert (count["first"], count["last"]) == (6, 9)
 
 
-def test_the_numbers_that_changed_most_come_first_whatever_their_unit() -> None:
-    watched = watch({"mm": 1000.0, "v": 12.0, "zero": 0.0, "still": 5},
-                    {"mm": 1100.0, "v": 6.0, "zero": 0.0, "still": 5})  # fmt: skip
-    assert [name for name, _ in watched.changed_most()] == ["v", "mm"]
-
-
-def test_changes_of_text_and_flags_are_found_at_any_depth_with_their_time() -> None:
-    watched = watch({"arm": {"mode": "a", "ok": True}}, {"arm": {"mode": "b", "ok": True}})
-    assert watched.changes == [(0.5, "arm.mode", "a", "b")]
-
-
-def test_what_is_missing_is_counted_and_breaks_nothing() -> None:
-    watched = watch({"front": 1.0}, {"front": None}, {"front": 3.0}, {})
-    assert (watched.numbers["front"].missing, watched.numbers["front"].last) == (1, 3.0)
-
-
-@given(st.lists(st.integers(), unique=True, max_size=300), st.integers(2, 50))
-def test_a_sample_is_in_order_and_keeps_both_ends(ids: list[int], most: int) -> None:
-    chosen = evenly(sorted(ids), most)
-    assert len(chosen) == min(len(ids), most)
-    assert chosen == sorted(set(chosen))
-    assert not ids or (chosen[0], chosen[-1]) == (min(ids), max(ids))
+async def test_what_was_logged_after_the_last_row_is_told(
+    connect: Connect, rover: RecordedRobot
+) -> None:
+    rover.state(1.0, {"x": 1})
+    rover.log(2.0, "the arm is blocked", level="error")
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_s=5)
+    (event,) = [row for row in rows_of(answer["events"]) if row["kind"] == "log"]
+    assert event["details"]["message"] == "the arm is blocked"

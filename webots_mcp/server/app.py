@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncGenerator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
+from sqlite3 import Connection
 from typing import Final
 
 from anyio import to_thread
@@ -14,6 +15,7 @@ from webots_mcp import __version__
 from webots_mcp.contract import Database
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.server.boundary import register
+from webots_mcp.server.resources import add_resources
 from webots_mcp.server.tools.commands import CommandTools
 from webots_mcp.server.tools.control import ControlTools
 from webots_mcp.server.tools.events import EventTools
@@ -22,13 +24,16 @@ from webots_mcp.server.tools.logs import LogTools
 from webots_mcp.server.tools.monitor import MonitorTools
 from webots_mcp.server.tools.pictures import PictureTools
 from webots_mcp.server.tools.plot import PlotTools
+from webots_mcp.server.tools.runs import RunTools
 from webots_mcp.server.tools.signals import SignalTools
+from webots_mcp.server.tools.sql import SqlTools
 from webots_mcp.server.tools.state import StateTools
 from webots_mcp.server.tools.timeline import TimelineTools
 from webots_mcp.server.tools.trends import TrendTools
 from webots_mcp.server.tools.world import WorldTools
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.retention import Upkeep
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "
@@ -48,7 +53,9 @@ FAMILIES: Final = (
     TrendTools,
     EventTools,
     TimelineTools,
+    RunTools,
     PlotTools,
+    SqlTools,
     ControlTools,
     CommandTools,
 )
@@ -68,25 +75,26 @@ def create_server(database: Database, data_dir: Path, *, read_only: bool = False
         title="Webots flight recorder",
         version=__version__,
         instructions=INSTRUCTIONS,
-        lifespan=_maintaining(maintained),
+        lifespan=_maintaining(maintained, data_dir),
     )
     recording = Recording(database, data_dir, read_only)
     for family in FAMILIES:
         register(mcp, family(recording), read_only=read_only)
+    add_resources(mcp, recording)
     return mcp
 
 
 def _maintaining(
-    database: Path | None,
+    database: Path | None, data_dir: Path
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[None]]:
-    """Keep the log short and the rollups current while the server runs, if it may write."""
+    """Keep the log short, the rollups current and the file small, if the server may write."""
 
     @asynccontextmanager
     async def lifespan(_: MCPServer) -> AsyncGenerator[None]:
         if database is None:
             yield
             return
-        maintainer = Maintainer(database, "server", work=roll)
+        maintainer = Maintainer(database, "server", work=_upkeep(data_dir))
         maintainer.start()
         try:
             yield
@@ -94,3 +102,14 @@ def _maintaining(
             await to_thread.run_sync(maintainer.stop, abandon_on_cancel=True)
 
     return lifespan
+
+
+def _upkeep(data_dir: Path) -> Callable[[Connection], None]:
+    """What the maintainer does each second while it holds the lease: both in bounded time."""
+    retain = Upkeep(data_dir)
+
+    def work(connection: Connection) -> None:
+        roll(connection)
+        retain(connection)
+
+    return work

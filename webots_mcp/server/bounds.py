@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import Final
 
+from webots_mcp.errors import NothingRecordedError
 from webots_mcp.store.history.ranges import TimeRange, resolve_range
 from webots_mcp.store.recording import View
 
@@ -25,7 +26,8 @@ class Bounds:
         """What they mean for the robot of a view, in its newest few runs.
 
         Raises:
-            InvalidRangeError, NothingRecordedError: See `resolve_range`.
+            InvalidRangeError: See `resolve_range`.
+            NothingRecordedError: There is no row, or none in that wall time.
         """
         found = resolve_range(
             view.connection,
@@ -37,6 +39,10 @@ class Bounds:
             wall_start=self.since,
             wall_end=self.until,
         )
+        if not found.segments:
+            raise NothingRecordedError(
+                f"{'; '.join(found.notes)}: webots_list_runs tells when each run was"
+            )
         return newest_runs(found)
 
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+import sqlite3
 from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeVar
 
-from webots_mcp.errors import NothingRecordedError
+from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.server.results import Answer, Table
 from webots_mcp.server.shortening import (
     DETAIL_BUDGET,
@@ -15,7 +16,7 @@ from webots_mcp.server.shortening import (
     round_number,
     shorten,
 )
-from webots_mcp.store.recording import View
+from webots_mcp.store.recording import View, look
 
 BUDGET: Final = 6_600  # characters of JSON, of the 8,000 that are 2,000 tokens; the header has 600
 LARGE_BUDGET: Final = 40_000  # where the asker said how much: clients put longer answers aside
@@ -38,9 +39,20 @@ def answer_about(view: View, model: type[_A], find: Callable[[], dict[str, Any]]
     return model(**answer)
 
 
+def header_of_only(connection: sqlite3.Connection) -> dict[str, Any]:
+    """The header of the only robot that can be meant; empty where several can, or none."""
+    try:
+        return look(connection, None).header()
+    except (AmbiguousRobotError, NothingRecordedError):
+        return {}
+
+
 def figure(value: float | None) -> float | None:
-    """A number as it is shown; None where there is none, or none that JSON could hold."""
-    return None if value is None or not math.isfinite(value) else round_number(value)
+    """A number as it is shown; None where there is none, or none that JSON could hold.
+
+    Adding zero makes -0.0 the 0.0 that it means.
+    """
+    return None if value is None or not math.isfinite(value) else round_number(value) + 0.0
 
 
 def seconds(time_s: float | None) -> float | None:

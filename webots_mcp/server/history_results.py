@@ -149,3 +149,57 @@ class TimelineAnswer(NotedAnswer):
     cursor: str | None = Field(
         default=None, description="Ask again with this cursor for later ones."
     )
+
+
+class MonitorAnswer(NotedAnswer):
+    """What was recorded in a window of wall time: of exactly those rows."""
+
+    window_s: float | None = Field(default=None, description="Wall time that was looked at.")
+    rows: int | None = Field(default=None, description="States recorded in the window.")
+    movement: dict[str, Any] | None = None
+    trends: list[RunTrendTables] | None = Field(
+        default=None, description="More than one: time went back in between."
+    )
+    events: Table | None = Field(
+        default=None, description="Columns with @ hold that signal's value when the event began."
+    )
+    totals: dict[str, int] | None = Field(
+        default=None, description="How many events there are of each kind, shown or not."
+    )
+
+
+class SqlAnswer(Answer):
+    """What a SELECT returned."""
+
+    result: Table | None = None
+    truncated: str | None = Field(default=None, description="Why rows are missing.")
+    shortened: int | None = Field(default=None, description="Values that were cut.")
+
+
+class RunsAnswer(Answer):
+    """Runs, the newest first."""
+
+    runs: Table | None = None
+    total: int | None = None
+    cursor: int | None = Field(
+        default=None, description="Ask again with this cursor for older ones."
+    )
+
+
+class ComparisonAnswer(NotedAnswer):
+    """Runs beside each other; the first group is the reference."""
+
+    groups: Table | None = None
+    compared_s: float | None = Field(
+        default=None, description="Differences are about the first so many seconds of each run."
+    )
+    differences: Table | None = Field(
+        default=None,
+        description="Most different first; lists are in the order of the groups. effect: how far "
+        "the mean is from the first group's, in pooled standard deviations (0.8 is large, null: "
+        "unequal constants).",
+    )
+    total: int | None = Field(default=None, description="Numeric signals that all groups have.")
+    only_in: dict[str, list[str]] | None = Field(
+        default=None, description="Signals that not every group has."
+    )

@@ -107,27 +107,6 @@ class LogsAnswer(Answer):
     )
 
 
-class MonitorAnswer(Answer):
-    """What was recorded while watching."""
-
-    watched_s: float | None = Field(default=None, description="Wall time.")
-    from_sim_time_s: float | None = None
-    rows: int | None = Field(default=None, description="States recorded in the window.")
-    sampled: int | None = Field(default=None, description="How many of them were read, if not all.")
-    runs: list[int] | None = Field(
-        default=None, description="More than one: time went back in between."
-    )
-    movement: dict[str, Any] | None = None
-    changes: Table | None = Field(
-        default=None, description="Changed text and flags, pauses, resets."
-    )
-    signals: Table | None = Field(default=None, description="Numbers that changed most, first.")
-    steady: int | None = Field(default=None, description="Numeric signals that did not change.")
-    events: dict[str, int] | None = Field(default=None, description="Other events by kind.")
-    logs: Table | None = Field(default=None, description="Lines of level warning and above.")
-    commands: Table | None = None
-
-
 class CommandAnswer(Answer):
     """What became of a command."""
 

@@ -1,136 +1,92 @@
-"""What a stretch of recorded rows shows: movement, changes, the numbers that changed most."""
+"""A window of wall time: the rows that were recorded in it, and how far the robot went."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple
+import sqlite3
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final
 
-from webots_mcp.server.shortening import round_number
-from webots_mcp.store.history.leaves import Value, flatten, parse
-from webots_mcp.store.states import State
+from webots_mcp.server.bounds import newest_runs
+from webots_mcp.server.fitting import figure
+from webots_mcp.store.history.columns import Columns, read_columns
+from webots_mcp.store.history.deadline import Deadline
+from webots_mcp.store.history.event import EventOptions
+from webots_mcp.store.history.motion import find_motion, path_length
+from webots_mcp.store.history.ranges import Segment, TimeRange, resolve_range
+from webots_mcp.store.history.series import signals_of
+from webots_mcp.store.recording import View
 
-# Names under which robots publish where they are, the most telling first.
-_PLACES: Final = ("pose", "position", "pos", "translation", "location", "xy", "xyz", "gps", "")
-_AXES: Final = (("x", "y"), ("0", "1"), ("x_m", "y_m"))
-_STEADY_RANGE: Final = 1e-9
-
-
-class Change(NamedTuple):
-    """A text or a flag that became another."""
-
-    sim_time_s: float
-    name: str
-    before: Value
-    after: Value
+_ROW_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 
 
-@dataclass
-class Number:
-    """A numeric signal over the window."""
+@dataclass(frozen=True)
+class Window:
+    """What was recorded from a moment on.
 
-    first: float
-    last: float
-    min: float
-    max: float
-    missing: int = 0
+    Attributes:
+        rows: Where there are rows; without segments if there are none.
+        around: The same with the time from the row before on and with what came after the last
+            row: a pause or a log line stands between rows.
+    """
 
-    def add(self, value: float) -> None:
-        """Take in the next value."""
-        self.last = value
-        self.min = min(self.min, value)
-        self.max = max(self.max, value)
-
-    @property
-    def relative_range(self) -> float:
-        """Range over largest magnitude: 0 is steady, 2 is from -a to a. Free of scale and unit."""
-        if self.max - self.min < _STEADY_RANGE:
-            return 0.0
-        return (self.max - self.min) / max(abs(self.min), abs(self.max))
+    rows: TimeRange
+    around: TimeRange
 
 
-@dataclass
-class Watched:
-    """What was seen in the rows of one or more runs."""
-
-    numbers: dict[str, Number] = field(default_factory=dict[str, Number])
-    changes: list[Change] = field(default_factory=list[Change])
-    distance: float = 0.0
-    place: tuple[str, str] | None = None
-    path: list[tuple[float, float]] = field(default_factory=list[tuple[float, float]])
-    _texts: dict[str, Value] = field(default_factory=dict[str, Value])
-
-    def read(self, states: Iterable[State]) -> None:
-        """Take in the rows of one run, in order."""
-        self._texts.clear()
-        here: tuple[float, float] | None = None
-        for state in states:
-            leaves = flatten(parse(state.data))
-            for name, value in leaves.items():
-                self._add(state.sim_time_s, name, value)
-            before, here = here, self._position(leaves) or here
-            if before and here:
-                self.distance += math.dist(before, here)
-            if here:
-                self.path.append(here)
-
-    def movement(self) -> dict[str, Any] | None:
-        """Distance along the path and displacement, in the unit of the published position."""
-        if self.place is None or len(self.path) < 2:
-            return None
-        start, end = self.path[0], self.path[-1]
-        return {
-            "position": list(self.place),
-            "from": [round_number(value) for value in start],
-            "to": [round_number(value) for value in end],
-            "distance": round_number(self.distance),
-            "displacement": round_number(math.dist(start, end)),
-        }
-
-    def changed_most(self) -> list[tuple[str, Number]]:
-        """The numeric signals that changed, in the order of their relative range."""
-        changed = [item for item in self.numbers.items() if item[1].relative_range > 0]
-        return sorted(changed, key=lambda item: -item[1].relative_range)
-
-    def _add(self, sim_time_s: float, name: str, value: Value) -> None:
-        if isinstance(value, (bool, str)):
-            before = self._texts.get(name, value)
-            self._texts[name] = value
-            if before != value:
-                self.changes.append(Change(sim_time_s, name, before, value))
-        elif value is None:
-            if name in self.numbers:
-                self.numbers[name].missing += 1
-        elif name in self.numbers:
-            self.numbers[name].add(float(value))
-        else:
-            number = float(value)
-            self.numbers[name] = Number(number, number, number, number)
-
-    def _position(self, leaves: dict[str, Value]) -> tuple[float, float] | None:
-        self.place = self.place or find_place(leaves)
-        if self.place is None:
-            return None
-        x, y = (leaves.get(name) for name in self.place)
-        return (x, y) if isinstance(x, (int, float)) and isinstance(y, (int, float)) else None
+def window_from(view: View, wall_start_s: float) -> Window:
+    """The window of a robot from that wall time (Unix) on."""
+    found = resolve_range(view.connection, robot=view.robot.name, wall_start=wall_start_s)
+    found = newest_runs(found if found.segments else replace(found, notes=()))
+    around = [
+        replace(segment, start_s=_row_before(view.connection, segment))
+        for segment in found.segments or [_standing(view, wall_start_s)]
+    ]
+    around[-1] = replace(around[-1], end_s=math.inf)
+    return Window(found, replace(found, segments=tuple(around)))
 
 
-def find_place(leaves: dict[str, Value]) -> tuple[str, str] | None:
-    """The names of the two signals that say where the robot is on the ground."""
-    for place in _PLACES:
-        for x, y in _AXES if place else _AXES[:1]:
-            for name in leaves:
-                parent, _, last = name.rpartition(".")
-                sibling = f"{parent}.{y}" if parent else y
-                if last == x and parent.rpartition(".")[2] == place and sibling in leaves:
-                    return name, sibling
-    return None
+def _row_before(connection: sqlite3.Connection, segment: Segment) -> float:
+    values = (segment.run_id, segment.start_s)
+    before_s = connection.execute(_ROW_BEFORE, values).fetchone()[0]
+    return segment.start_s if before_s is None else float(before_s)
 
 
-def evenly(ids: list[int], most: int) -> list[int]:
-    """At most that many of them, evenly spread, always with the first and the last."""
-    if len(ids) <= most:
-        return ids
-    step = (len(ids) - 1) / (most - 1)
-    return [ids[round(number * step)] for number in range(most)]
+def _standing(view: View, wall_start_s: float) -> Segment:
+    """The current run at its newest row, of which only what came in the window counts."""
+    run = view.require_run()
+    newest_s = view.state.sim_time_s if view.state else run.started_sim_time_s
+    return Segment(run.id, newest_s, math.inf, wall_start_s)
+
+
+def movement(view: View, found: TimeRange) -> dict[str, Any] | None:
+    """Distance along the way and displacement, in the unit of the position; None without one.
+
+    A jump to the start at a reset was not travelled, and a lost position is no place.
+    """
+    known = {signal.name: signal for signal in signals_of(view.connection, found, ["*"])}
+    position = find_motion(known, EventOptions()).position
+    if position is None:
+        return None
+    deadline = Deadline()
+    parts = [
+        read_columns(view.connection, segment, position, deadline) for segment in found.segments
+    ]
+    names = [signal.name for signal in position]
+    places = [place for part in parts for place in _places(part, names)]
+    if len(places) < 2:
+        return None
+    return {
+        "position": names,
+        "from": [figure(value) for value in places[0]],
+        "to": [figure(value) for value in places[-1]],
+        "distance": figure(math.fsum(path_length(part, position) for part in parts)),
+        "displacement": figure(math.dist(places[0], places[-1])),
+    }
+
+
+def _places(columns: Columns, names: Sequence[str]) -> Iterator[tuple[float, float]]:
+    for x, y in zip(*(columns.values[name] for name in names), strict=True):
+        if isinstance(x, (int, float)) and isinstance(y, (int, float)):
+            yield float(x), float(y)

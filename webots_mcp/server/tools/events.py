@@ -37,7 +37,7 @@ from webots_mcp.server.parameters import (
 )
 from webots_mcp.server.results import Table
 from webots_mcp.store.history.event import KINDS, Event, EventOptions, Kind, Threshold
-from webots_mcp.store.history.events import Events, choose, find_events
+from webots_mcp.store.history.events import choose, find_events
 from webots_mcp.store.history.ranges import TimeRange
 from webots_mcp.store.recording import Recording, View
 
@@ -128,7 +128,7 @@ def _found(
     view: View, asked: TimeRange, options: EventOptions, limit: int | None
 ) -> dict[str, Any]:
     found = find_events(view.connection, asked, options, limit=limit or DEFAULT_LIMIT)
-    events, left_out = fitting_events(found, BUDGET if limit is None else LARGE_BUDGET, view)
+    events, left_out = fitting_events(found.events, BUDGET if limit is None else LARGE_BUDGET, view)
     hints = [f"{left_out} more left out to keep it short: ask by kinds or time"] if left_out else []
     hints += [] if found.totals else [_why_none(options)]
     return {
@@ -139,14 +139,14 @@ def _found(
     }
 
 
-def fitting_events(found: Events, budget: int, view: View) -> tuple[Table | None, int]:
+def fitting_events(found: Sequence[Event], budget: int, view: View) -> tuple[Table | None, int]:
     """As many of the events as fit the budget, rare kinds whole; and how many were left out."""
-    events = list(found.events)
+    events = list(found)
     while True:
         made = events_table(events, view)
         size = size_of(made.rows) if made else 0
         if size <= budget or len(events) == 1:
-            return made, len(found.events) - len(events)
+            return made, len(found) - len(events)
         events = choose(events, max(1, min(len(events) - 1, int(len(events) * budget / size))))
 
 

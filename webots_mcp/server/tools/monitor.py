@@ -1,13 +1,11 @@
-"""The tool that watches for a while and reports from what was recorded meanwhile."""
+"""The tool that watches for a while, or looks back, and reports what was recorded."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
-from typing import Annotated, Any, Final, cast
+from typing import Annotated, Any, Final
 
 import anyio
 from anyio import to_thread
@@ -15,42 +13,22 @@ from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.server.boundary import READS, reporter, tool
+from webots_mcp.server.fitting import BUDGET, answer_about, notes_of
+from webots_mcp.server.history_results import MonitorAnswer
 from webots_mcp.server.parameters import RobotName
-from webots_mcp.server.results import MonitorAnswer, Table
-from webots_mcp.server.shortening import DETAIL_BUDGET, cut_text, round_number, shorten
-from webots_mcp.server.tools.commands import COMMAND_COLUMNS, command_row
-from webots_mcp.server.tools.logs import LOG_COLUMNS, log_row
-from webots_mcp.server.watching import Watched, evenly
-from webots_mcp.store.events import Event, events_after, newest_event_id
-from webots_mcp.store.logs import lines_after, newest_log_id
-from webots_mcp.store.queue import commands_since
+from webots_mcp.server.tools.events import fitting_events
+from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
+from webots_mcp.server.watching import movement, window_from
+from webots_mcp.store.history.event import KINDS, EventOptions, Kind
+from webots_mcp.store.history.events import choose, find_events
+from webots_mcp.store.history.trends import trends
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.runs import Run, runs_since
-from webots_mcp.store.states import fetch_states, newest_state_id, state_ids_after
 
 _REPORT_INTERVAL_S: Final = 1.0
-_MOST_ROWS: Final = 3_000
-_MOST_BYTES: Final = 20_000_000
-_MOST_EVENTS: Final = 2_000
-_SHOWN_CHANGES: Final = 30
 _SHOWN_SIGNALS: Final = 12
-_SHOWN_LOGS: Final = 12
-_SHOWN_COMMANDS: Final = 10
-_LONGEST_NAME: Final = 80
-_CHANGE_KINDS: Final = ("change", "pause", "resume", "reset", "reload", "start")
-
-
-@dataclass(frozen=True)
-class Mark:
-    """Where the recording stood when the watching began."""
-
-    robot: str
-    first_run_id: int
-    sim_time_s: float
-    wall_time_s: float
-    state_id: int
-    event_id: int
-    log_id: int
+_SHOWN_EVENTS: Final = 30
+_MOST_EVENTS: Final = 500
+_WATCHED_KINDS: Final[tuple[Kind, ...]] = tuple(kind for kind in KINDS if kind != "image")
 
 
 class MonitorTools:
@@ -66,150 +44,85 @@ class MonitorTools:
         duration_s: Annotated[
             float, Field(ge=1, le=120, description="How long to watch, wall seconds.")
         ] = 10,
+        lookback_s: Annotated[
+            float | None,
+            Field(
+                gt=0,
+                le=86_400,
+                description="Do not watch: report at once on so many wall seconds before the "
+                "newest row.",
+            ),
+        ] = None,
         robot: RobotName = None,
     ) -> MonitorAnswer:
-        """Watch for some seconds, then report what was recorded meanwhile.
+        """Watch for some seconds, then report what was recorded meanwhile; or look back at once.
 
-        Movement, changes of modes and flags with their times, pauses and resets, the numbers that
-        changed most, warnings, commands. Nothing that was recorded in the window is missed.
+        Movement, trends and events (changed modes and flags, stuck, pauses, commands, warnings) of
+        exactly the rows of that window: nothing depends on when one looked.
         """
-        mark = await to_thread.run_sync(self._mark, robot)
+        if lookback_s is not None:
+            return await to_thread.run_sync(self._look_back, robot, lookback_s)
+        name, started_s = await to_thread.run_sync(self._start, robot)
         report = reporter(ctx)
         for second in range(1, math.ceil(duration_s) + 1):
             await anyio.sleep(min(_REPORT_INTERVAL_S, duration_s - second + 1))
-            doing = await to_thread.run_sync(self._doing, mark)
+            doing = await to_thread.run_sync(self._doing, name)
             await report(min(second, duration_s), duration_s, doing)
-        return await to_thread.run_sync(self._report, mark)
+        return await to_thread.run_sync(self._watched, name, started_s)
 
-    def _mark(self, robot: str | None) -> Mark:
+    def _start(self, robot: str | None) -> tuple[str, float]:
+        with self._recording.view(robot) as view:
+            view.require_run()
+            return view.robot.name, time.time()
+
+    def _doing(self, robot: str) -> str:
+        with self._recording.view(robot) as view:
+            at = f", simulation time {view.state.sim_time_s:.2f} s" if view.state else ""
+            return f"{robot}: {view.status.text}{at}"
+
+    def _watched(self, robot: str, started_s: float) -> MonitorAnswer:
+        with self._recording.view(robot) as view:
+            return _report(view, started_s, view.now_s - started_s)
+
+    def _look_back(self, robot: str | None, lookback_s: float) -> MonitorAnswer:
         with self._recording.view(robot) as view:
             run = view.require_run()
-            return Mark(
-                view.robot.name,
-                run.id,
-                view.state.sim_time_s if view.state else -math.inf,
-                time.time(),
-                newest_state_id(view.connection),
-                newest_event_id(view.connection),
-                newest_log_id(view.connection),
-            )
-
-    def _doing(self, mark: Mark) -> str:
-        with self._recording.view(mark.robot) as view:
-            at = f", simulation time {view.state.sim_time_s:.2f} s" if view.state else ""
-            return f"{mark.robot}: {view.status.text}{at}"
-
-    def _report(self, mark: Mark) -> MonitorAnswer:
-        with self._recording.view(mark.robot) as view:
-            runs = runs_since(view.connection, view.robot.id, mark.first_run_id)
-            ids = {run.id: _ids(view, mark, run) for run in runs}
-            rows = sum(map(len, ids.values()))
-            watched, sampled = _read(view, ids, rows)
-            events = [event for run in runs for event in _events(view, mark, run)]
-            return MonitorAnswer(
-                **view.header(),
-                watched_s=round(view.now_s - mark.wall_time_s, 2),
-                from_sim_time_s=None if math.isinf(mark.sim_time_s) else round(mark.sim_time_s, 4),
-                rows=rows,
-                sampled=sampled if sampled < rows else None,
-                runs=[run.id for run in runs] if len(runs) > 1 else None,
-                movement=watched.movement(),
-                changes=_changes(watched, events),
-                signals=_signals(watched),
-                steady=sum(number.relative_range == 0 for number in watched.numbers.values()),
-                events=_other_events(events),
-                logs=_logs(view, mark, runs),
-                commands=_commands(view, mark),
-                hint=None if rows else _why_nothing(view),
-            )
+            newest_s = view.state.wall_time_s if view.state else run.last_wall_time_s
+            return _report(view, newest_s - lookback_s, lookback_s)
 
 
-def _ids(view: View, mark: Mark, run: Run) -> list[int]:
-    from_s = mark.sim_time_s if run.id == mark.first_run_id else -math.inf
-    return state_ids_after(view.connection, run.id, mark.state_id, from_s)
+def _report(view: View, wall_start_s: float, window_s: float) -> MonitorAnswer:
+    return answer_about(
+        view, MonitorAnswer, lambda: {"window_s": round(window_s, 2), **_found(view, wall_start_s)}
+    )
 
 
-def _read(view: View, ids: dict[int, list[int]], rows: int) -> tuple[Watched, int]:
-    """Read the rows, or evenly spread ones where there are too many or they are too big."""
-    watched, sampled = Watched(), 0
-    size = max(len(view.state.data) if view.state else 1, 1)
-    most = max(2, min(_MOST_ROWS, _MOST_BYTES // size))
-    for run_ids in ids.values():
-        share = max(2, math.ceil(most * len(run_ids) / rows)) if rows else 0
-        chosen = evenly(run_ids, share)
-        sampled += len(chosen)
-        watched.read(fetch_states(view.connection, chosen))
-    return watched, sampled
+def _found(view: View, wall_start_s: float) -> dict[str, Any]:
+    window = window_from(view, wall_start_s)
+    recorded = bool(window.rows.segments)
+    told = trends(view.connection, window.rows, limit=MOST_SIGNALS).runs if recorded else ()
+    budget = BUDGET // 2 // max(len(told), 1)
+    options = EventOptions(kinds=_WATCHED_KINDS)
+    found = find_events(view.connection, window.around, options, limit=_MOST_EVENTS)
+    happened = [event for event in found.events if event.wall_time_s >= wall_start_s]
+    shown = choose(happened, _SHOWN_EVENTS)
+    events, left_out = fitting_events(shown, BUDGET // 2, view)
+    rows = sum(run.rows for run in told)
+    return {
+        "rows": rows,
+        "movement": movement(view, window.rows) if recorded else None,
+        "trends": [trend_tables(run, _SHOWN_SIGNALS, budget) for run in told] or None,
+        "events": events,
+        "totals": dict(Counter(event.kind for event in happened)) or None,
+        "notes": notes_of(window.rows.notes),
+        "hint": _hint(rows, len(happened) - len(shown) + left_out, view),
+    }
 
 
-def _events(view: View, mark: Mark, run: Run) -> list[Event]:
-    return events_after(view.connection, run.id, mark.event_id, _MOST_EVENTS)
-
-
-def _changes(watched: Watched, events: list[Event]) -> Table | None:
-    """Bridge events tell of the top of the state exactly; the rows tell of what lies deeper."""
-    rows = [row for event in events if (row := _event_row(event)) is not None]
-    rows += [
-        [round(change.sim_time_s, 3), change.name[:_LONGEST_NAME], change.before, change.after]
-        for change in watched.changes
-        if "." in change.name
-    ]
-    return _table(("sim_time_s", "name", "from", "to"), rows, _SHOWN_CHANGES)
-
-
-def _event_row(event: Event) -> list[Any] | None:
-    if event.kind not in _CHANGE_KINDS:
-        return None
-    at, details = round(event.sim_time_s, 3), event.details()
-    if event.kind == "change" and isinstance(details, dict):
-        change = cast("dict[str, Any]", details)
-        before, after = (shorten(change.get(end), DETAIL_BUDGET).value for end in ("from", "to"))
-        return [at, (event.name or "")[:_LONGEST_NAME], before, after]
-    return [at, event.kind, None, shorten(details, DETAIL_BUDGET).value]
-
-
-def _signals(watched: Watched) -> Table | None:
-    rows = [
-        [name[:_LONGEST_NAME], *map(round_number, (n.first, n.last, n.min, n.max)), n.missing]
-        for name, n in watched.changed_most()[:_SHOWN_SIGNALS]
-    ]
-    columns = ["signal", "first", "last", "min", "max", "missing"]
-    return Table(columns=columns, rows=rows) if rows else None
-
-
-def _other_events(events: list[Event]) -> dict[str, int] | None:
-    kinds = Counter(event.kind for event in events if event.kind not in _CHANGE_KINDS)
-    return dict(kinds) or None
-
-
-def _logs(view: View, mark: Mark, runs: list[Run]) -> Table | None:
-    lines = [
-        line
-        for run in runs
-        for line in lines_after(view.connection, run.id, mark.log_id, _MOST_EVENTS)
-        if line.level in ("warning", "error")
-    ]
-    return _table(LOG_COLUMNS, [log_row(line) for line in lines], _SHOWN_LOGS)
-
-
-def _commands(view: View, mark: Mark) -> Table | None:
-    commands = commands_since(view.connection, view.robot.id, mark.wall_time_s)
-    rows = [command_row(command, view.now_s) for command in commands]
-    return _table(COMMAND_COLUMNS, rows, _SHOWN_COMMANDS)
-
-
-def _table(columns: tuple[str, ...], rows: list[list[Any]], most: int) -> Table | None:
-    """The newest rows; how many older ones were left out stands in the table itself."""
-    if not rows:
-        return None
-    left_out = len(rows) - most
-    shown = list(_with_note(rows[-most:], left_out)) if left_out > 0 else rows
-    return Table(columns=list(columns), rows=shown)
-
-
-def _with_note(rows: list[list[Any]], left_out: int) -> Iterator[list[Any]]:
-    yield [None, cut_text(f"… {left_out} earlier left out", _LONGEST_NAME)]
-    yield from rows
+def _hint(rows: int, left_out: int, view: View) -> str | None:
+    if rows == 0:
+        return _why_nothing(view)
+    return "more events: ask webots_find_events with last_s" if left_out else None
 
 
 def _why_nothing(view: View) -> str:

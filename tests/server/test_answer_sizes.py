@@ -1,0 +1,126 @@
+"""How long the answers are: every default one stays under 2,000 tokens, on any recording.
+
+Run with `-s` to see the table. A token is counted as four characters of what a model reads.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from tests.history.long_recording import build
+from tests.server.conftest import text_of
+from tests.server.story import client_on
+from webots_mcp.connection import connect
+
+pytestmark = pytest.mark.anyio
+
+TOKENS: Final = 2_000
+ROWS: Final = 5_000
+LONG_RUN: Final = 2
+MORE_SIGNALS: Final = 30  # to the 39 of the long recording
+
+DEFAULTS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
+    ("webots_list_robots", {}),
+    ("webots_get_robot_state", {}),
+    ("webots_get_logs", {}),
+    ("webots_list_commands", {}),
+    ("webots_list_signals", {}),
+    ("webots_query_history", {"signals": ["pose"]}),
+    ("webots_query_history", {"signals": ["*"]}),
+    ("webots_query_history", {"signals": ["*"], "raw": True}),
+    ("webots_get_trends", {}),
+    ("webots_find_events", {}),
+    ("webots_get_timeline", {}),
+    ("webots_monitor", {"lookback_s": 10}),
+    ("webots_monitor", {"lookback_s": 3600}),
+    ("webots_list_runs", {}),
+    ("webots_compare_runs", {"run_ids": [1, 2]}),
+    ("webots_plot", {}),
+    ("webots_query_sql", {"sql": "SELECT * FROM state"}),
+    ("webots_query_sql", {"sql": "SELECT * FROM robot_run"}),
+)
+
+
+@pytest.fixture(scope="module")
+def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Long names, 69 signals, many log lines and events, two long runs and many short ones."""
+    file = tmp_path_factory.mktemp("big") / "webots.db"
+    build(file, ROWS, rolled=False)
+    more = {f"manipulator_joint_{i}_torque_estimate_nm": 0.5 for i in range(MORE_SIGNALS)}
+    with connect(file, "writer") as connection:
+        connection.execute("BEGIN IMMEDIATE")
+        for name, value in more.items():
+            assert name.isidentifier()
+            connection.execute(
+                f"UPDATE state SET data = json_set(data, '$.{name}', {value} * (id % 97))"
+            )
+        _add_runs(connection)
+        connection.execute("COMMIT")
+    connection.close()
+    return file
+
+
+def _add_runs(connection: Any) -> None:
+    columns = "session_id, robot_id, world, basic_time_step_ms, start_reason"
+    for run_id in range(2, 60):
+        connection.execute(
+            f"INSERT INTO run ({columns}, started_wall_time_s, started_sim_time_s, "
+            f"last_wall_time_s, last_sim_time_s, rows) SELECT {columns}, "
+            "started_wall_time_s + ?, 0, started_wall_time_s + ?, 900, 9 FROM run WHERE id = 1",
+            (1000 * run_id, 1000 * run_id + 900),
+        )
+        limit = ROWS if run_id == 2 else 9
+        connection.execute(
+            "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) SELECT ?, sim_time_s, "
+            "wall_time_s + ?, data FROM state WHERE run_id = 1 ORDER BY id LIMIT ?",
+            (run_id, 1000 * run_id, limit),
+        )
+    for step in range(3_000):
+        stamp = (2, step * 0.1, 1_700_002_000.0 + step * 0.1)
+        connection.execute(
+            "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
+            "VALUES (?, ?, ?, 'warning', 'controller', ?)",
+            (*stamp, f"wheel slip {step}: " + "the estimate and the odometry differ " * 5),
+        )
+        connection.execute(
+            "INSERT INTO event (run_id, sim_time_s, wall_time_s, kind, name, data) "
+            "VALUES (?, ?, ?, 'noticed_something', 'a signal', ?)",
+            (*stamp, json.dumps({"why": "because " * 30})),
+        )
+
+
+async def test_every_default_answer_is_under_2000_tokens(big: Path) -> None:
+    async with client_on(big) as client:
+        tools = {tool.name: tool for tool in (await client.list_tools()).tools}
+        table: list[str] = []
+        for tool, arguments in DEFAULTS:
+            takes_run = "run_id" in tools[tool].input_schema["properties"]
+            asked = arguments | ({"run_id": LONG_RUN} if takes_run else {})
+            result = await client.call_tool(tool, asked)
+            assert not result.is_error, (tool, text_of(result))
+            size = len(text_of(result))
+            table.append(f"{tool:24} {json.dumps(asked):55} {size:6} {size / 4:6.0f}")
+            assert size / 4 < TOKENS, table[-1]
+        print("\n" + "\n".join(table))
+
+
+async def test_an_answer_that_was_asked_to_be_long_stays_under_what_clients_put_aside(
+    big: Path,
+) -> None:
+    async with client_on(big) as client:
+        for tool, arguments in (
+            ("webots_query_history", {"signals": ["*"], "max_points": 500}),
+            ("webots_query_history", {"signals": ["*"], "max_points": 500, "raw": True}),
+            ("webots_get_trends", {"limit": 500}),
+            ("webots_find_events", {"limit": 500}),
+            ("webots_get_timeline", {"limit": 500}),
+            ("webots_query_sql", {"sql": "SELECT * FROM state", "limit": 500}),
+        ):
+            result = await client.call_tool(tool, arguments if "sql" in arguments else
+                                            arguments | {"run_id": 2})  # fmt: skip
+            assert not result.is_error, text_of(result)
+            assert len(text_of(result)) < 50_000, tool

@@ -1,0 +1,41 @@
+"""What a client can read beside the tools."""
+
+from __future__ import annotations
+
+from contextlib import closing
+
+from mcp.server import MCPServer
+
+from webots_mcp.connection import connect
+from webots_mcp.contract import MemoryDatabase
+from webots_mcp.errors import NoDatabaseError
+from webots_mcp.schema import create_schema
+from webots_mcp.store.history.schema_text import describe_schema
+from webots_mcp.store.recording import Recording
+
+SCHEMA_URI = "webots://schema"
+
+
+def add_resources(mcp: MCPServer, recording: Recording) -> None:
+    """Register the resources of a recording."""
+
+    @mcp.resource(
+        SCHEMA_URI, title="Schema of the recording", mime_type="text/plain",
+        description="All tables, views and columns with their comments, for webots_query_sql.",
+    )  # fmt: skip
+    def schema() -> str:
+        try:
+            with recording.reader() as connection:
+                return describe_schema(connection)
+        except NoDatabaseError:
+            return _schema_to_come()
+
+
+def _schema_to_come() -> str:
+    """What the database will have when something is recorded."""
+    database = MemoryDatabase()
+    with closing(connect(database, "writer")) as connection:
+        create_schema(connection)
+        text = describe_schema(connection)
+    database.close()
+    return text

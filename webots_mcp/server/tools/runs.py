@@ -1,0 +1,244 @@
+"""Tools about runs as a whole: which there were, how they differ, what to call them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime, timezone
+from pathlib import PurePath
+from typing import Annotated, Any, Final
+
+from pydantic import Field
+
+from webots_mcp.server.boundary import ACTS, READS, tool
+from webots_mcp.server.fitting import (
+    BUDGET,
+    LARGE_BUDGET,
+    answer_about,
+    figure,
+    figures,
+    fitting,
+    header_of_only,
+    notes_of,
+    seconds,
+    short_name,
+    shown,
+    without_empty,
+)
+from webots_mcp.server.history_results import ComparisonAnswer, RunsAnswer
+from webots_mcp.server.parameters import (
+    AnyNames,
+    Cursor,
+    Limit,
+    RobotName,
+    RunId,
+    RunIds,
+    ShownLimit,
+)
+from webots_mcp.server.results import Table
+from webots_mcp.store.history.compare import (
+    Comparison,
+    Difference,
+    Group,
+    compare_code,
+    compare_runs,
+)
+from webots_mcp.store.history.runs import MOST_RUNS, RunInfo, annotate_run, list_runs
+from webots_mcp.store.recording import Recording, View, look
+
+RUN_COLUMNS: Final = (
+    "run_id", "robot", "label", "started", "began_by", "ended_by", "duration_s",
+    "real_time_factor", "rows", "notable", "controller", "sha256", "git_commit", "world", "note",
+)  # fmt: skip
+GROUP_COLUMNS: Final = (
+    "name", "runs", "labels", "sha256", "ended_by", "duration_s", "real_time_factor",
+    "distance_m", "time_by_mode_s", "events",
+)  # fmt: skip
+DIFFERENCE_COLUMNS: Final = (
+    "signal", "unit", "mean", "deviation", "min", "max", "effect",
+)  # fmt: skip
+DEFAULT_DIFFERENCES: Final = 15
+_SHOWN_HASH: Final = 10
+_MOST_ONLY_IN: Final = 10
+_GOING_ON: Final = "going on"
+_TAKE_AWAY: Final = "-"
+
+
+class RunTools:
+    """Runs as a whole."""
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+
+    @tool("List the runs", READS)
+    def webots_list_runs(
+        self, limit: Limit = 20, cursor: Cursor = None, robot: RobotName = None
+    ) -> RunsAnswer:
+        """Runs, newest first: controller file and its hash, world, duration, pace, how it ended.
+
+        A run is a stretch of rising simulation time: a start, reset or reload begins the next.
+        `notable` counts warnings, errors, dropped rows, failed commands.
+        """
+        with self._recording.reader() as connection:
+            header = look(connection, robot).header() if robot else header_of_only(connection)
+            most = min(limit, MOST_RUNS)
+            found = list_runs(connection, robot=robot, limit=most, before_id=cursor)
+            rows = fitting([run_row(run) for run in found.runs])
+            older = len(rows) < len(found.runs)
+            return RunsAnswer(
+                **header,
+                runs=without_empty(RUN_COLUMNS, rows),
+                total=found.total,
+                cursor=found.runs[len(rows) - 1].run_id if older else found.cursor,
+                hint=None if rows else "no run was recorded, or none before that cursor",
+            )
+
+    @tool("Compare runs", READS)
+    def webots_compare_runs(
+        self,
+        run_ids: RunIds = None,
+        signals: AnyNames = None,
+        limit: ShownLimit = None,
+        robot: RobotName = None,
+    ) -> ComparisonAnswer:
+        """Two or more runs beside each other; the first is the reference. What differs most first.
+
+        Without run_ids: the runs before and after the last edit of the controller's file. Duration,
+        distance, time per mode, events of each kind, and how far each signal is apart.
+        """
+        with self._recording.view(robot, run_ids[0] if run_ids else None) as view:
+            return answer_about(
+                view, ComparisonAnswer, lambda: _compared(view, run_ids, signals, limit)
+            )
+
+    @tool("Annotate a run", ACTS)
+    def webots_annotate_run(
+        self,
+        label: Annotated[
+            str,
+            Field(
+                max_length=100,
+                description="Short name to find it by; '-' takes it away, '' leaves it.",
+            ),
+        ] = "",
+        note: Annotated[
+            str, Field(max_length=4000, description="Any text; '-' takes it away, '' leaves it.")
+        ] = "",
+        robot: RobotName = None,
+        run_id: RunId = None,
+    ) -> RunsAnswer:
+        """Give a run a label or a note, by default the current one.
+
+        A run with either is kept for good: retention deletes nothing of it.
+        """
+        with self._recording.writer() as connection:
+            run = look(connection, robot, run_id).require_run()
+            told = annotate_run(connection, run.id, label=_change(label), note=_change(note))
+            header = look(connection, robot, run_id).header()
+            return RunsAnswer(**header, runs=without_empty(RUN_COLUMNS, [run_row(told)]))
+
+
+def _change(text: str) -> str | None:
+    """None leaves it as it is, an empty text takes it away."""
+    return "" if text == _TAKE_AWAY else text or None
+
+
+def run_row(run: RunInfo) -> list[Any]:
+    """A run as a row under `RUN_COLUMNS`."""
+    return [
+        run.run_id,
+        short_name(run.robot),
+        short_name(run.label),
+        started(run),
+        run.start_reason,
+        run.end_reason or _GOING_ON,
+        seconds(run.duration_s),
+        figure(run.real_time_factor),
+        run.rows,
+        shown(run.notable) or None,
+        short_name(_file(run.controller)),
+        run.controller_sha256 and run.controller_sha256[:_SHOWN_HASH],
+        run.git_commit and run.git_commit[:_SHOWN_HASH],
+        short_name(_file(run.world)),
+        shown(run.note),
+    ]
+
+
+def started(run: RunInfo) -> str:
+    """When the run began, UTC, as `since` takes it."""
+    return datetime.fromtimestamp(run.started_wall_time_s, timezone.utc).strftime(
+        "%Y-%m-%dT%H:%M:%SZ"
+    )
+
+
+def _file(path: str | None) -> str | None:
+    """The name of a file without its folder, of whichever system."""
+    return path and PurePath(path.replace("\\", "/")).name
+
+
+def _compared(
+    view: View,
+    run_ids: Sequence[int] | None,
+    names: Sequence[str] | None,
+    limit: int | None,
+) -> dict[str, Any]:
+    wanted, most = names or ("*",), limit or DEFAULT_DIFFERENCES
+    if run_ids:
+        found = compare_runs(view.connection, run_ids, names=wanted, limit=most)
+    else:
+        found = compare_code(view.connection, robot=view.robot.name, names=wanted, limit=most)
+    differing = [each for each in found.differences if any(e != 0 for e in each.effect[1:])]
+    groups = _groups(found)
+    room = (BUDGET if limit is None else LARGE_BUDGET) - len(str(groups.rows if groups else ""))
+    rows = fitting([_difference_row(difference) for difference in differing], room)
+    only_in = list(found.only_in.items())
+    return {
+        "groups": groups,
+        "compared_s": seconds(found.compared_s),
+        "differences": without_empty(DIFFERENCE_COLUMNS, rows),
+        "total": found.total,
+        "only_in": {name: list(groups) for name, groups in only_in[:_MOST_ONLY_IN]} or None,
+        "notes": notes_of(found.notes),
+        "hint": _hint(found, len(rows), len(differing), len(only_in)),
+    }
+
+
+def _groups(found: Comparison) -> Table | None:
+    return without_empty(GROUP_COLUMNS, [_group_row(group) for group in found.groups])
+
+
+def _group_row(group: Group) -> list[Any]:
+    labels = [short_name(run.label) for run in group.runs if run.label]
+    hashes = dict.fromkeys((run.controller_sha256 or "")[:_SHOWN_HASH] for run in group.runs)
+    wall_s = sum(run.wall_duration_s for run in group.runs)
+    return [
+        group.name,
+        [run.run_id for run in group.runs],
+        labels or None,
+        ", ".join(hashes) or None,
+        ", ".join(dict.fromkeys(run.end_reason or _GOING_ON for run in group.runs)),
+        seconds(group.duration_s),
+        figure(group.duration_s / wall_s) if wall_s > 0 else None,
+        figure(group.distance_m),
+        shown({value: round(time_s, 3) for value, time_s in group.time_by_mode_s.items()}) or None,
+        group.events or None,
+    ]
+
+
+def _difference_row(difference: Difference) -> list[Any]:
+    return [
+        short_name(difference.name),
+        difference.unit,
+        figures(difference.mean),
+        figures(difference.deviation),
+        figures(difference.min),
+        figures(difference.max),
+        figures(difference.effect),
+    ]
+
+
+def _hint(found: Comparison, told: int, differing: int, only_in: int) -> str | None:
+    more = told < differing or differing == len(found.differences) < found.total
+    hints = [f"the {told} that differ most of {found.total}: limit or signals for others"] * more
+    hints += ["no numeric signal differs"] * (differing == 0)
+    hints += [f"{only_in} signals are in some groups only"] * (only_in > _MOST_ONLY_IN)
+    return "; ".join(hints) or None

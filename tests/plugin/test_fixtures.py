@@ -147,6 +147,20 @@ def test_events_and_logs_come_in_order_and_by_kind(story: Recording) -> None:
         story.logs("loud")
 
 
+def test_what_the_values_show_can_be_asked_for(
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, recording: Recording
+) -> None:
+    for step in range(120):
+        webots_robot.step(96)
+        webots_bridge.publish({"pose": [min(step, 60) * 0.1, 0.0], "mode": "cruise"})
+    (stuck,) = recording.find_events("stuck", stuck_s=4.0)
+    assert (stuck.start_s, stuck.end_s) == pytest.approx((61 * 0.096, 120 * 0.096), abs=0.1)
+    assert stuck.ongoing
+    assert recording.find_events("jump", "silent") == []
+    with pytest.raises(InvalidInputError, match="unknown kind 'stucked'"):
+        recording.find_events("stucked")  # pyright: ignore[reportArgumentType]
+
+
 def test_a_command_is_followed_from_sending_to_its_answer(
     webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, recording: Recording
 ) -> None:

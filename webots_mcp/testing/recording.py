@@ -16,7 +16,10 @@ from webots_mcp.schema import schema_version
 from webots_mcp.store.events import Event, events_after
 from webots_mcp.store.history.columns import read_columns
 from webots_mcp.store.history.deadline import Deadline
-from webots_mcp.store.history.ranges import whole_run
+from webots_mcp.store.history.event import KINDS, EventOptions, Kind
+from webots_mcp.store.history.event import Event as FoundEvent
+from webots_mcp.store.history.events import find_events
+from webots_mcp.store.history.ranges import resolve_range, whole_run
 from webots_mcp.store.history.registry import Signal, registered
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.history.signals import resolve_signals
@@ -107,6 +110,23 @@ class Recording:
         with self._subject() as (connection, subject):
             found = events_after(connection, subject.run_id, 0, _NO_LIMIT)
         return [event for event in found if kind in (None, event.kind)]
+
+    def find_events(self, *kinds: Kind, **options: Any) -> list[FoundEvent]:
+        """What the values of the run show: when it was stuck, where a signal jumped, and the like.
+
+        Args:
+            kinds: `stuck`, `jump`, `oscillation`, `silent`, `flat`, `gap`, ...; none for all.
+            options: More fields of `webots_mcp.store.history.event.EventOptions`.
+
+        Raises:
+            InvalidInputError: There is no such kind.
+        """
+        self._roll_up()
+        wanted = EventOptions(kinds=kinds or KINDS, **options)
+        with self._subject() as (connection, subject):
+            whole = resolve_range(connection, robot=subject.robot, run_id=subject.run_id)
+            found = find_events(connection, whole, wanted, limit=sys.maxsize, deadline_s=math.inf)
+        return list(found.events)
 
     def logs(self, level: str = "debug", text: str = "") -> list[LogLine]:
         """The lines that were logged in the run, in order.

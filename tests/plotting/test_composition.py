@@ -89,10 +89,10 @@ def test_events_are_of_the_drawn_signals_and_of_the_robot(rover: sqlite3.Connect
 
 
 def test_a_unit_is_an_axis_and_so_is_a_scale(rover: sqlite3.Connection) -> None:
-    timeline = timeline_of(rover, "pose", "battery_v", "speed_m_s")
+    timeline = timeline_of(rover, "pose", "battery_v", "heading")
     panels = [(panel.unit, panel.names) for panel in timeline.panels]
     assert panels == [
-        (None, ["pose.0", "pose.1"]), ("V", ["battery_v"]), ("m/s", ["speed_m_s"]),
+        (None, ["pose.0", "pose.1"]), ("V", ["battery_v"]), ("rad", ["heading"]),
     ]  # fmt: skip
 
 

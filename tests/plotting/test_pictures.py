@@ -37,7 +37,7 @@ Ask = dict[str, Any]
 
 QUESTIONS: dict[str, Ask] = {
     "one signal": {"signals": ["sensors.front"]},
-    "several scales": {"signals": ["pose", "heading", "speed_m_s", "battery_v", "sensors"]},
+    "several scales": {"signals": ["pose", "heading", "target", "battery_v", "sensors"]},
     "everything": {"signals": ["*"]},
     "text alone": {"signals": ["mode", "sensors.bumper"]},
     "a part": {"signals": ["pose.0", "ir"], "start_s": 38, "end_s": 66},

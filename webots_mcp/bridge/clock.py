@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from typing import Final
 
-from webots_mcp.bridge.recorder import Run
+from webots_mcp.bridge.run import Run
 from webots_mcp.bridge.simulation import Simulation
 
 _EPSILON_S: Final = 1e-9

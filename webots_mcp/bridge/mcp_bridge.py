@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from webots_mcp.bridge.changes import Changes
 from webots_mcp.bridge.clock import Clock
@@ -22,6 +22,7 @@ from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.stats import BridgeStats
 from webots_mcp.contract import (
     STRICT_VARIABLE,
     Database,
@@ -32,21 +33,6 @@ from webots_mcp.maintenance import Maintainer
 
 LEVELS: Final = ("debug", "info", "warning", "error")
 _CALM_S: Final = 0.5  # a loop that recorded nothing for so long stands still
-
-
-class BridgeStats(NamedTuple):
-    """What a bridge recorded so far, and what it could not."""
-
-    rows_written: int
-    rows_waiting: int
-    rows_dropped: int
-    publish_calls: int
-    publish_throttled: int
-    values_replaced: int
-    publish_mean_us: float
-    publish_max_us: float
-    failures: int
-    last_error: str | None
 
 
 class MCPBridge:

@@ -23,6 +23,7 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.opening import is_damage, is_ours, open_session
 from webots_mcp.bridge.registration import Registration, deregister
+from webots_mcp.bridge.run import Run
 from webots_mcp.connection import journal_mode
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import (
@@ -66,19 +67,6 @@ _END_SESSION: Final = (
 
 
 Values = tuple[Any, ...] | dict[str, Any]
-
-
-class Run:
-    """A stretch of rising simulation time; its id is None until its row is written."""
-
-    __slots__ = ("id", "rows", "start_reason", "started_sim_time_s", "started_wall_time_s")
-
-    def __init__(self, start_reason: str, sim_time_s: float) -> None:
-        self.id: int | None = None
-        self.rows = 0
-        self.start_reason = start_reason
-        self.started_sim_time_s = sim_time_s
-        self.started_wall_time_s = time.time()
 
 
 class Pulse(NamedTuple):

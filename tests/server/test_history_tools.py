@@ -236,7 +236,7 @@ async def test_before_and_after_the_last_edit_are_compared(story: Path) -> None:
     assert (before["runs"], after["runs"]) == ([1, 2], [3])
     assert after["distance_m"] == pytest.approx(17.97, abs=0.01)
     differences = {row["signal"]: row for row in rows_of(answer["differences"])}
-    assert differences["speed_m_s"]["mean"] == [0.2, 0.3]
+    assert differences["commanded_m_s"]["mean"] == [0.2, 0.3]
     assert "target" not in differences
 
 

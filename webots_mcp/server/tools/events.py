@@ -39,6 +39,7 @@ from webots_mcp.server.results import Table
 from webots_mcp.store.history.event import KINDS, Event, EventOptions, Kind, Threshold
 from webots_mcp.store.history.events import choose, find_events
 from webots_mcp.store.history.ranges import TimeRange
+from webots_mcp.store.history.thresholds import thresholds_on
 from webots_mcp.store.recording import Recording, View
 
 EVENT_COLUMNS: Final = ("kind", "run_id", "start_s", "duration_s", "ongoing", "name", "details")
@@ -85,7 +86,7 @@ class EventTools:
         recording gaps, runs, commands, log lines, pictures: "since when, how often, in which mode".
         """
         bounds = Bounds(last_s, start_s, end_s, since, until)
-        thresholds = _thresholds(signals, above, below, for_s)
+        thresholds = thresholds_on(signals or (), above, below, for_s)
         options = EventOptions(
             kinds=_kinds(kinds, thresholds),
             signals=tuple(signals or ("*",)),
@@ -100,21 +101,6 @@ class EventTools:
                 EventsAnswer,
                 lambda: _found(view, bounds.resolve(view, run_id), options, limit),
             )
-
-
-def _thresholds(
-    signals: Sequence[str] | None, above: float | None, below: float | None, for_s: float
-) -> tuple[Threshold, ...]:
-    if above is None and below is None:
-        return ()
-    if not signals:
-        raise InvalidInputError("above and below need signals: name those that are compared")
-    return tuple(
-        Threshold(name, for_s=for_s, **limit)
-        for name in signals
-        for limit in ({"above": above}, {"below": below})
-        if None not in limit.values()
-    )
 
 
 def _kinds(kinds: Sequence[Kind] | None, thresholds: Sequence[Threshold]) -> tuple[Kind, ...]:

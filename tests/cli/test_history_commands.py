@@ -1,0 +1,138 @@
+"""The commands about the past, on a recording whose story is known."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.server.story import write_story
+from webots_mcp.cli import main
+from webots_mcp.cli.tables import print_table, text_of
+
+Say = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def story(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_story(tmp_path_factory.mktemp("story") / "webots.db")
+
+
+@pytest.fixture
+def say(story: Path, capsys: pytest.CaptureFixture[str]) -> Say:
+    """What a command prints when it succeeds."""
+
+    def said(*arguments: str) -> str:
+        assert main([*arguments, "--database", str(story)]) == 0
+        return capsys.readouterr().out
+
+    return said
+
+
+def line_with(text: str, *words: str) -> str:
+    lines = [line for line in text.splitlines() if all(word in line for word in words)]
+    assert len(lines) == 1, (words, text)
+    return lines[0]
+
+
+def test_runs_tells_how_each_ended(say: Say) -> None:
+    text = say("runs")
+    assert "finished" in line_with(text, "  3  rover")
+    assert "crashed" in line_with(text, "  2  rover")
+    assert "log warning 1" in line_with(text, "  1  rover", "reset")
+    assert "3 runs in all" in say("runs", "-n", "1")
+
+
+def test_history_has_a_row_per_bucket_and_names_the_gap(say: Say) -> None:
+    text = say("history", "pose.0", "mode", "--run", "1", "--points", "8")
+    assert "a row is 15 s" in text
+    assert line_with(text, "pose.0 mean", "min", "max")
+    assert line_with(text, "mode", "52", "back_up")
+    assert "no row from 89.900 to 95.000 s" in text
+
+
+def test_history_of_few_rows_shows_the_rows(say: Say) -> None:
+    text = say("history", "pose.0", "--last", "0.3")
+    assert text.splitlines()[-1].split() == ["59.9", "17.97"]
+
+
+def test_trends_say_what_each_signal_did(say: Say) -> None:
+    text = say("trends", "--run", "1")
+    assert "every 2 s" in line_with(text, "heading")
+    assert "cruise 76.9, avoid 35.0" in line_with(text, "mode")
+    assert "more signals" in say("trends", "--run", "1", "-n", "2")
+
+
+def test_events_tell_since_when_it_was_stuck(say: Say) -> None:
+    text = say("events", "--run", "1", "--kind", "stuck", "--kind", "gap")
+    assert "mode cruise" in line_with(text, "stuck", "40")
+    assert line_with(text, "gap", "89.9")
+    beyond = say("events", "--run", "1", "--signal", "pose.0", "--above", "7.9", "--for", "2")
+    assert len(beyond.splitlines()) == 3
+    assert "nothing of these kinds" in say("events", "--kind", "stuck")
+
+
+def test_compare_says_what_differs(say: Say) -> None:
+    assert "0.2         0.3" in line_with(say("compare"), "commanded_m_s")
+    assert line_with(say("compare", "1", "3"), "mean run 1", "mean run 3", "effect run 3")
+
+
+@pytest.mark.parametrize(("name", "start"), [("a.png", b"\x89PNG"), ("a.svg", b"<?xml")])
+def test_plot_writes_a_picture(say: Say, tmp_path: Path, name: str, start: bytes) -> None:
+    file = tmp_path / name
+    assert str(file) in say("plot", "pose.0", "--run", "1", "-o", str(file))
+    assert file.read_bytes().startswith(start)
+
+
+@pytest.mark.parametrize("command", ["runs", "trends", "events", "compare", "history mode"])
+def test_json_is_one_object_for_other_programs(say: Say, command: str) -> None:
+    answer = json.loads(say(*command.split(), "--json"))
+    assert isinstance(answer, dict)
+    assert answer
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("history moed", "there is mode"),
+        ("history mode --points 9999999", "from 1 to 500"),
+        ("history mode --run 99", "newest runs are [3, 2, 1]"),
+        ("trends --robot rovr", "did you mean 'rover'"),
+        ("trends --start 9 --end 3", "reversed"),
+        ("trends --start 3 --last 3", "two ways"),
+        ("trends -n 0", "must be 1 or more"),
+        ("events --kind explosion", "unknown kind"),
+        ("events --above 3", "need signals"),
+        ("compare 1", "2 to 10"),
+        ("runs -n 0", "from 1 to 200"),
+        ("plot -o a.gif", ".png or .svg"),
+        ("plot -o /no/such/folder/a.png", "cannot be written"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    story: Path, capsys: pytest.CaptureFixture[str], arguments: str, words: str
+) -> None:
+    assert main([*arguments.split(), "--database", str(story)]) == 2
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1
+
+
+def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture[str]) -> None:
+    print_table(("name", "empty"), [["red \x1b[31m alarm", None], ["two\nlines", None]])
+    assert capsys.readouterr().out == "name\nred \\x1b[31m alarm\ntwo\\nlines\n"
+    assert text_of("x" * 1000).endswith("…")
+
+
+def test_questions_load_neither_the_server_nor_matplotlib(story: Path) -> None:
+    program = (
+        "import sys\nfrom webots_mcp.cli import main\n"
+        f"main(['trends', '--database', {str(story)!r}])\n"
+        "print({'mcp', 'matplotlib', 'pydantic', 'sqlmodel'} & set(sys.modules), file=sys.stderr)"
+    )
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert ended.stderr.strip() == "set()"

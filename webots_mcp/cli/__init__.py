@@ -1,0 +1,64 @@
+"""The console commands.
+
+A command is one function under `@command`; what it needs is imported inside it, so that
+`webots-mcp --help` answers at once. Our own errors end it with one line on stderr and exit code 2.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from typing import Final
+
+from webots_mcp.cli import history, looking, serving
+from webots_mcp.cli.command import COMMANDS
+from webots_mcp.errors import WebotsMCPError
+
+__all__ = ["COMMANDS", "main"]
+
+FAMILIES: Final = (serving, looking, history)  # each registered its commands at import
+EXIT_BAD_INPUT: Final = 2
+_DESCRIPTION: Final = (
+    "Flight recorder and remote control for Webots simulations: controllers record into one "
+    "SQLite database, an AI assistant reads it and steers the simulation over MCP."
+)
+_EPILOG: Final = "'webots-mcp COMMAND --help' explains a command. Try 'webots-mcp demo' first."
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code: 0, or 2 for bad input and our own errors."""
+    arguments = _parser().parse_args(argv)
+    try:
+        arguments.run(arguments)
+        sys.stdout.flush()
+    except WebotsMCPError as error:
+        print(f"webots-mcp: {error}", file=sys.stderr)
+        return EXIT_BAD_INPUT
+    except KeyboardInterrupt:
+        return 0
+    except BrokenPipeError:  # the reader of a pipe has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    from webots_mcp import __version__
+
+    parser = argparse.ArgumentParser("webots-mcp", description=_DESCRIPTION, epilog=_EPILOG)
+    parser.add_argument("--version", action="version", version=f"webots-mcp {__version__}")
+    subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
+    for name, run, arguments in sorted(COMMANDS):
+        text = run.__doc__ or ""
+        subparser = subparsers.add_parser(
+            name, help=text.partition("\n")[0].rstrip("."), description=_unindented(text)
+        )
+        subparser.set_defaults(run=run)
+        for flags, options in arguments:
+            subparser.add_argument(*flags, **options)
+    return parser
+
+
+def _unindented(text: str) -> str:
+    return " ".join(text.split())

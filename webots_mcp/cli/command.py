@@ -1,0 +1,64 @@
+"""What a console command is: a function, its arguments, and how it gets at a recording."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from webots_mcp.store.recording import Recording
+
+
+class Argument(NamedTuple):
+    """What `add_argument` takes."""
+
+    flags: tuple[str, ...]
+    options: dict[str, Any]
+
+
+class Command(NamedTuple):
+    """A subcommand: its name, its function (whose docstring is its help), its arguments."""
+
+    name: str
+    run: Callable[[argparse.Namespace], None]
+    arguments: tuple[Argument, ...]
+
+
+COMMANDS: Final[list[Command]] = []
+
+
+def argument(*flags: str, **options: Any) -> Argument:
+    """An argument of a command, as `argparse` takes it."""
+    return Argument(flags, options)
+
+
+def command(
+    name: str, *arguments: Argument
+) -> Callable[[Callable[[argparse.Namespace], None]], Callable[[argparse.Namespace], None]]:
+    """Make a function a subcommand."""
+
+    def register(run: Callable[[argparse.Namespace], None]) -> Callable[..., None]:
+        COMMANDS.append(Command(name, run, arguments))
+        return run
+
+    return register
+
+
+DATA_DIR: Final = argument(
+    "--data-dir",
+    metavar="DIR",
+    help="folder of the database and the pictures (default: mcp_data/ in the nearest Webots "
+    "project, else ~/.webots-mcp/data; also WEBOTS_MCP_DATA_DIR)",
+)
+DATABASE: Final = argument("--database", metavar="FILE", help="the database file itself")
+ROBOT: Final = argument("--robot", metavar="NAME", help="only this robot")
+JSON: Final = argument("--json", action="store_true", help="print it as JSON")
+
+
+def open_recording(arguments: argparse.Namespace) -> Recording:
+    """The recording that a command reads; commands that only look never migrate it."""
+    from webots_mcp.contract import resolve_database
+    from webots_mcp.store.recording import Recording
+
+    return Recording(*resolve_database(arguments.database, arguments.data_dir), read_only=True)

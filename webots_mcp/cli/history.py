@@ -1,0 +1,328 @@
+"""Commands about the past: the same questions that the MCP tools ask."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sqlite3
+import time
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from webots_mcp.cli.command import (
+    DATA_DIR,
+    DATABASE,
+    JSON,
+    ROBOT,
+    Argument,
+    argument,
+    command,
+    open_recording,
+)
+from webots_mcp.cli.tables import print_notes, print_table
+from webots_mcp.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from webots_mcp.store.history.compare import Comparison
+    from webots_mcp.store.history.event import EventOptions
+    from webots_mcp.store.history.ranges import TimeRange
+    from webots_mcp.store.history.series import RunHistory
+    from webots_mcp.store.history.trends import RunTrends
+
+RUN: Final = argument(
+    "--run", type=int, dest="run_id", metavar="ID", help="that run instead of the newest one"
+)
+TIMES: Final[tuple[Argument, ...]] = (
+    argument("--last", type=float, metavar="S", help="the last S seconds of simulation time"),
+    argument("--start", type=float, metavar="S", help="from this simulation time on"),
+    argument("--end", type=float, metavar="S", help="up to, not including, this simulation time"),
+    argument("--since", metavar="TIME", help="from this wall time on (ISO 8601 or Unix seconds)"),
+    argument("--until", metavar="TIME", help="up to, not including, this wall time"),
+)
+RANGE: Final = (ROBOT, RUN, *TIMES)
+SIGNALS: Final = argument("signals", nargs="*", metavar="SIGNAL", help="names, with '*' (all)")
+
+
+@command(
+    "runs", DATA_DIR, DATABASE, ROBOT, JSON,
+    argument("-n", type=int, default=20, metavar="N", help="the newest N runs (20)"),
+)  # fmt: skip
+def runs(arguments: argparse.Namespace) -> None:
+    """List the runs: when, with which code, how long, how fast, how they ended."""
+    from webots_mcp.store.history.runs import list_runs
+
+    with _connected(arguments) as connection:
+        found = list_runs(connection, robot=arguments.robot, limit=arguments.n)
+    if arguments.json:
+        return _print_json(found)
+    rows = [
+        [
+            run.run_id, run.robot, run.label, _clock(run.started_wall_time_s), run.duration_s,
+            run.real_time_factor, run.rows, run.end_reason or "going on",
+            (run.controller_sha256 or "")[:8] or None, run.notable or None, run.note,
+        ]
+        for run in found.runs
+    ]  # fmt: skip
+    columns = ("run", "robot", "label", "started", "duration_s", "pace", "rows", "ended by",
+               "code", "notable", "note")  # fmt: skip
+    print_table(columns, rows)
+    print_notes([f"{found.total} runs in all: -n shows more"] if found.cursor else [])
+
+
+@command(
+    "history", DATA_DIR, DATABASE, *RANGE, JSON,
+    argument("signals", nargs="+", metavar="SIGNAL", help="names, with '*'"),
+    argument("--points", type=int, default=20, metavar="N", help="at most N buckets (20)"),
+)  # fmt: skip
+def history(arguments: argparse.Namespace) -> None:
+    """Show signals over time: mean, minimum and maximum of each bucket; changes of modes and flags.
+
+    Without a range the whole newest run is shown.
+    """
+    from webots_mcp.store.history.series import query_history
+
+    with _connected(arguments) as connection:
+        found = query_history(
+            connection, _range(connection, arguments), arguments.signals,
+            max_points=arguments.points,
+        )  # fmt: skip
+    if arguments.json:
+        return _print_json(found)
+    for run in found.runs:
+        _print_history(run)
+    print_notes(found.notes)
+
+
+@command(
+    "trends", DATA_DIR, DATABASE, *RANGE, JSON, SIGNALS,
+    argument("-n", type=int, default=20, metavar="N", help="the N that changed most (20)"),
+)  # fmt: skip
+def trends(arguments: argparse.Namespace) -> None:
+    """Say in one line each what the signals did; what changed most comes first."""
+    from webots_mcp.store.history import trends as store
+
+    if arguments.n < 1:
+        raise InvalidInputError(f"-n {arguments.n} must be 1 or more")
+    with _connected(arguments) as connection:
+        found = store.trends(
+            connection, _range(connection, arguments), arguments.signals or ["*"],
+            limit=arguments.n,
+        )  # fmt: skip
+    if arguments.json:
+        return _print_json(found)
+    for run in found.runs:
+        _print_trends(run)
+    print_notes(found.notes)
+
+
+@command(
+    "events", DATA_DIR, DATABASE, *RANGE, JSON,
+    argument("--kind", action="append", metavar="KIND", help="only this kind; may be repeated"),
+    argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
+    argument("--above", type=float, metavar="X", help="where the signals were above X"),
+    argument("--below", type=float, metavar="X", help="where the signals were below X"),
+    argument("--for", type=float, default=0.0, dest="for_s", metavar="S",
+             help="for at least S simulated seconds"),
+    argument("-n", type=int, default=50, metavar="N", help="at most N events (50)"),
+)  # fmt: skip
+def events(arguments: argparse.Namespace) -> None:
+    """Find what happened: changes, stuck, gaps, jumps, silent sensors, commands, warnings."""
+    from webots_mcp.store.history.events import find_events
+
+    if arguments.n < 1:
+        raise InvalidInputError(f"-n {arguments.n} must be 1 or more")
+    with _connected(arguments) as connection:
+        found = find_events(
+            connection, _range(connection, arguments), _options(arguments), limit=arguments.n
+        )
+    if arguments.json:
+        return _print_json(found)
+    several = len({event.run_id for event in found.events}) > 1
+    rows = [
+        [
+            event.run_id if several else None, event.start_s, event.duration_s or None, event.kind,
+            event.name, event.details or None,
+        ]
+        for event in found.events
+    ]  # fmt: skip
+    print_table(("run", "start_s", "duration_s", "kind", "name", "details"), rows)
+    print_notes([*found.notes, *([] if rows else ["nothing of these kinds in that range"])])
+
+
+@command(
+    "plot", DATA_DIR, DATABASE, *RANGE, SIGNALS,
+    argument("-o", "--output", required=True, metavar="FILE", help="a .png or .svg file"),
+    argument("--trajectory", action="store_true", help="the way of the robot, seen from above"),
+    argument("--runs", type=int, nargs="+", default=[], dest="run_ids", metavar="ID",
+             help="several runs, laid over each other"),
+)  # fmt: skip
+def plot(arguments: argparse.Namespace) -> None:
+    """Draw signals over time, or the way of the robot; without signals those that changed most."""
+    from webots_mcp import plotting
+
+    file = Path(arguments.output)
+    run_ids = [*([arguments.run_id] if arguments.run_id is not None else []), *arguments.run_ids]
+    with _connected(arguments) as connection:
+        picture = plotting.plot(
+            connection,
+            "trajectory" if arguments.trajectory else "signals",
+            arguments.signals,
+            robot=arguments.robot,
+            run_ids=run_ids,
+            start_s=arguments.start,
+            end_s=arguments.end,
+            last_s=arguments.last,
+            wall_start=arguments.since,
+            wall_end=arguments.until,
+            image_format=plotting.image_format_of(file),
+        )
+    try:
+        file.write_bytes(picture.data)
+    except OSError as error:
+        raise InvalidInputError(f"{file} cannot be written: {error}") from error
+    print(f"{file}: {picture.caption}")
+    print_notes(picture.notes)
+
+
+@command(
+    "compare", DATA_DIR, DATABASE, ROBOT, JSON,
+    argument("run_ids", type=int, nargs="*", metavar="RUN",
+             help="two or more runs; none: before and after the last edit of the controller"),
+    argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
+    argument("-n", type=int, default=15, metavar="N", help="the N that differ most (15)"),
+)  # fmt: skip
+def compare(arguments: argparse.Namespace) -> None:
+    """Compare runs: duration, distance, time per mode, events, and the signals that differ most."""
+    from webots_mcp.store.history.compare import compare_code, compare_runs
+
+    names = arguments.signal or ["*"]
+    with _connected(arguments) as connection:
+        if arguments.run_ids:
+            found = compare_runs(connection, arguments.run_ids, names=names, limit=arguments.n)
+        else:
+            found = compare_code(connection, robot=arguments.robot, names=names, limit=arguments.n)
+    if arguments.json:
+        return _print_json(found)
+    _print_comparison(found)
+
+
+@contextmanager
+def _connected(arguments: argparse.Namespace) -> Generator[sqlite3.Connection]:
+    with open_recording(arguments).reader() as connection:
+        yield connection
+
+
+def _range(connection: sqlite3.Connection, arguments: argparse.Namespace) -> TimeRange:
+    from webots_mcp.store.history.ranges import resolve_range
+
+    return resolve_range(
+        connection,
+        robot=arguments.robot,
+        run_id=arguments.run_id,
+        start_s=arguments.start,
+        end_s=arguments.end,
+        last_s=arguments.last,
+        wall_start=arguments.since,
+        wall_end=arguments.until,
+    )
+
+
+def _options(arguments: argparse.Namespace) -> EventOptions:
+    from webots_mcp.store.history.event import KINDS, EventOptions
+    from webots_mcp.store.history.thresholds import thresholds_on
+
+    limits = thresholds_on(
+        arguments.signal or (), arguments.above, arguments.below, arguments.for_s
+    )
+    kinds = tuple(arguments.kind or (("threshold",) if limits else KINDS))
+    return EventOptions(kinds=kinds, signals=tuple(arguments.signal or "*"), thresholds=limits)
+
+
+def _print_json(found: Any) -> None:
+    assert is_dataclass(found)
+    assert not isinstance(found, type)
+    print(json.dumps(asdict(found), ensure_ascii=False))
+
+
+def _clock(wall_time_s: float) -> str:
+    """Local time."""
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(wall_time_s))
+
+
+def _print_heading(run_id: int, start_s: float, end_s: float, more: str = "") -> None:
+    print(f"run {run_id}, {start_s:.3f} to {end_s:.3f} s{more}")
+
+
+def _print_history(run: RunHistory) -> None:
+    step = f", a row is {run.step_s:g} s" if run.step_s else ""
+    _print_heading(run.run_id, run.start_s, run.end_s, step)
+    columns = ["sim_time_s"]
+    series: list[Sequence[float | None]] = [run.sim_time_s]
+    for number in run.numbers:
+        if run.step_s is None:
+            columns.append(number.name)
+            series.append(number.last)
+        else:
+            columns += [f"{number.name} mean", "min", "max"]
+            series += [number.mean, number.min, number.max]
+    if run.numbers:
+        print_table(columns, list(zip(*series, strict=True)))
+    changes = [
+        [states.name, point.sim_time_s, "null" if point.value is None else point.value]
+        for states in run.changes
+        for point in states.points
+    ]
+    if changes:
+        print_table(("signal", "since_s", "value"), changes)
+    print_notes([f"no row from {gap.start_s:.3f} to {gap.end_s:.3f} s" for gap in run.gaps[:10]])
+
+
+def _print_trends(run: RunTrends) -> None:
+    _print_heading(run.run_id, run.start_s, run.end_s, f", {run.rows} rows")
+    numbers = [
+        [trend.name, trend.says, trend.mean, trend.deviation, trend.unit] for trend in run.numbers
+    ]
+    if numbers:
+        print_table(("signal", "what it did", "mean", "deviation", "unit"), numbers)
+    states = [
+        [state.name, state.changes, _spelled(state.last), state.since_s, _times(state)]
+        for state in run.states
+    ]
+    if states:
+        print_table(("signal", "changes", "last", "since_s", "seconds in each value"), states)
+    left = run.total - len(run.numbers)
+    print_notes([f"{left} more signals that changed less: -n shows them"] if left else [])
+
+
+def _times(state: Any) -> str:
+    return ", ".join(f"{value} {time_s:.1f}" for value, time_s in state.time_by_value_s.items())
+
+
+def _spelled(value: object) -> object:
+    return "null" if value is None else value
+
+
+def _print_comparison(found: Comparison) -> None:
+    groups = [
+        [
+            group.name,
+            ", ".join(str(run.run_id) for run in group.runs),
+            group.duration_s,
+            group.distance_m,
+            {value: round(time_s, 1) for value, time_s in group.time_by_mode_s.items()} or None,
+            group.events or None,
+        ]
+        for group in found.groups
+    ]
+    columns = ("", "runs", "duration_s", "distance_m", "seconds per mode", "events")
+    print_table(columns, groups)
+    print(f"\nSignals over the first {found.compared_s:.3f} s, what differs most first:")
+    names: Sequence[str] = [group.name for group in found.groups]
+    print_table(
+        ["signal", *(f"mean {name}" for name in names), *(f"effect {name}" for name in names[1:])],
+        [[each.name, *each.mean, *each.effect[1:]] for each in found.differences],
+    )
+    print_notes(found.notes)

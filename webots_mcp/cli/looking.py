@@ -1,0 +1,121 @@
+"""Commands that look at what is being recorded now."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+from webots_mcp.cli.command import (
+    DATA_DIR,
+    DATABASE,
+    JSON,
+    ROBOT,
+    argument,
+    command,
+    open_recording,
+)
+from webots_mcp.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from webots_mcp.store.follow import Line
+    from webots_mcp.store.recording import View
+
+
+@command("status", DATA_DIR, DATABASE, JSON)
+def status(arguments: argparse.Namespace) -> None:
+    """Show the robots: whether they run, how old their data is, what could not be recorded."""
+    import webots_mcp.store.recording as recordings
+    from webots_mcp.store.robots import list_robots
+
+    recording = open_recording(arguments)
+    with recording.reader() as connection:
+        now_s = time.time()
+        views = [
+            recordings.view_of(connection, robot, None, now_s)
+            for robot in list_robots(connection, now_s)
+        ]
+        facts = {"database": str(recording.database), "robots": [_facts(view) for view in views]}
+    print(json.dumps(facts, indent=2) if arguments.json else _as_text(facts))
+
+
+@command(
+    "tail",
+    DATA_DIR,
+    DATABASE,
+    ROBOT,
+    argument("-n", type=int, default=10, metavar="N", help="begin with the last N lines (10)"),
+    argument(
+        "--interval", type=float, default=0.5, metavar="S", help="seconds between looks (0.5)"
+    ),
+    argument("--no-follow", action="store_true", help="print the last lines and end"),
+)
+def tail(arguments: argparse.Namespace) -> None:
+    """Follow what is being recorded: states, log lines, events, commands. Ctrl-C ends it.
+
+    Of the states that came since the last look the newest of each robot is shown.
+    """
+    from webots_mcp.store.follow import Follower
+    from webots_mcp.store.robots import resolve_robot
+
+    if arguments.n < 0 or arguments.interval <= 0:
+        raise InvalidInputError("-n must not be negative, and --interval must be greater than 0")
+    with open_recording(arguments).reader() as connection:
+        robot = arguments.robot and resolve_robot(connection, arguments.robot, time.time())
+        follower = Follower(connection, robot.id if robot else None)
+        _print_lines(follower.look(arguments.n))
+        while not arguments.no_follow:
+            time.sleep(arguments.interval)
+            _print_lines(_newest_states_only(follower.look()))
+
+
+def _facts(view: View) -> dict[str, Any]:
+    from webots_mcp.store.runs import count_runs
+
+    session = view.session
+    return {
+        **view.header(),
+        "kind": view.robot.kind,
+        "live": view.robot.live,
+        "runs": count_runs(view.connection, view.robot.id),
+        "rows": view.run.rows if view.run else 0,
+        "rows_waiting": session.rows_waiting if session else 0,
+        "rows_dropped": session.rows_dropped if session else 0,
+        "last_error": session.last_error if session else None,
+        "controller": session.controller if session else None,
+    }
+
+
+def _as_text(facts: dict[str, Any]) -> str:
+    robots = "\n".join(_robot_as_text(robot) for robot in facts["robots"])
+    return f"{facts['database']}\n{robots or 'no robot was recorded yet'}"
+
+
+def _robot_as_text(robot: dict[str, Any]) -> str:
+    time_text = "no data yet"
+    if robot["sim_time_s"] is not None:
+        time_text = f"simulation time {robot['sim_time_s']:.3f} s, {robot['age_s']:.1f} s old"
+    lines = [
+        f"{robot['robot']} ({robot['kind']}): {robot['status']}",
+        f"  run {robot['run_id']} of {robot['runs']} runs, {robot['rows']} rows, {time_text}",
+        f"  rows waiting {robot['rows_waiting']}, dropped {robot['rows_dropped']}",
+    ]
+    lines += [f"  {robot['why']}"] if robot["why"] else []
+    lines += [f"  last error: {robot['last_error']}"] if robot["last_error"] else []
+    return "\n".join(lines)
+
+
+def _print_lines(lines: Sequence[Line]) -> None:
+    for line in lines:
+        clock = time.strftime("%H:%M:%S", time.localtime(line.wall_time_s))
+        at = "" if line.sim_time_s is None else f"{line.sim_time_s:.3f} s"
+        text = line.text.replace("\n", "\\n")
+        print(f"{clock} {line.robot} {at:>11} {line.kind:<8} {text}", flush=True)
+
+
+def _newest_states_only(lines: Sequence[Line]) -> list[Line]:
+    """A robot that publishes a hundred times a second would scroll all else away."""
+    newest = {line.robot: line for line in lines if line.kind == "state"}
+    return [line for line in lines if line.kind != "state" or newest[line.robot] is line]

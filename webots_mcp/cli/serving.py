@@ -1,0 +1,77 @@
+"""Commands that run something: the server, the demo, a migration."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command
+from webots_mcp.errors import InvalidInputError
+
+
+@command(
+    "serve",
+    DATA_DIR,
+    DATABASE,
+    argument(
+        "--read-only", action="store_true", help="leave out the tools that change the simulation"
+    ),
+)
+def serve(arguments: argparse.Namespace) -> None:
+    """Serve a recording to an MCP client over stdin and stdout.
+
+    Starts whether or not anything was recorded yet. Connect Claude Code with:
+    claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
+    """
+    import logging
+
+    from webots_mcp.contract import resolve_database
+
+    logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
+    database, data_dir = resolve_database(arguments.database, arguments.data_dir)
+    if sys.stdin.isatty():
+        print(
+            f"webots-mcp: serving {database} to an MCP client on stdin and stdout; Ctrl-C ends it. "
+            "Clients start this command themselves, see 'webots-mcp serve --help'.",
+            file=sys.stderr,
+        )
+    from webots_mcp.server import create_server
+
+    create_server(database, data_dir, read_only=arguments.read_only).run()
+
+
+@command(
+    "migrate",
+    DATA_DIR,
+    DATABASE,
+    argument("--revision", default="head", help="an Alembic revision (default: the newest)"),
+)
+def migrate(arguments: argparse.Namespace) -> None:
+    """Bring a database to the schema of this version; its data is kept."""
+    from alembic.util import CommandError
+
+    from webots_mcp.contract import MemoryDatabase, resolve_database
+    from webots_mcp.store.migrate import upgrade
+
+    database, _ = resolve_database(arguments.database, arguments.data_dir)
+    if isinstance(database, MemoryDatabase) or not database.exists():
+        raise InvalidInputError(f"no database at {database}: give --data-dir or --database")
+    try:
+        before, after = upgrade(database, arguments.revision)
+    except CommandError as error:
+        raise InvalidInputError(f"--revision {arguments.revision}: {error}") from error
+    print(f"{database}: schema {before}, now {after}" if before != after else f"schema {after}")
+
+
+@command(
+    "demo",
+    argument("--data-dir", metavar="DIR", help="where to record (default: ~/.webots-mcp/demo)"),
+    argument("--keep", action="store_true", help="leave the robot running until Ctrl-C"),
+)
+def demo(arguments: argparse.Namespace) -> None:
+    """Run a robot on the stand-in simulator and talk to it: no Webots needed, under 30 s."""
+    from webots_mcp.demo import DEFAULT_DATA_DIR, run
+
+    chosen = Path(arguments.data_dir).expanduser().resolve() if arguments.data_dir else None
+    run(chosen or DEFAULT_DATA_DIR, keep=arguments.keep)

@@ -1,0 +1,54 @@
+"""Answers as a person reads them in a terminal."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from typing import Any, Final, cast
+
+_LONGEST_CELL: Final = 110
+_RIGHT: Final = (int, float)
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print rows under their column names; columns that are empty throughout are left out."""
+    kept = [index for index in range(len(columns)) if any(row[index] is not None for row in rows)]
+    cells = [[columns[index] for index in kept]]
+    cells += [[text_of(row[index]) for index in kept] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    right = [all(isinstance(row[i], (*_RIGHT, type(None))) for row in rows) for i in kept]
+    for line in cells:
+        fields = zip(line, widths, right, strict=True)
+        padded = (cell.rjust(width) if r else cell.ljust(width) for cell, width, r in fields)
+        print("  ".join(padded).rstrip())
+
+
+def text_of(value: Any) -> str:
+    """A value in one line; what a terminal would obey is spelled out instead."""
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return number_text(value)
+    if isinstance(value, dict):
+        members = cast("dict[str, Any]", value).items()
+        return _one_line(", ".join(f"{name} {text_of(member)}" for name, member in members))
+    return _one_line(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
+
+
+def _one_line(text: str) -> str:
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return line if len(line) <= _LONGEST_CELL else f"{line[: _LONGEST_CELL - 1]}…"
+
+
+def number_text(value: float) -> str:
+    """4 significant digits, but never coarser than a thousandth."""
+    if not math.isfinite(value):
+        return str(value)
+    return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) >= 1 else f"{value:.4g}"
+
+
+def print_notes(notes: Sequence[str]) -> None:
+    """What there is to know about an answer, below it."""
+    for note in notes:
+        print(f"note: {text_of(note)}")

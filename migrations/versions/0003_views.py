@@ -109,7 +109,8 @@ SELECT {ROBOT.format("l")},
 FROM log l"""
 
 # From the events that the bridge writes at once, so that it needs no rollup. The value before a
-# signal's first change (of the row with the least id) held from the start of the run.
+# signal's first change held from the start of the run: that change counts twice, as side 0 and 1.
+# Without UNION, on which DuckDB stumbles when it reads the views of a SQLite database.
 ROBOT_PERIOD = f"""
 CREATE VIEW robot_period AS
 /* How long a text or flag of the state kept a value. Signals that never changed have none. */
@@ -119,16 +120,17 @@ SELECT {ROBOT.format("p")},
   round(coalesce(p.next_s, u.last_sim_time_s) - p.start_s, 3) AS duration_s
 FROM (
   SELECT run_id, name, value, start_s,
-    lead(start_s) OVER (PARTITION BY run_id, name ORDER BY start_s, id) AS next_s
+    lead(start_s) OVER (PARTITION BY run_id, name ORDER BY start_s, id, side) AS next_s
   FROM (
-    SELECT run_id, name, id, sim_time_s AS start_s,
-      CASE WHEN json_valid(data) THEN json_extract(data, '$.to') END AS value
-    FROM event WHERE kind = 'change'
-    UNION ALL
-    SELECT e.run_id, e.name, min(e.id) - 1, v.started_sim_time_s,
-      CASE WHEN json_valid(e.data) THEN json_extract(e.data, '$.from') END
-    FROM event e JOIN run v ON v.id = e.run_id WHERE e.kind = 'change' GROUP BY e.run_id, e.name
-  )
+    SELECT e.run_id, e.name, e.id, k.value AS side,
+      CASE k.value WHEN 0 THEN v.started_sim_time_s ELSE e.sim_time_s END AS start_s,
+      CASE WHEN json_valid(e.data)
+        THEN json_extract(e.data, CASE k.value WHEN 0 THEN '$.from' ELSE '$.to' END) END AS value
+    FROM event e JOIN run v ON v.id = e.run_id CROSS JOIN json_each('[0, 1]') k
+    WHERE e.kind = 'change' AND (k.value = 1 OR NOT EXISTS (
+      SELECT 1 FROM event b
+      WHERE b.run_id = e.run_id AND b.kind = 'change' AND b.name = e.name AND b.id < e.id))
+  ) c
 ) p JOIN run u ON u.id = p.run_id"""
 
 # A comment behind the last word would not be kept in the schema.

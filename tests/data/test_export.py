@@ -124,7 +124,7 @@ def without_odd(value: Any) -> Any:
     return value
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(STATES)
 def test_json_lines_read_back_as_the_rows(states: list[dict[str, Any]]) -> None:
     for recorder in make_run():
@@ -141,7 +141,7 @@ def test_json_lines_read_back_as_the_rows(states: list[dict[str, Any]]) -> None:
             assert same(line, without_odd(expected(state)))
 
 
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(STATES)
 def test_csv_reads_back_as_the_rows(states: list[dict[str, Any]]) -> None:
     for recorder in make_run():
@@ -167,7 +167,7 @@ def assert_cell(cell: str, value: Any) -> None:
         assert same(json.loads(cell), value)
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(STATES)
 def test_parquet_reads_back_as_the_rows(states: list[dict[str, Any]]) -> None:
     for recorder in make_run():
@@ -277,11 +277,14 @@ def test_progress_reaches_its_end(recorder: Recorder, form: str) -> None:
 
 
 @pytest.mark.parametrize("form", ["csv", "jsonl"])
-def test_memory_does_not_grow_with_the_recording(recorder: Recorder, form: str) -> None:
+def test_memory_does_not_grow_with_the_recording(
+    recorder: Recorder, form: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("webots_mcp.store.export.rows.CHUNK_ROWS", 100)
     peaks: list[int] = []
-    for rows in (6000, 6000, 12000):
+    for rows in (300, 300, 1200):
         for i in range(rows):
-            recorder.publish(float(i), {"text": "t" * 200})
+            recorder.publish(float(i), {"text": "t" * 500})
         wanted = resolve_range(recorder.connection)
         tracemalloc.start()
         with Path("/dev/null").open("wb") as sink:

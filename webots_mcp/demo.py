@@ -42,6 +42,13 @@ CONVERSATION: Final[tuple[tuple[str, str, dict[str, Any]], ...]] = (
     ("Go on.", "webots_simulation_control", {"command": "resume"}),
     ("Show me the arena.", "webots_take_screenshot", {}),
     ("Watch it for five seconds.", "webots_monitor", {"duration_s": 5}),
+    ("What has each signal done since the start?", "webots_get_trends", {}),
+    (
+        "Since when, and how often, was it avoiding something or stuck?",
+        "webots_find_events",
+        {"kinds": ["change", "stuck"], "signals": ["mode"]},
+    ),
+    ("Draw the way it took.", "webots_plot", {"kind": "trajectory"}),
     ("Start over.", "webots_simulation_control", {"command": "reset"}),
 )
 

@@ -126,7 +126,7 @@ def _record_cruise(recorder: Recorder, duration_s: float, speed_m_s: float) -> N
     for step in range(round(duration_s / INTERVAL_S)):
         time_s = round(step * INTERVAL_S, 6)
         state, odd = rover_state(0.0)
-        state |= {"pose": [speed_m_s * time_s, 0.0], "speed_m_s": speed_m_s}
+        state |= {"pose": [speed_m_s * time_s, 0.0], "commanded_m_s": speed_m_s}
         recorder.publish(time_s, state | {"battery_v": 12.6 - 0.001 * time_s}, odd)
 
 
@@ -162,7 +162,7 @@ def rover_state(time_s: float) -> tuple[dict[str, Any], dict[str, str] | None]:
         "mode": mode,
         "pose": [rover_x(time_s), 1.0 if time_s >= 110 else 0.0],
         "heading": rover_heading(time_s),
-        "speed_m_s": {"cruise": 0.2, "back_up": -0.1}.get(mode, 0.0),
+        "commanded_m_s": {"cruise": 0.2, "back_up": -0.1}.get(mode, 0.0),
         "sensors": {"front": front, "bumper": STUCK_S[0] <= time_s < STUCK_S[1]},
         "ir": 5.0 if abs(time_s - 70) < 1e-6 else 0.01 * math.sin(time_s * 3),
         "lidar": [2.0] * 7 + [1.5 + 0.001 * time_s] + [3.0] * 24,

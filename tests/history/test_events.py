@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from tests.history.recording import WALL_START_S
+from tests.history.recording import WALL_START_S, Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.history import columns
-from webots_mcp.store.history.event import EventOptions, Threshold
+from webots_mcp.store.history.event import Event, EventOptions, Threshold
 from webots_mcp.store.history.events import Events, find_events
 from webots_mcp.store.history.jolts import find_jumps, find_to_and_fro
 from webots_mcp.store.history.ranges import resolve_range
@@ -176,6 +176,8 @@ def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
         EventOptions(stuck_s=0)
     with pytest.raises(UnknownSignalError):
         ask(rover, "stuck", mode="moood")
+    with pytest.raises(InvalidInputError, match="means 2 signals"):
+        ask(rover, "stuck", position=("pose", "pose.1"))
     with pytest.raises(UnknownSignalError):
         ask(rover, "threshold", thresholds=(Threshold("nothing", above=1.0),))
 
@@ -197,3 +199,37 @@ def test_a_swing_within_a_drive_has_its_own_begin_and_end() -> None:
     (swing,) = find_to_and_fro(times, values, 6, 5.0)
     assert swing.start_s == pytest.approx(20.25, abs=0.1)
     assert swing.end_s == pytest.approx(39.75, abs=0.1)
+
+
+def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tuple[Event, ...]:
+    """Ten seconds of driving and ten of standing; each signal has a value for either."""
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(200):
+        state = {name: pair[step > 100] for name, pair in moving_and_standing.items()}
+        recorder.publish(step * 0.1, state | {"gps": {"x": min(step, 100) * 0.02, "y": 0}})
+    return ask(empty, "stuck").events
+
+
+def test_a_measured_speed_of_zero_does_not_hide_that_it_is_stuck(empty: sqlite3.Connection) -> None:
+    (stuck,) = publish_stuck(empty, speed=(0.2, 0.0), mode=("drive", "drive"))
+    assert stuck.start_s == pytest.approx(10.0, abs=0.2) and stuck.ongoing
+
+
+def test_a_robot_told_to_stand_is_not_stuck(empty: sqlite3.Connection) -> None:
+    assert not publish_stuck(empty, commanded_m_s=(0.2, 0.0), mode=("drive", "drive"))
+
+
+def test_a_robot_that_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
+    assert not publish_stuck(empty, mode=("go", "turn_left"))
+
+
+def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder.publish(0.0, {"mode": "drive", "range": 1.0})
+    assert "no position is published" in ask(empty, "stuck", bounds={"run_id": 1}).notes[0]

@@ -77,7 +77,7 @@ def test_two_runs_differ_in_what_was_changed(rover: sqlite3.Connection, tier: st
     assert x.effect == [0.0, pytest.approx(d)]
     assert x.count == [300, 300]
     assert difference(comparison, "battery_v").effect == [0.0, pytest.approx(0.0, abs=1e-9)]
-    assert comparison.differences[0].name == "speed_m_s"  # constant at 0.2, constant at 0.3
+    assert comparison.differences[0].name == "commanded_m_s"  # constant at 0.2, constant at 0.3
     assert comparison.differences[0].effect == [0.0, None]
 
 

@@ -10,12 +10,12 @@ from typing import Any, Final
 
 from webots_mcp.store.history.batch import odd_names
 from webots_mcp.store.history.deadline import Deadline
-from webots_mcp.store.history.leaves import Value, flatten, parse, shown
+from webots_mcp.store.history.leaves import Value, flatten, parse, reduce_text, shown
 from webots_mcp.store.history.ranges import Segment
 from webots_mcp.store.history.registry import Signal
 
 RAW_ROWS: Final = 30_000  # 2 to 3 us each: what a question may read without rollups
-MAX_EXTRACTED: Final = 12  # beyond, decoding the whole row in Python is faster than json_extract
+MAX_EXTRACTED: Final = 100  # beyond, decoding the whole row in Python is not slower
 
 _IN_SEGMENT: Final = (
     "FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
@@ -79,7 +79,7 @@ def read_columns(
         limit: At most so many rows; -1 for all.
     """
     columns = Columns(segment.run_id, values={signal.name: [] for signal in signals})
-    decode = len(signals) > MAX_EXTRACTED or any(signal.needs_decoding for signal in signals)
+    decode = len(signals) > MAX_EXTRACTED or any(signal.mixed for signal in signals)
     read = _read_decoded if decode else _read_extracted
     bounds = (segment.run_id, segment.start_s, segment.end_s)
     parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id, limit)
@@ -102,14 +102,24 @@ def _read_extracted(
     columns: Columns,
     deadline: Deadline,
 ) -> None:
-    extracts = "".join(", json_extract(data, ?)" for _ in signals)
+    """Each path is extracted once; of a long array SQLite gives the text."""
+    paths = tuple(dict.fromkeys(signal.path for signal in signals))
+    extracts = ", json_extract(data, ?)" * len(paths)
     query = f"SELECT id, sim_time_s, wall_time_s, odd{extracts} {_IN_SEGMENT}"
-    paths = tuple(signal.path for signal in signals)
     for chunk in _chunks(connection, query, (*paths, *parameters), columns, deadline):
         read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
         _extend(columns, signals, read[:3], read[3])
-        for signal, column in zip(signals, read[4:], strict=True):
-            columns.values[signal.name].extend(column)
+        by_path = dict(zip(paths, read[4:], strict=True))
+        reduced = {
+            path: [reduce_text(text) for text in by_path[path]]
+            for path in {signal.path for signal in signals if signal.reduce}
+        }
+        for signal in signals:
+            if signal.reduce is None:
+                columns.values[signal.name].extend(by_path[signal.path])
+            else:
+                rows = reduced[signal.path]
+                columns.values[signal.name].extend([row.get(signal.reduce) for row in rows])
 
 
 def _read_decoded(

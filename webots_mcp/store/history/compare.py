@@ -343,7 +343,7 @@ def _distance(connection: sqlite3.Connection, part: _Part, deadline: Deadline) -
     position = part.motion.position
     if position is None:
         return None
-    if not exceeds(connection, part.segment) or any(each.needs_decoding for each in position):
+    if not exceeds(connection, part.segment) or not all(each.is_plain for each in position):
         columns = read_columns(connection, part.segment, position, deadline)
     else:
         every_s = max(SAMPLE_S, (part.segment.end_s - part.segment.start_s) / MOST_SAMPLES)

@@ -24,6 +24,8 @@ DETECTED: Final[tuple[Kind, ...]] = (
     "stuck", "threshold", "silent", "flat", "jump", "oscillation",
 )  # fmt: skip
 
+OF_NUMBERS: Final = frozenset[Kind]({"silent", "flat", "jump", "oscillation"})
+
 # What a robot swings with; sensors swing by nature while it drives.
 _SWINGING: Final = re.compile(
     r"(^|[._])(heading|yaw|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"

@@ -78,8 +78,8 @@ class EventOptions:
         mode: The text signal of the mode; None finds it by name (`mode`, `state`, ...).
         moving_modes: Modes in which the robot should move; None for all but those whose name says
             that they do not (idle, stop, wait, turn, ...).
-        commanded: The signal of the commanded speed; None finds it by name (`speed`,
-            `velocity`, `commanded`, ...), and without any the mode alone tells.
+        commanded: The signal of the commanded speed; None finds it by name (`commanded`, `cmd`,
+            `target_speed`, else `speed`, `velocity`), and without any the mode alone tells.
         min_commanded: A commanded speed of at least this should move the robot.
         stuck_m: Stuck is who should move and stays within this distance ...
         stuck_s: ... for so long.

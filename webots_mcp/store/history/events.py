@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.history.detectors import DETECTED, DETECTORS, Search
+from webots_mcp.store.history.detectors import DETECTED, DETECTORS, OF_NUMBERS, Search
 from webots_mcp.store.history.event import Event, EventOptions, Kind
 from webots_mcp.store.history.leaves import Value, flatten, parse
 from webots_mcp.store.history.motion import Motion, find_motion
@@ -172,7 +172,7 @@ def _detected(
     if recorded is None or not kinds:
         return []
     matching = resolve_signals(known, options.signals) if known else []
-    numbers = [signal for signal in matching if signal.is_number]
+    numbers = [signal for signal in matching if signal.is_number and set(kinds) & OF_NUMBERS]
     limits = [
         signal for each in options.thresholds for signal in resolve_signals(known, [each.signal])
     ]

@@ -20,7 +20,8 @@ _ANGLE_NAME: Final = re.compile(
     r"(^|[._])(yaw|heading|theta|bearing|roll|pitch)(_rad)?(\.\d+)?$", re.IGNORECASE
 )
 _UNIT_SUFFIXES: Final = {
-    "_rad_s": "rad/s", "_m_s": "m/s", "_mps": "m/s", "_m_s2": "m/s²", "_rad": "rad",
+    "_rad_s": "rad/s", "_radps": "rad/s", "_m_s": "m/s", "_mps": "m/s", "_m_s2": "m/s²",
+    "_mps2": "m/s²", "_rad": "rad",
     "_deg": "deg", "_mm": "mm", "_m": "m", "_ms": "ms", "_s": "s", "_hz": "Hz", "_v": "V",
     "_a": "A", "_w": "W", "_nm": "N·m", "_n": "N", "_kg": "kg", "_percent": "%", "_bytes": "B",
 }  # fmt: skip
@@ -73,17 +74,31 @@ def _spread(prefix: str, items: Iterable[tuple[str, Any]], leaves: dict[str, Val
 
 
 def _reduce(name: str, array: list[Any], leaves: dict[str, Value]) -> None:
+    for reduction, value in zip(REDUCTIONS, reduce_array(array), strict=True):
+        leaves[f"{name}.{reduction}"] = value
+
+
+def reduce_array(array: list[Any]) -> tuple[Value, ...]:
+    """An array as one value per reduction."""
     numbers = [item for item in array if type(item) is float or type(item) is int]
     low = min(numbers, default=None)
-    reduced: tuple[Value, ...] = (
+    return (
         len(array),
         low,
         max(numbers, default=None),
         sum(numbers) / len(numbers) if numbers else None,
         None if low is None else array.index(low),
     )
-    for reduction, value in zip(REDUCTIONS, reduced, strict=True):
-        leaves[f"{name}.{reduction}"] = value
+
+
+def reduce_text(text: object) -> dict[str, Value]:
+    """The reductions of an array given as JSON text; empty where it is no long array."""
+    if not isinstance(text, str) or not text.startswith("["):
+        return {}
+    array = json.loads(text)
+    if len(array) <= LONGEST_SPREAD_ARRAY:
+        return {}
+    return dict(zip(REDUCTIONS, reduce_array(array), strict=True))
 
 
 def places(state: dict[str, Any]) -> dict[str, Place]:
@@ -140,11 +155,19 @@ def widen(known: Kind, seen: Kind) -> Kind:
 
 
 def unit_of(name: str, kind: Kind) -> str | None:
-    """The unit, where the name ends in one (`speed_m_s`) or the signal is an angle."""
+    """The unit, where a part of the name ends in one (`speed_m_s`, `distance_m.left`)."""
     if kind == "angle":
         return "rad"
-    last = name.rpartition(".")[2].lower()
-    return next((unit for suffix, unit in _UNIT_SUFFIXES.items() if last.endswith(suffix)), None)
+    parts = name.lower().split(".")
+    if kind != "num" or parts[-1] in ("count", "argmin"):
+        return None
+    units = (
+        unit
+        for part in reversed(parts)
+        for suffix, unit in _UNIT_SUFFIXES.items()
+        if part.endswith(suffix)
+    )
+    return next(units, None)
 
 
 def shown(value: Value) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
 import statistics
@@ -11,8 +12,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.history.columns import Columns
 from webots_mcp.store.history.event import EventOptions
+from webots_mcp.store.history.gaps import GAP_INTERVALS, rhythm_of
 from webots_mcp.store.history.leaves import Value
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.signals import resolve_signals
@@ -26,10 +29,11 @@ _STILL: Final = re.compile(
     r"idle|stop|wait|paus|hold|dock|charg|turn|rotat|spin|done|finish|init|ready|rest|stand|sleep",
     re.IGNORECASE,
 )
+_TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps))*$"
 _COMMANDED: Final = re.compile(
-    r"(^|[._])(commanded|command|cmd|target_speed|speed|velocity|linear)([._](x|vx|m_s|mps|linear))*$",
-    re.IGNORECASE,
+    rf"(^|[._])(commanded|command|cmd|cmd_vel|target_speed){_TAIL}", re.IGNORECASE
 )
+_SPEED: Final = re.compile(rf"(^|[._])(speed|velocity|linear){_TAIL}", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -39,11 +43,14 @@ class Motion:
     Attributes:
         position: x and y in metres.
         commanded: Speed that it should have.
+        measured: The name leaves open whether that speed is commanded or measured; then a mode
+            in which it should move tells as well.
         mode: What it is doing.
     """
 
     position: tuple[Signal, Signal] | None
     commanded: Signal | None
+    measured: bool
     mode: Signal | None
 
     @property
@@ -69,25 +76,33 @@ def find_motion(known: dict[str, Signal], options: EventOptions) -> Motion:
 
     Raises:
         UnknownSignalError: The options name a signal that does not exist.
+        InvalidInputError: A name in them means several.
     """
-    named = [name for name in (*(options.position or ()), options.commanded, options.mode) if name]
-    if named:
-        resolve_signals(known, named)
-    mode = options.mode or _first(known, _MODE, ("text",))
-    commanded = options.commanded or _first(known, _COMMANDED, ("num",))
-    return Motion(
-        _position(known, options.position),
-        known[commanded] if commanded else None,
-        known[mode] if mode else None,
-    )
+    mode = _named(known, options.mode) or _first(known, _MODE, ("text",))
+    commanded = _named(known, options.commanded) or _first(known, _COMMANDED, ("num",))
+    measured = commanded is None
+    if measured:
+        commanded = _first(known, _SPEED, ("num",))
+    return Motion(_position(known, options.position), commanded, measured, mode)
+
+
+def _named(known: dict[str, Signal], name: str | None) -> Signal | None:
+    if name is None:
+        return None
+    found = resolve_signals(known, [name])
+    if len(found) > 1:
+        raise InvalidInputError(f"{name!r} means {len(found)} signals; name one of them")
+    return found[0]
 
 
 def _position(
     known: dict[str, Signal], named: tuple[str, str] | None
 ) -> tuple[Signal, Signal] | None:
     if named is not None:
-        return known[named[0]], known[named[1]]
-    for branch in _BRANCHES:
+        x, y = (_named(known, name) for name in named)
+        return (x, y) if x and y else None
+    others = sorted(name[:-2] for name in known if name.endswith(".x"))
+    for branch in (*_BRANCHES, *others):
         for x, y in _AXES if branch else _AXES[1:]:
             names = (f"{branch}.{x}", f"{branch}.{y}") if branch else (x, y)
             if all(name in known and known[name].is_number for name in names):
@@ -95,17 +110,20 @@ def _position(
     return None
 
 
-def _first(known: dict[str, Signal], name: re.Pattern[str], kinds: tuple[str, ...]) -> str | None:
-    """The shortest name that fits: `mode` before `arm.mode`."""
+def _first(
+    known: dict[str, Signal], name: re.Pattern[str], kinds: tuple[str, ...]
+) -> Signal | None:
+    """The one with the shortest name that fits: `mode` before `arm.mode`."""
     fitting = [each for each in known if name.search(each) and known[each].kind in kinds]
-    return min(fitting, key=len, default=None)
+    return known[min(fitting, key=len)] if fitting else None
 
 
 def find_stays(columns: Columns, motion: Motion, options: EventOptions) -> list[Stay]:
     """Stretches of at least `stuck_s` within `stuck_m`, through all of which it should move.
 
     Should move: a commanded speed of at least `min_commanded`; where none is published, a mode in
-    which it should. Without either it is not known, and every stay counts.
+    which it should, or a speed whose name leaves open whether it is commanded or measured. Without
+    any of them it is not known, and every stay counts.
     """
     if motion.position is None:
         return []
@@ -126,25 +144,29 @@ def find_stays(columns: Columns, motion: Motion, options: EventOptions) -> list[
 
 
 def _should_move(columns: Columns, motion: Motion, options: EventOptions) -> list[bool]:
+    if motion.commanded is None and motion.mode is None:
+        return [True] * len(columns.times)
+    should = [False] * len(columns.times)
     if motion.commanded is not None:
-        return [
+        should = [
             isinstance(value, (int, float)) and abs(value) >= options.min_commanded
             for value in columns.values[motion.commanded.name]
         ]
-    if motion.mode is not None:
+    if motion.mode is not None and (motion.commanded is None or motion.measured):
         modes = columns.values[motion.mode.name]
         moving = {mode: is_moving(mode, options) for mode in set(modes)}
-        return [moving[mode] for mode in modes]
-    return [True] * len(columns.times)
+        return [moving[mode] or fast for mode, fast in zip(modes, should, strict=True)]
+    return should
 
 
 def is_moving(mode: Value, options: EventOptions) -> bool:
     """Whether a robot in that mode should move."""
-    if not isinstance(mode, str):
+    if mode is None:
         return False
+    name = mode if isinstance(mode, str) else json.dumps(mode)
     if options.moving_modes is not None:
-        return mode in options.moving_modes
-    return not _STILL.search(mode)
+        return name in options.moving_modes
+    return not _STILL.search(name)
 
 
 def _stretches(
@@ -155,8 +177,10 @@ def _stretches(
 ) -> Iterable[tuple[int, int]]:
     """Index ranges [start, end) in which every place is within `stuck_m` of the first.
 
-    Where the place `stuck_s` later is farther away, no stretch begins, and one look was enough.
+    Where the place `stuck_s` later is farther away, no stretch begins, and one look was enough. A
+    recording gap ends a stretch: nobody knows what happened in it.
     """
+    gap_s = GAP_INTERVALS * (rhythm_of(times).interval_s or math.inf)
     start = 0
     while start < len(times):
         if not wanted[start]:
@@ -172,6 +196,7 @@ def _stretches(
         while (
             end < len(times)
             and wanted[end]
+            and times[end] - times[max(start, end - 1)] <= gap_s
             and math.dist(places[start], places[end]) <= options.stuck_m
         ):
             end += 1

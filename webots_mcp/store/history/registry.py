@@ -52,9 +52,9 @@ class Signal:
     mixed: bool = False
 
     @property
-    def needs_decoding(self) -> bool:
-        """Whether `json_extract` alone would not give the same as `flatten`."""
-        return self.reduce is not None or self.mixed
+    def is_plain(self) -> bool:
+        """Whether `json_extract` alone gives the same as `flatten`."""
+        return self.reduce is None and not self.mixed
 
     @property
     def is_number(self) -> bool:

@@ -7,9 +7,10 @@ last state row that is in: ids are given under the write lock, so a row never co
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from typing import Final, NamedTuple
 
 from webots_mcp.store.history.batch import Batch, BatchColumn
@@ -100,10 +101,21 @@ def forget(connection: sqlite3.Connection) -> None:
 
     What was rolled up from rows that have been deleted since is lost.
     """
+    with _writing(connection):
+        for statement in _FORGET:
+            connection.execute(statement)
+
+
+@contextlib.contextmanager
+def _writing(connection: sqlite3.Connection) -> Generator[None]:
+    """A transaction that takes the write lock first; all of it is stored, or nothing."""
     connection.execute("BEGIN IMMEDIATE")
-    for statement in _FORGET:
-        connection.execute(statement)
-    connection.execute("COMMIT")
+    try:
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        connection.execute("ROLLBACK")
+        raise
 
 
 def watermark(connection: sqlite3.Connection) -> int:
@@ -128,16 +140,11 @@ def _roll_batch(connection: sqlite3.Connection, limit: int) -> int | None:
         batch.add(*row)
     if not batch.rows:
         return None
-    connection.execute("BEGIN IMMEDIATE")
-    try:
+    with _writing(connection):
         current = watermark(connection) == mark
         if current:
             _store(connection, batch)
             connection.execute(_SET_WATERMARK, (batch.last_id,))
-        connection.execute("COMMIT")
-    except BaseException:
-        connection.execute("ROLLBACK")
-        raise
     return batch.rows if current else 0
 
 

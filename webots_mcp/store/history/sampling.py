@@ -38,7 +38,7 @@ def read_sampled(
     Args:
         connection: Any.
         segment: Of any length.
-        signals: None that needs decoding (`Signal.needs_decoding`).
+        signals: Plain ones (`Signal.is_plain`).
         every_s: Simulated seconds.
         deadline: After it no further rows are read.
     """

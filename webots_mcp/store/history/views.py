@@ -155,7 +155,7 @@ class LongView:
         every_s = max(stay_s / SAMPLES_PER_STAY, span_s / MOST_SAMPLES)
         if every_s > stay_s / 2:
             self.notes.append(f"stuck for less than {2 * every_s:.3g} s may be missed")
-        plain = [signal for signal in signals if not signal.needs_decoding]
+        plain = [signal for signal in signals if signal.is_plain]
         found = read_sampled(self._connection, self._segment, plain, every_s, self._deadline)
         if found.cut:
             reached_s = found.times[-1] if found.times else self._segment.start_s

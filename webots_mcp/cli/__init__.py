@@ -12,13 +12,13 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from webots_mcp.cli import history, looking, serving
+from webots_mcp.cli import data, history, looking, serving
 from webots_mcp.cli.command import COMMANDS
 from webots_mcp.errors import WebotsMCPError
 
 __all__ = ["COMMANDS", "main"]
 
-FAMILIES: Final = (serving, looking, history)  # each registered its commands at import
+FAMILIES: Final = (serving, looking, history, data)  # each registered its commands at import
 EXIT_BAD_INPUT: Final = 2
 _DESCRIPTION: Final = (
     "Flight recorder and remote control for Webots simulations: controllers record into one "

@@ -86,7 +86,7 @@ def history(arguments: argparse.Namespace) -> None:
 
     with _connected(arguments) as connection:
         found = query_history(
-            connection, _range(connection, arguments), arguments.signals,
+            connection, range_of(connection, arguments), arguments.signals,
             max_points=arguments.points,
         )  # fmt: skip
     if arguments.json:
@@ -108,7 +108,7 @@ def trends(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"-n {arguments.n} must be 1 or more")
     with _connected(arguments) as connection:
         found = store.trends(
-            connection, _range(connection, arguments), arguments.signals or ["*"],
+            connection, range_of(connection, arguments), arguments.signals or ["*"],
             limit=arguments.n,
         )  # fmt: skip
     if arguments.json:
@@ -136,7 +136,7 @@ def events(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"-n {arguments.n} must be 1 or more")
     with _connected(arguments) as connection:
         found = find_events(
-            connection, _range(connection, arguments), _options(arguments), limit=arguments.n
+            connection, range_of(connection, arguments), _options(arguments), limit=arguments.n
         )
     if arguments.json:
         return _print_json(found)
@@ -215,7 +215,8 @@ def _connected(arguments: argparse.Namespace) -> Generator[sqlite3.Connection]:
         yield connection
 
 
-def _range(connection: sqlite3.Connection, arguments: argparse.Namespace) -> TimeRange:
+def range_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> TimeRange:
+    """What the arguments of `RANGE` ask for."""
     from webots_mcp.store.history.ranges import resolve_range
 
     return resolve_range(

@@ -84,6 +84,16 @@ class Plan:
             rows[step.table] += step.rows
         return rows
 
+    def size_of(self, table: str) -> int:
+        """About what a table's rows that go take."""
+        return sum(step.size_bytes for step in self.steps if step.table == table)
+
+    def runs_of(self, table: str) -> list[int]:
+        """The runs that lose rows of a table; commands have none."""
+        if table == "command":
+            return []
+        return [step.owner_id for step in self.steps if step.table == table]
+
 
 def plan(
     connection: sqlite3.Connection, retention: Retention = DEFAULT, now_s: float | None = None

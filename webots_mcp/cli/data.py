@@ -1,0 +1,224 @@
+"""Commands about the recording as a file: taking data out, in, and away."""
+
+from __future__ import annotations
+
+import argparse
+import sqlite3
+import sys
+import time
+from collections.abc import Generator, Sequence
+from contextlib import closing, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command, open_recording
+from webots_mcp.cli.history import RANGE, range_of
+from webots_mcp.cli.progress import shown_progress
+from webots_mcp.cli.tables import print_notes, print_table
+from webots_mcp.errors import InvalidInputError
+
+if TYPE_CHECKING:
+    from webots_mcp.store.recording import Recording
+    from webots_mcp.store.retention import Plan, Purged, Retention
+
+KINDS: Final = {
+    "state": "recorded states",
+    "rollup": "rollups and change points",
+    "log": "log lines",
+    "event": "events; its age also holds for commands",
+    "image": "pictures with their files",
+}
+_HURRIED_PAUSE_S: Final = 0.01  # where no robot records
+
+
+@command(
+    "export", DATA_DIR, DATABASE, *RANGE,
+    argument("-o", "--output", metavar="FILE",
+             help="a .csv, .jsonl or .parquet file (default: CSV to stdout)"),
+    argument("--format", choices=("csv", "jsonl", "parquet"),
+             help="where the file's name does not tell it"),
+)  # fmt: skip
+def export(arguments: argparse.Namespace) -> None:
+    """Write recorded states as a table: one row per state, one column per value.
+
+    The newest run is written, or a range; --since 0 writes all runs of a robot. Columns are run,
+    row, times, and the dotted names of what the controller published; NaN and infinity are kept.
+    Parquet needs pyarrow: pip install 'webots-mcp[parquet]'.
+    """
+    from webots_mcp.store.export import export as write
+    from webots_mcp.store.export import export_file, format_of
+
+    file = Path(arguments.output) if arguments.output not in (None, "-") else None
+    form = arguments.format or (format_of(file) if file else "csv")
+    recording = open_recording(arguments)
+    if file and isinstance(recording.database, Path) and file.resolve() == recording.database:
+        raise InvalidInputError(f"{file} is the recording itself: choose another file")
+    if file is None and form == "parquet" and sys.stdout.isatty():
+        raise InvalidInputError("Parquet is not for a terminal: give a file with -o")
+    with recording.reader() as connection, shown_progress("exporting") as progress:
+        wanted = range_of(connection, arguments)
+        if file is None:
+            write(connection, wanted, form, sys.stdout.buffer, progress)
+            return
+        rows = export_file(connection, wanted, form, file, progress)
+    print(f"{file}: {rows} rows")
+    print_notes(wanted.notes)
+
+
+@command(
+    "import", DATA_DIR, DATABASE,
+    argument("folder", metavar="FOLDER", help="holds status.json, logs/, camera/, ..."),
+    argument("--robot", default="imported", metavar="NAME",
+             help="the name to record under, which no robot may have yet (imported)"),
+)  # fmt: skip
+def import_(arguments: argparse.Namespace) -> None:
+    """Import the data folder of a bridge that writes JSON files, as one finished run.
+
+    Taken are status.json, logs/controller.log, camera/*.png, screenshots/*.png and commands.json.
+    All of it is imported or, if a file is damaged, nothing. Such a folder has no simulation times:
+    they are counted in seconds of wall time from its earliest entry.
+    """
+    from webots_mcp.store.json_folder import import_folder
+
+    with _writable(arguments, create=True) as (recording, connection):
+        with shown_progress("importing") as progress:
+            made = import_folder(
+                connection, Path(arguments.folder), recording.data_dir, arguments.robot, progress
+            )
+        print(
+            f"run {made.run_id} of robot {made.robot!r}: states {made.states}, log lines "
+            f"{made.lines}, pictures {made.pictures}, commands {made.commands}"
+        )
+
+
+@command(
+    "prune", DATA_DIR, DATABASE,
+    argument("--dry-run", action="store_true", help="only tell what would go"),
+    *(
+        argument(f"--{kind}", metavar="LIMIT", help=f"how much to keep of {what}")
+        for kind, what in KINDS.items()
+    ),
+    argument("--outlive", type=float, metavar="TIMES",
+             help="keep what is left of a run so many times longer than its states (10; 0: for "
+             "ever)"),
+)  # fmt: skip
+def prune(arguments: argparse.Namespace) -> None:
+    """Delete what is beyond the limits, oldest first, and give the space back to the disk.
+
+    A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
+    commas between, or none. Without it 1 GB of states, 1 GB of pictures, 100 MB of log lines and
+    100 MB of events are kept. Runs with a label or a note, and those marked by 'webots-mcp keep',
+    lose nothing. Robots may record meanwhile. The MCP server does the same once a minute, with the
+    default limits.
+    """
+    from webots_mcp.store.retention import plan
+
+    retention = _retention(arguments)
+    if arguments.dry_run:
+        with open_recording(arguments).reader() as connection:
+            return _print_plan(plan(connection, retention), "would go")
+    with _writable(arguments) as (recording, connection):
+        _print_plan(plan(connection, retention), "goes")
+        _print_purged(_prune(recording, connection, retention))
+
+
+@command(
+    "keep", DATA_DIR, DATABASE,
+    argument("run_ids", type=int, nargs="+", metavar="RUN", help="as 'webots-mcp runs' lists them"),
+    argument("--release", action="store_true", help="let retention have them again"),
+)  # fmt: skip
+def keep(arguments: argparse.Namespace) -> None:
+    """Mark runs of which nothing is ever pruned."""
+    from webots_mcp.store.retention import mark_kept
+
+    with _writable(arguments) as (_, connection):
+        mark_kept(connection, arguments.run_ids, keep=not arguments.release)
+
+
+@contextmanager
+def _writable(
+    arguments: argparse.Namespace, *, create: bool = False
+) -> Generator[tuple[Recording, sqlite3.Connection]]:
+    """The recording, migrated where it has to be, and a connection that may write to it."""
+    from webots_mcp.connection import connect
+    from webots_mcp.contract import resolve_database
+    from webots_mcp.schema import create_schema
+    from webots_mcp.store.recording import Recording
+
+    recording = Recording(*resolve_database(arguments.database, arguments.data_dir))
+    if create:
+        with closing(connect(recording.database, "writer", create=True)) as connection:
+            create_schema(connection)
+    with recording.writer() as connection:
+        yield recording, connection
+
+
+def _retention(arguments: argparse.Namespace) -> Retention:
+    from dataclasses import replace
+
+    from webots_mcp.store.retention import DEFAULT
+    from webots_mcp.store.retention.notation import parse_limit
+
+    given = {kind: text for kind in KINDS if (text := getattr(arguments, kind)) is not None}
+    limits = {kind: parse_limit(text, getattr(DEFAULT, kind)) for kind, text in given.items()}
+    outlive = DEFAULT.outlive if arguments.outlive is None else arguments.outlive
+    return replace(DEFAULT, **limits, outlive=outlive)
+
+
+def _prune(recording: Recording, connection: sqlite3.Connection, retention: Retention) -> Purged:
+    """Purge, with somebody who keeps the log of the database short meanwhile."""
+    from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS
+    from webots_mcp.maintenance import Maintainer
+    from webots_mcp.store.retention import prune as purge
+    from webots_mcp.store.retention.purge import PAUSE_S
+    from webots_mcp.store.robots import list_robots
+
+    assert isinstance(recording.database, Path)
+    connection.execute(f"PRAGMA busy_timeout={CHECKPOINT_TIMEOUT_MS}")
+    live = any(robot.live for robot in list_robots(connection, time.time()))
+    maintainer = Maintainer(recording.database, "prune")  # idle while a server or a bridge is it
+    maintainer.start()
+    try:
+        with shown_progress("pruning") as progress:
+            pause_s = PAUSE_S if live else _HURRIED_PAUSE_S
+            return purge(
+                connection, recording.data_dir, retention, pause_s=pause_s, progress=progress
+            )
+    finally:
+        maintainer.stop()
+
+
+def _print_plan(wanted: Plan, going: str) -> None:
+    from webots_mcp.store.retention.notation import size_text
+
+    rows = wanted.rows_by_table()
+    table = [
+        [kind, rows[kind], size_text(wanted.size_of(kind)), _ranges(wanted.runs_of(kind))]
+        for kind in rows
+    ]
+    if table:
+        print_table((going, "rows", "about", "runs"), table)
+    else:
+        print("nothing is beyond the limits")
+    if wanted.kept_run_ids:
+        ids = _ranges(wanted.kept_run_ids)
+        print_notes([f"kept because of a label, a note or a mark: run {ids}"])
+
+
+def _ranges(numbers: Sequence[int]) -> str | None:
+    """Numbers as a person lists them: 1 to 7, 9."""
+    parts: list[list[int]] = []
+    for number in sorted(numbers):
+        if parts and number == parts[-1][-1] + 1:
+            parts[-1][1:] = [number]
+        else:
+            parts.append([number])
+    return ", ".join(" to ".join(map(str, part)) for part in parts) or None
+
+
+def _print_purged(purged: Purged) -> None:
+    from webots_mcp.store.retention.notation import size_text
+
+    if purged.freed_bytes:
+        print(f"{size_text(purged.freed_bytes)} of the database file freed")
+    print_notes(purged.problems)

@@ -132,6 +132,9 @@ class Maintainer(threading.Thread):
             return False
         if not holder:  # it was free: there is no checkpoint of another's to wait for
             self._held_before = True
+        return self._take_lease(connection, now)
+
+    def _take_lease(self, connection: sqlite3.Connection, now: float) -> bool:
         values = {"holder": self._holder, "until": now + LEASE_S, "now": now}
         return connection.execute(TAKE_LEASE, values).rowcount > 0
 
@@ -154,6 +157,9 @@ class Maintainer(threading.Thread):
             if sqlite3.sqlite_version_info >= WAL_RESET_FIXED:
                 connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
             connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+            # The first commit into an emptied log waits until the disk has the log's header. Made
+            # here it costs no control loop its time: 5 ms at p99.9.
+            self._take_lease(connection, time.time())
 
     def _give_back(self) -> None:
         if self._connection is None:

@@ -10,12 +10,24 @@ import pytest
 from tests.history.recording import GAP_S, NAN_S, STUCK_S, WALL_START_S
 from tests.server.conftest import ask, fail, pictures_of, text_of
 from tests.server.story import WAYS, Way, client_on, copy_of, rows_of, write_story
+from tests.store.recorded import Recorded
 from webots_mcp.connection import connect
 from webots_mcp.store.history.rollup import roll
 
 pytestmark = pytest.mark.anyio
 
 STORY = 1  # the run of which the story tells
+EVERY: tuple[tuple[str, dict[str, Any]], ...] = (
+    ("webots_list_signals", {}),
+    ("webots_query_history", {"signals": ["pose"]}),
+    ("webots_get_trends", {}),
+    ("webots_find_events", {}),
+    ("webots_get_timeline", {}),
+    ("webots_monitor", {"lookback_s": 5}),
+    ("webots_compare_runs", {}),
+    ("webots_list_runs", {}),
+    ("webots_query_sql", {"sql": "SELECT 1"}),
+)
 
 
 @pytest.fixture(scope="module")
@@ -46,17 +58,7 @@ async def test_since_when_is_it_stuck_is_one_call_in_both_eras_and_over_stdio(
 
 
 async def test_every_answer_says_about_which_robot_and_run_and_as_of_when(story: Path) -> None:
-    for tool, arguments in (
-        ("webots_list_signals", {}),
-        ("webots_query_history", {"signals": ["pose"]}),
-        ("webots_get_trends", {}),
-        ("webots_find_events", {}),
-        ("webots_get_timeline", {}),
-        ("webots_monitor", {"lookback_s": 5}),
-        ("webots_compare_runs", {}),
-        ("webots_list_runs", {}),
-        ("webots_query_sql", {"sql": "SELECT 1"}),
-    ):
+    for tool, arguments in EVERY:
         answer = await tell(story, tool, **arguments)
         assert (answer["robot"], answer["run_id"], answer["sim_time_s"]) == ("rover", 3, 59.9), tool
         assert answer["status"].startswith("stopped "), tool
@@ -299,6 +301,7 @@ async def test_the_schema_is_told_before_anything_was_recorded(tmp_path: Path) -
         ("webots_find_events", {"start_s": 3, "end_s": 3}, "empty"),
         ("webots_get_trends", {"start_s": 3, "last_s": 3}, "two ways"),
         ("webots_get_trends", {"since": "yesterday"}, "ISO 8601"),
+        ("webots_get_trends", {"since": 1700000100, "until": 1.7e9}, "until=1700000000"),
         ("webots_query_history", {"signals": ["mode"], "max_points": 10**9}, "less than or equal"),
         ("webots_find_events", {"kinds": ["threshold"]}, "above or below"),
         ("webots_find_events", {"kinds": ["explosion"]}, "Input should be"),
@@ -317,6 +320,31 @@ async def test_bad_input_is_an_error_with_the_next_step(
     story: Path, tool: str, arguments: dict[str, Any], words: str
 ) -> None:
     assert words in await refuse(story, tool, **arguments)
+
+
+async def test_without_a_database_every_tool_about_the_past_says_how_to_get_one(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "folder" / "webots.db"
+    async with client_on(file) as client:
+        for tool, arguments in EVERY:
+            answer = await ask(client, tool, **arguments)
+            assert answer["status"] == "never seen", tool
+            assert "MCPBridge" in answer["hint"], tool
+        assert "MCPBridge" in text_of(await client.call_tool("webots_plot", {}))
+    assert not file.parent.exists()
+
+
+async def test_a_run_without_a_row_says_so_in_every_tool(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    recorded.robot().log(0.0, "hello")
+    async with client_on(tmp_path / "webots.db") as client:
+        for tool, arguments in EVERY:
+            if tool not in ("webots_list_runs", "webots_query_sql"):
+                answer = await ask(client, tool, **arguments)
+                assert (answer["robot"], answer["run_id"]) == ("rover", 1), tool
+                assert answer["hint"], tool
+    recorded.close()
 
 
 async def test_sql_that_never_ends_is_ended(story: Path) -> None:

@@ -123,7 +123,7 @@ def _series(
 def _likely_points(view: View, asked: TimeRange, names: Sequence[str], budget: int) -> int:
     signals = signals_of(view.connection, asked, names)
     numbers = sum(signal.is_number for signal in signals)
-    room = budget - _SIGNAL_CHARACTERS * len(signals)
+    room = budget - _SIGNAL_CHARACTERS * len(signals) * len(asked.segments)
     return max(1, room // (_CELL_CHARACTERS * max(numbers, 1)))
 
 

@@ -60,7 +60,7 @@ class PlotTools:
                 view.connection,
                 kind,
                 signals or (),
-                robot=view.robot.name,
+                robot=robot if runs else view.robot.name,
                 run_ids=runs,
                 start_s=start_s,
                 end_s=end_s,

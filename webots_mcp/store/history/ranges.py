@@ -117,7 +117,7 @@ def resolve_range(
         subject = find_subject(connection, robot, run_id)
         return _in_simulation_time(connection, subject, start_s, end_s, last_s)
     walls = (parse_wall_time(wall_start, -math.inf), parse_wall_time(wall_end, math.inf))
-    _require_order(*walls, "wall_start", "wall_end")
+    _require_order(*walls, "since", "until")
     subject = find_subject(connection, robot, run_id)
     return _in_wall_time(connection, subject, run_id, *walls)
 
@@ -134,7 +134,7 @@ def _reject_contradictions(
     if simulation + wall + (last_s is not None) > 1:
         raise InvalidRangeError(
             "the range is given in two ways: use start_s and end_s (simulation time), or last_s, "
-            "or wall_start and wall_end"
+            "or since and until (wall time)"
         )
     if last_s is not None and not 0 < last_s < math.inf:
         raise InvalidRangeError(f"last_s={last_s} must be a number of seconds above 0")
@@ -147,7 +147,8 @@ def _require_order(start_s: float, end_s: float, start_name: str, end_name: str)
     if start_s >= end_s:
         what = "empty" if start_s == end_s else "reversed"
         raise InvalidRangeError(
-            f"the range is {what}: {start_name}={start_s:g} must be less than {end_name}={end_s:g}"
+            f"the range is {what}: {start_name}={start_s:.13g} must be less than "
+            f"{end_name}={end_s:.13g}"
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from importlib import import_module
 from itertools import islice
 from typing import Any, BinaryIO, Final
 
@@ -39,13 +40,11 @@ def write_parquet(source: Source, sink: BinaryIO) -> None:
 
 def _pyarrow() -> tuple[Any, Any]:
     try:
-        import pyarrow  # pyright: ignore[reportMissingTypeStubs, reportMissingImports]
-        import pyarrow.parquet  # pyright: ignore[reportMissingTypeStubs, reportMissingImports]
+        return import_module("pyarrow"), import_module("pyarrow.parquet")
     except ImportError as error:
         raise InvalidInputError(
             "Parquet needs pyarrow: pip install 'webots-mcp[parquet]', or export as csv or jsonl"
         ) from error
-    return pyarrow, pyarrow.parquet
 
 
 def _values(group: list[Row], column: Column) -> list[Any]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -16,11 +18,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.history.recording import Recorder
+from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import MemoryDatabase
 from webots_mcp.errors import InvalidInputError, UnknownRunError
 from webots_mcp.schema import create_schema
 from webots_mcp.settlement import end_session
+from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.history.rollup import buckets, roll, watermark
 from webots_mcp.store.retention import Limit, Retention, Upkeep, mark_kept, plan, prune
 from webots_mcp.store.retention.purge import purge
@@ -497,3 +501,35 @@ def test_a_maintainer_that_reconnects_begins_with_a_new_plan(filed: tuple[Path, 
     upkeep(recorded.connection)
     upkeep(recorded.connection)
     assert recorded.rows() == {2: 4000}
+
+
+def test_a_robot_that_records_meanwhile_loses_no_row(filed: tuple[Path, Recorded]) -> None:
+    file, recorded = filed
+    recorded.end_run("finished")
+    recorded.run(1, recorded.robot_id)  # a robot's newest run would be spared
+    robot, steps = InProcessSupervisor("other"), 0
+    line = [sys.executable, "-m", "webots_mcp", "prune", "--state", "0rows"]
+    with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
+        command = subprocess.Popen([*line, "--database", str(file)], stdout=subprocess.PIPE)
+        while is_running(command):
+            robot.step(16)
+            bridge.publish({"x": steps})
+            steps += 1
+        said = command.communicate()[0].decode()
+        assert command.returncode == 0
+        assert bridge.stats().rows_dropped == 0
+    assert said.splitlines()[1].split()[:2] == ["state", "5000"]
+    rows = recorded.connection.execute(
+        "SELECT run.rows, count(*) FROM state JOIN run ON run.id = run_id GROUP BY run_id"
+    ).fetchall()
+    assert rows == [(steps, steps)]
+    assert recorded.connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+
+
+def is_running(command: subprocess.Popen[bytes]) -> bool:
+    """Whether it runs on; asked at the pace of a robot."""
+    try:
+        command.wait(timeout=0.002)
+    except subprocess.TimeoutExpired:
+        return True
+    return False

@@ -1,0 +1,42 @@
+"""The README names what is there: all of it, and nothing else."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+
+import anyio
+
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.cli import COMMANDS
+from webots_mcp.server import create_server
+
+README = (Path(__file__).parent.parent / "README.md").read_text("utf-8")
+
+
+def test_it_names_every_tool_and_no_other() -> None:
+    memory = MemoryDatabase()
+    try:
+        server = create_server(memory, memory.data_dir)
+        tools = {tool.name for tool in anyio.run(server.list_tools)}
+    finally:
+        memory.close()
+    fixtures = {"webots_mcp", "webots_simulation"}
+    assert set(re.findall(r"\bwebots_[a-z_]+\b", README)) - fixtures == tools
+
+
+def test_it_names_every_command() -> None:
+    for command in COMMANDS:
+        assert re.search(rf"`(webots-mcp )?{command.name}\b", README), command.name
+
+
+def test_it_names_every_method_of_the_bridge() -> None:
+    for name, _ in inspect.getmembers(MCPBridge, inspect.isfunction):
+        if not name.startswith("_"):
+            assert f"bridge.{name}(" in README, name
+
+
+def test_the_files_it_links_to_exist() -> None:
+    for target in re.findall(r"\]\(((?!http)[^)#]+)\)", README):
+        assert (Path(__file__).parent.parent / target).exists(), target

@@ -85,7 +85,7 @@ def _file_uri(file: Database, create: bool) -> str:
         raise NoDatabaseError(
             f"no database at {file}: no controller with an MCPBridge has recorded there yet"
         )
-    return f"{file.as_uri()}?mode={'rwc' if create else 'rw'}"
+    return f"{file.absolute().as_uri()}?mode={'rwc' if create else 'rw'}"
 
 
 def _make_wal(connection: sqlite3.Connection) -> None:

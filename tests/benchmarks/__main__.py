@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = [b for b in benchmarks if not options.only or b.name in options.only]
     started_s, load = time.monotonic(), _load()
     sections = [
-        _run(benchmark, _QUICK if options.quick else 1.0, f"{number}/{len(chosen)}")
+        _run(benchmark, options, f"{number}/{len(chosen)}")
         for number, benchmark in enumerate(chosen, 1)
     ]
     _show("")
@@ -36,13 +36,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _run(benchmark: Benchmark, effort: float, number: str) -> Section:
+def _run(benchmark: Benchmark, options: argparse.Namespace, number: str) -> Section:
     def say(text: str) -> None:
         _show(f"[{number}] {benchmark.name}: {text}")
 
     say("...")
     with tempfile.TemporaryDirectory(prefix="webots-mcp-bench-") as folder:
-        return benchmark.run(Bench(Path(folder), effort, say))
+        effort = _QUICK if options.quick else 1.0
+        return benchmark.run(Bench(Path(folder), effort, say, options.rows))
 
 
 def _show(text: str) -> None:
@@ -66,6 +67,9 @@ def _load() -> str:
 def _parser(names: list[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m tests.benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="smaller counts: under a minute")
+    parser.add_argument(
+        "--rows", type=int, metavar="ROWS", help="length of the long recording (1000000)"
+    )
     parser.add_argument(
         "--only",
         action="append",

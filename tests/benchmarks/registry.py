@@ -24,11 +24,13 @@ class Bench:
         folder: An empty folder of its own.
         effort: 1 for a full run; counts shrink with it.
         say: Shows on a terminal what is going on.
+        rows: How long the long recording is, where that was asked for.
     """
 
     folder: Path
     effort: float
     say: Callable[[str], None]
+    rows: int | None = None
 
     def count(self, full: int, least: int = 1) -> int:
         """How often to do what a full run does `full` times."""

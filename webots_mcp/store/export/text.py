@@ -15,10 +15,11 @@ _encode: Final = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separator
 
 
 def write_csv(source: Source, sink: BinaryIO) -> None:
-    """One line per row under a line of column names; UTF-8, lines end as in RFC 4180.
+    r"""One line per row under a line of column names; UTF-8, lines end as in RFC 4180.
 
     What a row lacks, or is null, is empty; flags are `true` and `false`; what was not finite is
-    `nan`, `inf` or `-inf`; a long array is its JSON text.
+    `nan`, `inf` or `-inf`; a long array is its JSON text; a NUL character is `\0`, because many
+    readers of CSV end there.
     """
     columns = source.columns()
     names = [column.name for column in columns]
@@ -26,13 +27,17 @@ def write_csv(source: Source, sink: BinaryIO) -> None:
     spelled = [i for i, column in enumerate(columns, len(HEAD)) if column.kind in _SPELLED]
     text = io.TextIOWrapper(sink, "utf-8", newline="")
     writer = csv.writer(text)
-    writer.writerow((*HEAD, *names))
+    writer.writerow(map(_without_nul, (*HEAD, *names)))
     for row in source.rows(pass_number=2):
         cells: list[object] = [*row.head, *map(row.values.get, names)]
         for i in spelled:
-            cells[i] = as_text(cells[i])
+            cells[i] = _without_nul(as_text(cells[i]))
         writer.writerow(cells)
     text.detach()
+
+
+def _without_nul(text: str | None) -> str | None:
+    return text.replace("\0", "\\0") if text else text
 
 
 def write_json_lines(source: Source, sink: BinaryIO) -> None:

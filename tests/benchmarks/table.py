@@ -23,7 +23,7 @@ class Target:
             return "met"
         if not self.limit:
             return f"missed by {_digits(measured)}"
-        return f"missed by {abs(measured / self.limit - 1):.0%}"
+        return f"missed by {_digits(100 * abs(measured / self.limit - 1))} %"
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,7 @@ def test_a_line_says_whether_its_target_is_met_or_by_how_much_it_is_missed() -> 
         Line("lost", "9 kills", "", 2, "rows", Target(0)),
     ]
     ends = [line.rsplit("  ", 1)[1] for line in render([Section("t", lines)]).splitlines()[4:]]
-    assert ends == ["met", "missed by 100%", "missed by 6%", "missed by 2"]
+    assert ends == ["met", "missed by 100 %", "missed by 5.88 %", "missed by 2"]
 
 
 def test_the_state_has_39_leaves_and_about_740_bytes() -> None:

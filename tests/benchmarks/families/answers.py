@@ -1,0 +1,101 @@
+"""How much a model has to read: the answer of each MCP tool about the arena's rover."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Iterable
+from contextlib import closing
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import anyio
+from mcp import Client
+from mcp.types import ImageContent, TextContent, Tool
+
+from tests.benchmarks.processes import environment
+from tests.benchmarks.registry import Bench, benchmark
+from tests.benchmarks.table import Line, Target
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
+from webots_mcp.server import create_server
+from webots_mcp.standin import Simulation
+from webots_mcp.standin.in_process import DEFAULT_WORLD
+
+_ROWS: Final = 2000
+_START_TIMEOUT_S: Final = 120
+_CHARACTERS_PER_TOKEN: Final = 4
+_TOKENS: Final = 2000
+_ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
+    "webots_monitor": {"lookback_s": 10},
+    "webots_query_history": {"signals": ["*"]},
+    "webots_query_sql": {"sql": "SELECT * FROM state"},
+    "webots_send_command": {"action": "set_speed", "params": {"speed": 6.0}},
+    "webots_simulation_control": {"command": "resume"},
+    "webots_annotate_run": {"label": "benchmark"},
+}
+_ROWS_AND_BYTES: Final = "SELECT count(*), coalesce(sum(length(data)), 0) FROM state"
+_IS_CREATED: Final = "SELECT 1 FROM sqlite_master WHERE name = 'state'"
+
+
+class _Answer(NamedTuple):
+    """What a tool said: characters of text, and bytes of pictures."""
+
+    tool: str
+    text: int
+    picture: int
+    recorded: int  # bytes of JSON in the database by then
+
+
+@benchmark("answers", "what a model reads: each tool's answer about the arena's rover")
+def measure_answers(bench: Bench) -> Iterable[Line]:
+    rows = bench.count(_ROWS, least=50)
+    variables = {**environment(), DATA_DIR_VARIABLE: str(bench.folder)}
+    database = bench.folder / DATABASE_NAME
+    with Simulation(DEFAULT_WORLD, mode="fast", environment=variables) as simulation:
+        bench.say(f"recording {rows:,} rows")
+        simulation.wait_for(lambda: _recorded(database)[0] >= rows, _START_TIMEOUT_S)
+        simulation.resume()
+        for answer in anyio.run(_ask_all, bench):
+            yield _line(answer)
+
+
+def _recorded(database: Path) -> tuple[int, int]:
+    """State rows, and the bytes of their JSON."""
+    if not database.exists():
+        return 0, 0
+    with closing(connect(database, "reader")) as connection:
+        if not connection.execute(_IS_CREATED).fetchone():
+            return 0, 0
+        return connection.execute(_ROWS_AND_BYTES).fetchone()
+
+
+async def _ask_all(bench: Bench) -> list[_Answer]:
+    server = create_server(bench.folder / DATABASE_NAME, bench.folder)
+    async with Client(server) as client:
+        tools = sorted((await client.list_tools()).tools, key=_order)
+        return [answer async for answer in _answers(bench, client, tools)]
+
+
+def _order(tool: Tool) -> tuple[bool, bool]:
+    """Those that act after those that read; two runs are compared when there are two."""
+    reads = bool(tool.annotations and tool.annotations.read_only_hint)
+    return tool.name == "webots_compare_runs", not reads
+
+
+async def _answers(bench: Bench, client: Client, tools: list[Tool]) -> AsyncIterator[_Answer]:
+    for tool in tools:
+        bench.say(tool.name)
+        result = await client.call_tool(tool.name, _ARGUMENTS.get(tool.name, {}))
+        assert not result.is_error, (tool.name, result.content)
+        text = sum(len(block.text) for block in result.content if isinstance(block, TextContent))
+        pictures = (block.data for block in result.content if isinstance(block, ImageContent))
+        picture = sum(len(data) * 3 // 4 for data in pictures)
+        yield _Answer(tool.name, text, picture, _recorded(bench.folder / DATABASE_NAME)[1])
+
+
+def _line(answer: _Answer) -> Line:
+    ours = f"{answer.text:,} characters"
+    if answer.picture:
+        ours += f", picture of {answer.picture:,} bytes"
+    beside = f"all rows as JSON {answer.recorded / _CHARACTERS_PER_TOKEN:,.0f} tokens"
+    tokens = answer.text / _CHARACTERS_PER_TOKEN
+    return Line(answer.tool, ours, beside, tokens, "tokens", Target(_TOKENS))

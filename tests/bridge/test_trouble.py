@@ -226,9 +226,7 @@ def test_an_sqlite_that_is_too_old_is_said_and_the_robot_drives_on(
     assert "3.38 is needed" in capfd.readouterr().err
 
 
-def test_a_relative_path_is_opened_as_well(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_relative_path_is_opened_as_well(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     connect(Path("here.db"), "writer", create=True).close()
     assert (tmp_path / "here.db").exists()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from base64 import b64decode
 from collections.abc import AsyncIterator, Iterable
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -24,6 +26,7 @@ _ROWS: Final = 2000
 _START_TIMEOUT_S: Final = 120
 _CHARACTERS_PER_TOKEN: Final = 4
 _TOKENS: Final = 2000
+_PLOT: Final = "webots_plot"
 _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
     "webots_monitor": {"lookback_s": 10},
     "webots_query_history": {"signals": ["*"]},
@@ -31,18 +34,19 @@ _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
     "webots_send_command": {"action": "set_speed", "params": {"speed": 6.0}},
     "webots_simulation_control": {"command": "resume"},
     "webots_annotate_run": {"label": "benchmark"},
+    "webots_compare_runs": {"run_ids": [1, 2]},
 }
 _ROWS_AND_BYTES: Final = "SELECT count(*), coalesce(sum(length(data)), 0) FROM state"
 _IS_CREATED: Final = "SELECT 1 FROM sqlite_master WHERE name = 'state'"
 
 
 class _Answer(NamedTuple):
-    """What a tool said: characters of text, and bytes of pictures."""
+    """What a tool said: its text, the bytes of its picture, the JSON in the database by then."""
 
     tool: str
-    text: int
-    picture: int
-    recorded: int  # bytes of JSON in the database by then
+    text: str
+    picture_bytes: int
+    recorded_bytes: int
 
 
 @benchmark("answers", "what a model reads: each tool's answer about the arena's rover")
@@ -72,7 +76,8 @@ async def _ask_all(bench: Bench) -> list[_Answer]:
     server = create_server(bench.folder / DATABASE_NAME, bench.folder)
     async with Client(server) as client:
         tools = sorted((await client.list_tools()).tools, key=_order)
-        return [answer async for answer in _answers(bench, client, tools)]
+        there = [tool for tool in tools if tool.name != _PLOT or find_spec("matplotlib")]
+        return [answer async for answer in _answers(bench, client, there)]
 
 
 def _order(tool: Tool) -> tuple[bool, bool]:
@@ -86,16 +91,16 @@ async def _answers(bench: Bench, client: Client, tools: list[Tool]) -> AsyncIter
         bench.say(tool.name)
         result = await client.call_tool(tool.name, _ARGUMENTS.get(tool.name, {}))
         assert not result.is_error, (tool.name, result.content)
-        text = sum(len(block.text) for block in result.content if isinstance(block, TextContent))
+        text = "".join(block.text for block in result.content if isinstance(block, TextContent))
         pictures = (block.data for block in result.content if isinstance(block, ImageContent))
-        picture = sum(len(data) * 3 // 4 for data in pictures)
+        picture = sum(len(b64decode(data)) for data in pictures)
         yield _Answer(tool.name, text, picture, _recorded(bench.folder / DATABASE_NAME)[1])
 
 
 def _line(answer: _Answer) -> Line:
-    ours = f"{answer.text:,} characters"
-    if answer.picture:
-        ours += f", picture of {answer.picture:,} bytes"
-    beside = f"all rows as JSON {answer.recorded / _CHARACTERS_PER_TOKEN:,.0f} tokens"
-    tokens = answer.text / _CHARACTERS_PER_TOKEN
+    ours = f"{len(answer.text.encode()):,} bytes"
+    if answer.picture_bytes:
+        ours += f", picture of {answer.picture_bytes:,}"
+    beside = f"all rows as JSON {answer.recorded_bytes / _CHARACTERS_PER_TOKEN:,.0f} tokens"
+    tokens = len(answer.text) / _CHARACTERS_PER_TOKEN
     return Line(answer.tool, ours, beside, tokens, "tokens", Target(_TOKENS))

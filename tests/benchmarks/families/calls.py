@@ -124,8 +124,8 @@ def _polling(way: Way, robot: Rover, calls: int) -> Callable[[], list[float]]:
 
 
 def _calls(bench: Bench, full: int) -> int:
-    """Calls in a block: fewer only in the smallest of runs."""
-    return min(full, bench.count(10 * full, least=10))
+    """Calls in a block: fewer only in a quick run."""
+    return min(full, bench.count(5 * full, least=10))
 
 
 def _take_turns(

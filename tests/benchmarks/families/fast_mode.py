@@ -48,7 +48,7 @@ def _kept(bench: Bench, what: str, loop: _Loop, target: Target | None = None) ->
         **loop._asdict(),
         "folder": str(folder),
         "blocks": bench.count(_BLOCKS, least=2),
-        "steps": min(_STEPS, bench.count(10 * _STEPS, least=20)),
+        "steps": min(_STEPS, bench.count(5 * _STEPS, least=20)),
     }
     taken = _drive(order, folder / "result.json")
     ours, none = taken[loop.way], taken["none"]

@@ -63,7 +63,7 @@ def _measure_ways(bench: Bench) -> dict[str, _Taken]:
     if ORJSON is not None:
         robots["orjson"] = Rover()
         ways["orjson"] = BridgeWay(robots["orjson"], bench.place("orjson"), orjson=True)
-    steps = min(_STEPS, bench.count(10 * _STEPS, least=5))
+    steps = min(_STEPS, bench.count(5 * _STEPS, least=5))
     contenders = {name: _driving(way, robots[name], steps) for name, way in ways.items()}
     taken = alternate(contenders, bench.count(_BLOCKS, least=1))
     for way in ways.values():

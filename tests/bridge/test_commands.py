@@ -241,6 +241,24 @@ def test_a_reset_right_after_the_start_is_noticed_as_well(
     assert recording.rows("SELECT count(*) FROM run") == [2]
 
 
+@pytest.mark.parametrize("steps", [0, 1, 5])
+def test_a_loop_that_publishes_after_its_commands_sees_one_reset(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, steps: int
+) -> None:
+    for _ in range(steps):
+        robot.step(STEP_MS)
+        eager(bridge)
+        bridge.publish({"n": 1})
+    sent = recording.send("reset")
+    for _ in range(4):
+        eager(bridge)
+        bridge.publish({"n": 2})
+        robot.step(STEP_MS)
+    eager(bridge)
+    assert recording.fate(sent)[0] == "done"
+    assert recording.rows("SELECT start_reason FROM run ORDER BY id") == ["start", "reset"]
+
+
 def test_reset_state_runs_the_callbacks_or_says_that_there_are_none(
     bridge: MCPBridge, recording: Recording
 ) -> None:

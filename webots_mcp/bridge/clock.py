@@ -25,13 +25,17 @@ class Clock:
         self.ended_sim_time_s = self.sim_time_s  # of the run before this one
         self._reset_from_s: float | None = None
 
-    def look(self) -> bool:
-        """Read the time; True if it went back since the last look: a new run has begun."""
+    def look(self, *, came_round: bool = False) -> bool:
+        """Read the time; True if it went back since the last look: a new run has begun.
+
+        Args:
+            came_round: The user's loop has come round, so that it has made a step.
+        """
         before, now = self.sim_time_s, self._simulation.time_s
         self.sim_time_s = now
         if now > before + _EPSILON_S:
             self.moved_wall_time_s = time.time()
-        if now >= before - _EPSILON_S and not self._is_awaited_reset(now):
+        if now >= before - _EPSILON_S and not self._is_awaited_reset(now, came_round):
             return False
         self._reset_from_s = None
         self.ended_sim_time_s = before
@@ -41,8 +45,8 @@ class Clock:
     def await_reset(self) -> None:
         """A reset was asked for. It comes with the end of the next physics step.
 
-        Close to the start the first time after it is not below the last one before it, so from
-        here on the same time, after a step, counts as going back as well.
+        Close to the start the first time after it is not below the last one before it: from 0
+        any time that follows, and else the same time again after a step, is that of the new run.
         """
         self._reset_from_s = self.sim_time_s
 
@@ -50,8 +54,9 @@ class Clock:
         """The reset did not come."""
         self._reset_from_s = None
 
-    def _is_awaited_reset(self, now_s: float) -> bool:
+    def _is_awaited_reset(self, now_s: float, came_round: bool) -> bool:
         if self._reset_from_s is None:
             return False
-        early = self._reset_from_s <= self._simulation.basic_time_step_s + _EPSILON_S
-        return now_s <= self._reset_from_s + (self._simulation.basic_time_step_s if early else 0)
+        if self._reset_from_s < self._simulation.basic_time_step_s - _EPSILON_S:
+            return now_s > self._reset_from_s + _EPSILON_S
+        return came_round and now_s <= self._reset_from_s + _EPSILON_S

@@ -118,7 +118,7 @@ class MCPBridge:
             as keys; None where there was none.
         """
         try:
-            if self._clock.look():
+            if self._clock.look(came_round=True):
                 self._begin_run()
             if self._simulation.over:
                 return None

@@ -25,6 +25,10 @@ _FEWER_THAN: Final = (
     "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? "
     "AND sim_time_s < ? LIMIT ?)"
 )
+_PURGED_IN: Final = (  # before the first row that is left
+    "SELECT 1 FROM run WHERE id = ?1 AND purged_rows > 0 AND ?2 < coalesce("
+    "(SELECT min(sim_time_s) FROM state WHERE run_id = ?1), last_sim_time_s)"
+)
 _CHUNK_ROWS: Final = 2000
 
 
@@ -54,9 +58,14 @@ class Columns:
 
 
 def exceeds(connection: sqlite3.Connection, segment: Segment, rows: int = RAW_ROWS) -> bool:
-    """Whether a segment has more rows than that; looks at no more index entries than that."""
+    """Whether a segment has more rows than that, or rows of which only rollups are left.
+
+    Looks at no more index entries than that.
+    """
     bounds = (segment.run_id, segment.start_s, segment.end_s, rows + 1)
-    return bool(connection.execute(_FEWER_THAN, bounds).fetchone()[0] > rows)
+    if connection.execute(_FEWER_THAN, bounds).fetchone()[0] > rows:
+        return True
+    return connection.execute(_PURGED_IN, (segment.run_id, segment.start_s)).fetchone() is not None
 
 
 def read_columns(

@@ -23,6 +23,10 @@ from typing import Final, Literal
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
 from webots_mcp.store.history.subject import Subject, find_subject
 
+_PURGED: Final = (
+    "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0 "
+    "AND EXISTS (SELECT 1 FROM rollup WHERE run_id = run.id)"
+)
 _FIRST: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
 _NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"
 _RUNS_IN: Final = (
@@ -181,6 +185,18 @@ def _iso_seconds(text: str) -> float:
 
 
 def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
+    """Simulation times between which a run recorded; None if it has no row.
+
+    Rows that retention deleted count: their rollups are still there.
+    """
+    rows = _row_bounds(connection, run_id)
+    purged = connection.execute(_PURGED, (run_id,)).fetchone()
+    if purged is None:
+        return rows
+    return purged[0], rows[1] if rows else purged[1]
+
+
+def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
     """Simulation times of a run's first and newest row; None without any."""
     first = connection.execute(_FIRST, (run_id,)).fetchone()[0]
     return None if first is None else (first, connection.execute(_NEWEST, (run_id,)).fetchone()[0])
@@ -260,7 +276,7 @@ def _cut(
     connection: sqlite3.Connection, run_id: int, wall_start_s: float, wall_end_s: float
 ) -> Segment | None:
     """The part of a run in [wall_start_s, wall_end_s): wall time rises with simulation time."""
-    bounds = recorded_bounds(connection, run_id)
+    bounds = _row_bounds(connection, run_id)
     if bounds is None:
         return None
 

@@ -19,7 +19,7 @@ from webots_mcp.store.history.registry import Signal, enter_signals
 from webots_mcp.store.history.summary import Summary, merge, summarise
 
 BUCKET_S: Final = 10.0
-BATCH_ROWS: Final = 1000  # about 50 ms of work outside the write lock and 5 ms inside
+BATCH_ROWS: Final = 200  # summing holds the write lock, about 0.1 ms a row: keep a batch short
 
 _WATERMARK: Final = "SELECT state_id FROM watermark WHERE name = 'rollup'"
 _SET_WATERMARK: Final = "INSERT OR REPLACE INTO watermark (name, state_id) VALUES ('rollup', ?)"
@@ -73,7 +73,7 @@ class Rolled(NamedTuple):
 def roll(connection: sqlite3.Connection, budget_rows: int = 2000) -> Rolled:
     """Take in the state rows after the watermark, at most `budget_rows` of them.
 
-    Each batch is read and summed outside the write lock and stored in one short transaction that
+    Each batch is read and parsed outside the write lock, summed and stored in one transaction that
     first looks whether the watermark is still where it was: of two callers one stores, the other
     finds nothing left to do. A missing watermark, or rollups emptied by hand, begin at the first
     row again.

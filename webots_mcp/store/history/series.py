@@ -25,7 +25,8 @@ DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
 
 _NEWEST_WALL: Final = (
-    "SELECT wall_time_s FROM state WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+    "SELECT coalesce((SELECT wall_time_s FROM state WHERE run_id = run.id "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1), last_wall_time_s) FROM run WHERE id = ?"
 )
 
 

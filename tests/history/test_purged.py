@@ -1,0 +1,57 @@
+"""What is said of a run whose first rows, or all of them, were purged: its rollups stay."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from tests.history.recording import record_rover
+from webots_mcp.store.history.ranges import resolve_range
+from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.history.series import RunHistory, query_history
+from webots_mcp.store.retention import Limit, Retention, prune
+
+
+def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:
+    wanted = resolve_range(connection, run_id=1, start_s=start_s)
+    return query_history(connection, wanted, ["pose.0", "mode"], max_points=12).runs[0]
+
+
+def keep_rows(connection: sqlite3.Connection, folder: Path, rows: int) -> None:
+    limits = Retention(state=Limit(rows=rows), outlive=0)
+    prune(connection, folder, limits, pause_s=0)
+
+
+@pytest.fixture
+def rover(empty: sqlite3.Connection) -> sqlite3.Connection:
+    record_rover(empty)
+    roll(empty, 100_000)
+    return empty
+
+
+def test_an_overview_is_the_same_after_a_purge(rover: sqlite3.Connection, tmp_path: Path) -> None:
+    before = overview(rover)
+    keep_rows(rover, tmp_path, 1500)
+    after = overview(rover)
+    assert after.tier == "rollup"
+    assert (after.start_s, after.end_s, after.rows) == (before.start_s, before.end_s, before.rows)
+    assert after.numbers[0].max == before.numbers[0].max
+    assert after.numbers[0].count == before.numbers[0].count
+    assert after.changes == before.changes
+
+
+def test_what_is_left_is_read_from_rows(rover: sqlite3.Connection, tmp_path: Path) -> None:
+    keep_rows(rover, tmp_path, 1500)
+    assert overview(rover, start_s=60).tier == "raw"
+
+
+def test_a_run_of_which_only_rollups_are_left_still_has_an_overview(
+    rover: sqlite3.Connection, tmp_path: Path
+) -> None:
+    keep_rows(rover, tmp_path, 900)
+    assert rover.execute("SELECT count(*) FROM state WHERE run_id = 1").fetchone() == (0,)
+    run = overview(rover)
+    assert run.numbers[0].count == [*[100] * 9, 50, 100]
+    assert run.age_s > 0

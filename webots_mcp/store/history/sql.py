@@ -87,7 +87,7 @@ def query_sql(
             columns = tuple(str(column[0]) for column in cursor.description or ())
             why = _fetch(cursor, rows, max_rows, budget)
             cursor.close()
-    except (sqlite3.Error, sqlite3.Warning) as error:
+    except (sqlite3.Error, sqlite3.Warning, ValueError) as error:  # ValueError: a NUL, on 3.10
         if not (deadline.passed and "interrupted" in str(error)):
             raise InvalidInputError(_explain(connection, statement, error)) from error
         if not rows:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import threading
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -25,7 +26,7 @@ _READ_INTERVAL_S = 0.1
 _RANGE = "SELECT sim_time_s, data FROM state WHERE id > (SELECT max(id) FROM state) - 2000"
 
 
-class _Reader:
+class _Reader(ABC):
     """Reads ten times a second as long as its `with` block lasts."""
 
     def __init__(self, folder: Path) -> None:
@@ -44,9 +45,9 @@ class _Reader:
         while not self._over.wait(_READ_INTERVAL_S):
             self.read(self._folder)
 
+    @abstractmethod
     def read(self, folder: Path) -> None:
         """What one look reads."""
-        raise NotImplementedError
 
 
 class _RowReader(_Reader):

@@ -184,8 +184,9 @@ def test_a_run_that_does_not_exist_cannot_be_kept(
 def test_a_limit_that_is_none_is_told_how_to_write_one(
     limit: str, database: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    said = complaint(capsys, "prune", f"--state={limit}", "--database", str(database))
-    assert "500MB" in said or "twice" in said
+    for command in ("prune", "serve"):
+        said = complaint(capsys, command, f"--state={limit}", "--database", str(database))
+        assert "500MB" in said or "twice" in said
 
 
 @pytest.mark.parametrize(

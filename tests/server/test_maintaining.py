@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import anyio
 import pytest
+from mcp import Client
 
 from tests.server.conftest import Connect
 from tests.store.recorded import Recorded
+from webots_mcp.server import create_server
+from webots_mcp.store.retention import Limit, Retention
 
 pytestmark = pytest.mark.anyio
 
@@ -24,3 +29,15 @@ async def test_a_server_that_may_write_maintains_the_database(
         holder = recorded.connection.execute("SELECT holder FROM lease").fetchone()[0]
         assert holder.startswith("server ")
     assert recorded.connection.execute("SELECT count(*) FROM lease").fetchone() == (0,)
+
+
+async def test_the_server_keeps_as_much_as_it_was_told(file: Path, recorded: Recorded) -> None:
+    robot = recorded.robot()
+    for i in range(10):
+        robot.state(i * 1.0, {"x": float(i)})
+    retention = Retention(state=Limit(rows=4, spared_rows=0))
+    async with Client(create_server(file, file.parent, retention=retention)):
+        with anyio.fail_after(10):
+            while recorded.connection.execute("SELECT count(*) FROM state").fetchone()[0] > 4:
+                await anyio.sleep(0.02)
+    assert recorded.connection.execute("SELECT min(sim_time_s) FROM state").fetchone() == (6.0,)

@@ -7,6 +7,7 @@ A command is one function under `@command`; what it needs is imported inside it,
 from __future__ import annotations
 
 import argparse
+import inspect
 import os
 import sys
 from collections.abc import Sequence
@@ -52,7 +53,10 @@ def _parser() -> argparse.ArgumentParser:
     for name, run, arguments in sorted(COMMANDS):
         text = run.__doc__ or ""
         subparser = subparsers.add_parser(
-            name, help=text.partition("\n")[0].rstrip("."), description=_unindented(text)
+            name,
+            help=text.partition("\n")[0].rstrip("."),
+            description=inspect.cleandoc(text),
+            formatter_class=_Paragraphs,
         )
         subparser.set_defaults(run=run)
         for flags, options in arguments:
@@ -60,5 +64,10 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _unindented(text: str) -> str:
-    return " ".join(text.split())
+class _Paragraphs(argparse.HelpFormatter):
+    """Fills each paragraph by itself; an indented one is a command to copy, and stays as it is."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        fill = super()._fill_text
+        paragraphs = text.split("\n\n")
+        return "\n\n".join(p if p.startswith(" ") else fill(p, width, indent) for p in paragraphs)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command, open_recording
 from webots_mcp.cli.history import RANGE, range_of
+from webots_mcp.cli.limits import LIMITS, retention_of
 from webots_mcp.cli.progress import shown_progress
 from webots_mcp.cli.tables import print_notes, print_table
 from webots_mcp.errors import InvalidInputError
@@ -21,13 +22,6 @@ if TYPE_CHECKING:
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.retention import Plan, Purged, Retention
 
-KINDS: Final = {
-    "state": "recorded states",
-    "rollup": "rollups and change points",
-    "log": "log lines",
-    "event": "events; its age also holds for commands",
-    "image": "pictures with their files",
-}
 _HURRIED_PAUSE_S: Final = 0.01  # where no robot records
 
 
@@ -93,14 +87,7 @@ def import_(arguments: argparse.Namespace) -> None:
 
 @command(
     "prune", DATA_DIR, DATABASE,
-    argument("--dry-run", action="store_true", help="only tell what would go"),
-    *(
-        argument(f"--{kind}", metavar="LIMIT", help=f"how much to keep of {what}")
-        for kind, what in KINDS.items()
-    ),
-    argument("--outlive", type=float, metavar="TIMES",
-             help="keep what is left of a run so many times longer than its states (10; 0: for "
-             "ever)"),
+    argument("--dry-run", action="store_true", help="only tell what would go"), *LIMITS,
 )  # fmt: skip
 def prune(arguments: argparse.Namespace) -> None:
     """Delete what is beyond the limits, oldest first, and give the space back to the disk.
@@ -109,11 +96,11 @@ def prune(arguments: argparse.Namespace) -> None:
     commas between, or none. Without it 1 GB of states, 1 GB of pictures, 100 MB of log lines and
     100 MB of events are kept. Runs with a label or a note, and those marked by 'webots-mcp keep',
     lose nothing. Robots may record meanwhile. The MCP server does the same once a minute, with the
-    default limits.
+    limits that 'webots-mcp serve' was given.
     """
     from webots_mcp.store.retention import plan
 
-    retention = _retention(arguments)
+    retention = retention_of(arguments)
     if arguments.dry_run:
         with open_recording(arguments).reader() as connection:
             return _print_plan(plan(connection, retention), "would go")
@@ -151,18 +138,6 @@ def _writable(
             create_schema(connection)
     with recording.writer() as connection:
         yield recording, connection
-
-
-def _retention(arguments: argparse.Namespace) -> Retention:
-    from dataclasses import replace
-
-    from webots_mcp.store.retention import DEFAULT
-    from webots_mcp.store.retention.notation import parse_limit
-
-    given = {kind: text for kind in KINDS if (text := getattr(arguments, kind)) is not None}
-    limits = {kind: parse_limit(text, getattr(DEFAULT, kind)) for kind, text in given.items()}
-    outlive = DEFAULT.outlive if arguments.outlive is None else arguments.outlive
-    return replace(DEFAULT, **limits, outlive=outlive)
 
 
 def _prune(recording: Recording, connection: sqlite3.Connection, retention: Retention) -> Purged:

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command
+from webots_mcp.cli.limits import LIMITS, retention_of
 from webots_mcp.errors import InvalidInputError
 
 
@@ -17,12 +18,18 @@ from webots_mcp.errors import InvalidInputError
     argument(
         "--read-only", action="store_true", help="leave out the tools that change the simulation"
     ),
+    *LIMITS,
 )
 def serve(arguments: argparse.Namespace) -> None:
     """Serve a recording to an MCP client over stdin and stdout.
 
     Starts whether or not anything was recorded yet. Connect Claude Code with:
-    claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
+
+        claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
+
+    While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
+    A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
+    commas between, or none. 'webots-mcp prune --dry-run' with the same limits tells what would go.
     """
     import logging
 
@@ -30,6 +37,7 @@ def serve(arguments: argparse.Namespace) -> None:
 
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
     database, data_dir = resolve_database(arguments.database, arguments.data_dir)
+    retention = retention_of(arguments)
     if sys.stdin.isatty():
         print(
             f"webots-mcp: serving {database} to an MCP client on stdin and stdout; Ctrl-C ends it. "
@@ -38,7 +46,7 @@ def serve(arguments: argparse.Namespace) -> None:
         )
     from webots_mcp.server import create_server
 
-    create_server(database, data_dir, read_only=arguments.read_only).run()
+    create_server(database, data_dir, read_only=arguments.read_only, retention=retention).run()
 
 
 @command(

@@ -33,7 +33,7 @@ from webots_mcp.server.tools.trends import TrendTools
 from webots_mcp.server.tools.world import WorldTools
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.retention import Upkeep
+from webots_mcp.store.retention import DEFAULT, Retention, Upkeep
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "
@@ -63,21 +63,27 @@ FAMILIES: Final = (
 )
 
 
-def create_server(database: Database, data_dir: Path, *, read_only: bool = False) -> MCPServer:
+def create_server(
+    database: Database,
+    data_dir: Path,
+    *,
+    read_only: bool = False,
+    retention: Retention = DEFAULT,
+) -> MCPServer:
     """An MCP server over a recording; it starts whether or not anything was recorded yet.
 
     Args:
         database: A file, or a database in memory that a bridge in this process shares.
         data_dir: The folder of the pictures.
         read_only: Leave out the tools that change the simulation, and never write.
+        retention: How much of the recording is kept while the server runs and may write.
     """
-    maintained = database if isinstance(database, Path) and not read_only else None
     mcp = MCPServer(
         "webots-mcp",
         title="Webots flight recorder",
         version=__version__,
         instructions=INSTRUCTIONS,
-        lifespan=_maintaining(maintained, data_dir),
+        lifespan=_maintaining(None if read_only else database, Upkeep(data_dir, retention)),
     )
     recording = Recording(database, data_dir, read_only)
     for family in FAMILIES:
@@ -87,16 +93,20 @@ def create_server(database: Database, data_dir: Path, *, read_only: bool = False
 
 
 def _maintaining(
-    database: Path | None, data_dir: Path
+    database: Database | None, retain: Upkeep
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[None]]:
     """Keep the log short, the rollups current and the file small, if the server may write."""
 
+    def work(connection: Connection) -> None:
+        roll(connection)
+        retain(connection)
+
     @asynccontextmanager
     async def lifespan(_: MCPServer) -> AsyncGenerator[None]:
-        if database is None:
+        if not isinstance(database, Path):
             yield
             return
-        maintainer = Maintainer(database, "server", work=_upkeep(data_dir))
+        maintainer = Maintainer(database, "server", work=work)
         maintainer.start()
         try:
             yield
@@ -104,14 +114,3 @@ def _maintaining(
             await to_thread.run_sync(maintainer.stop, abandon_on_cancel=True)
 
     return lifespan
-
-
-def _upkeep(data_dir: Path) -> Callable[[Connection], None]:
-    """What the maintainer does each second while it holds the lease: both in bounded time."""
-    retain = Upkeep(data_dir)
-
-    def work(connection: Connection) -> None:
-        roll(connection)
-        retain(connection)
-
-    return work

@@ -8,8 +8,8 @@ import json
 import math
 import sqlite3
 import tracemalloc
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.history.recording import Recorder
+from tests.memory import memory_connection
 from webots_mcp.bridge.encoding import encode
-from webots_mcp.connection import connect
-from webots_mcp.contract import MemoryDatabase
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.schema import create_schema
 from webots_mcp.store.export import FORMATS, export, export_file, format_of
 from webots_mcp.store.history.ranges import resolve_range
 
@@ -31,18 +29,17 @@ HEAD = ["run_id", "state_id", "sim_time_s", "wall_time_s"]
 
 @pytest.fixture
 def recorder() -> Iterator[Recorder]:
-    yield from make_run()
+    with recorded_run() as recorder:
+        yield recorder
 
 
-def make_run() -> Iterator[Recorder]:
-    database = MemoryDatabase()
-    with closing(connect(database, "writer")) as connection:
-        create_schema(connection)
+@contextmanager
+def recorded_run() -> Generator[Recorder]:
+    with memory_connection() as connection:
         recorder = Recorder(connection)
         robot_id = recorder.robot("rover")
         recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
         yield recorder
-    database.close()
 
 
 def publish(recorder: Recorder, time_s: float, state: dict[str, Any]) -> None:
@@ -127,7 +124,7 @@ def without_odd(value: Any) -> Any:
 @settings(max_examples=40, deadline=None)
 @given(STATES)
 def test_json_lines_read_back_as_the_rows(states: list[dict[str, Any]]) -> None:
-    for recorder in make_run():
+    with recorded_run() as recorder:
         for i, state in enumerate(states):
             publish(recorder, float(i), state)
         lines = json_lines(recorder.connection)
@@ -144,7 +141,7 @@ def test_json_lines_read_back_as_the_rows(states: list[dict[str, Any]]) -> None:
 @settings(max_examples=40, deadline=None)
 @given(STATES)
 def test_csv_reads_back_as_the_rows(states: list[dict[str, Any]]) -> None:
-    for recorder in make_run():
+    with recorded_run() as recorder:
         for i, state in enumerate(states):
             publish(recorder, float(i), state)
         rows = table(recorder.connection)
@@ -177,7 +174,7 @@ def assert_cell(cell: str, value: Any) -> None:
 @settings(max_examples=30, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(STATES)
 def test_parquet_reads_back_as_the_rows(states: list[dict[str, Any]]) -> None:
-    for recorder in make_run():
+    with recorded_run() as recorder:
         for i, state in enumerate(states):
             publish(recorder, float(i), state)
         rows = parquet(recorder.connection).to_pylist()

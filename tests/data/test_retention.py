@@ -1,12 +1,7 @@
-"""What is kept, what goes, and how it goes."""
+"""What is kept, and what goes."""
 
 from __future__ import annotations
 
-import json
-import sqlite3
-import subprocess
-import sys
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -17,118 +12,24 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from tests.history.recording import Recorder
-from webots_mcp import MCPBridge
+from tests.data.runs import ROW_S, Recorded, states
+from tests.memory import memory_connection
 from webots_mcp.connection import connect
-from webots_mcp.contract import MemoryDatabase
 from webots_mcp.errors import InvalidInputError, UnknownRunError
 from webots_mcp.schema import create_schema
 from webots_mcp.settlement import end_session
-from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.history.rollup import buckets, roll, watermark
-from webots_mcp.store.retention import Limit, Retention, Upkeep, mark_kept, plan, prune
+from webots_mcp.store.history.rollup import buckets, roll
+from webots_mcp.store.retention import Limit, Retention, mark_kept, plan
 from webots_mcp.store.retention.purge import purge
 
 TABLES = ("state", "rollup", "change", "log", "event", "image", "command", "run", "session")
 NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)
-ROW_S = 0.5  # simulated and wall time between two rows of these recordings
-
-
-class Recorded(Recorder):
-    """Runs with a known number of rows of each kind, one after the other."""
-
-    def __init__(self, connection: sqlite3.Connection, folder: Path) -> None:
-        super().__init__(connection)
-        self.folder = folder
-        self.robot_id = self.robot("rover")
-
-    def add_run(self, rows: int, end: str | None = "reset", robot_id: int | None = None) -> int:
-        """A run with that many states, half as many events, log lines, a picture, a command."""
-        owner = robot_id or self.robot_id
-        session_id = self.session(owner, "a" * 64)
-        run_id = self.run(session_id, owner)
-        self.add_command(session_id, owner)
-        for i in range(rows):
-            time_s = i * ROW_S
-            self.publish(time_s, {"x": i, "mode": "ab"[i % 2]})
-            if i % 2:
-                change = json.dumps({"from": "a", "to": "b"})
-                self.insert("event", **self.at(time_s), kind="change", name="mode", data=change)
-                self.insert(
-                    "log", **self.at(time_s), level="info", source="controller", message="line"
-                )
-        self.add_picture(run_id)
-        self.at(rows * ROW_S * 2)
-        if end:
-            self.connection.execute(
-                "UPDATE run SET end_reason = ?, ended_wall_time_s = ?, last_wall_time_s = ?, "
-                "last_sim_time_s = ?, rows = ? WHERE id = ?",
-                (end, self.wall_s, self.wall_s, rows * ROW_S, rows, run_id),
-            )
-            self.connection.execute(
-                "UPDATE session SET ended_wall_time_s = ?, end_reason = 'finished' WHERE id = ?",
-                (self.wall_s, session_id),
-            )
-        return run_id
-
-    def add_command(self, session_id: int, robot_id: int) -> None:
-        self.insert(
-            "command", robot_id=robot_id, action="a", params="{}", status="done",
-            created_wall_time_s=self.wall_s + 0.01, expires_wall_time_s=self.wall_s + 10,
-            session_id=session_id,
-        )  # fmt: skip
-
-    def add_picture(self, run_id: int) -> None:
-        path = f"camera/{run_id}.png"
-        file = self.folder / path
-        file.parent.mkdir(exist_ok=True)
-        file.write_bytes(b"picture")
-        self.insert(
-            "image", **self.at(1.0), kind="camera", device="c", path=path, width=1, height=1,
-            bytes=1000,
-        )  # fmt: skip
-
-    def rows(self) -> dict[int, int]:
-        sql = "SELECT run_id, count(*) FROM state GROUP BY run_id"
-        return dict(self.connection.execute(sql).fetchall())
-
-    def count(self, table: str) -> int:
-        return int(self.connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0])
-
-    def of_runs(self, run_ids: list[int]) -> list[Any]:
-        """Everything that is recorded of these runs."""
-        marks = ",".join(map(str, run_ids)) or "NULL"
-        tables = ("state", "rollup", "change", "log", "event", "image")
-        found: list[Any] = [
-            self.connection.execute(f"SELECT * FROM {table} WHERE run_id IN ({marks})").fetchall()
-            for table in tables
-        ]
-        found += self.connection.execute(f"SELECT * FROM run WHERE id IN ({marks})").fetchall()
-        return found
-
-    def prune(self, retention: Retention, now_s: float | None = None):
-        return prune(self.connection, self.folder, retention, now_s=now_s or self.wall_s, pause_s=0)
 
 
 @pytest.fixture
 def recorded(tmp_path: Path) -> Iterator[Recorded]:
-    yield from make_recording(tmp_path)
-
-
-def make_recording(folder: Path) -> Iterator[Recorded]:
-    database = MemoryDatabase()
-    with closing(connect(database, "writer")) as connection:
-        create_schema(connection)
-        yield Recorded(connection, folder)
-    database.close()
-
-
-def states(**limits: Any) -> Retention:
-    """Only state rows are limited."""
-    return Retention(Limit(**limits), Limit(), Limit(), Limit(), Limit(), outlive=0)
-
-
-# -- what goes ------------------------------------------------------------------------------------
+    with memory_connection() as connection:
+        yield Recorded(connection, tmp_path)
 
 
 def test_finished_runs_lose_their_oldest_rows_first(recorded: Recorded) -> None:
@@ -363,7 +264,8 @@ RUNS = st.lists(st.tuples(st.integers(0, 30), st.booleans(), st.booleans()), max
 def test_what_was_planned_is_what_goes_and_kept_runs_stay_whole(
     tmp_path: Path, retention: Retention, runs: list[tuple[int, bool, bool]]
 ) -> None:
-    for recorded in make_recording(tmp_path):
+    with memory_connection() as connection:
+        recorded = Recorded(connection, tmp_path)
         others = recorded.robot("other")
         kept: list[int] = []
         for rows, keep, other in runs:
@@ -389,150 +291,3 @@ def test_what_was_planned_is_what_goes_and_kept_runs_stay_whole(
         again = plan(recorded.connection, retention, now_s).rows_by_table()["state"]
         assert again <= (0 if retention.state.size_bytes is None else 2)
         assert recorded.connection.execute("PRAGMA foreign_key_check").fetchall() == []
-
-
-# -- how it goes ----------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def filed(tmp_path: Path) -> Iterator[tuple[Path, Recorded]]:
-    file = tmp_path / "webots.db"
-    with closing(connect(file, "writer", create=True)) as connection:
-        create_schema(connection)
-        recorded = Recorded(connection, tmp_path)
-        connection.execute("BEGIN")
-        recorded.add_run(0)
-        recorded.run(1, recorded.robot_id)
-        for i in range(5000):
-            recorded.publish(i * ROW_S, {"x": i, "text": "t" * 400})
-        connection.execute("COMMIT")
-        yield file, recorded
-
-
-def test_purging_gives_the_space_back_to_the_disk(filed: tuple[Path, Recorded]) -> None:
-    file, recorded = filed
-    recorded.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    before = file.stat().st_size
-    done = recorded.prune(states(rows=500, spared_rows=0))
-    recorded.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    assert file.stat().st_size < before / 4
-    assert done.freed_bytes == pytest.approx(before - file.stat().st_size, rel=0.2)
-
-
-def test_rows_are_rolled_up_before_they_go(filed: tuple[Path, Recorded]) -> None:
-    _, recorded = filed
-    assert watermark(recorded.connection) == 0
-    recorded.prune(states(rows=1000, spared_rows=0))
-    assert watermark(recorded.connection) >= 4000
-    assert recorded.connection.execute("SELECT max(rows) FROM signal").fetchone()[0] >= 4000
-
-
-def test_progress_ends_with_everything_that_was_planned(filed: tuple[Path, Recorded]) -> None:
-    _, recorded = filed
-    told: list[tuple[int, int]] = []
-    prune(
-        recorded.connection,
-        recorded.folder,
-        states(rows=1000, spared_rows=0),
-        pause_s=0,
-        progress=lambda done, of: told.append((done, of)),
-    )
-    assert told[0] == (0, 4000)
-    assert told[-1] == (4000, 4000)
-    assert [done for done, _ in told] == sorted(done for done, _ in told)
-
-
-def test_two_that_carry_out_the_same_plan_delete_no_more_than_one(
-    filed: tuple[Path, Recorded],
-) -> None:
-    file, recorded = filed
-    wanted = plan(recorded.connection, states(rows=2000, spared_rows=0))
-    with closing(connect(file, "writer")) as other:
-        first = purge(recorded.connection, wanted, recorded.folder)
-        second = purge(other, wanted, recorded.folder)
-        for _ in first:
-            next(second, None)
-        total = next(purge(other, wanted, recorded.folder))  # what is left of it: nothing
-    assert total.rows == Counter()
-    assert recorded.rows() == {2: 2000}
-    assert recorded.connection.execute("SELECT purged_rows FROM run").fetchall() == [(0,), (3000,)]
-
-
-def test_a_lock_that_another_holds_is_waited_for_without_waiting(
-    filed: tuple[Path, Recorded],
-) -> None:
-    file, recorded = filed
-    roll(recorded.connection, 10_000)
-    recorded.connection.execute("PRAGMA busy_timeout=0")
-    wanted = plan(recorded.connection, states(rows=4000, spared_rows=0))
-    work = purge(recorded.connection, wanted, recorded.folder)
-    with closing(connect(file, "writer")) as other:
-        other.execute("BEGIN IMMEDIATE")
-        started_s = time.monotonic()
-        for _ in range(5):
-            assert next(work).rows == Counter()
-        assert time.monotonic() - started_s < 1
-        other.execute("COMMIT")
-    assert [done.rows.total() for done in work][-1] == 1000
-
-
-def test_a_maintainer_purges_a_little_in_each_round(filed: tuple[Path, Recorded]) -> None:
-    _, recorded = filed
-    roll(recorded.connection, 10_000)
-    upkeep = Upkeep(recorded.folder, states(rows=1000, spared_rows=0), budget_s=0.0)
-    upkeep(recorded.connection)
-    assert recorded.rows() == {2: 5000}
-    for left in (4500, 4000, 3500):
-        upkeep(recorded.connection)
-        assert recorded.rows() == {2: left}
-    upkeep._budget_s = 10
-    upkeep(recorded.connection)
-    assert recorded.rows() == {2: 1000}
-    recorded.publish(2501.0, {})
-    upkeep(recorded.connection)  # the next plan is a minute away
-    assert recorded.rows() == {2: 1001}
-
-
-def test_a_maintainer_that_reconnects_begins_with_a_new_plan(filed: tuple[Path, Recorded]) -> None:
-    file, recorded = filed
-    roll(recorded.connection, 10_000)
-    limits = states(rows=1000, spared_rows=0)
-    upkeep = Upkeep(recorded.folder, limits, interval_s=0, budget_s=0.0)
-    with closing(connect(file, "writer")) as first:
-        upkeep(first)
-        upkeep(first)
-    upkeep(recorded.connection)
-    upkeep(recorded.connection)
-    assert recorded.rows() == {2: 4000}
-
-
-def test_a_robot_that_records_meanwhile_loses_no_row(filed: tuple[Path, Recorded]) -> None:
-    file, recorded = filed
-    recorded.end_run("finished")
-    recorded.run(1, recorded.robot_id)  # a robot's newest run would be spared
-    robot, steps = InProcessSupervisor("other"), 0
-    line = [sys.executable, "-m", "webots_mcp", "prune", "--state", "0rows"]
-    with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
-        command = subprocess.Popen([*line, "--database", str(file)], stdout=subprocess.PIPE)
-        while is_running(command):
-            robot.step(16)
-            bridge.publish({"x": steps})
-            steps += 1
-        said = command.communicate()[0].decode()
-        assert command.returncode == 0
-        assert bridge.stats().rows_dropped == 0
-    assert said.splitlines()[1].split()[:2] == ["state", "5000"]
-    rows = recorded.connection.execute(
-        "SELECT run.rows, count(*) FROM state JOIN run ON run.id = run_id GROUP BY run_id"
-    ).fetchall()
-    assert rows == [(steps, steps)]
-    assert recorded.connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
-
-
-def is_running(command: subprocess.Popen[bytes]) -> bool:
-    """Whether it runs on; asked at the pace of a robot."""
-    try:
-        command.wait(timeout=0.002)
-    except subprocess.TimeoutExpired:
-        return True
-    return False

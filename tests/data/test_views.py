@@ -12,9 +12,8 @@ from typing import Any
 import pytest
 
 from tests.history.recording import Recorder
+from tests.memory import memory_connection
 from webots_mcp.connection import connect
-from webots_mcp.contract import MemoryDatabase
-from webots_mcp.schema import create_schema
 from webots_mcp.store.migrate import downgrade, upgrade
 
 POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
@@ -40,14 +39,11 @@ VIEWS = {
 @pytest.fixture
 def recorder() -> Iterator[Recorder]:
     """A run that a test fills by SQL."""
-    database = MemoryDatabase()
-    with closing(connect(database, "writer")) as connection:
-        create_schema(connection)
+    with memory_connection() as connection:
         recorder = Recorder(connection)
         robot_id = recorder.robot("rover")
         recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
         yield recorder
-    database.close()
 
 
 def rows(connection: sqlite3.Connection, sql: str) -> list[Any]:

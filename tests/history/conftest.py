@@ -8,37 +8,24 @@ from collections.abc import Iterator
 import pytest
 
 from tests.history.recording import record_rover
-from webots_mcp.connection import connect
-from webots_mcp.contract import MemoryDatabase
-from webots_mcp.schema import create_schema
+from tests.memory import memory_connection
 from webots_mcp.store.history.rollup import roll
 
 
 @pytest.fixture
 def empty() -> Iterator[sqlite3.Connection]:
     """A database of the current schema without a row."""
-    database = MemoryDatabase()
-    connection = connect(database, "writer")
-    create_schema(connection)
-    yield connection
-    connection.close()
-    database.close()
+    with memory_connection() as connection:
+        yield connection
 
 
 @pytest.fixture(scope="session")
 def _recorded() -> Iterator[dict[str, sqlite3.Connection]]:
-    databases = [MemoryDatabase(), MemoryDatabase()]
-    made: dict[str, sqlite3.Connection] = {}
-    for name, database in zip(("raw", "rolled"), databases, strict=True):
-        made[name] = connect(database, "writer")
-        create_schema(made[name])
-        record_rover(made[name])
-    assert roll(made["rolled"], 100_000).done
-    yield made
-    for connection in made.values():
-        connection.close()
-    for database in databases:
-        database.close()
+    with memory_connection() as raw, memory_connection() as rolled:
+        for connection in (raw, rolled):
+            record_rover(connection)
+        assert roll(rolled, 100_000).done
+        yield {"raw": raw, "rolled": rolled}
 
 
 @pytest.fixture(params=["raw", "rolled"])

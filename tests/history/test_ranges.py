@@ -13,8 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.history.recording import WALL_START_S, Recorder
-from webots_mcp.connection import connect
-from webots_mcp.contract import MemoryDatabase
+from tests.memory import memory_connection
 from webots_mcp.errors import (
     AmbiguousRobotError,
     InvalidRangeError,
@@ -22,7 +21,6 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
-from webots_mcp.schema import create_schema
 from webots_mcp.store.history.ranges import Segment, parse_wall_time, resolve_range
 
 IN_SEGMENT = (
@@ -123,22 +121,18 @@ def test_a_wall_range_holds_exactly_its_rows(
 @pytest.fixture(scope="module")
 def paused() -> Iterator[sqlite3.Connection]:
     """Simulation time stands still now and then, wall time goes on."""
-    database = MemoryDatabase()
-    connection = connect(database, "writer")
-    create_schema(connection)
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("r")
-    session_id = recorder.session(robot_id, "x")
-    for run in range(2):
-        recorder.run(session_id, robot_id)
-        for step in range(60):
-            wall_s = WALL_START_S + run * 100 + step
-            values = {"run_id": recorder.run_id, "sim_time_s": float(step // 7 * 3)}
-            recorder.insert("state", **values, wall_time_s=wall_s, data="{}")
-        recorder.wall_s = WALL_START_S + 100
-    yield connection
-    connection.close()
-    database.close()
+    with memory_connection() as connection:
+        recorder = Recorder(connection)
+        robot_id = recorder.robot("r")
+        session_id = recorder.session(robot_id, "x")
+        for run in range(2):
+            recorder.run(session_id, robot_id)
+            for step in range(60):
+                wall_s = WALL_START_S + run * 100 + step
+                values = {"run_id": recorder.run_id, "sim_time_s": float(step // 7 * 3)}
+                recorder.insert("state", **values, wall_time_s=wall_s, data="{}")
+            recorder.wall_s = WALL_START_S + 100
+        yield connection
 
 
 def test_wall_time_may_be_iso_text() -> None:

@@ -15,8 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.history.recording import Recorder, record_rover
+from tests.memory import memory_connection
 from webots_mcp.connection import connect
-from webots_mcp.contract import MemoryDatabase
 from webots_mcp.schema import create_schema
 from webots_mcp.store.history import columns
 from webots_mcp.store.history.leaves import flatten
@@ -47,9 +47,7 @@ steps = st.tuples(st.floats(0.0, 8.0), state)
 def test_rolling_in_any_pieces_equals_computing_from_the_rows(
     runs: list[list[tuple[float, dict[str, Any]]]], budget_rows: int
 ) -> None:
-    database = MemoryDatabase()
-    with closing(connect(database, "writer")) as connection:
-        create_schema(connection)
+    with memory_connection() as connection:
         recorder = Recorder(connection)
         robot_id = recorder.robot("r")
         session_id = recorder.session(robot_id, "x")
@@ -65,7 +63,6 @@ def test_rolling_in_any_pieces_equals_computing_from_the_rows(
         assert rolled.keys() == expected.keys()
         for key, summary in expected.items():
             assert _same(rolled[key], summary), key
-    database.close()
 
 
 def _record(

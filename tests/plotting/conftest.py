@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from typing import Any, Protocol
 
 import pytest
 
 from tests.history.recording import Recorder, record_rover
-from webots_mcp.connection import connect
-from webots_mcp.contract import MemoryDatabase
-from webots_mcp.schema import create_schema
+from tests.memory import memory_connection
 from webots_mcp.store.history.ranges import TimeRange, resolve_range
 from webots_mcp.store.history.rollup import roll
 
@@ -26,32 +25,22 @@ class Record(Protocol):
     ) -> sqlite3.Connection: ...
 
 
-def database() -> tuple[MemoryDatabase, sqlite3.Connection]:
-    memory = MemoryDatabase()
-    connection = connect(memory, "writer")
-    create_schema(connection)
-    return memory, connection
-
-
 @pytest.fixture(scope="session")
 def rover() -> Iterator[sqlite3.Connection]:
     """The story of tests.history.recording: runs 1 to 3 of one robot."""
-    memory, connection = database()
-    record_rover(connection)
-    roll(connection, 100_000)
-    yield connection
-    connection.close()
-    memory.close()
+    with memory_connection() as connection:
+        record_rover(connection)
+        roll(connection, 100_000)
+        yield connection
 
 
 @pytest.fixture
 def record() -> Iterator[Record]:
     """Record one run; its state is a function of the simulation time."""
-    opened: list[tuple[MemoryDatabase, sqlite3.Connection]] = []
+    opened = ExitStack()
 
     def write(state: State, rows: int = 100, interval_s: float = 0.1) -> sqlite3.Connection:
-        opened.append(database())
-        connection = opened[-1][1]
+        connection = opened.enter_context(memory_connection())
         recorder = Recorder(connection)
         connection.execute("BEGIN IMMEDIATE")
         robot_id = recorder.robot("spot")
@@ -61,10 +50,8 @@ def record() -> Iterator[Record]:
         connection.execute("COMMIT")
         return connection
 
-    yield write
-    for memory, connection in opened:
-        connection.close()
-        memory.close()
+    with opened:
+        yield write
 
 
 def whole(connection: sqlite3.Connection, run_id: int = 1, **limits: Any) -> TimeRange:

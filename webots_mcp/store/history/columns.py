@@ -26,8 +26,8 @@ _FEWER_THAN: Final = (
     "AND sim_time_s < ? LIMIT ?)"
 )
 _PURGED_IN: Final = (  # before the first row that is left
-    "SELECT 1 FROM run WHERE id = ?1 AND purged_rows > 0 AND ?2 < coalesce("
-    "(SELECT min(sim_time_s) FROM state WHERE run_id = ?1), last_sim_time_s)"
+    "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0 AND ? < coalesce("
+    "(SELECT min(sim_time_s) FROM state WHERE run_id = run.id), last_sim_time_s)"
 )
 _CHUNK_ROWS: Final = 2000
 

@@ -304,7 +304,7 @@ async def test_the_schema_is_told_before_anything_was_recorded(tmp_path: Path) -
         ("webots_get_trends", {"since": 1700000100, "until": 1.7e9}, "until=1700000000"),
         ("webots_query_history", {"signals": ["mode"], "max_points": 10**9}, "less than or equal"),
         ("webots_find_events", {"kinds": ["threshold"]}, "above or below"),
-        ("webots_find_events", {"kinds": ["explosion"]}, "Input should be"),
+        ("webots_find_events", {"kinds": ["explosion"]}, "must be 'run'"),
         ("webots_get_timeline", {"cursor": "xyz"}, "no cursor"),
         ("webots_compare_runs", {"run_ids": [1]}, "2 to 10"),
         ("webots_compare_runs", {"run_ids": [1, 99]}, "no run 99"),

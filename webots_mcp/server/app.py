@@ -14,7 +14,7 @@ from mcp.server import MCPServer
 from webots_mcp import __version__
 from webots_mcp.contract import Database
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.server.boundary import register
+from webots_mcp.server.boundary import tools_of
 from webots_mcp.server.resources import add_resources
 from webots_mcp.server.tools.commands import CommandTools
 from webots_mcp.server.tools.control import ControlTools
@@ -78,16 +78,16 @@ def create_server(
         read_only: Leave out the tools that change the simulation, and never write.
         retention: How much of the recording is kept while the server runs and may write.
     """
+    recording = Recording(database, data_dir, read_only)
+    families = [family(recording) for family in FAMILIES]
     mcp = MCPServer(
         "webots-mcp",
         title="Webots flight recorder",
         version=__version__,
         instructions=INSTRUCTIONS,
+        tools=[tool for family in families for tool in tools_of(family, read_only=read_only)],
         lifespan=_maintaining(None if read_only else database, Upkeep(data_dir, retention)),
     )
-    recording = Recording(database, data_dir, read_only)
-    for family in FAMILIES:
-        register(mcp, family(recording), read_only=read_only)
     add_resources(mcp, recording)
     return mcp
 

@@ -12,12 +12,13 @@ from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, ParamSpec, TypeVar, cast, get_type_hints
 
-from mcp.server import MCPServer
 from mcp.server.mcpserver import Context
 from mcp.server.mcpserver.exceptions import ToolError
+from mcp.server.mcpserver.tools import Tool
 from mcp.types import CallToolResult, TextContent, ToolAnnotations
 
 from webots_mcp.errors import NoDatabaseError, NothingRecordedError, WebotsMCPError
+from webots_mcp.server.arguments import CheckedTool
 from webots_mcp.server.results import Answer, CommandAnswer
 from webots_mcp.server.shortening import compact_json
 
@@ -61,12 +62,16 @@ def tool(
     return declare
 
 
-def register(mcp: MCPServer, family: object, *, read_only: bool) -> None:
-    """Add the declared tools of an object; with `read_only` those that only read."""
+def tools_of(family: object, *, read_only: bool) -> Iterator[Tool]:
+    """The declared tools of an object; with `read_only` those that only read."""
     for method, declaration in _declared(family):
         if declaration.annotations.read_only_hint or not read_only:
-            description = inspect.getdoc(method)
-            mcp.add_tool(method, None, declaration.title, description, declaration.annotations)
+            yield CheckedTool.from_function(
+                method,
+                title=declaration.title,
+                description=inspect.getdoc(method),
+                annotations=declaration.annotations,
+            )
 
 
 def reporter(ctx: Context[Any]) -> Callable[[float, float, str], Awaitable[None]]:

@@ -4,10 +4,26 @@ from __future__ import annotations
 
 from typing import Annotated, Final, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from webots_mcp.store.history.event import Kind
 
+
+def _as_id(value: int) -> int:
+    if value >= 2**63:  # what SQLite can compare with
+        raise ValueError("be an id from an earlier answer")
+    return value
+
+
+def _as_seconds(value: float) -> float:
+    if abs(value) > 1e12:
+        raise ValueError("be a number of seconds")
+    return value
+
+
+# Bounds that only an absurd value meets stay out of the schemas, which every client carries along.
+_Id = Annotated[int, AfterValidator(_as_id)]
+_Seconds = Annotated[float, AfterValidator(_as_seconds)]
 RobotName = Annotated[
     str | None,
     Field(
@@ -16,19 +32,21 @@ RobotName = Annotated[
     ),
 ]
 RunId = Annotated[
-    int | None, Field(ge=1, description="That run instead of the robot's current one.")
+    _Id | None, Field(ge=1, description="That run instead of the robot's current one.")
 ]
 LastS = Annotated[
-    float | None,
+    _Seconds | None,
     Field(gt=0, description="Only the last so many seconds of simulation time."),
 ]
-StartS = Annotated[float | None, Field(description="From this simulation time on, s.")]
-EndS = Annotated[float | None, Field(description="Up to, not including, this simulation time, s.")]
+StartS = Annotated[_Seconds | None, Field(description="From this simulation time on, s.")]
+EndS = Annotated[
+    _Seconds | None, Field(description="Up to, not including, this simulation time, s.")
+]
 TimeoutS = Annotated[
     float, Field(ge=0.1, le=600, description="How long to wait for the outcome, wall seconds.")
 ]
 _CURSOR: Final = "From the previous answer, to go on where it ended."
-Cursor = Annotated[int | None, Field(ge=0, description=_CURSOR)]
+Cursor = Annotated[_Id | None, Field(ge=0, description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=500, description=_CURSOR)]
 Since = Annotated[
     float | str | None,
@@ -72,6 +90,6 @@ Level = Literal["debug", "info", "warning", "error"]
 LogLevel = Annotated[Level, Field(description="Log lines of this level and above.")]
 Limit = Annotated[int, Field(ge=1, le=500, description="At most so many.")]
 RunIds = Annotated[
-    list[int] | None,
+    list[_Id] | None,
     Field(max_length=10, description="Several runs by their ids (webots_list_runs)."),
 ]

@@ -1,0 +1,51 @@
+"""What a tool cannot mean is refused with what it can."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from tests.server.conftest import Connect, text_of
+
+pytestmark = pytest.mark.anyio
+
+HUGE = 2**63
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "told"),
+    [
+        ("compare_runs", {"runs": [1, 2]}, "no parameter 'runs': there is run_ids, "),
+        ("get_trends", {"params": {"robot": "a"}}, "no parameter 'params'"),
+        ("list_robots", {"x": 1}, "no parameter 'x': there is none"),
+        ("query_history", {}, "signals is missing"),
+        ("query_history", {"signals": ["x"], "max_points": 501}, "max_points must be less than"),
+        ("query_history", {"signals": []}, "signals must have at least 1 item"),
+        ("get_trends", {"last_s": 0}, "last_s must be greater than 0, not 0"),
+        ("get_trends", {"start_s": 1e308}, "start_s must be a number of seconds, not 1e+308"),
+        (
+            "get_trends",
+            {"run_id": HUGE},
+            f"run_id must be an id from an earlier answer, not {HUGE}",
+        ),
+        ("plot", {"run_ids": [1, HUGE]}, "run_ids.1 must be an id from an earlier answer"),
+        ("get_logs", {"level": "loud"}, "level must be 'debug', 'info', 'warning' or 'error', not"),
+        ("query_sql", {"sql": "x" * 10**6}, "sql must have at most"),
+    ],
+)
+async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
+    connect: Connect, tool: str, arguments: dict[str, Any], told: str
+) -> None:
+    async with connect() as client:
+        answer = await client.call_tool(f"webots_{tool}", arguments)
+    assert answer.is_error
+    assert text_of(answer).startswith(told)
+    assert len(text_of(answer)) < 400
+
+
+async def test_every_schema_says_that_there_are_no_other_parameters(connect: Connect) -> None:
+    async with connect() as client:
+        tools = (await client.list_tools()).tools
+    assert tools
+    assert all(tool.input_schema["additionalProperties"] is False for tool in tools)

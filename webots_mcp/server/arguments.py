@@ -1,0 +1,63 @@
+"""What a client gives a tool: refused where the tool cannot mean it, in words a model can act on.
+
+The SDK ignores an argument that a tool does not have, so that the answer would be to another
+question than was asked; and it tells what is wrong with a value in the words of its validator.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from typing import Any, Final
+
+from mcp.server.mcpserver.exceptions import ToolError
+from mcp.server.mcpserver.tools import Tool
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+_MOST_FAULTS: Final = 3
+_LONGEST_VALUE: Final = 80
+
+
+class CheckedTool(Tool):
+    """A tool of ours, which takes no arguments but its own."""
+
+    def model_post_init(self, context: Any, /) -> None:
+        """Say so in the schema as well."""
+        self.parameters["additionalProperties"] = False
+
+    async def run(
+        self, arguments: dict[str, Any], context: Any, convert_result: bool = False
+    ) -> Any:
+        """Run the tool.
+
+        Raises:
+            ToolError: An argument is unknown, missing or out of bounds, or the tool refused.
+        """
+        _require_known(arguments, self.parameters["properties"])
+        try:
+            return await super().run(arguments, context, convert_result)
+        except ToolError as error:
+            if isinstance(error.__cause__, ValidationError):
+                raise ToolError(_explained(error.__cause__)) from error
+            raise
+
+
+def _require_known(arguments: Iterable[str], known: Iterable[str]) -> None:
+    for name in arguments:
+        if name not in known:
+            raise ToolError(f"no parameter {name!r}: there is {', '.join(known) or 'none'}")
+
+
+def _explained(error: ValidationError) -> str:
+    faults = {str(each["loc"][0]): _fault(each) for each in reversed(error.errors())}
+    return "; ".join(list(faults.values())[:_MOST_FAULTS])
+
+
+def _fault(error: ErrorDetails) -> str:
+    """One thing that is wrong: the parameter, what is asked of it, and what came."""
+    name = ".".join(map(str, error["loc"]))
+    if error["type"] == "missing":
+        return f"{name} is missing"
+    asked = re.sub(r"^(Value error, |\w+ should )", "must ", error["msg"])
+    return f"{name} {asked}, not {repr(error['input'])[:_LONGEST_VALUE]}"

@@ -11,18 +11,10 @@ import pytest
 
 from tests.history.recording import WALL_START_S, Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.history import columns
 from webots_mcp.store.history.event import Event, EventOptions, Threshold
 from webots_mcp.store.history.events import Events, find_events
 from webots_mcp.store.history.jolts import find_jumps, find_to_and_fro
 from webots_mcp.store.history.ranges import resolve_range
-
-
-@pytest.fixture(params=["rows", "rollups"])
-def tier(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    if request.param == "rollups":
-        monkeypatch.setattr(columns.exceeds, "__defaults__", (100,))
-    return request.param
 
 
 def ask(connection: sqlite3.Connection, kind: Any, *, bounds: Any = None, **options: Any) -> Events:
@@ -233,3 +225,20 @@ def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(
     recorder.run(recorder.session(robot_id, "x"), robot_id)
     recorder.publish(0.0, {"mode": "drive", "range": 1.0})
     assert "no position is published" in ask(empty, "stuck", bounds={"run_id": 1}).notes[0]
+
+
+def test_a_wall_range_over_several_runs_knows_the_signals_of_each(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    session_id = recorder.session(robot_id, "a" * 64)
+    for run, name in enumerate(("alt_m", "depth_m", "temp_c")):
+        recorder.run(session_id, robot_id, "reset" if run else "start")
+        for step in range(30):
+            recorder.publish(step * 0.1, {name: float(step >= 20)})
+    above = tuple(Threshold(name, above=0.5) for name in ("alt_m", "depth_m", "temp_c"))
+    found = ask(empty, "threshold", bounds={"wall_start": WALL_START_S}, thresholds=above)
+    assert [(e.run_id, e.name, e.start_s) for e in found.events] == [
+        (1, "alt_m", 2.0), (2, "depth_m", 2.0), (3, "temp_c", 2.0),
+    ]  # fmt: skip

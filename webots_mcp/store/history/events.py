@@ -15,7 +15,7 @@ from webots_mcp.store.history.leaves import Value, flatten, parse
 from webots_mcp.store.history.motion import Motion, find_motion
 from webots_mcp.store.history.ranges import Segment, TimeRange, just_after, recorded_bounds
 from webots_mcp.store.history.registry import Signal
-from webots_mcp.store.history.signals import catalogue, resolve_signals
+from webots_mcp.store.history.signals import known_signals, resolve_signals
 from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.stored import (
     change_events,
@@ -26,7 +26,6 @@ from webots_mcp.store.history.stored import (
     noticed_events,
     run_events,
 )
-from webots_mcp.store.history.subject import Subject
 from webots_mcp.store.history.views import view_of
 
 MOST_AROUND: Final = 6  # values that are told with an event
@@ -82,7 +81,7 @@ def find_events(
         UnknownSignalError: A name in the options or in `around` meets nothing.
     """
     options = options or EventOptions()
-    context = _context(_known(connection, time_range), options, around)
+    context = _context(known_signals(connection, time_range), options, around)
     found, notes = collect(connection, time_range, options, deadline_s)
     chosen = choose(found, limit)
     if len(chosen) < len(found):
@@ -107,7 +106,7 @@ def collect(
     Raises:
         UnknownSignalError: A name in the options meets nothing.
     """
-    known = _known(connection, time_range)
+    known = known_signals(connection, time_range)
     motion = find_motion(known, options)
     deadline = Deadline(deadline_s)
     notes = list(time_range.notes)
@@ -116,11 +115,6 @@ def collect(
         found += _stored(connection, segment, known, options, deadline)
         found += _detected(connection, segment, known, motion, options, deadline, notes)
     return found, notes
-
-
-def _known(connection: sqlite3.Connection, time_range: TimeRange) -> dict[str, Signal]:
-    run_id = time_range.segments[-1].run_id if time_range.segments else 0
-    return catalogue(connection, Subject(time_range.robot_id, time_range.robot, run_id))
 
 
 def _context(

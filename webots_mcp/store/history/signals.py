@@ -6,13 +6,14 @@ import difflib
 import fnmatch
 import sqlite3
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.history.batch import Batch, BatchColumn
 from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.history.leaves import Kind, Value, flatten, parse
+from webots_mcp.store.history.leaves import Kind, Value, flatten, parse, unit_of, widen
+from webots_mcp.store.history.ranges import TimeRange
 from webots_mcp.store.history.registry import MAX_SIGNALS, Signal, by_name, registered, unregistered
 from webots_mcp.store.history.rollup import watermark
 from webots_mcp.store.history.snapshot import in_one_snapshot
@@ -71,21 +72,37 @@ class SignalList:
 
 def catalogue(connection: sqlite3.Connection, subject: Subject) -> dict[str, Signal]:
     """Every signal of the subject's robot: the registered, and those in the run's newest rows."""
-    known = registered(connection, subject.robot_id)
-    batch = _unrolled_sample(connection, subject)
-    found = [unregistered(column) for column in batch.columns() if column.name not in known]
-    new = [signal for signal in found if signal is not None]
-    return by_name([*known.values(), *new]) if new else known
+    return _signals_in(connection, subject.robot_id, [subject.run_id])
 
 
-def _unrolled_sample(connection: sqlite3.Connection, subject: Subject) -> Batch:
-    """The run's newest rows after the watermark."""
+def known_signals(connection: sqlite3.Connection, time_range: TimeRange) -> dict[str, Signal]:
+    """Every signal of a range's robot: the registered, and those in the newest rows of each run."""
+    runs = [segment.run_id for segment in time_range.segments]
+    return _signals_in(connection, time_range.robot_id, runs)
+
+
+def _signals_in(
+    connection: sqlite3.Connection, robot_id: int, run_ids: Sequence[int]
+) -> dict[str, Signal]:
+    known = registered(connection, robot_id)
+    new: dict[str, Signal] = {}
+    for run_id in run_ids:
+        for column in _unrolled_sample(connection, robot_id, run_id).columns():
+            signal = None if column.name in known else unregistered(column)
+            if signal is not None:
+                kind = widen(new.get(signal.name, signal).kind, signal.kind)
+                new[signal.name] = replace(signal, kind=kind, unit=unit_of(signal.name, kind))
+    return by_name([*known.values(), *new.values()]) if new else known
+
+
+def _unrolled_sample(connection: sqlite3.Connection, robot_id: int, run_id: int) -> Batch:
+    """A run's newest rows after the watermark."""
     mark = watermark(connection)
     batch = Batch()
-    for state_id, *row in connection.execute(_NEWEST_ROWS, (subject.run_id,)):
+    for state_id, *row in connection.execute(_NEWEST_ROWS, (run_id,)):
         if state_id <= mark or batch.rows == SAMPLED_ROWS:
             break
-        batch.add(state_id, subject.robot_id, subject.run_id, *row)
+        batch.add(state_id, robot_id, run_id, *row)
     return batch
 
 

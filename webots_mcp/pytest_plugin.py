@@ -6,16 +6,16 @@ fixtures that use it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import pytest
 
 if TYPE_CHECKING:
     from webots_mcp import MCPBridge, MemoryDatabase
-    from webots_mcp.standin import InProcessRobot, InProcessSupervisor
-    from webots_mcp.testing import RecordedSimulation, Recording
+    from webots_mcp.standin import InProcessSupervisor
+    from webots_mcp.testing import Recording, RobotFactory, SimulationFactory
 
 
 @pytest.fixture
@@ -36,20 +36,20 @@ def webots_database(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryDatabase]
 
 
 @pytest.fixture
-def webots_robot_factory() -> Callable[..., InProcessRobot]:
+def webots_robot_factory() -> RobotFactory:
     """Makes robots of the stand-in, without a process.
 
     `webots_robot_factory(name=None, *, world=..., supervisor=True, duration_s=inf)`: a robot of a
     world, by name or the first. After `duration_s` of simulated time its `step` returns -1. Robots
     share a world when they are given the `simulation` of the first as `world`.
     """
-    return _make_robot
+    from webots_mcp.testing import RobotFactory
+
+    return RobotFactory()
 
 
 @pytest.fixture
-def webots_robot(
-    webots_robot_factory: Callable[..., InProcessSupervisor],
-) -> InProcessSupervisor:
+def webots_robot(webots_robot_factory: RobotFactory) -> InProcessSupervisor:
     """The stand-in's rover, with a supervisor's rights, in a 4 m x 4 m arena with obstacles."""
     return webots_robot_factory("rover")
 
@@ -66,7 +66,7 @@ def webots_bridge(
 
 
 @pytest.fixture
-def recording(webots_database: MemoryDatabase) -> Recording:
+def webots_recording(webots_database: MemoryDatabase) -> Recording:
     """What was recorded in `webots_database`, and the way to send commands."""
     from webots_mcp.testing import Recording
 
@@ -74,40 +74,14 @@ def recording(webots_database: MemoryDatabase) -> Recording:
 
 
 @pytest.fixture
-def webots_simulation(tmp_path: Path) -> Iterator[Callable[..., RecordedSimulation]]:
+def webots_simulation(tmp_path: Path) -> Iterator[SimulationFactory]:
     """Starts a world whose controllers are real processes that record into the test's folder.
 
     `webots_simulation(world=..., controllers={"rover": file}, environment={})`: paused before its
     first step; `run_for(duration_s)` lets it run, `recording` is what its controllers recorded.
     """
-    from webots_mcp.testing import RecordedSimulation
+    from webots_mcp.testing import SimulationFactory
 
-    started: list[RecordedSimulation] = []
-
-    def start(*arguments: Any, **options: Any) -> RecordedSimulation:
-        options.setdefault("data_dir", tmp_path / f"mcp_data_{len(started) + 1}")
-        simulation = RecordedSimulation(*arguments, **options)
-        started.append(simulation)
-        simulation.start()
-        return simulation
-
-    yield start
-    for simulation in started:
-        simulation.close()
-
-
-def _make_robot(
-    name: str | None = None,
-    *,
-    world: Any = None,
-    supervisor: bool = True,
-    duration_s: float = float("inf"),
-) -> InProcessRobot:
-    from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
-    from webots_mcp.standin.in_process import DEFAULT_WORLD
-    from webots_mcp.testing import Rehearsal
-
-    if not isinstance(world, InProcessSimulation):
-        world = Rehearsal(DEFAULT_WORLD if world is None else world, duration_s=duration_s)
-    kind = InProcessSupervisor if supervisor else InProcessRobot
-    return kind(name, world=world)
+    factory = SimulationFactory(tmp_path)
+    yield factory
+    factory.close()

@@ -1,6 +1,5 @@
 """What the rover does, read from what it recorded. Run with `pytest examples/tests`."""
 
-from collections.abc import Callable
 from math import pi
 from pathlib import Path
 from runpy import run_path
@@ -8,15 +7,13 @@ from runpy import run_path
 import pytest
 
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.testing import RecordedSimulation
+from webots_mcp.testing import RecordedSimulation, SimulationFactory
 
 PROJECT = Path(__file__).parent.parent
 
-Start = Callable[..., RecordedSimulation]
-
 
 @pytest.fixture
-def simulation(webots_simulation: Start) -> RecordedSimulation:
+def simulation(webots_simulation: SimulationFactory) -> RecordedSimulation:
     """The arena with the rover, as Webots would start it; paused before the first step."""
     return webots_simulation(PROJECT / "worlds" / "arena.wbt")
 

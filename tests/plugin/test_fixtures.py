@@ -17,11 +17,8 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownSignalError,
 )
-from webots_mcp.standin import InProcessRobot, InProcessSupervisor, StandInError, WouldBlockError
-from webots_mcp.testing import RecordedSimulation, Recording
-
-MakeRobot = Callable[..., InProcessSupervisor]
-Start = Callable[..., RecordedSimulation]
+from webots_mcp.standin import InProcessSupervisor, StandInError, WouldBlockError
+from webots_mcp.testing import Recording, RobotFactory, SimulationFactory
 
 CONTROLLER = """
 from controller import Supervisor
@@ -39,7 +36,7 @@ while robot.step(16) != -1:
 
 @pytest.fixture
 def story(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
 ) -> Recording:
     """Ten rows, 0.1 s apart: front sinks from 0.9 to 0.0 m, the mode changes twice."""
     modes = ["cruise"] * 4 + ["turn"] * 3 + ["cruise"] * 3
@@ -48,7 +45,7 @@ def story(
         front_m = float("nan") if step == 2 else round(0.9 - 0.1 * step, 6)
         webots_bridge.publish({"mode": mode, "sensors": {"front_m": front_m}, "blind": step == 2})
         webots_bridge.log(f"step {step}", level="warning" if step > 7 else "info")
-    return recording
+    return webots_recording
 
 
 def test_a_signal_gives_all_its_values_and_their_times(story: Recording) -> None:
@@ -113,22 +110,22 @@ def test_an_unknown_signal_is_told_with_near_names(story: Recording) -> None:
 
 
 def test_a_signal_seen_only_at_the_beginning_is_known(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
 ) -> None:
     for step in range(300):
         webots_robot.step(16)
         webots_bridge.publish({"booting": True} if step == 0 else {"n": step})
-    assert recording.signal("booting").values() == [True] + [None] * 299
+    assert webots_recording.signal("booting").values() == [True] + [None] * 299
 
 
 def test_a_name_that_means_several_signals_is_refused_by_signal_and_taken_by_signals(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
 ) -> None:
     webots_robot.step(16)
     webots_bridge.publish({"pose": [1.0, 2.0]})
     with pytest.raises(InvalidInputError, match=r"'pose' means 2 signals: pose.0, pose.1"):
-        recording.signal("pose")
-    assert [signal.last for signal in recording.signals("pose.*")] == [1.0, 2.0]
+        webots_recording.signal("pose")
+    assert [signal.last for signal in webots_recording.signals("pose.*")] == [1.0, 2.0]
 
 
 def test_states_come_as_they_were_published(story: Recording) -> None:
@@ -148,36 +145,36 @@ def test_events_and_logs_come_in_order_and_by_kind(story: Recording) -> None:
 
 
 def test_what_the_values_show_can_be_asked_for(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
 ) -> None:
     for step in range(120):
         webots_robot.step(96)
         webots_bridge.publish({"pose": [min(step, 60) * 0.1, 0.0], "mode": "cruise"})
-    (stuck,) = recording.find_events("stuck", stuck_s=4.0)
+    (stuck,) = webots_recording.find_events("stuck", stuck_s=4.0)
     assert (stuck.start_s, stuck.end_s) == pytest.approx((61 * 0.096, 120 * 0.096), abs=0.1)
     assert stuck.ongoing
-    assert recording.find_events("jump", "silent") == []
+    assert webots_recording.find_events("jump", "silent") == []
     with pytest.raises(InvalidInputError, match="unknown kind 'stucked'"):
-        recording.find_events("stucked")  # pyright: ignore[reportArgumentType]
+        webots_recording.find_events("stucked")  # pyright: ignore[reportArgumentType]
 
 
 def test_a_command_is_followed_from_sending_to_its_answer(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
 ) -> None:
     webots_bridge.register_command("aim", lambda command: command["angle"] * 2)
-    sent = recording.send("aim", angle=1.5)
+    sent = webots_recording.send("aim", angle=1.5)
     assert (sent.status, sent.is_final, sent.result) == ("pending", False, None)
     webots_robot.step(16)
     webots_bridge.get_command()
     assert (sent.action, sent.params) == ("aim", {"angle": 1.5})
     assert (sent.status, sent.is_final, sent.result, sent.error) == ("done", True, 3.0, None)
-    assert [command.id for command in recording.commands("aim")] == [sent.id]
-    assert recording.commands("pause") == []
+    assert [command.id for command in webots_recording.commands("aim")] == [sent.id]
+    assert webots_recording.commands("pause") == []
     assert repr(sent) == '<command 1: aim {"angle": 1.5}, done, 3.0>'
 
 
 def test_each_run_is_a_recording_of_its_own(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
 ) -> None:
     for step in range(5):
         webots_robot.step(32)
@@ -185,13 +182,13 @@ def test_each_run_is_a_recording_of_its_own(
     webots_robot.simulationReset()
     webots_robot.step(32)
     webots_bridge.publish({"n": 100})
-    first, second = recording.runs()
+    first, second = webots_recording.runs()
     assert first.signal("n").values() == [0, 1, 2, 3, 4]
-    assert second.signal("n").values() == recording.signal("n").values() == [100]
+    assert second.signal("n").values() == webots_recording.signal("n").values() == [100]
 
 
 def test_two_robots_share_a_world_and_a_database(
-    webots_robot_factory: MakeRobot, webots_database: MemoryDatabase, recording: Recording
+    webots_robot_factory: RobotFactory, webots_database: MemoryDatabase, webots_recording: Recording
 ) -> None:
     world = Path(__file__).parents[2] / "examples" / "worlds" / "arena_referee.wbt"
     rover = webots_robot_factory("rover", world=world, supervisor=False)
@@ -202,31 +199,31 @@ def test_two_robots_share_a_world_and_a_database(
         robot.step(16)
         bridge.publish({"who": robot.getName()})
         bridge.close()
-    assert recording.robot("rover").signal("who").last == "rover"
-    assert recording.robot("referee").signal("who").last == "referee"
+    assert webots_recording.robot("rover").signal("who").last == "rover"
+    assert webots_recording.robot("referee").signal("who").last == "referee"
     with pytest.raises(UnknownRobotError, match="did you mean 'rover'"):
-        recording.robot("rovr").signal("who")
+        webots_recording.robot("rovr").signal("who")
 
 
 def test_a_whole_loop_ends_after_the_time_that_it_was_given(
-    webots_robot_factory: MakeRobot, webots_database: MemoryDatabase, recording: Recording
+    webots_robot_factory: RobotFactory, webots_database: MemoryDatabase, webots_recording: Recording
 ) -> None:
     robot = webots_robot_factory(duration_s=1.0)
     with MCPBridge(robot, throttle_interval=1, database=webots_database) as bridge:
         while robot.step(100) != -1:
             bridge.publish({"time_s": robot.getTime()})
             bridge.get_command()
-    assert recording.signal("time_s").last == pytest.approx(1.008)
+    assert webots_recording.signal("time_s").last == pytest.approx(1.008)
 
 
 def test_a_pause_that_nobody_can_end_is_an_error_and_no_endless_wait(
     webots_robot: InProcessSupervisor,
     webots_bridge: MCPBridge,
-    recording: Recording,
+    webots_recording: Recording,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("webots_mcp.testing.rehearsal.HOLD_LIMIT_S", 0.05)
-    recording.send("pause")
+    webots_recording.send("pause")
     webots_robot.step(16)
     with pytest.raises(WouldBlockError, match="send 'resume' before"):
         webots_bridge.get_command()
@@ -237,18 +234,18 @@ def test_what_a_bridge_cannot_record_is_raised(webots_bridge: MCPBridge) -> None
         webots_bridge.publish([1, 2, 3])  # type: ignore[arg-type]
 
 
-def test_a_recording_without_a_bridge_says_what_to_do(recording: Recording) -> None:
+def test_a_recording_without_a_bridge_says_what_to_do(webots_recording: Recording) -> None:
     with pytest.raises(NothingRecordedError, match="make an MCPBridge on it"):
-        recording.signal("mode")
+        webots_recording.signal("mode")
     with pytest.raises(NothingRecordedError, match="make an MCPBridge on it"):
-        recording.send("pause")
+        webots_recording.send("pause")
 
 
 def test_a_bridge_that_published_nothing_is_told_as_such(
-    webots_bridge: MCPBridge, recording: Recording
+    webots_bridge: MCPBridge, webots_recording: Recording
 ) -> None:
     with pytest.raises(UnknownSignalError, match="no state row with values"):
-        recording.signal("mode")
+        webots_recording.signal("mode")
 
 
 # Real processes -----------------------------------------------------------------------------------
@@ -265,7 +262,7 @@ def controller(tmp_path: Path) -> Callable[[str], Path]:
 
 
 def test_a_process_runs_for_exactly_the_time_that_was_asked_for(
-    webots_simulation: Start, controller: Callable[[str], Path]
+    webots_simulation: SimulationFactory, controller: Callable[[str], Path]
 ) -> None:
     simulation = webots_simulation(controllers={"rover": controller(CONTROLLER)})
     simulation.run_for(0.8)
@@ -279,7 +276,7 @@ def test_a_process_runs_for_exactly_the_time_that_was_asked_for(
 
 
 def test_a_paused_controller_stays_paused_until_somebody_presses_play(
-    webots_simulation: Start, controller: Callable[[str], Path]
+    webots_simulation: SimulationFactory, controller: Callable[[str], Path]
 ) -> None:
     simulation = webots_simulation(controllers={"rover": controller(CONTROLLER)})
     simulation.run_for(0.8)
@@ -294,7 +291,7 @@ def test_a_paused_controller_stays_paused_until_somebody_presses_play(
 
 
 def test_a_reset_in_the_middle_does_not_lengthen_the_run(
-    webots_simulation: Start, controller: Callable[[str], Path]
+    webots_simulation: SimulationFactory, controller: Callable[[str], Path]
 ) -> None:
     simulation = webots_simulation(controllers={"rover": controller(CONTROLLER)})
     simulation.run_for(0.8)
@@ -307,7 +304,7 @@ def test_a_reset_in_the_middle_does_not_lengthen_the_run(
 
 
 def test_a_controller_that_fails_fails_the_test_with_its_traceback(
-    webots_simulation: Start, controller: Callable[[str], Path]
+    webots_simulation: SimulationFactory, controller: Callable[[str], Path]
 ) -> None:
     file = controller(CONTROLLER.replace("n += 1", "n += 1 if n < 10 else 1 / 0"))
     simulation = webots_simulation(controllers={"rover": file})
@@ -318,7 +315,7 @@ def test_a_controller_that_fails_fails_the_test_with_its_traceback(
 
 
 def test_two_simulations_of_a_test_do_not_share_their_recordings(
-    webots_simulation: Start, controller: Callable[[str], Path], tmp_path: Path
+    webots_simulation: SimulationFactory, controller: Callable[[str], Path], tmp_path: Path
 ) -> None:
     file = controller(CONTROLLER)
     first = webots_simulation(controllers={"rover": file})
@@ -342,13 +339,13 @@ def test_two_simulations_of_a_test_do_not_share_their_recordings(
     ],
 )
 def test_a_controller_that_cannot_be_meant_is_refused_at_once(
-    webots_simulation: Start, options: dict[str, Any], message: str
+    webots_simulation: SimulationFactory, options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(StandInError, match=message):
         webots_simulation(**options)
 
 
-def test_a_simulation_that_never_ran_has_no_recording(webots_simulation: Start) -> None:
+def test_a_simulation_that_never_ran_has_no_recording(webots_simulation: SimulationFactory) -> None:
     simulation = webots_simulation()
     with pytest.raises(NoDatabaseError, match="has recorded there yet"):
         simulation.recording.states()
@@ -356,13 +353,13 @@ def test_a_simulation_that_never_ran_has_no_recording(webots_simulation: Start) 
 
 
 def test_a_robot_without_rights_cannot_pause(
-    webots_robot_factory: Callable[..., InProcessRobot],
+    webots_robot_factory: RobotFactory,
     webots_database: MemoryDatabase,
-    recording: Recording,
+    webots_recording: Recording,
 ) -> None:
     robot = webots_robot_factory(supervisor=False)
     with MCPBridge(robot, throttle_interval=1, database=webots_database) as bridge:
-        pause = recording.send("pause")
+        pause = webots_recording.send("pause")
         robot.step(16)
         bridge.get_command()
     assert pause.status == "failed"

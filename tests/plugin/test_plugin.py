@@ -41,17 +41,17 @@ def test_the_example_passes() -> None:
 def test_a_failure_shows_the_users_line_and_the_reason(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
-        def test_distance(webots_robot, webots_bridge, recording):
+        def test_distance(webots_robot, webots_bridge, webots_recording):
             webots_robot.step(16)
             webots_bridge.publish({"front_m": 0.05})
-            recording.signal("front_m").assert_never_below(0.1)
+            webots_recording.signal("front_m").assert_never_below(0.1)
         """
     )
     result = pytester.runpytest_inprocess()
     result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines(
         [
-            '>*recording.signal("front_m").assert_never_below(0.1)',
+            '>*webots_recording.signal("front_m").assert_never_below(0.1)',
             "E*front_m fell below 0.1 in 1 of 1 rows of run 1 of robot 'rover'",
             "E*first at 0.016 s: 0.05",
         ]
@@ -65,7 +65,7 @@ def test_a_fixture_of_the_users_own_wins(pytester: pytest.Pytester) -> None:
         import pytest
 
         @pytest.fixture
-        def recording():
+        def webots_recording():
             return "a gramophone record"
 
         @pytest.fixture
@@ -75,12 +75,21 @@ def test_a_fixture_of_the_users_own_wins(pytester: pytest.Pytester) -> None:
     )
     pytester.makepyfile(
         """
-        def test_mine(recording, webots_bridge):
-            assert recording == "a gramophone record"
+        def test_mine(webots_recording, webots_bridge):
+            assert webots_recording == "a gramophone record"
             assert webots_bridge.robot_name == "spot"
         """
     )
     pytester.runpytest_inprocess().assert_outcomes(passed=1)
+
+
+def test_no_fixture_takes_a_name_that_a_test_suite_may_use_itself(
+    pytester: pytest.Pytester,
+) -> None:
+    text = pytester.runpytest_inprocess("--fixtures").stdout.str()
+    names = re.findall(r"^(\w+) -- .*webots_mcp.pytest_plugin\.py:\d+$", text, re.MULTILINE)
+    assert len(names) == 6
+    assert all(name.startswith("webots_") for name in names)
 
 
 def test_a_run_that_does_not_use_the_plugin_does_not_pay_for_it(pytester: pytest.Pytester) -> None:

@@ -4,6 +4,7 @@ The pytest plugin (`webots_mcp.pytest_plugin`) offers these as fixtures; they ne
 """
 
 from webots_mcp.testing.commands import RecordedCommand
+from webots_mcp.testing.factories import RobotFactory, SimulationFactory
 from webots_mcp.testing.recording import Recording
 from webots_mcp.testing.rehearsal import Rehearsal
 from webots_mcp.testing.signals import RecordedSignal
@@ -15,4 +16,6 @@ __all__ = [
     "RecordedSimulation",
     "Recording",
     "Rehearsal",
+    "RobotFactory",
+    "SimulationFactory",
 ]

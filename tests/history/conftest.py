@@ -9,6 +9,7 @@ import pytest
 
 from tests.history.recording import record_rover
 from tests.memory import memory_connection
+from webots_mcp.store.history import columns
 from webots_mcp.store.history.rollup import roll
 
 
@@ -26,6 +27,20 @@ def _recorded() -> Iterator[dict[str, sqlite3.Connection]]:
             record_rover(connection)
         assert roll(rolled, 100_000).done
         yield {"raw": raw, "rolled": rolled}
+
+
+@pytest.fixture
+def long_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A range of more than 100 rows counts as one that is too long to be read row by row."""
+    monkeypatch.setattr(columns, "RAW_ROWS", 100)
+
+
+@pytest.fixture(params=["rows", "rollups"])
+def tier(request: pytest.FixtureRequest) -> str:
+    """Answers from rows; and from rollups, by letting a short range count as a long one."""
+    if request.param == "rollups":
+        request.getfixturevalue("long_ranges")
+    return request.param
 
 
 @pytest.fixture(params=["raw", "rolled"])

@@ -18,12 +18,14 @@ from tests.history.recording import Recorder, record_rover
 from tests.memory import memory_connection
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
-from webots_mcp.store.history import columns
 from webots_mcp.store.history.leaves import flatten
+from webots_mcp.store.history.pages import query_rows
 from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.history.rollup import BUCKET_S, forget, roll, watermark
 from webots_mcp.store.history.series import query_history
+from webots_mcp.store.history.signals import list_signals
 from webots_mcp.store.history.summary import Summary, merge, summarise
+from webots_mcp.store.history.trends import trends
 
 Rows = list[tuple[float, dict[str, Any]]]
 finite = st.floats(-1e9, 1e9, allow_nan=False) | st.integers(-1000, 1000)
@@ -167,6 +169,41 @@ def test_an_unreadable_row_costs_itself_and_not_the_rollup(empty: sqlite3.Connec
     assert empty.execute("SELECT rows, min, max FROM signal").fetchall() == [(2, 1.0, 3.0)]
 
 
+@pytest.mark.parametrize("power", [63, 64, 100, 1400])
+def test_an_integer_beyond_64_bits_stops_neither_the_rollups_nor_an_answer(
+    empty: sqlite3.Connection, power: int, tier: str
+) -> None:
+    number, usable = 2**power, power < 300
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(200):
+        recorder.publish(float(step), {"hash": number + step, "x": step, "array": [number] * 20})
+    if tier == "rollups":
+        assert roll(empty, 100_000).done
+    for name, present in (("hash", 200 * usable), ("x", 200), ("array.mean", 200 * usable)):
+        (run,) = query_history(empty, resolve_range(empty), [name], max_points=10).runs
+        assert run.numbers[0].whole.present == present
+    assert len(list_signals(empty).signals) == 7
+    trends(empty, resolve_range(empty))
+    query_rows(empty, resolve_range(empty), ["*"])
+
+
+def test_a_row_that_cannot_be_stored_costs_itself_and_not_the_rollup(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(20):
+        half_a_character = "\ud800" if step in (7, 8) else "a"
+        recorder.publish(float(step), {"x": step, "text": half_a_character})
+    while not roll(empty, 3).done:
+        pass
+    counted = empty.execute("SELECT name, rows FROM signal ORDER BY name").fetchall()
+    assert counted == [("text", 18), ("x", 18)]
+
+
 def test_change_points_carry_on_across_batches(empty: sqlite3.Connection) -> None:
     recorder = Recorder(empty)
     robot_id = recorder.robot("r")
@@ -209,9 +246,8 @@ def test_a_robot_that_invents_names_for_ever_does_not_fill_the_register(
 
 
 def test_rows_that_are_rolled_up_during_an_answer_are_counted_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, long_ranges: None
 ) -> None:
-    monkeypatch.setattr(columns.exceeds, "__defaults__", (100,))
     file = tmp_path / "webots.db"
     with closing(connect(file, "writer", create=True)) as writer:
         create_schema(writer)

@@ -16,7 +16,6 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
-from webots_mcp.store.history import columns
 from webots_mcp.store.history.compare import Comparison, Difference, compare_code, compare_runs
 from webots_mcp.store.history.runs import annotate_run, list_runs, run_info
 
@@ -52,13 +51,6 @@ def test_a_note_stays_with_its_run(empty: sqlite3.Connection) -> None:
         annotate_run(empty, 2, label="x" * 101)
     with pytest.raises(UnknownRunError):
         annotate_run(empty, 9, label="x")
-
-
-@pytest.fixture(params=["rows", "rollups"])
-def tier(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    if request.param == "rollups":
-        monkeypatch.setattr(columns.exceeds, "__defaults__", (100,))
-    return request.param
 
 
 def difference(comparison: Comparison, name: str) -> Difference:

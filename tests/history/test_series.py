@@ -10,19 +10,10 @@ import pytest
 
 from tests.history.recording import Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.history import columns
 from webots_mcp.store.history.pages import query_rows
 from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.history.series import NumberColumns, query_history
-
-
-@pytest.fixture(params=["rows", "rollups"])
-def tier(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Answers from rows; and from rollups, by letting a short range count as a long one."""
-    if request.param == "rollups":
-        monkeypatch.setattr(columns.exceeds, "__defaults__", (100,))
-    return request.param
 
 
 def ask(connection: sqlite3.Connection, *names: str, max_points: int = 50, **bounds: Any):
@@ -55,9 +46,8 @@ def test_counts_are_exact_at_both_ends(rover: sqlite3.Connection, tier: str) -> 
 
 
 def test_a_long_step_is_a_multiple_of_the_tier(
-    rover: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+    rover: sqlite3.Connection, long_ranges: None
 ) -> None:
-    monkeypatch.setattr(columns.exceeds, "__defaults__", (100,))
     run = ask(rover, "ir", max_points=5)
     assert (run.tier, run.step_s) == ("rollup", 30.0)
     assert run.sim_time_s == [0.0, 30.0, 60.0, 90.0]

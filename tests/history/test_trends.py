@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from webots_mcp.store.history import columns
 from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.history.shapes import (
     find_oscillation,
@@ -98,13 +97,6 @@ def test_flat_since_is_the_begin_of_the_rest() -> None:
     assert flat_since(times, [min(index, 60.0) for index in range(100)]) == 60.0
     assert flat_since(times, [float(index) for index in range(100)]) is None
     assert flat_since(times, [2.0] * 100) == 0.0
-
-
-@pytest.fixture(params=["rows", "rollups"])
-def tier(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    if request.param == "rollups":
-        monkeypatch.setattr(columns.exceeds, "__defaults__", (100,))
-    return request.param
 
 
 def ask(connection: sqlite3.Connection, *names: str, **bounds: Any) -> RunTrends:

@@ -68,3 +68,8 @@ def test_a_tighter_level_is_taken_where_the_first_does_not_fit(levels: Any) -> N
     short = shorten(state, 2000, levels)
     assert len(compact_json(short.value)) <= 2000
     assert short.rule
+
+
+def test_integers_that_no_float_holds_do_not_spoil_a_long_array() -> None:
+    short = shorten([10**400] * 40 + [1.0], GLANCE).value
+    assert (short["count"], len(short["first"])) == (41, 3)

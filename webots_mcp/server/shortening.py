@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, NamedTuple, cast
@@ -138,8 +139,8 @@ class _Shortener:
         return [self.shorten(item, depth + 1) for item in items]
 
     def _summary(self, items: list[Any], depth: int) -> dict[str, Any]:
-        numbers = [item for item in items if type(item) in (int, float)]
-        others = [item for item in items if type(item) not in (int, float)]
+        numbers = [item for item in items if _is_figure(item)]
+        others = [item for item in items if not _is_figure(item)]
         if all(item is None or item in _ODD_NUMBERS for item in others):
             return {**self._statistics(items, numbers), **_counts(others)}
         first = [self.shorten(item, depth + 1) for item in items[: min(3, self._limits.items)]]
@@ -149,7 +150,8 @@ class _Shortener:
     def _statistics(items: list[Any], numbers: list[float]) -> dict[str, Any]:
         if not numbers:
             return {"count": len(items)}
-        low, high, mean = min(numbers), max(numbers), sum(numbers) / len(numbers)
+        low, high = min(numbers), max(numbers)
+        mean = sum(number / len(numbers) for number in numbers)
         return {
             "count": len(items),
             "min": round_number(low),
@@ -157,6 +159,11 @@ class _Shortener:
             "mean": round_number(mean),
             "argmin": items.index(low),
         }
+
+
+def _is_figure(item: Any) -> bool:
+    """Whether it is a number that a float can hold, unlike an integer of 400 digits."""
+    return type(item) in (int, float) and abs(item) <= sys.float_info.max
 
 
 def _counts(others: list[Any]) -> dict[str, int]:

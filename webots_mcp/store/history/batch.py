@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import cast
@@ -35,7 +34,6 @@ class Batch:
 
     def __init__(self) -> None:
         self.rows = 0
-        self.last_id = 0
         self._runs: dict[int, dict[str, BatchColumn]] = {}
 
     def add(
@@ -50,7 +48,6 @@ class Batch:
     ) -> None:
         """Add a row; one whose data is no JSON object only counts."""
         self.rows += 1
-        self.last_id = state_id
         columns = self._runs.setdefault(run_id, {})
         for name, value in flatten(parse(data)).items():
             column = columns.get(name)
@@ -74,7 +71,7 @@ def odd_names(odd: str | None) -> dict[str, str]:
     if odd is None:
         return {}
     reasons: dict[str, str] = {}
-    for path, reason in cast("dict[str, str]", json.loads(odd)).items():
+    for path, reason in cast("dict[str, str]", parse(odd)).items():
         reasons[path] = reason
         array, _, item = path.rpartition(".")
         if item.isdecimal():

@@ -50,20 +50,14 @@ class Columns:
     odd: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])
     cut: bool = False
 
-    def slice(self, start: int, end: int) -> Columns:
-        """The rows [start, end) of these; what was odd in them is not known any more."""
-        values = {name: column[start:end] for name, column in self.values.items()}
-        part = (self.ids[start:end], self.times[start:end], self.walls[start:end])
-        return Columns(self.run_id, *part, values)
 
-
-def exceeds(connection: sqlite3.Connection, segment: Segment, rows: int = RAW_ROWS) -> bool:
-    """Whether a segment has more rows than that, or rows of which only rollups are left.
+def exceeds(connection: sqlite3.Connection, segment: Segment) -> bool:
+    """Whether a segment has more than 30,000 rows, or rows of which only rollups are left.
 
     Looks at no more index entries than that.
     """
-    bounds = (segment.run_id, segment.start_s, segment.end_s, rows + 1)
-    if connection.execute(_FEWER_THAN, bounds).fetchone()[0] > rows:
+    bounds = (segment.run_id, segment.start_s, segment.end_s, RAW_ROWS + 1)
+    if connection.execute(_FEWER_THAN, bounds).fetchone()[0] > RAW_ROWS:
         return True
     return connection.execute(_PURGED_IN, (segment.run_id, segment.start_s)).fetchone() is not None
 

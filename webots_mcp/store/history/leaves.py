@@ -86,9 +86,16 @@ def reduce_array(array: list[Any]) -> tuple[Value, ...]:
         len(array),
         low,
         max(numbers, default=None),
-        sum(numbers) / len(numbers) if numbers else None,
+        _mean(numbers),
         None if low is None else array.index(low),
     )
+
+
+def _mean(numbers: list[int | float]) -> float | None:
+    try:
+        return sum(numbers) / len(numbers) if numbers else None
+    except OverflowError:  # an integer beyond all floats
+        return None
 
 
 def reduce_text(text: object) -> dict[str, Value]:

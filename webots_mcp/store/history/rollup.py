@@ -10,8 +10,8 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 from bisect import bisect_left
-from collections.abc import Generator, Iterator
-from typing import Final, NamedTuple
+from collections.abc import Generator, Iterator, Sequence
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.store.history.batch import Batch, BatchColumn
 from webots_mcp.store.history.leaves import shown
@@ -50,6 +50,8 @@ _EMPTIED: Final = (
     "AND EXISTS (SELECT 1 FROM signal WHERE rows > 0) "
     "AND EXISTS (SELECT 1 FROM state WHERE id <= (SELECT state_id FROM watermark))"
 )
+# What a row of foreign origin may hold: numbers, text and nesting that cannot be stored.
+_UNSTORABLE: Final = (OverflowError, ValueError, RecursionError, sqlite3.DataError)
 _FORGET: Final = (
     "DELETE FROM watermark WHERE name = 'rollup'",
     "DELETE FROM rollup",
@@ -133,19 +135,34 @@ def buckets(
 
 
 def _roll_batch(connection: sqlite3.Connection, limit: int) -> int | None:
-    """The rows taken in: None if there are no more, 0 if another caller was faster."""
+    """The rows taken in: None if there are no more, 0 if another caller was faster.
+
+    A row that cannot be summed up costs only itself: it is looked for by halving, and left out.
+    """
     mark = watermark(connection)
-    batch = Batch()
-    for row in connection.execute(_ROWS, (mark, limit)):
-        batch.add(*row)
-    if not batch.rows:
+    rows = connection.execute(_ROWS, (mark, limit)).fetchall()
+    if not rows:
         return None
+    try:
+        return _take_in(connection, mark, rows)
+    except _UNSTORABLE:
+        if len(rows) > 1:
+            return _roll_batch(connection, len(rows) // 2)
+        return _take_in(connection, mark, rows, leave_out=True)
+
+
+def _take_in(
+    connection: sqlite3.Connection, mark: int, rows: Sequence[Any], *, leave_out: bool = False
+) -> int:
+    batch = Batch()
+    for row in () if leave_out else rows:
+        batch.add(*row)
     with _writing(connection):
         current = watermark(connection) == mark
         if current:
             _store(connection, batch)
-            connection.execute(_SET_WATERMARK, (batch.last_id,))
-    return batch.rows if current else 0
+            connection.execute(_SET_WATERMARK, (rows[-1][0],))
+    return len(rows) if current else 0
 
 
 def _store(connection: sqlite3.Connection, batch: Batch) -> None:

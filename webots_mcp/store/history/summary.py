@@ -16,6 +16,7 @@ from webots_mcp.store.history.leaves import Value
 
 _NUMBERS: Final = frozenset({int, float, bool})
 _LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
+_INTEGERS: Final = 2**63  # SQLite takes no larger ones: they become floats
 
 
 class Summary(NamedTuple):
@@ -112,7 +113,7 @@ def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = 
 
 
 def _without_numbers(times: Sequence[float], values: Sequence[Value]) -> Summary:
-    held = [time for time, value in zip(times, values, strict=True) if value is not None]
+    held = [time for time, value in zip(times, values, strict=True) if type(value) is str]
     if not held:
         return Summary(len(values))
     return Summary(len(values), len(held), first_sim_time_s=held[0], last_sim_time_s=held[-1])
@@ -128,7 +129,7 @@ def usable_numbers(
     if _NUMBERS.issuperset(map(type, values)) and _usable(cast("Sequence[float]", values)):
         return times, cast("Sequence[float]", values)
     pairs = [
-        (time, cast("float", value))
+        (time, float(cast("float", value)))
         for time, value in zip(times, values, strict=True)
         if type(value) in _NUMBERS and -_LARGEST <= cast("float", value) <= _LARGEST
     ]
@@ -137,7 +138,7 @@ def usable_numbers(
 
 def _usable(numbers: Sequence[float]) -> bool:
     """All at once: a NaN would show in the sum, and hide in the extremes."""
-    if not numbers or not min(numbers) >= -_LARGEST or not max(numbers) <= _LARGEST:
+    if not numbers or not min(numbers) > -_INTEGERS or not max(numbers) < _INTEGERS:
         return False
     return math.isfinite(sum(numbers))
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.server.story import write_story
-from webots_mcp.cli import main
+from webots_mcp.cli import COMMANDS, main
 from webots_mcp.cli.tables import print_table, text_of
 
 Say = Callable[..., str]
@@ -104,11 +104,10 @@ def test_json_is_one_object_for_other_programs(say: Say, command: str) -> None:
         ("trends --robot rovr", "did you mean 'rover'"),
         ("trends --start 9 --end 3", "reversed"),
         ("trends --start 3 --last 3", "two ways"),
-        ("trends -n 0", "must be 1 or more"),
         ("events --kind explosion", "unknown kind"),
         ("events --above 3", "need signals"),
         ("compare 1", "2 to 10"),
-        ("runs -n 0", "from 1 to 200"),
+        ("runs -n 300", "from 1 to 200"),
         ("plot -o a.gif", ".png or .svg"),
         ("plot -o /no/such/folder/a.png", "cannot be written"),
     ],
@@ -120,6 +119,17 @@ def test_bad_input_is_one_line_and_exit_code_2(
     said = capsys.readouterr()
     assert words in said.err
     assert said.err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", [c.name for c in COMMANDS for a in c.arguments if "-n" in a.flags])
+@pytest.mark.parametrize("number", ["-1", "1.5", "many"])
+def test_a_count_that_is_none_is_refused_by_every_command(
+    capsys: pytest.CaptureFixture[str], name: str, number: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main([name, "-n", number])
+    assert ended.value.code == 2
+    assert f"argument -n: '{number}' must be a whole number" in capsys.readouterr().err
 
 
 def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture[str]) -> None:

@@ -33,6 +33,17 @@ def argument(*flags: str, **options: Any) -> Argument:
     return Argument(flags, options)
 
 
+def count(flag: str, what: str, *, default: int, least: int = 1) -> Argument:
+    """An argument that says how many; `what` is its help, to which the default is added."""
+
+    def parse(text: str) -> int:
+        if text.isascii() and text.isdecimal() and int(text) >= least:
+            return int(text)
+        raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, {least} or more")
+
+    return argument(flag, type=parse, default=default, metavar="N", help=f"{what} ({default})")
+
+
 def command(
     name: str, *arguments: Argument
 ) -> Callable[[Callable[[argparse.Namespace], None]], Callable[[argparse.Namespace], None]]:

@@ -6,8 +6,7 @@ import argparse
 import json
 import sqlite3
 import time
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,6 +19,7 @@ from webots_mcp.cli.command import (
     Argument,
     argument,
     command,
+    count,
     open_recording,
 )
 from webots_mcp.cli.tables import print_notes, print_table
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.history.event import EventOptions
     from webots_mcp.store.history.ranges import TimeRange
     from webots_mcp.store.history.series import RunHistory
-    from webots_mcp.store.history.trends import RunTrends
+    from webots_mcp.store.history.trends import RunTrends, StateTrend
 
 RUN: Final = argument(
     "--run", type=int, dest="run_id", metavar="ID", help="that run instead of the newest one"
@@ -48,13 +48,13 @@ SIGNALS: Final = argument("signals", nargs="*", metavar="SIGNAL", help="names, w
 
 @command(
     "runs", DATA_DIR, DATABASE, ROBOT, JSON,
-    argument("-n", type=int, default=20, metavar="N", help="the newest N runs (20)"),
+    count("-n", "the newest N runs", default=20),
 )  # fmt: skip
 def runs(arguments: argparse.Namespace) -> None:
     """List the runs: when, with which code, how long, how fast, how they ended."""
     from webots_mcp.store.history.runs import list_runs
 
-    with _connected(arguments) as connection:
+    with open_recording(arguments).reader() as connection:
         found = list_runs(connection, robot=arguments.robot, limit=arguments.n)
     if arguments.json:
         return _print_json(found)
@@ -75,7 +75,7 @@ def runs(arguments: argparse.Namespace) -> None:
 @command(
     "history", DATA_DIR, DATABASE, *RANGE, JSON,
     argument("signals", nargs="+", metavar="SIGNAL", help="names, with '*'"),
-    argument("--points", type=int, default=20, metavar="N", help="at most N buckets (20)"),
+    count("--points", "at most N buckets", default=20),
 )  # fmt: skip
 def history(arguments: argparse.Namespace) -> None:
     """Show signals over time: mean, minimum and maximum of each bucket; changes of modes and flags.
@@ -84,7 +84,7 @@ def history(arguments: argparse.Namespace) -> None:
     """
     from webots_mcp.store.history.series import query_history
 
-    with _connected(arguments) as connection:
+    with open_recording(arguments).reader() as connection:
         found = query_history(
             connection, range_of(connection, arguments), arguments.signals,
             max_points=arguments.points,
@@ -98,16 +98,14 @@ def history(arguments: argparse.Namespace) -> None:
 
 @command(
     "trends", DATA_DIR, DATABASE, *RANGE, JSON, SIGNALS,
-    argument("-n", type=int, default=20, metavar="N", help="the N that changed most (20)"),
+    count("-n", "the N that changed most", default=20),
 )  # fmt: skip
 def trends(arguments: argparse.Namespace) -> None:
     """Say in one line each what the signals did; what changed most comes first."""
-    from webots_mcp.store.history import trends as store
+    from webots_mcp.store.history.trends import trends as find_trends
 
-    if arguments.n < 1:
-        raise InvalidInputError(f"-n {arguments.n} must be 1 or more")
-    with _connected(arguments) as connection:
-        found = store.trends(
+    with open_recording(arguments).reader() as connection:
+        found = find_trends(
             connection, range_of(connection, arguments), arguments.signals or ["*"],
             limit=arguments.n,
         )  # fmt: skip
@@ -126,15 +124,13 @@ def trends(arguments: argparse.Namespace) -> None:
     argument("--below", type=float, metavar="X", help="where the signals were below X"),
     argument("--for", type=float, default=0.0, dest="for_s", metavar="S",
              help="for at least S simulated seconds"),
-    argument("-n", type=int, default=50, metavar="N", help="at most N events (50)"),
+    count("-n", "at most N events", default=50),
 )  # fmt: skip
 def events(arguments: argparse.Namespace) -> None:
     """Find what happened: changes, stuck, gaps, jumps, silent sensors, commands, warnings."""
     from webots_mcp.store.history.events import find_events
 
-    if arguments.n < 1:
-        raise InvalidInputError(f"-n {arguments.n} must be 1 or more")
-    with _connected(arguments) as connection:
+    with open_recording(arguments).reader() as connection:
         found = find_events(
             connection, range_of(connection, arguments), _options(arguments), limit=arguments.n
         )
@@ -165,7 +161,7 @@ def plot(arguments: argparse.Namespace) -> None:
 
     file = Path(arguments.output)
     run_ids = [*([arguments.run_id] if arguments.run_id is not None else []), *arguments.run_ids]
-    with _connected(arguments) as connection:
+    with open_recording(arguments).reader() as connection:
         picture = plotting.plot(
             connection,
             "trajectory" if arguments.trajectory else "signals",
@@ -192,14 +188,14 @@ def plot(arguments: argparse.Namespace) -> None:
     argument("run_ids", type=int, nargs="*", metavar="RUN",
              help="two or more runs; none: before and after the last edit of the controller"),
     argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
-    argument("-n", type=int, default=15, metavar="N", help="the N that differ most (15)"),
+    count("-n", "the N that differ most", default=15),
 )  # fmt: skip
 def compare(arguments: argparse.Namespace) -> None:
     """Compare runs: duration, distance, time per mode, events, and the signals that differ most."""
     from webots_mcp.store.history.compare import compare_code, compare_runs
 
     names = arguments.signal or ["*"]
-    with _connected(arguments) as connection:
+    with open_recording(arguments).reader() as connection:
         if arguments.run_ids:
             found = compare_runs(connection, arguments.run_ids, names=names, limit=arguments.n)
         else:
@@ -207,12 +203,6 @@ def compare(arguments: argparse.Namespace) -> None:
     if arguments.json:
         return _print_json(found)
     _print_comparison(found)
-
-
-@contextmanager
-def _connected(arguments: argparse.Namespace) -> Generator[sqlite3.Connection]:
-    with open_recording(arguments).reader() as connection:
-        yield connection
 
 
 def range_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> TimeRange:
@@ -298,7 +288,7 @@ def _print_trends(run: RunTrends) -> None:
     print_notes([f"{left} more signals that changed less: -n shows them"] if left else [])
 
 
-def _times(state: Any) -> str:
+def _times(state: StateTrend) -> str:
     return ", ".join(f"{value} {time_s:.1f}" for value, time_s in state.time_by_value_s.items())
 
 

@@ -15,6 +15,7 @@ from webots_mcp.cli.command import (
     ROBOT,
     argument,
     command,
+    count,
     open_recording,
 )
 from webots_mcp.errors import InvalidInputError
@@ -46,7 +47,7 @@ def status(arguments: argparse.Namespace) -> None:
     DATA_DIR,
     DATABASE,
     ROBOT,
-    argument("-n", type=int, default=10, metavar="N", help="begin with the last N lines (10)"),
+    count("-n", "begin with the last N lines", default=10, least=0),
     argument(
         "--interval", type=float, default=0.5, metavar="S", help="seconds between looks (0.5)"
     ),
@@ -60,8 +61,8 @@ def tail(arguments: argparse.Namespace) -> None:
     from webots_mcp.store.follow import Follower
     from webots_mcp.store.robots import resolve_robot
 
-    if arguments.n < 0 or arguments.interval <= 0:
-        raise InvalidInputError("-n must not be negative, and --interval must be greater than 0")
+    if arguments.interval <= 0:
+        raise InvalidInputError("--interval must be greater than 0")
     with open_recording(arguments).reader() as connection:
         robot = arguments.robot and resolve_robot(connection, arguments.robot, time.time())
         follower = Follower(connection, robot.id if robot else None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import pytest
@@ -42,6 +43,20 @@ async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
     assert answer.is_error
     assert text_of(answer).startswith(told)
     assert len(text_of(answer)) < 400
+
+
+async def test_a_parameter_that_may_be_left_out_may_be_null_as_well(connect: Connect) -> None:
+    async with connect() as client:
+        answer = await client.call_tool("webots_list_commands", {"robot": None, "cursor": None})
+    assert not answer.is_error
+
+
+async def test_the_names_texts_and_parameters_of_all_tools_are_short(connect: Connect) -> None:
+    async with connect() as client:
+        tools = (await client.list_tools()).tools
+    told = [(tool.name, tool.description, tool.input_schema) for tool in tools]
+    assert len(json.dumps(told, separators=(",", ":"))) < 6_000 * 4  # tokens, of 4 characters
+    assert '"null"' not in json.dumps(told)
 
 
 async def test_every_schema_says_that_there_are_no_other_parameters(connect: Connect) -> None:

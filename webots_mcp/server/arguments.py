@@ -23,8 +23,10 @@ class CheckedTool(Tool):
     """A tool of ours, which takes no arguments but its own."""
 
     def model_post_init(self, context: Any, /) -> None:
-        """Say so in the schema as well."""
-        self.parameters["additionalProperties"] = False
+        """Say so in the schema as well, and leave out of it what says nothing."""
+        slim = {name: _slim(schema) for name, schema in self.parameters["properties"].items()}
+        self.parameters |= {"properties": slim, "additionalProperties": False}
+        self.parameters.pop("title", None)
 
     async def run(
         self, arguments: dict[str, Any], context: Any, convert_result: bool = False
@@ -41,6 +43,15 @@ class CheckedTool(Tool):
             if isinstance(error.__cause__, ValidationError):
                 raise ToolError(_explained(error.__cause__)) from error
             raise
+
+
+def _slim(schema: dict[str, Any]) -> dict[str, Any]:
+    """A parameter's schema without its name once more, and without null for "may be left out"."""
+    kept = {key: value for key, value in schema.items() if key not in ("title", "anyOf")}
+    choices = [choice for choice in schema.get("anyOf", ()) if choice != {"type": "null"}]
+    if kept.get("default", ...) is None:
+        del kept["default"]
+    return kept | (choices[0] if len(choices) == 1 else {"anyOf": choices} if choices else {})
 
 
 def _require_known(arguments: Iterable[str], known: Iterable[str]) -> None:

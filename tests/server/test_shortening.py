@@ -71,5 +71,5 @@ def test_a_tighter_level_is_taken_where_the_first_does_not_fit(levels: Any) -> N
 
 
 def test_integers_that_no_float_holds_do_not_spoil_a_long_array() -> None:
-    short = shorten([10**400] * 40 + [1.0], GLANCE).value
+    short = shorten([10**400] * 40 + [1.0]).value
     assert (short["count"], len(short["first"])) == (41, 3)

@@ -1,4 +1,4 @@
-"""Opening the database: every PRAGMA, in one place, for the bridge and for the server.
+"""Opening the database and writing to it: PRAGMAs, transactions and errors, for both sides.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -6,6 +6,8 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Generator
+from contextlib import contextmanager
 from typing import Final, Literal
 
 from webots_mcp.contract import Database, MemoryDatabase
@@ -16,6 +18,7 @@ Role = Literal["loop", "writer", "reader"]
 OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
 OPENING_TIMEOUT_MS: Final = 5000
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
+_DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
 
 # Why: a control loop never waits for a lock; an automatic checkpoint would be its slowest step,
 # so only the maintainer checkpoints; NORMAL costs the last commits at a power cut, never the file.
@@ -72,6 +75,36 @@ def connect(
 def never_wait(connection: sqlite3.Connection) -> None:
     """From now on a lock that is held by another is an error at once, not a wait."""
     connection.execute("PRAGMA busy_timeout=0")
+
+
+@contextmanager
+def transaction(connection: sqlite3.Connection) -> Generator[None]:
+    """All that is written inside is stored, or nothing; the write lock is taken before the first.
+
+    Args:
+        connection: In autocommit mode and in no transaction, as `connect` gives it.
+
+    Raises:
+        sqlite3.Error: Also where the lock is not to be had (`is_busy`); then nothing ran inside.
+    """
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield
+        connection.execute("COMMIT")
+    except BaseException:
+        if connection.in_transaction:  # a full disk has ended it already
+            connection.execute("ROLLBACK")
+        raise
+
+
+def is_busy(error: Exception) -> bool:
+    """Whether another connection held the lock at that instant: trying again helps."""
+    return isinstance(error, sqlite3.OperationalError) and "locked" in str(error)
+
+
+def is_damage(error: Exception) -> bool:
+    """Whether SQLite says that the file itself is broken, or never was a database."""
+    return isinstance(error, sqlite3.DatabaseError) and any(s in str(error) for s in _DAMAGE)
 
 
 def _file_uri(file: Database, create: bool) -> str:

@@ -9,7 +9,7 @@ import os
 import sqlite3
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final, Literal, get_args
 
 if TYPE_CHECKING:
     import tempfile
@@ -25,6 +25,8 @@ STRICT_VARIABLE: Final = "WEBOTS_MCP_STRICT"
 
 CommandStatus = Literal["pending", "claimed", "done", "failed", "expired", "cancelled", "lost"]
 FINAL_STATUSES: Final = ("done", "failed", "expired", "cancelled", "lost")
+LogLevel = Literal["debug", "info", "warning", "error"]
+LOG_LEVELS: Final[tuple[LogLevel, ...]] = get_args(LogLevel)  # in rising order
 
 BUILT_IN_ACTIONS: Final = (
     "pause", "resume", "fast", "step", "reset", "reload", "screenshot", "reset_state",
@@ -33,6 +35,7 @@ BUILT_IN_ACTIONS: Final = (
 COMMAND_TIME_TO_LIVE_S: Final = 10.0
 HEARTBEAT_INTERVAL_S: Final = 0.5  # how often a session says that its loop is alive
 HEARTBEAT_LATE_S: Final = 2.0  # a session silent for longer is not looping
+REMOTE_SILENCE_S: Final = 10.0  # one on another host, whose process cannot be asked, is dead then
 ISSUED_TIME_TO_LIVE_S: Final = 60.0  # how long a reload may take until it counts as lost
 MAX_STEPS: Final = 100_000
 

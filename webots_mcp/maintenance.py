@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect
+from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect, is_busy
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.schema import require_current
 
@@ -82,7 +82,7 @@ class Maintainer(threading.Thread):
             self.tick()
         except (sqlite3.Error, WebotsMCPError, OSError) as error:
             self._disconnect()
-            if "locked" not in str(error) and str(error) != self._complained:
+            if not is_busy(error) and str(error) != self._complained:
                 self._complained = str(error)
                 print(f"webots-mcp: maintenance waits: {error}", file=sys.stderr)  # noqa: T201
 

@@ -11,6 +11,7 @@ import sqlite3
 from pathlib import Path
 from typing import Final
 
+from webots_mcp.connection import transaction
 from webots_mcp.contract import APPLICATION_ID, SCHEMA_VERSION
 from webots_mcp.errors import ForeignDatabaseError, SchemaTooNewError, SchemaTooOldError
 
@@ -65,15 +66,10 @@ def create_schema(connection: sqlite3.Connection) -> None:
 
     The check and the tables stand in one transaction that takes the write lock first.
     """
-    connection.execute("BEGIN IMMEDIATE")
-    try:
+    with transaction(connection):
         if schema_version(connection) == 0:
             for statement in _statements():
                 connection.execute(statement)
-        connection.execute("COMMIT")
-    except BaseException:
-        connection.execute("ROLLBACK")
-        raise
 
 
 def _statements() -> list[str]:

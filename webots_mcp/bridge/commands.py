@@ -8,7 +8,6 @@ never run a second time, and a result is final once.
 from __future__ import annotations
 
 import json
-import sqlite3
 import time
 from typing import Any, Final, cast
 
@@ -124,8 +123,3 @@ class CommandQueue:
                 f"command {command.id}",
                 f"command {command.id} ({command.action}) was judged lost before it was {status}",
             )
-
-
-def is_busy(error: sqlite3.Error) -> bool:
-    """Whether another writer held the lock at that instant."""
-    return "locked" in str(error)

@@ -10,13 +10,14 @@ from typing import Any, Final
 
 from webots_mcp.bridge.actions import Actions, Progress
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.commands import Command, CommandQueue, is_busy
+from webots_mcp.bridge.commands import Command, CommandQueue
 from webots_mcp.bridge.heart import Heart
 from webots_mcp.bridge.hold import PUMP_INTERVAL_S, Hold
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.connection import is_busy
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.errors import CommandRefusedError, WebotsMCPError
 

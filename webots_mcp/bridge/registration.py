@@ -8,7 +8,8 @@ from typing import Final, NamedTuple
 
 from webots_mcp import settlement
 from webots_mcp.bridge.identity import Identity
-from webots_mcp.contract import HEARTBEAT_LATE_S
+from webots_mcp.connection import transaction
+from webots_mcp.contract import REMOTE_SILENCE_S
 
 _KNOWN_ROBOT: Final = (
     "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
@@ -53,18 +54,13 @@ def register(
     is settled, an unfinished session of the same robot is ended as `replaced`, and where a live
     process already has the name, `#2` (and so on) is appended.
     """
-    connection.execute("BEGIN IMMEDIATE")
-    try:
+    with transaction(connection):
         settlement.settle(connection, now_s)
         name = _free_name(connection, identity, now_s)
         robot_id = _enter_robot(connection, identity, name, now_s)
         values = {"robot": robot_id, "instance": identity.instance}
         reloaded = connection.execute(_RELOADED, values).fetchone() is not None
         session_id = _enter_session(connection, identity, robot_id, actions, now_s)
-        connection.execute("COMMIT")
-    except BaseException:
-        connection.execute("ROLLBACK")
-        raise
     _own_sessions.add(session_id)
     return Registration(robot_id, name, session_id, reloaded)
 
@@ -91,7 +87,7 @@ def _is_living(session: tuple[int, int, str, float], identity: Identity, now_s: 
     """On this host the process tells; on another only a recent heartbeat does."""
     session_id, pid, host, last_seen_s = session
     if host != identity.host:
-        return now_s - last_seen_s < HEARTBEAT_LATE_S * 5
+        return now_s - last_seen_s < REMOTE_SILENCE_S
     if pid == identity.pid:
         return session_id in _own_sessions
     return settlement.process_alive(pid)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
+from webots_mcp.connection import is_busy
 from webots_mcp.contract import COMMAND_TIME_TO_LIVE_S, FINAL_STATUSES
 from webots_mcp.errors import InvalidInputError
 
@@ -219,6 +220,6 @@ def _while_busy(execute: Callable[[], _T], attempts: int = _ATTEMPTS) -> _T:
     try:
         return execute()
     except sqlite3.OperationalError as error:
-        if "locked" not in str(error) or attempts == 1:
+        if not is_busy(error) or attempts == 1:
             raise
     return _while_busy(execute, attempts - 1)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp import settlement
-from webots_mcp.connection import Role, connect
+from webots_mcp.connection import Role, connect, is_busy, is_damage
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import (
     DatabaseError,
@@ -229,12 +229,12 @@ def name_of(database: Database) -> str:
 def _explain(error: sqlite3.Error, database: Database) -> str:
     """What a person can do about it."""
     text, name = str(error), name_of(database)
-    if "locked" in text:
+    if is_busy(error):
         return (
             f"the database at {name} stayed locked by another process: ask again; if it lasts, "
             "look for a program that holds a transaction open (a sqlite3 shell?)"
         )
-    if "malformed" in text or "not a database" in text:
+    if is_damage(error):
         return (
             f"the database at {name} is damaged ({text}): the bridge moves such a file aside at "
             "its next start; 'sqlite3 FILE .recover' can save rows from it"

@@ -7,11 +7,8 @@ import sqlite3
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.contract import HEARTBEAT_LATE_S, host_name
+from webots_mcp.contract import HEARTBEAT_LATE_S, REMOTE_SILENCE_S, host_name
 from webots_mcp.settlement import process_alive
-
-# A session on another host, whose process cannot be asked, counts as dead after this silence.
-REMOTE_SILENCE_S: Final = 5 * HEARTBEAT_LATE_S
 
 _COLUMNS: Final = (
     "id, robot_id, pid, host, instance, controller, controller_sha256, git_commit, versions, "

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
 from mcp.server.mcpserver import Context
 from pydantic import Field
 
-from webots_mcp.contract import BUILT_IN_ACTIONS
+from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
 from webots_mcp.server.boundary import ACTS, READS, reporter, tool
 from webots_mcp.server.dispatch import Dispatcher, Request, shown_result
 from webots_mcp.server.parameters import Cursor, RobotName, TimeoutS
@@ -16,8 +16,6 @@ from webots_mcp.server.results import CommandAnswer, CommandsAnswer, Table
 from webots_mcp.server.shortening import DETAIL_BUDGET, cut_text, shorten
 from webots_mcp.store.queue import Command, list_commands
 from webots_mcp.store.recording import Recording, View
-
-Status = Literal["pending", "claimed", "done", "failed", "expired", "cancelled", "lost"]
 
 COMMAND_COLUMNS: Final = (
     "id", "action", "params", "outcome", "asked_ago_s", "took_s", "result", "error",
@@ -59,7 +57,9 @@ class CommandTools:
     def webots_list_commands(
         self,
         limit: Annotated[int, Field(ge=1, le=200, description="At most so many.")] = 10,
-        status: Annotated[Status | None, Field(description="Only commands in this state.")] = None,
+        status: Annotated[
+            CommandStatus | None, Field(description="Only commands in this state.")
+        ] = None,
         cursor: Cursor = None,
         robot: RobotName = None,
     ) -> CommandsAnswer:

@@ -83,9 +83,16 @@ def test_export_of_parquet_can_be_read_back(say: Say, tmp_path: Path) -> None:
     assert set(parquet.read_table(file).column("mode").to_pylist()) == {"cruise"}
 
 
-def test_a_range_beyond_the_recording_is_noted(say: Say, tmp_path: Path) -> None:
-    text = say("export", "-o", str(tmp_path / "a.csv"), "--run", "1", "--end", "99")
-    assert "note: the recording of run 1 ends at" in text
+@pytest.mark.parametrize("output", ["a.csv", "-"])
+def test_a_range_beyond_the_recording_is_noted_beside_the_table(
+    database: Path, tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes], output: str
+) -> None:
+    file = str(tmp_path / output) if output != "-" else output
+    asked = ["export", "-o", file, "--run", "1", "--end", "99", "--database", str(database)]
+    assert main(asked) == 0
+    said = capfdbinary.readouterr()
+    assert b"note: the recording of run 1 ends at" in said.err
+    assert b"note" not in said.out
 
 
 def test_export_never_overwrites_the_recording(

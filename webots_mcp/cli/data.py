@@ -53,10 +53,9 @@ def export(arguments: argparse.Namespace) -> None:
         wanted = range_of(connection, arguments)
         if file is None:
             write(connection, wanted, form, sys.stdout.buffer, progress)
-            return
-        rows = export_file(connection, wanted, form, file, progress)
-    print(f"{file}: {rows} rows")
-    print_notes(wanted.notes)
+        else:
+            print(f"{file}: {export_file(connection, wanted, form, file, progress)} rows")
+    print_notes(wanted.notes, sys.stderr)  # stdout may be the table
 
 
 @command(

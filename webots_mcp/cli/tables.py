@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from typing import Any, Final, cast
+from typing import Any, Final, TextIO, cast
 
 _LONGEST_CELL: Final = 110
 _RIGHT: Final = (int, float)
@@ -48,7 +48,7 @@ def number_text(value: float) -> str:
     return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) >= 1 else f"{value:.4g}"
 
 
-def print_notes(notes: Sequence[str]) -> None:
-    """What there is to know about an answer, below it."""
+def print_notes(notes: Sequence[str], file: TextIO | None = None) -> None:
+    """What there is to know about an answer, below it; on stdout, or in that file."""
     for note in notes:
-        print(f"note: {text_of(note)}")
+        print(f"note: {text_of(note)}", file=file)

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Any, Final
 
 from webots_mcp.store.history.ranges import Segment
 from webots_mcp.store.history.rollup import BUCKET_S, bucket_of
@@ -20,7 +20,7 @@ _TIMES: Final = (  # answered by the index alone
     "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
     "ORDER BY sim_time_s LIMIT ?"
 )
-# One signal that is in every row tells how many rows a bucket has, and its first and last time.
+# The signal that is in most rows tells how many a bucket has, and its first and last time.
 _BUCKETS: Final = (
     "SELECT bucket, rows, first_sim_time_s, last_sim_time_s FROM rollup "
     "WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = (SELECT id "
@@ -92,9 +92,8 @@ def _stretches(
 ) -> Iterator[tuple[Sequence[float], bool]]:
     """Times in order: the ends of each bucket that is complete, all times of another."""
     run_id, reached_s, looked = segment.run_id, segment.start_s, 0
-    span = {"first": bucket_of(segment.start_s) + 1, "end": bucket_of(segment.end_s)}
-    found = connection.execute(_BUCKETS, {"run": run_id, **span}).fetchall()
-    for bucket, rows, first_s, last_s in found:
+    span = range(bucket_of(segment.start_s) + 1, bucket_of(segment.end_s))
+    for bucket, rows, first_s, last_s in _counted(connection, run_id, span):
         start_s, end_s = bucket * BUCKET_S, (bucket + 1) * BUCKET_S
         if start_s > reached_s and (head := _times(connection, run_id, reached_s, start_s)):
             yield head, False
@@ -107,6 +106,19 @@ def _stretches(
             yield times, False
     if foot := _times(connection, run_id, reached_s, segment.end_s):
         yield foot, False
+
+
+def rows_by_bucket(connection: sqlite3.Connection, run_id: int, span: range) -> dict[int, int]:
+    """How many rows each bucket has in the rollups: also of a signal that not all of them hold."""
+    return {bucket: rows for bucket, rows, *_ in _counted(connection, run_id, span)}
+
+
+def _counted(
+    connection: sqlite3.Connection, run_id: int, span: range
+) -> list[tuple[int, int, Any, Any]]:
+    """Bucket, rows, and the times of the first and last value; None where there is no value."""
+    bounds = {"run": run_id, "first": span.start, "end": span.stop}
+    return connection.execute(_BUCKETS, bounds).fetchall()
 
 
 def _times(

@@ -27,10 +27,12 @@ MOSTLY: Final = 0.5  # who is silent or flat for longer than this share is so by
 
 @dataclass(frozen=True)
 class Span:
-    """From the first to the last row in a row in which it held.
+    """From the first to the last of rows, one after the other, in all of which it held.
 
     Attributes:
         key: What held: spans that touch are one only if it is the same.
+        from_first: It held in the first row that was read: it may have begun before.
+        to_last: It held in the last row that was read: it may go on.
     """
 
     start_s: float
@@ -38,6 +40,8 @@ class Span:
     key: Value
     low: float | None = None
     high: float | None = None
+    from_first: bool = False
+    to_last: bool = False
 
 
 Verdict = Literal["all", "none", "some"]
@@ -120,11 +124,12 @@ def spans_in_rows(
     start = 0
     for key, group in groupby(values, condition.of_row):
         end = start + len(list(group))
-        inside = start > 0 and end < len(values)  # else what comes before or after may be the same
-        if key is not None and not (condition.lasting and inside and end - start == 1):
+        ends = (start == 0, end == len(values))
+        alone = end - start == 1 and not any(ends)  # else the row before or after may be the same
+        if key is not None and not (condition.lasting and alone):
             _, held = usable_numbers(times[start:end], values[start:end])
             low, high = min(held, default=None), max(held, default=None)
-            yield Span(times[start], times[end - 1], key, low, high)
+            yield Span(times[start], times[end - 1], key, low, high, *ends)
         start = end
 
 
@@ -135,7 +140,7 @@ def spans_in_pieces(
     pieces: Pieces,
     condition: Condition,
     deadline: Deadline,
-) -> Iterator[Span]:
+) -> Iterator[list[Span]]:
     """The spans in a long segment, bucket by bucket; one in between is read until the deadline.
 
     Flat buckets are looked for whole; of the others only those next to one are read.
@@ -143,15 +148,24 @@ def spans_in_pieces(
     buckets = pieces.of(signal.name)
     verdicts = [condition.of_bucket(summary) for _, summary in buckets]
     for index, (bucket, summary) in enumerate(buckets):
-        verdict = verdicts[index]
         near_whole = "all" in verdicts[max(0, index - 1) : index + 2]
         part = _bucket_of(segment, bucket)
-        if verdict == "all":
-            key = condition.of_row(summary.last)
-            yield Span(part.start_s, part.end_s, key, summary.min, summary.max)
-        elif verdict == "some" and (near_whole or not isinstance(condition, Flat)):
+        if verdicts[index] == "all":
+            yield [_whole(part, summary, condition)]
+        elif verdicts[index] == "some" and (near_whole or not isinstance(condition, Flat)):
             columns = read_columns(connection, part, [signal], deadline)
-            yield from spans_in_rows(columns.times, columns.values[signal.name], condition)
+            yield list(spans_in_rows(columns.times, columns.values[signal.name], condition))
+        else:
+            yield []
+
+
+def _whole(part: Segment, summary: Summary, condition: Condition) -> Span:
+    """Of a bucket in all rows of which it held; without a value, rows are known by bucket only."""
+    first_s, last_s = summary.first_sim_time_s, summary.last_sim_time_s
+    start_s = part.start_s if first_s is None else first_s
+    end_s = part.end_s if last_s is None else last_s
+    key = condition.of_row(summary.last)
+    return Span(start_s, end_s, key, summary.min, summary.max, from_first=True, to_last=True)
 
 
 def _bucket_of(segment: Segment, bucket: int) -> Segment:
@@ -159,16 +173,21 @@ def _bucket_of(segment: Segment, bucket: int) -> Segment:
     return replace(segment, start_s=start_s, end_s=min(segment.end_s, (bucket + 1) * BUCKET_S))
 
 
-def joined(spans: Iterable[Span], within_s: float) -> list[Span]:
-    """Spans of the same key that follow within that time are one."""
+def joined(pieces: Iterable[Sequence[Span]]) -> list[Span]:
+    """The spans of pieces whose rows follow each other: what goes on across a border is one."""
     found: list[Span] = []
-    for span in spans:
-        last = found[-1] if found else None
-        if last is not None and last.key == span.key and span.start_s - last.end_s <= within_s:
-            lows = [each for each in (last.low, span.low) if each is not None]
-            highs = [each for each in (last.high, span.high) if each is not None]
-            low, high = min(lows, default=None), max(highs, default=None)
-            found[-1] = Span(last.start_s, span.end_s, span.key, low, high)
-        else:
-            found.append(span)
+    goes_on = False
+    for spans in pieces:
+        more = list(spans)
+        if goes_on and more and more[0].from_first and more[0].key == found[-1].key:
+            more[0] = _as_one(found.pop(), more[0])
+        found += more
+        goes_on = bool(more) and more[-1].to_last
     return found
+
+
+def _as_one(before: Span, after: Span) -> Span:
+    lows = [each for each in (before.low, after.low) if each is not None]
+    highs = [each for each in (before.high, after.high) if each is not None]
+    low, high = min(lows, default=None), max(highs, default=None)
+    return replace(before, end_s=after.end_s, low=low, high=high, to_last=after.to_last)

@@ -16,6 +16,7 @@ from typing import Final
 
 from webots_mcp.store.history.columns import Columns, read_columns
 from webots_mcp.store.history.deadline import Deadline
+from webots_mcp.store.history.gaps import rows_by_bucket
 from webots_mcp.store.history.ranges import Segment
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.rollup import BUCKET_S, bucket_of, buckets, watermark
@@ -57,7 +58,11 @@ class Pieces:
     def add_rollups(
         self, connection: sqlite3.Connection, run_id: int, span: range, deadline: Deadline
     ) -> None:
-        """Add the stored rollups of those buckets, signal by signal until the deadline."""
+        """Add the stored rollups of those buckets, signal by signal until the deadline.
+
+        As with rows, all count: also those that do not hold the signal.
+        """
+        rows = rows_by_bucket(connection, run_id, span)
         for signal in self._signals:
             if signal.id is None:
                 continue
@@ -65,8 +70,11 @@ class Pieces:
                 self.cut_at_s = span.start * BUCKET_S
                 return
             parts = self._parts[signal.name]
-            for bucket, summary in buckets(connection, run_id, signal.id, span.start, span.stop):
-                parts[bucket].append(summary)
+            held = dict(buckets(connection, run_id, signal.id, span.start, span.stop))
+            for bucket in rows.keys() | held.keys():
+                summary = held.get(bucket, Summary())
+                whole = max(summary.rows, rows.get(bucket, 0))
+                parts[bucket].append(summary._replace(rows=whole))
 
     def of(self, name: str) -> list[tuple[int, Summary]]:
         """The buckets of a signal that have rows, in order."""

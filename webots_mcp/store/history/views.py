@@ -67,7 +67,7 @@ class View(Protocol):
         ...
 
     def spans(self, signal: Signal, condition: Condition) -> list[Span]:
-        """Where the condition holds; spans that follow each other directly are joined."""
+        """Where the condition holds in every row; across a recording gap it is taken to go on."""
         ...
 
     def courses(self, signal: Signal) -> Iterator[Course]:
@@ -102,7 +102,6 @@ class RowView:
             reached_s = columns.times[-1] if columns.times else 0.0
             self.notes.append(f"the time was over: searched up to {reached_s:g} s only")
         self._columns = columns
-        self._join_s = _join_s(columns.times)
 
     def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
         """All rows."""
@@ -115,7 +114,7 @@ class RowView:
     def spans(self, signal: Signal, condition: Condition) -> list[Span]:
         """From all rows."""
         values = self._columns.values[signal.name]
-        return joined(spans_in_rows(self._columns.times, values, condition), self._join_s)
+        return list(spans_in_rows(self._columns.times, values, condition))
 
     def courses(self, signal: Signal) -> Iterator[Course]:
         """All of it."""
@@ -177,7 +176,7 @@ class LongView:
         found = spans_in_pieces(
             self._connection, self._segment, signal, pieces, condition, self._deadline
         )
-        spans = joined(found, self._join_s)
+        spans = joined(found)
         if self._deadline.passed:
             self._cut()
         return spans
@@ -205,8 +204,10 @@ class LongView:
 
     @functools.cached_property
     def _totals(self) -> dict[int, Summary]:
-        rows = self._connection.execute(_COUNTS, self._span)
-        return {signal_id: Summary(*counts) for signal_id, *counts in rows}
+        """Rows count also where they lack the signal: as many as of the one that is in most."""
+        found = self._connection.execute(_COUNTS, self._span).fetchall()
+        rows = max((counted for _, counted, *_ in found), default=0)
+        return {signal_id: Summary(rows, *counts) for signal_id, _, *counts in found}
 
     @functools.cached_property
     def _sample(self) -> Columns:

@@ -141,6 +141,20 @@ def test_the_mark_of_a_command_that_was_taken_is_no_command(
     assert import_folder(database, peer.folder, data_dir).commands == 0
 
 
+def test_an_import_that_fails_at_last_leaves_neither_rows_nor_pictures(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.everything()
+    database.execute(
+        "CREATE TRIGGER full BEFORE INSERT ON log BEGIN SELECT raise(ABORT, 'disk full'); END"
+    )
+    with pytest.raises(sqlite3.Error, match="disk full"):
+        import_folder(database, peer.folder, data_dir)
+    assert set(counts(database).values()) == {0}
+    assert list(data_dir.rglob("*.png")) == []
+    assert not database.in_transaction
+
+
 def test_pictures_of_our_own_data_folder_stay_where_they_are(
     database: sqlite3.Connection, data_dir: Path
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -233,6 +234,20 @@ def test_marking_is_for_runs_that_exist(recorded: Recorded) -> None:
     with pytest.raises(UnknownRunError, match="no run 9"):
         mark_kept(recorded.connection, [1, 9])
     assert recorded.connection.execute("SELECT keep FROM run").fetchone() == (0,)
+
+
+def test_where_one_run_cannot_be_marked_none_is(recorded: Recorded) -> None:
+    connection = recorded.connection
+    for _ in range(2):
+        recorded.add_run(1)
+    connection.execute(
+        "CREATE TRIGGER no_more BEFORE UPDATE ON run WHEN NEW.id = 2 "
+        "BEGIN SELECT raise(ABORT, 'the disk is full'); END"
+    )
+    with pytest.raises(sqlite3.Error, match="the disk is full"):
+        mark_kept(connection, [1, 2])
+    assert connection.execute("SELECT keep FROM run").fetchall() == [(0,), (0,)]
+    assert not connection.in_transaction
 
 
 @pytest.mark.parametrize("limits", [{"rows": -1}, {"age_s": float("nan")}, {"size_bytes": -5}])

@@ -14,6 +14,7 @@ from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.connection import transaction
 from webots_mcp.contract import CAMERA_FOLDER, SCREENSHOT_FOLDER
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.json_folder.reading import (
@@ -78,12 +79,16 @@ def import_folder(
     folder, data_dir = folder.resolve(), data_dir.resolve()
     found = read_folder(folder)
     instance = f"import {_fingerprint(folder, found)}"
-    with _whole(connection):
+    with _taken_back() as made, transaction(connection):
         _require_new(connection, instance, folder, robot)
-        with _copied(found.pictures, folder, data_dir, robot) as paths:
-            writer = _Writer(connection, found, robot)
-            writer.write(instance, folder, paths, progress)
-            connection.execute("COMMIT")
+        paths = [
+            _copy(picture, _destination(picture, folder, data_dir, robot), made)
+            .relative_to(data_dir)
+            .as_posix()
+            for picture in found.pictures
+        ]
+        writer = _Writer(connection, found, robot)
+        writer.write(instance, folder, paths, progress)
     lines = found.log.lines if found.log else 0
     states, commands = int(found.state is not None), len(found.commands)
     return Imported(robot, writer.run_id, states, lines, commands, len(found.pictures))
@@ -114,47 +119,37 @@ def _require_new(connection: sqlite3.Connection, instance: str, folder: Path, ro
 
 
 @contextlib.contextmanager
-def _whole(connection: sqlite3.Connection) -> Generator[None]:
-    """A transaction that is undone unless it was committed inside."""
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        yield
-    finally:
-        if connection.in_transaction:
-            connection.execute("ROLLBACK")
-
-
-@contextlib.contextmanager
-def _copied(
-    pictures: tuple[FoundPicture, ...], folder: Path, data_dir: Path, robot: str
-) -> Generator[list[str]]:
-    """The pictures in our data folder, by their paths in it; taken back on an error."""
-    name = re.sub(r"[^\w-]", "_", robot)
+def _taken_back() -> Generator[list[Path]]:
+    """The files that are made inside; they go again on an error."""
     made: list[Path] = []
-    paths: list[str] = []
     try:
-        for picture in pictures:
-            file = _destination(picture, folder, data_dir, name)
-            if file != picture.file:
-                if file.exists():
-                    raise InvalidInputError(f"{file} is there already: move it away first")
-                file.parent.mkdir(parents=True, exist_ok=True)
-                made.append(file)
-                shutil.copy2(picture.file, file)
-            paths.append(file.relative_to(data_dir).as_posix())
-        yield paths
-    except BaseException as error:
+        yield made
+    except BaseException:
         for file in made:
             file.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise InvalidInputError(f"the pictures cannot be copied: {error}") from error
         raise
 
 
-def _destination(picture: FoundPicture, folder: Path, data_dir: Path, name: str) -> Path:
+def _copy(picture: FoundPicture, file: Path, made: list[Path]) -> Path:
+    """The picture where it belongs; a file that was made for it is noted."""
+    if file == picture.file:
+        return file
+    if file.exists():
+        raise InvalidInputError(f"{file} is there already: move it away first")
+    made.append(file)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(picture.file, file)
+    except OSError as error:
+        raise InvalidInputError(f"the pictures cannot be copied: {error}") from error
+    return file
+
+
+def _destination(picture: FoundPicture, folder: Path, data_dir: Path, robot: str) -> Path:
     """Where a picture goes; it stays where it is if its folder is our own."""
     if folder == data_dir:
         return picture.file
+    name = re.sub(r"[^\w-]", "_", robot)
     subfolder = CAMERA_FOLDER if picture.kind == "camera" else SCREENSHOT_FOLDER
     return data_dir / subfolder / name / picture.file.name
 

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Final
 
+from webots_mcp.connection import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.runs import fetch_run
 
@@ -91,8 +92,7 @@ def mark_kept(connection: sqlite3.Connection, run_ids: Sequence[int], *, keep: b
     Raises:
         UnknownRunError: There is no such run.
     """
-    for run_id in run_ids:
-        fetch_run(connection, run_id)
-    connection.execute("BEGIN IMMEDIATE")
-    connection.executemany(_MARK, [(int(keep), run_id) for run_id in run_ids])
-    connection.execute("COMMIT")
+    with transaction(connection):
+        for run_id in run_ids:
+            fetch_run(connection, run_id)
+        connection.executemany(_MARK, [(int(keep), run_id) for run_id in run_ids])

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.connection import is_busy, transaction
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.history.rollup import roll, watermark
 from webots_mcp.store.images import inside
@@ -155,7 +156,7 @@ class _Purge:
                 return  # another has deleted them
             if step.table == "state" and keys[-1][0] > watermark(self._connection):
                 roll(self._connection, ROLLED_ROWS)
-            elif self._exclusively(lambda step=step, keys=keys: self._delete(step, keys)):
+            elif self._deleted(step, keys):
                 left -= len(keys)
             yield self.purged
 
@@ -177,20 +178,34 @@ class _Purge:
         values = {"owner_id": step.owner_id, "bound": step.bound, "limit": limit}
         return self._connection.execute(_BATCHES[step.table].keys, values).fetchall()
 
-    def _delete(self, step: Step, keys: list[tuple[Any, ...]]) -> None:
-        """One batch, inside a transaction; nothing of a run that was marked since the plan."""
+    def _deleted(self, step: Step, keys: list[tuple[Any, ...]]) -> bool:
+        """One batch in one transaction; False where another holds the write lock."""
+        rows = 0
+
+        def delete() -> None:
+            nonlocal rows
+            with transaction(self._connection):
+                rows = self._delete(step, keys)
+
+        if not self._unless_locked(delete):
+            return False
+        self.purged.rows[step.table] += rows
+        return True
+
+    def _delete(self, step: Step, keys: list[tuple[Any, ...]]) -> int:
+        """So many rows; nothing of a run that was marked since the plan."""
         if step.table != "command" and self._first(_IS_KEPT, step.owner_id):
-            return
+            return 0
         paths = [self._first(_PATH, *key) for key in keys] if step.table == "image" else []
         session = self._first(_SESSION, step.owner_id) if step.table == "run" else None
         deleted = self._connection.executemany(_BATCHES[step.table].delete, keys).rowcount
-        self.purged.rows[step.table] += deleted
         if step.table == "state":
             self._connection.execute(_COUNT_PURGED, (deleted, step.owner_id))
         self._connection.execute(_FORGET_SESSION, (session,))
         for path in paths:
             if path and not self._first(_IN_USE, path):
                 self._delete_file(path)
+        return deleted
 
     def _delete_file(self, path: str) -> None:
         """Before the commit: a row that comes back without its file is found again."""
@@ -206,25 +221,13 @@ class _Purge:
         row = self._connection.execute(query, values).fetchone()
         return row[0] if row else None
 
-    def _exclusively(self, work: Callable[[], object]) -> bool:
-        """Do it in one transaction that takes the write lock first; False where that is taken."""
-        if not self._unless_locked(lambda: self._connection.execute("BEGIN IMMEDIATE")):
-            return False
-        try:
-            work()
-            self._connection.execute("COMMIT")
-        except BaseException:
-            self._connection.execute("ROLLBACK")
-            raise
-        return True
-
     def _unless_locked(self, work: Callable[[], object]) -> bool:
         try:
             work()
         except sqlite3.OperationalError as error:
-            self._failures += 1
-            if "locked" not in str(error):
+            if not is_busy(error):
                 raise
+            self._failures += 1
             if self._failures > _MOST_FAILURES:
                 raise DatabaseError(
                     f"another process held the write lock in {_MOST_FAILURES} attempts: end it "

@@ -6,13 +6,16 @@ import math
 import random
 import sqlite3
 import statistics
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.history.recording import Recorder
 from webots_mcp.store.history.ranges import resolve_range
+from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.history.shapes import (
     find_oscillation,
     find_spikes,
@@ -24,6 +27,7 @@ from webots_mcp.store.history.shapes import (
 from webots_mcp.store.history.trend import Trend
 from webots_mcp.store.history.trends import RunTrends, trends
 
+Course = Callable[[float], float | None]  # from the time; None leaves the key out
 numbers = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=50)
 
 
@@ -143,6 +147,93 @@ def test_a_spike_is_told(rover: sqlite3.Connection) -> None:
     assert ir.spikes is not None
     assert [(spike.sim_time_s, spike.value) for spike in ir.spikes] == [(70.0, 5.0)]
     assert "1 spike, the largest 5 at 70 s" in ir.says
+
+
+def record(
+    connection: sqlite3.Connection, *, rows: int, interval_s: float, **courses: Course
+) -> None:
+    """One run, rolled up: each signal by name with its course."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    connection.execute("BEGIN")
+    for index in range(rows):
+        time_s = round(index * interval_s, 6)
+        state = {name: course(time_s) for name, course in courses.items()}
+        present = {name: value for name, value in state.items() if value is not None}
+        recorder.publish(time_s, present)
+    connection.execute("COMMIT")
+    roll(connection, 100_000)
+
+
+def test_a_swing_faster_than_the_rollups_gets_no_period_of_an_alias(
+    empty: sqlite3.Connection, long_ranges: None
+) -> None:
+    def yaw(time_s: float) -> float:
+        return math.remainder(math.pi + 0.5 * math.sin(3 * time_s), 2 * math.pi)
+
+    record(empty, rows=4000, interval_s=0.1, sine=math.sin, yaw=yaw)
+    for name in ("sine", "yaw"):
+        trend = one(empty, name)
+        assert (trend.shape, trend.oscillation, trend.flat_since_s) == ("varying", None, None)
+        assert "varies faster than 10 s: ask for a shorter range" in trend.says
+        assert "varies faster" not in one(empty, name, start_s=100.0, end_s=109.0).says
+
+
+def test_a_swing_slower_than_the_rollups_is_told_in_both_tiers(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, rows=4000, interval_s=0.2, sine=lambda t: math.sin(2 * math.pi * t / 80))
+    sine = one(empty, "sine")
+    assert sine.shape == "oscillating" and sine.oscillation is not None
+    assert sine.oscillation.period_s == pytest.approx(80, rel=0.03)
+
+
+def test_what_swung_and_rests_is_said_to_have_swung(empty: sqlite3.Connection) -> None:
+    def swing(time_s: float) -> float:
+        return 0.3 * math.sin(math.pi * time_s) if 70 <= time_s < 82 else 0.0
+
+    record(empty, rows=1000, interval_s=0.1, swing=swing)
+    trend = one(empty, "swing")
+    assert trend.shape == "resting"
+    assert trend.says == "swung by 0.3 about 0 every 2 s from 70.1 to 82.1 s; flat at 0 since 82 s"
+
+
+def test_what_fell_rested_and_rose_twice_does_not_swing(empty: sqlite3.Connection) -> None:
+    record(empty, rows=1300, interval_s=0.1, front=lambda t: 1.0 if t % 60 < 30 else 0.05)
+    assert one(empty, "front").oscillation is None
+
+
+def test_noise_does_not_hide_a_swing(empty: sqlite3.Connection) -> None:
+    noise = random.Random(1)
+    record(
+        empty, rows=3000, interval_s=0.02,
+        sine=lambda t: math.sin(2 * math.pi * t / 5) + noise.gauss(0, 0.3),
+    )  # fmt: skip
+    sine = one(empty, "sine")
+    assert sine.oscillation is not None and sine.crossings in (23, 24)
+    assert sine.oscillation.period_s == pytest.approx(5, rel=0.02)
+
+
+@pytest.mark.parametrize("rate_rad_s", [0.2, -0.21])
+def test_an_angle_turns_by_as_much_as_it_turned(
+    empty: sqlite3.Connection, tier: str, rate_rad_s: float
+) -> None:
+    record(
+        empty, rows=2001, interval_s=0.05,
+        yaw=lambda t: math.remainder(0.6 + rate_rad_s * t, 2 * math.pi),
+    )  # fmt: skip
+    yaw = one(empty, "yaw")
+    assert yaw.says == f"turns by {rate_rad_s * 100:.3g} rad ({rate_rad_s:.3g} rad/s)"
+
+
+def test_rows_without_the_signal_are_rows_without_a_value(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, rows=2000, interval_s=0.1, x=float, lidar=lambda t: 1.0 + t if t < 100 else None)
+    lidar = one(empty, "lidar")
+    assert lidar.missing_share == pytest.approx(0.5)
+    assert "no value in 50 % of the rows" in lidar.says
 
 
 def test_missing_values_are_told(rover: sqlite3.Connection, tier: str) -> None:

@@ -254,7 +254,7 @@ def _difference(signal: Signal, groups: Sequence[dict[str, Summary]]) -> Differe
     summaries = [group[signal.name] for group in groups]
     counts = [summary.present if summary.sum is not None else 0 for summary in summaries]
     means = [summary.direction if angle else summary.mean for summary in summaries]
-    deviations = [_circular_deviation(each) if angle else each.deviation for each in summaries]
+    deviations = [each.circular_deviation if angle else each.deviation for each in summaries]
     effects = [
         _effect(mean, means[0], deviation, deviations[0], count, counts[0], angle=angle)
         for mean, deviation, count in zip(means, deviations, counts, strict=True)
@@ -270,14 +270,6 @@ def _difference(signal: Signal, groups: Sequence[dict[str, Summary]]) -> Differe
         count=counts,
         effect=effects,
     )
-
-
-def _circular_deviation(summary: Summary) -> float | None:
-    """sqrt(-2 ln R) with the mean resultant length R: Mardia and Jupp (2000), section 2.3.1."""
-    if summary.sines is None or summary.cosines is None or summary.present < 2:
-        return None
-    length = min(1.0, math.hypot(summary.sines, summary.cosines) / summary.present)
-    return math.sqrt(-2 * math.log(length)) if length > 0 else None
 
 
 def _effect(

@@ -18,7 +18,9 @@ from typing import Final
 TIME_BINS: Final = 8
 DEAD_BAND: Final = 0.3  # standard deviations about the mean within which noise may cross it
 MOST_IRREGULAR: Final = 0.4  # coefficient of variation of the half periods of an oscillation
-LEAST_CROSSINGS: Final = 4
+LEAST_CROSSINGS: Final = 6  # four are made by a value that fell, rested, and rose again
+SLOW_SHARE: Final = 0.5  # of the variance must be left in means for their course to be the values'
+AVERAGED: Final = 8  # values in one mean, where noise hides the crossings
 SPIKE_SCORE: Final = 8.0  # 3.5 is the usual; here thousands of values are looked at at once
 MOST_SPIKES_SHARE: Final = 0.001  # more than that are noise
 FLAT_BAND: Final = 0.005  # of the range: what moves less is at rest
@@ -39,11 +41,15 @@ class Oscillation:
     Attributes:
         crossings: How often the mean was crossed.
         amplitude: Median of the largest deviation in each half period.
+        start_s: Half a period before the first crossing; `end_s` half a one after the last (both
+            within the given times).
     """
 
     crossings: int
     period_s: float
     amplitude: float
+    start_s: float
+    end_s: float
 
 
 @dataclass(frozen=True)
@@ -78,19 +84,39 @@ def find_oscillation(
 
     A crossing counts when the value leaves a band of 0.3 standard deviations about the mean on the
     other side (a Schmitt trigger), so that noise about the mean makes none. Regular means: at
-    least four, at intervals whose standard deviation is at most 0.4 of their mean; noise of any
-    colour comes out near 1.
+    least six, at intervals whose standard deviation is at most 0.4 of their mean; noise of any
+    colour comes out near 1. Where they are not, stronger noise may hide a swing: then the means of
+    eight values each are looked at, if most of the variance is left in them.
     """
     if deviation == 0:
         return 0, None
-    moments, peaks = _crossings(times, values, mean, DEAD_BAND * deviation)
-    halves = [after - before for before, after in pairwise(moments)]
+    band = DEAD_BAND * deviation
+    crossings, swing = _regular_crossings(times, values, mean, band)
+    if swing is None and crossings >= LEAST_CROSSINGS:
+        means = _averaged(values)
+        if len(means) > 1 and statistics.variance(means) >= SLOW_SHARE * deviation**2:
+            smooth, swing = _regular_crossings(_averaged(times), means, mean, band)
+            crossings = smooth if swing else crossings
+    return crossings, swing
+
+
+def _averaged(values: Sequence[float]) -> list[float]:
+    ends = range(AVERAGED, len(values) + 1, AVERAGED)
+    return [sum(values[end - AVERAGED : end]) / AVERAGED for end in ends]
+
+
+def _regular_crossings(
+    times: Sequence[float], values: Sequence[float], mean: float, band: float
+) -> tuple[int, Oscillation | None]:
+    moments, peaks = _crossings(times, values, mean, band)
     if len(moments) < LEAST_CROSSINGS:
         return len(moments), None
+    halves = [after - before for before, after in pairwise(moments)]
     half_s = statistics.fmean(halves)
     if half_s <= 0 or statistics.pstdev(halves) > MOST_IRREGULAR * half_s:
         return len(moments), None
-    return len(moments), Oscillation(len(moments), 2 * half_s, statistics.median(peaks))
+    ends = (max(times[0], moments[0] - half_s), min(times[-1], moments[-1] + half_s))
+    return len(moments), Oscillation(len(moments), 2 * half_s, statistics.median(peaks), *ends)
 
 
 def _crossings(

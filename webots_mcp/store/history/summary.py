@@ -66,6 +66,17 @@ class Summary(NamedTuple):
             return None
         return math.sqrt(self.squares / (self.present - 1))
 
+    @property
+    def circular_deviation(self) -> float | None:
+        """Of an angle sqrt(-2 ln R) with the mean resultant length R.
+
+        K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.3.1.
+        """
+        if self.sines is None or self.cosines is None or self.present < 2:
+            return None
+        length = min(1.0, math.hypot(self.sines, self.cosines) / self.present)
+        return math.sqrt(-2 * math.log(length)) if length > 0 else None
+
 
 def circular_mean(sines: float, cosines: float, count: int) -> float | None:
     """The direction of the resultant vector: atan2(sum of sines, sum of cosines).

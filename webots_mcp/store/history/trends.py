@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -149,14 +150,18 @@ def _trend_of_pieces(signal: Signal, pieces: Pieces) -> Trend | None:
     summary = pieces.whole(signal.name)
     if summary.sum is None:
         return None
+    angle = signal.kind == "angle"
     middles: list[float] = []
     means: list[float] = []
+    inner: list[float] = []
     for _, part in pieces.of(signal.name):
-        centre = part.direction if signal.kind == "angle" else part.mean
+        centre = part.direction if angle else part.mean
         if centre is not None and part.first_sim_time_s is not None:
             middles.append((part.first_sim_time_s + (part.last_sim_time_s or 0.0)) / 2)
             means.append(centre)
-    return judge(signal, summary, middles, means, None)
+            inner.append((part.circular_deviation if angle else part.deviation) or 0.0)
+    variance = statistics.fmean(deviation**2 for deviation in inner)
+    return judge(signal, summary, middles, means, None, variance)
 
 
 def _state_trends(

@@ -19,7 +19,7 @@ ALLOWED = {
     "errors": set[str](),
     "bundled": set[str](),
     "connection": {"contract", "errors"},
-    "schema": {"contract", "errors"},
+    "schema": {"connection", "contract", "errors"},
     "settlement": {"contract"},
     "maintenance": {"connection", "errors", "schema"},
     "standin": {"standin", "bundled"},

@@ -28,6 +28,9 @@ FINAL_STATUSES: Final = ("done", "failed", "expired", "cancelled", "lost")
 LogLevel = Literal["debug", "info", "warning", "error"]
 LOG_LEVELS: Final[tuple[LogLevel, ...]] = get_args(LogLevel)  # in rising order
 
+PAUSED: Final = "paused"  # how a bridge holds its controller's loop, as the session tells it
+STEPPING: Final = "stepping"
+
 BUILT_IN_ACTIONS: Final = (
     "pause", "resume", "fast", "step", "reset", "reload", "screenshot", "reset_state",
 )  # fmt: skip

@@ -8,11 +8,12 @@ import sys
 import pytest
 
 from tests.store.recorded import Recorded, RecordedRobot
+from webots_mcp.store.queue import CommandQueue
 from webots_mcp.store.runs import current_run
 from webots_mcp.store.sessions import newest_session
 from webots_mcp.store.status import Status, judge
 
-NOW = 1_800_000_000.0
+NOW = 4_000_000_000.0  # later than this process, whose sessions these are
 
 
 def status_of(robot: RecordedRobot, after_s: float = 0.0) -> Status:
@@ -111,10 +112,46 @@ def test_a_loop_that_lives_without_moving_time_says_so(recorded: Recorded) -> No
     assert "stands still" in (status.why or "")
 
 
-def test_a_controller_that_never_moved_is_not_running(recorded: Recorded) -> None:
-    status = status_of(recorded.robot(now=NOW, moved_wall_time_s=None))
-    assert status.text == "stopped 0.0 s ago"
-    assert "not moved since" in (status.why or "")
+def test_a_controller_that_has_just_started_is_starting_and_soon_called_stopped(
+    recorded: Recorded,
+) -> None:
+    robot = recorded.robot(now=NOW, moved_wall_time_s=None)
+    assert status_of(robot, after_s=1) == ("starting", status_of(robot).why)
+    assert "just started" in (status_of(robot).why or "")
+    robot.beat(last_seen_wall_time_s=NOW + 5)
+    assert status_of(robot, after_s=5).text == "stopped 5.0 s ago"
+    assert "not moved since" in (status_of(robot, after_s=5).why or "")
+
+
+def test_a_loop_that_fell_silent_when_its_time_stopped_is_not_said_to_be_alive(
+    recorded: Recorded,
+) -> None:
+    status = status_of(recorded.robot(now=NOW), after_s=1.8)
+    assert status.text == "stopped 1.8 s ago"
+    assert "loop is silent" in (status.why or "")
+
+
+def claimed(robot: RecordedRobot, action: str, at: float) -> int:
+    command = CommandQueue(robot.connection).enqueue(robot.id, action)
+    robot.connection.execute(
+        "UPDATE command SET status = 'claimed', session_id = ?, claimed_wall_time_s = ?",
+        (robot.session_id, at),
+    )
+    return command.id
+
+
+def test_a_loop_that_is_inside_a_handler_says_in_which(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW)
+    command_id = claimed(robot, "slow", NOW)
+    status = status_of(robot, after_s=42)
+    assert status.text == "stopped 42 s ago"
+    assert status.why == f"its loop is inside the handler of command {command_id} (slow) for 42.0 s"
+
+
+def test_a_built_in_action_that_is_under_way_is_no_reason_to_stand(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW)
+    claimed(robot, "screenshot", NOW)
+    assert "loop is silent" in (status_of(robot, after_s=42).why or "")
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ class Clock:
         self._simulation = simulation
         self.sim_time_s = simulation.time_s
         self.moved_wall_time_s: float | None = None
+        self.steps_seen = 0  # looks at which time had gone forward
         self.run = Run("start", self.sim_time_s)
         self.ended_sim_time_s = self.sim_time_s  # of the run before this one
         self._reset_from_s: float | None = None
@@ -35,12 +36,18 @@ class Clock:
         self.sim_time_s = now
         if now > before + _EPSILON_S:
             self.moved_wall_time_s = time.time()
+            self.steps_seen += 1
         if now >= before - _EPSILON_S and not self._is_awaited_reset(now, came_round):
             return False
         self._reset_from_s = None
         self.ended_sim_time_s = before
         self.run = Run("reset", now)
+        self.let_go()
         return True
+
+    def let_go(self) -> None:
+        """From this moment on time moves; it counts as standing only after a while without."""
+        self.moved_wall_time_s = time.time()
 
     def await_reset(self) -> None:
         """A reset was asked for. It comes with the end of the next physics step.

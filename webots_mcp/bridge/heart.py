@@ -5,8 +5,9 @@ from __future__ import annotations
 import time
 
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.recorder import Pulse, Recorder
-from webots_mcp.contract import HEARTBEAT_INTERVAL_S
+from webots_mcp.bridge.pulse import Pulse
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.contract import HEARTBEAT_INTERVAL_S, PAUSED
 
 
 class Heart:
@@ -39,4 +40,6 @@ class Heart:
     def change_hold(self, hold: str | None) -> None:
         """Tell at once: whoever reads the command's answer must not see the old status."""
         self.hold = hold
+        if hold != PAUSED:
+            self._clock.let_go()
         self.beat()

@@ -8,6 +8,7 @@ from webots_mcp.bridge.commands import Command
 from webots_mcp.bridge.heart import Heart
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.contract import PAUSED, STEPPING
 
 PUMP_INTERVAL_S: Final = 0.01
 
@@ -34,7 +35,7 @@ class Hold:
         self._simulation.set_mode("pause")
         self.held = True
         self._journal.event("pause", {"command_id": command.id})
-        self._heart.change_hold("paused")
+        self._heart.change_hold(PAUSED)
 
     def release(self, command: Command, mode: str | None = None, *, stepping: bool = False) -> None:
         """Let the loop go on, in `mode` or in the one that it ran in before."""
@@ -43,7 +44,7 @@ class Hold:
         if self.held:
             self.held = False
             self._journal.event("resume", {"command_id": command.id})
-        self._heart.change_hold("stepping" if stepping else None)
+        self._heart.change_hold(STEPPING if stepping else None)
 
     def pump(self) -> None:
         """Hear from Webots: it may want to quit, or a person may have pressed play."""

@@ -5,14 +5,14 @@ from __future__ import annotations
 import sqlite3
 from typing import Final, NamedTuple
 
-from webots_mcp.contract import HEARTBEAT_INTERVAL_S
+from webots_mcp.contract import BUILT_IN_ACTIONS, HEARTBEAT_INTERVAL_S, PAUSED
 from webots_mcp.store.runs import Run
 from webots_mcp.store.sessions import Session, companions
 from webots_mcp.store.states import recent_interval_s
 
 NEVER_SEEN: Final = "never seen"
 RUNNING: Final = "running"
-PAUSED: Final = "paused"
+STARTING: Final = "starting"
 
 # A hold is noted as an event at the instant; the heartbeat tells of it only at its next beat.
 # What came after the beat has at least its simulation time, which bounds the search to the index.
@@ -20,6 +20,11 @@ _HOLD_SINCE_BEAT: Final = (
     "SELECT e.kind FROM run r JOIN event e ON e.run_id = r.id AND e.sim_time_s >= :sim_time_s "
     "WHERE r.session_id = :session_id AND e.wall_time_s > :beat_s "
     "AND e.kind IN ('pause', 'resume') ORDER BY e.id DESC LIMIT 1"
+)
+
+_CLAIMED: Final = (
+    "SELECT id, action, claimed_wall_time_s FROM command WHERE robot_id = ? AND session_id = ? "
+    "AND status = 'claimed' ORDER BY id DESC"
 )
 
 _STILL_MOVING_S: Final = 1.0
@@ -36,6 +41,7 @@ SILENT: Final = (
     "breakpoint, another controller looping, or an extern controller missing; from inside the "
     "simulation these look alike"
 )
+_STARTED: Final = "its controller has just started; simulation time has not moved yet"
 _NOT_STARTED: Final = (
     "its controller has started, but simulation time has not moved since: the simulation may be "
     "paused in Webots, or the controller has not reached its loop"
@@ -78,11 +84,36 @@ def judge(
     fresh = session.heartbeat_is_fresh(now_s)
     if fresh and _hold_since_beat(connection, session) == "resume":
         return Status(RUNNING)
-    if session.moved_wall_time_s is None:
-        return _stopped(session, now_s, _NOT_STARTED)
-    if now_s - session.moved_wall_time_s <= _still_moving_s(connection, run):
+    moved_s, still_moving_s = session.moved_wall_time_s, _still_moving_s(connection, run)
+    if moved_s is None and now_s - session.started_wall_time_s <= still_moving_s:
+        return Status(STARTING, _STARTED)
+    if moved_s is not None and now_s - moved_s <= still_moving_s:
         return Status(RUNNING)
-    return _stopped(session, now_s, _STANDING if fresh else SILENT)
+    return _stopped(session, now_s, _why_standing(connection, session, now_s))
+
+
+def _why_standing(connection: sqlite3.Connection, session: Session, now_s: float) -> str:
+    """Why the time of a living controller, which its bridge does not hold, stands still."""
+    if inside := _handler_at_work(connection, session, now_s):
+        return inside
+    if session.moved_wall_time_s is None:
+        return _NOT_STARTED
+    # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
+    beaten_since_s = session.last_seen_wall_time_s - session.moved_wall_time_s
+    alive = session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S
+    return _STANDING if alive else SILENT
+
+
+def _handler_at_work(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
+    """The custom action that the loop is inside of; it beats and steps only by itself there."""
+    claimed = connection.execute(_CLAIMED, (session.robot_id, session.id)).fetchall()
+    for command_id, action, since_s in claimed:
+        if action == "reset_state" or action not in BUILT_IN_ACTIONS:
+            return (
+                f"its loop is inside the handler of command {command_id} ({action}) for "
+                f"{max(now_s - since_s, 0.0):.1f} s"
+            )
+    return None
 
 
 def stopped_for(seconds: float) -> str:

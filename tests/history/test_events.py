@@ -242,3 +242,14 @@ def test_a_wall_range_over_several_runs_knows_the_signals_of_each(
     assert [(e.run_id, e.name, e.start_s) for e in found.events] == [
         (1, "alt_m", 2.0), (2, "depth_m", 2.0), (3, "temp_c", 2.0),
     ]  # fmt: skip
+
+
+def test_a_gap_is_an_event_also_where_the_range_lies_within_it(
+    rover: sqlite3.Connection, tier: str
+) -> None:
+    for start_s, end_s in ((91.0, 93.0), (88.0, 92.0), (94.0, 99.0)):
+        asked = {"run_id": 1, "start_s": start_s, "end_s": end_s}
+        assert spans(ask(rover, "gap", bounds=asked)) == [(89.9, 95.0)]
+    for start_s, end_s in ((80.0, 89.9), (95.0, 99.0)):
+        asked = {"run_id": 1, "start_s": start_s, "end_s": end_s}
+        assert spans(ask(rover, "gap", bounds=asked)) == []

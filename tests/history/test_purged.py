@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.history.recording import record_rover
+from tests.history.recording import WALL_START_S, record_rover
+from webots_mcp.store.history.events import find_events
 from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.history.series import RunHistory, query_history
@@ -55,3 +56,44 @@ def test_a_run_of_which_only_rollups_are_left_still_has_an_overview(
     run = overview(rover)
     assert run.numbers[0].count == [*[100] * 9, 50, 100]
     assert run.age_s > 0
+
+
+def test_a_range_that_begins_before_the_first_row_left_says_so(
+    rover: sqlite3.Connection, tmp_path: Path
+) -> None:
+    keep_rows(rover, tmp_path, 1500)
+    (note,) = resolve_range(rover, run_id=1).notes
+    assert "rows of run 1 before 55 s were purged" in note and "10 s summaries" in note
+    assert resolve_range(rover, run_id=1, start_s=60.0).notes == ()
+    assert "were purged" in resolve_range(rover, run_id=1, start_s=10.0, end_s=20.0).notes[0]
+
+
+def test_wall_time_reaches_into_what_was_purged(rover: sqlite3.Connection, tmp_path: Path) -> None:
+    keep_rows(rover, tmp_path, 1500)
+    start, end = WALL_START_S + 10, WALL_START_S + 40
+    found = resolve_range(rover, run_id=1, wall_start=start, wall_end=end)
+    (segment,) = found.segments
+    assert (segment.start_s, segment.end_s) == (
+        pytest.approx(20, abs=0.2), pytest.approx(80, abs=0.2),
+    )  # fmt: skip
+    assert "were purged" in found.notes[0]
+    (run,) = query_history(rover, found, ["pose.0"], max_points=500).runs
+    assert run.sim_time_s[0] <= 30.0
+
+
+def test_a_run_of_which_only_rollups_are_left_is_found_by_wall_time(
+    rover: sqlite3.Connection, tmp_path: Path
+) -> None:
+    keep_rows(rover, tmp_path, 900)
+    found = resolve_range(rover, wall_start=WALL_START_S, wall_end=WALL_START_S + 30)
+    assert [segment.run_id for segment in found.segments] == [1]
+    assert found.segments[0].end_s == pytest.approx(60, abs=0.2)
+    assert "the rows of run 1 were purged" in found.notes[0]
+
+
+def test_where_rows_were_purged_events_do_not_claim_to_have_looked_at_them(
+    rover: sqlite3.Connection, tmp_path: Path
+) -> None:
+    keep_rows(rover, tmp_path, 1500)
+    notes = find_events(rover, resolve_range(rover, run_id=1)).notes
+    assert any("searched from 55 s on only" in note for note in notes)

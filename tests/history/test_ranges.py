@@ -21,7 +21,8 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
-from webots_mcp.store.history.ranges import Segment, parse_wall_time, resolve_range
+from webots_mcp.store.history.ranges import Segment, resolve_range
+from webots_mcp.store.history.wall_time import parse_wall_time
 
 IN_SEGMENT = (
     "SELECT id FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
@@ -171,3 +172,11 @@ def test_a_wall_range_over_very_many_runs_takes_the_newest(empty: sqlite3.Connec
     found = resolve_range(empty, wall_start=0.0)
     assert [segment.run_id for segment in found.segments] == list(range(11, 61))
     assert "newest 50 runs" in found.notes[0]
+
+
+def test_a_range_within_a_recording_gap_says_what_is_missing(rover: sqlite3.Connection) -> None:
+    (note,) = resolve_range(rover, run_id=1, start_s=91.0, end_s=93.0).notes
+    assert note == "no row: nothing was recorded between 89.9 and 95 s of run 1"
+    start, end = WALL_START_S + 45.5, WALL_START_S + 46.5
+    found = resolve_range(rover, run_id=1, wall_start=start, wall_end=end)
+    assert (found.segments, found.notes) == ((), ("no row of robot 'rover' in that wall time",))

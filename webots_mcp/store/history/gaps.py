@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import statistics
 from collections.abc import Iterator, Sequence
@@ -14,11 +15,16 @@ from webots_mcp.store.history.rollup import BUCKET_S, bucket_of
 
 GAP_INTERVALS: Final = 3.0  # a gap is longer than so many median intervals
 _SAMPLE_ROWS: Final = 2000
+_ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
 _MOST_BUCKETS: Final = 300  # of a long stretch that are looked into row by row
 
 _TIMES: Final = (  # answered by the index alone
     "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
     "ORDER BY sim_time_s LIMIT ?"
+)
+_BEFORE: Final = (
+    "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s < ? "
+    "ORDER BY sim_time_s DESC LIMIT ?"
 )
 # The signal that is in most rows tells how many a bucket has, and its first and last time.
 _BUCKETS: Final = (
@@ -49,6 +55,15 @@ class Rhythm:
 
     interval_s: float | None
     gaps: tuple[Gap, ...]
+
+
+def with_rows_around(connection: sqlite3.Connection, segment: Segment) -> Segment:
+    """The segment with some rows before and after it: a gap at its end, or all around it, shows."""
+    before = connection.execute(_BEFORE, (segment.run_id, segment.start_s, _ROWS_AROUND)).fetchall()
+    after = _times(connection, segment.run_id, segment.end_s, math.inf, _ROWS_AROUND)
+    start_s = before[-1][0] if before else segment.start_s
+    end_s = math.nextafter(after[-1], math.inf) if after else segment.end_s
+    return Segment(segment.run_id, start_s, end_s)
 
 
 def rhythm_of(times: Sequence[float]) -> Rhythm:

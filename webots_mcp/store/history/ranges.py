@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Callable
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
+from webots_mcp.store.history.coverage import coverage_notes, purge_notes
 from webots_mcp.store.history.subject import Subject, find_subject
+from webots_mcp.store.history.wall_time import parse_wall_time, simulation_times
 
 _PURGED: Final = (
     "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0 "
@@ -34,15 +34,6 @@ _RUNS_IN: Final = (
     "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) "
     "AND (? IS NULL OR id = ?) ORDER BY id DESC LIMIT ?"
 )
-_WALL_UP_TO: Final = (  # of the last row at or before a simulation time
-    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_WALL_FROM: Final = (  # of the first row at or after a simulation time
-    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? "
-    "ORDER BY sim_time_s, id LIMIT 1"
-)
-_BISECTIONS: Final = 60
 MOST_RUNS: Final = 50  # that one range in wall time may hold
 
 
@@ -88,7 +79,8 @@ class TimeRange:
 
     Attributes:
         segments: One per run, in the order of the runs.
-        notes: What the asker should know: where the range reaches outside the recording.
+        notes: What the asker should know: where the range reaches outside the recording, or into
+            what was purged or never recorded.
     """
 
     robot_id: int
@@ -156,34 +148,6 @@ def _require_order(start_s: float, end_s: float, start_name: str, end_name: str)
         )
 
 
-def parse_wall_time(value: float | str | None, default_s: float = math.nan) -> float:
-    """Unix seconds of a wall time, given as such or in ISO 8601.
-
-    Without an offset ISO times are local times of this machine.
-
-    Raises:
-        InvalidRangeError: Neither a finite number nor ISO 8601.
-    """
-    if value is None:
-        return default_s
-    try:
-        seconds = float(value)
-    except ValueError:
-        seconds = _iso_seconds(str(value))
-    if not math.isfinite(seconds):
-        raise InvalidRangeError(f"{value!r} is no finite time in Unix seconds")
-    return seconds
-
-
-def _iso_seconds(text: str) -> float:
-    try:
-        return datetime.fromisoformat(text.strip().replace("Z", "+00:00")).timestamp()
-    except (ValueError, OverflowError, OSError) as error:
-        raise InvalidRangeError(
-            f"{text!r} is no time: give Unix seconds or ISO 8601 such as 2026-05-04T13:30:00+02:00"
-        ) from error
-
-
 def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
     """Simulation times between which a run recorded; None if it has no row.
 
@@ -237,22 +201,8 @@ def _in_simulation_time(
     end = just_after(max(newest_s, start)) if end_s is None else end_s
     _require_order(start, end, "start_s", "end_s")
     segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
-    notes = _notes_outside(segment, first_s, newest_s)
+    notes = tuple(coverage_notes(connection, run_id, (start, end), bounds))
     return TimeRange(subject.robot_id, subject.robot, (segment,), "simulation", notes)
-
-
-def _notes_outside(segment: Segment, first_s: float, newest_s: float) -> tuple[str, ...]:
-    run = f"run {segment.run_id}"
-    if segment.end_s <= first_s:
-        return (f"no row: the range ends before the first row of {run} at {first_s:g} s",)
-    if segment.start_s > newest_s:
-        return (f"no row: the range begins after the newest row of {run} at {newest_s:g} s",)
-    notes: list[str] = []
-    if segment.start_s < first_s:
-        notes.append(f"the recording of {run} begins at {first_s:g} s, within the range")
-    if segment.end_s > just_after(newest_s):
-        notes.append(f"the recording of {run} ends at {newest_s:g} s, within the range")
-    return tuple(notes)
 
 
 def _in_wall_time(
@@ -267,6 +217,8 @@ def _in_wall_time(
     cuts = (_cut(connection, run, wall_start_s, wall_end_s) for run in reversed(runs[:MOST_RUNS]))
     segments = tuple(segment for segment in cuts if segment is not None)
     notes = [] if segments else [f"no row of robot {subject.robot!r} in that wall time"]
+    for segment in segments:
+        notes += purge_notes(connection, segment.run_id, segment.start_s)
     if len(runs) > MOST_RUNS:
         notes.append(f"only the newest {MOST_RUNS} runs in that wall time are looked at")
     return TimeRange(subject.robot_id, subject.robot, segments, "wall", tuple(notes))
@@ -275,37 +227,11 @@ def _in_wall_time(
 def _cut(
     connection: sqlite3.Connection, run_id: int, wall_start_s: float, wall_end_s: float
 ) -> Segment | None:
-    """The part of a run in [wall_start_s, wall_end_s): wall time rises with simulation time."""
-    bounds = _row_bounds(connection, run_id)
-    if bounds is None:
-        return None
-
-    def wall_s(query: str, time_s: float) -> float:
-        return float(connection.execute(query, (run_id, time_s)).fetchone()[0])
-
-    def begun(time_s: float) -> bool:
-        return wall_s(_WALL_UP_TO, time_s) >= wall_start_s
-
-    def over(time_s: float) -> bool:
-        return wall_s(_WALL_FROM, time_s) >= wall_end_s
-
-    first_s, newest_s = bounds
-    if not begun(newest_s) or over(first_s):
-        return None
-    start_s = first_s if begun(first_s) else _turn(first_s, newest_s, begun)[1]
-    last_s = _turn(first_s, newest_s, over)[0] if over(newest_s) else newest_s
+    """The part of a run in [wall_start_s, wall_end_s)."""
+    recorded = recorded_bounds(connection, run_id)
     walls = (wall_start_s, wall_end_s)
+    found = simulation_times(connection, run_id, recorded, walls) if recorded else None
+    if found is None:
+        return None
+    start_s, last_s = found
     return Segment(run_id, start_s, just_after(last_s), *walls, open_start=True, open_end=True)
-
-
-def _turn(
-    before_s: float, after_s: float, has_turned: Callable[[float], bool]
-) -> tuple[float, float]:
-    """The last time before and the first after something turned from false to true."""
-    for _ in range(_BISECTIONS):
-        middle_s = (before_s + after_s) / 2
-        if has_turned(middle_s):
-            after_s = middle_s
-        else:
-            before_s = middle_s
-    return before_s, after_s

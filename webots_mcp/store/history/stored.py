@@ -12,7 +12,7 @@ from webots_mcp.store.history.changes import Point, change_points
 from webots_mcp.store.history.columns import exceeds, read_columns
 from webots_mcp.store.history.deadline import Deadline
 from webots_mcp.store.history.event import LEVELS, Event, EventOptions
-from webots_mcp.store.history.gaps import rhythm_in, rhythm_of
+from webots_mcp.store.history.gaps import rhythm_in, rhythm_of, with_rows_around
 from webots_mcp.store.history.ranges import Segment
 from webots_mcp.store.history.registry import Signal
 
@@ -77,15 +77,17 @@ def run_events(connection: sqlite3.Connection, segment: Segment) -> Iterator[Eve
 
 
 def gap_events(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> list[Event]:
-    """Where rows are missing."""
-    if exceeds(connection, segment):
-        rhythm = rhythm_in(connection, segment)
+    """Where rows are missing: gaps that the segment touches, also all around it."""
+    around = with_rows_around(connection, segment)
+    if exceeds(connection, around):
+        rhythm = rhythm_in(connection, around)
     else:
-        rhythm = rhythm_of(read_columns(connection, segment, (), deadline).times)
+        rhythm = rhythm_of(read_columns(connection, around, (), deadline).times)
     details = {"usual_interval_s": rhythm.interval_s}
     return [
         Event("gap", segment.run_id, gap.start_s, gap.end_s, wall_s, None, details)
         for gap in rhythm.gaps
+        if gap.end_s > segment.start_s and gap.start_s < segment.end_s
         for wall_s in [wall_time_at(connection, segment.run_id, gap.start_s)]
     ]
 

@@ -194,10 +194,10 @@ class LongView:
     def newest(self, signals: Sequence[Signal]) -> Columns:
         """The newest rows."""
         part = newest_part(self._connection, self._segment)
-        self.notes.append(
-            f"oscillation and jumps of the position were searched from {part.start_s:g} s on only"
-        )
         columns = read_columns(self._connection, part, signals, self._deadline)
+        if columns.times and columns.times[0] > self._segment.start_s:
+            since = f"from {columns.times[0]:g} s on only"
+            self.notes.append(f"oscillation and jumps of the position were searched {since}")
         if columns.cut:
             self._cut()
         return columns

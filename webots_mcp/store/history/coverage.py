@@ -1,0 +1,62 @@
+"""What a range asks for that the recording does not have, told to the asker."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Iterator
+from typing import Final
+
+_ROWS_LEFT: Final = (
+    "SELECT (SELECT min(sim_time_s) FROM state WHERE run_id = run.id) FROM run "
+    "WHERE id = ? AND purged_rows > 0"
+)
+_ROW_IN: Final = (
+    "SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? LIMIT 1"
+)
+_LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
+_FIRST_FROM: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s >= ?"
+
+
+def coverage_notes(
+    connection: sqlite3.Connection,
+    run_id: int,
+    span: tuple[float, float],
+    recorded: tuple[float, float],
+) -> Iterator[str]:
+    """Notes on [start, end) of a run that was recorded from the first to the newest time."""
+    (start_s, end_s), (first_s, newest_s) = span, recorded
+    run = f"run {run_id}"
+    if end_s <= first_s:
+        yield f"no row: the range ends before the first row of {run} at {first_s:g} s"
+    elif start_s > newest_s:
+        yield f"no row: the range begins after the newest row of {run} at {newest_s:g} s"
+    else:
+        if start_s < first_s:
+            yield f"the recording of {run} begins at {first_s:g} s, within the range"
+        if end_s > math.nextafter(newest_s, math.inf):
+            yield f"the recording of {run} ends at {newest_s:g} s, within the range"
+        yield from purge_notes(connection, run_id, start_s)
+        yield from _gap_notes(connection, run_id, start_s, end_s)
+
+
+def purge_notes(connection: sqlite3.Connection, run_id: int, start_s: float) -> Iterator[str]:
+    """That rows from `start_s` on were purged, and what is left of that time."""
+    found = connection.execute(_ROWS_LEFT, (run_id,)).fetchone()
+    if found is None or (found[0] is not None and start_s >= found[0]):
+        return
+    when = "" if found[0] is None else f" before {found[0]:g} s"
+    left = "of that time only 10 s summaries are left (no single rows, jumps, stuck or export)"
+    yield f"the rows of run {run_id}{when} were purged: {left}"
+
+
+def _gap_notes(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> Iterator[str]:
+    """That the range lies between two rows."""
+    if connection.execute(_ROW_IN, (run_id, start_s, end_s)).fetchone():
+        return
+    before_s = connection.execute(_LAST_BEFORE, (run_id, start_s)).fetchone()[0]
+    after_s = connection.execute(_FIRST_FROM, (run_id, end_s)).fetchone()[0]
+    if before_s is not None and after_s is not None:
+        yield f"no row: nothing was recorded between {before_s:g} and {after_s:g} s of run {run_id}"

@@ -1,0 +1,121 @@
+"""Wall times as a person gives them, and the part of a run that lies between two of them."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Callable
+from datetime import datetime
+from typing import Final
+
+from webots_mcp.errors import InvalidRangeError
+
+_ENDS: Final = (
+    "SELECT started_sim_time_s, started_wall_time_s, last_sim_time_s, last_wall_time_s "
+    "FROM run WHERE id = ?"
+)
+_FIRST_ROW: Final = (
+    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? ORDER BY sim_time_s, id LIMIT 1"
+)
+_UP_TO: Final = (  # of the last row at or before a simulation time
+    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_FROM: Final = (  # of the first row at or after a simulation time
+    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? "
+    "ORDER BY sim_time_s, id LIMIT 1"
+)
+_BISECTIONS: Final = 60
+
+
+def parse_wall_time(value: float | str | None, default_s: float = math.nan) -> float:
+    """Unix seconds of a wall time, given as such or in ISO 8601.
+
+    Without an offset ISO times are local times of this machine.
+
+    Raises:
+        InvalidRangeError: Neither a finite number nor ISO 8601.
+    """
+    if value is None:
+        return default_s
+    try:
+        seconds = float(value)
+    except ValueError:
+        seconds = _iso_seconds(str(value))
+    if not math.isfinite(seconds):
+        raise InvalidRangeError(f"{value!r} is no finite time in Unix seconds")
+    return seconds
+
+
+def _iso_seconds(text: str) -> float:
+    try:
+        return datetime.fromisoformat(text.strip().replace("Z", "+00:00")).timestamp()
+    except (ValueError, OverflowError, OSError) as error:
+        raise InvalidRangeError(
+            f"{text!r} is no time: give Unix seconds or ISO 8601 such as 2026-05-04T13:30:00+02:00"
+        ) from error
+
+
+def simulation_times(
+    connection: sqlite3.Connection,
+    run_id: int,
+    recorded: tuple[float, float],
+    walls: tuple[float, float],
+) -> tuple[float, float] | None:
+    """First and last simulation time of a run in [start, end) of wall time; None without any.
+
+    Wall time rises with simulation time, so both are found by bisection.
+
+    Args:
+        connection: Any.
+        run_id: Which.
+        recorded: Simulation times of its first and newest row, purged ones too.
+        walls: Unix times.
+    """
+    clock = _RunClock(connection, run_id)
+
+    def begun(time_s: float) -> bool:
+        return clock.wall_s(_UP_TO, time_s) >= walls[0]
+
+    def over(time_s: float) -> bool:
+        return clock.wall_s(_FROM, time_s) >= walls[1]
+
+    first_s, newest_s = recorded
+    if not begun(newest_s) or over(first_s):
+        return None
+    start_s = first_s if begun(first_s) else _turn(first_s, newest_s, begun)[1]
+    last_s = _turn(first_s, newest_s, over)[0] if over(newest_s) else newest_s
+    return (start_s, last_s) if start_s <= last_s else None  # else between two rows
+
+
+class _RunClock:
+    """The wall times of a run; of purged rows as if wall time had risen evenly."""
+
+    def __init__(self, connection: sqlite3.Connection, run_id: int) -> None:
+        self._connection = connection
+        self._run_id = run_id
+        *start, last_s, last_wall_s = connection.execute(_ENDS, (run_id,)).fetchone()
+        first_row = connection.execute(_FIRST_ROW, (run_id,)).fetchone()
+        self._start_s, self._start_wall_s = start
+        self._rows_from_s, self._rows_from_wall_s = first_row or (last_s, last_wall_s)
+
+    def wall_s(self, query: str, time_s: float) -> float:
+        """At a simulation time within the recording."""
+        if time_s >= self._rows_from_s:
+            row = self._connection.execute(query, (self._run_id, time_s)).fetchone()
+            return float(row[0]) if row else self._rows_from_wall_s
+        share = (time_s - self._start_s) / (self._rows_from_s - self._start_s)
+        return self._start_wall_s + share * (self._rows_from_wall_s - self._start_wall_s)
+
+
+def _turn(
+    before_s: float, after_s: float, has_turned: Callable[[float], bool]
+) -> tuple[float, float]:
+    """The last time before and the first after something turned from false to true."""
+    for _ in range(_BISECTIONS):
+        middle_s = (before_s + after_s) / 2
+        if has_turned(middle_s):
+            after_s = middle_s
+        else:
+            before_s = middle_s
+    return before_s, after_s

@@ -14,7 +14,7 @@ from webots_mcp.errors import (
     UnknownRunError,
 )
 from webots_mcp.store.robots import list_robots, resolve_robot
-from webots_mcp.store.runs import count_runs, current_run, fetch_run, runs_since
+from webots_mcp.store.runs import count_runs, current_run, fetch_run, runs_of
 
 
 def ended(recorded: Recorded, name: str) -> None:
@@ -67,7 +67,7 @@ def test_the_newest_run_is_the_current_one(recorded: Recorded) -> None:
     run = current_run(recorded.connection, robot.id)
     assert run is not None
     assert (run.id, run.start_reason) == (second, "reset")
-    assert [r.id for r in runs_since(recorded.connection, robot.id, first)] == [first, second]
+    assert [r.id for r in runs_of(recorded.connection, robot.id)] == [first, second]
     assert count_runs(recorded.connection, robot.id) == 2
 
 

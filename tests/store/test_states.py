@@ -14,12 +14,10 @@ from webots_mcp.errors import InvalidInputError, InvalidRangeError
 from webots_mcp.store.logs import LogFilter, count_lines, newest_lines
 from webots_mcp.store.states import (
     State,
-    fetch_states,
     newest_state,
-    newest_state_id,
     real_time_factor,
     select,
-    state_ids_after,
+    states_of,
 )
 from webots_mcp.store.window import Window, resolve_window
 
@@ -87,15 +85,13 @@ def test_a_wrong_path_is_answered_with_what_there_is(path: str, said: str) -> No
         select({"sensors": [1, 2]}, path)
 
 
-def test_only_rows_recorded_after_the_cursor_are_read(recorded: Recorded) -> None:
-    robot = recorded.robot()
-    robot.state(1.0, {"x": 1})
-    cursor = newest_state_id(recorded.connection)
-    robot.state(1.0, {"x": 2})
-    robot.state(2.0, {"x": 3})
-    ids = state_ids_after(recorded.connection, robot.run_id, cursor, 1.0)
-    rows = list(fetch_states(recorded.connection, [*ids, 999]))
-    assert [row.value()["x"] for row in rows] == [2, 3]
+def test_the_rows_of_a_run_come_in_order_and_without_those_of_others(recorded: Recorded) -> None:
+    robot, other = recorded.robot(), recorded.robot("other")
+    for time_s, x in ((1.0, 1), (1.0, 2), (2.0, 3)):
+        robot.state(time_s, {"x": x})
+        other.state(time_s, {"x": 0})
+    rows = states_of(recorded.connection, robot.run_id)
+    assert [row.value()["x"] for row in rows] == [1, 2, 3]
 
 
 def test_the_real_time_factor_is_that_of_the_last_seconds(recorded: Recorded) -> None:

@@ -7,15 +7,7 @@ import sqlite3
 from dataclasses import dataclass
 from typing import Any, Final
 
-_COLUMNS: Final = "id, run_id, sim_time_s, wall_time_s, kind, name, data"
-_NEWEST: Final = (
-    f"SELECT {_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT ?"
-)
-_AFTER: Final = (
-    f"SELECT {_COLUMNS} FROM event WHERE run_id = :run_id AND id > :after_id "
-    "ORDER BY sim_time_s, id LIMIT :limit"
-)
-_NEWEST_ID: Final = "SELECT coalesce(max(id), 0) FROM event"
+from webots_mcp.store.rows import columns_of
 
 
 @dataclass(frozen=True)
@@ -35,20 +27,13 @@ class Event:
         return json.loads(self.data) if self.data else None
 
 
+_COLUMNS: Final = columns_of(Event)
+_NEWEST: Final = (
+    f"SELECT {_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT ?"
+)
+
+
 def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> list[Event]:
-    """The latest events of a run, oldest first."""
+    """The latest events of a run, oldest first; with a limit of -1 all of them."""
     rows = connection.execute(_NEWEST, (run_id, limit)).fetchall()
     return [Event(*row) for row in reversed(rows)]
-
-
-def events_after(
-    connection: sqlite3.Connection, run_id: int, after_id: int, limit: int
-) -> list[Event]:
-    """The events of a run with greater ids, in order."""
-    values = {"run_id": run_id, "after_id": after_id, "limit": limit}
-    return [Event(*row) for row in connection.execute(_AFTER, values).fetchall()]
-
-
-def newest_event_id(connection: sqlite3.Connection) -> int:
-    """A cursor: events noticed from now on have greater ids."""
-    return int(connection.execute(_NEWEST_ID).fetchone()[0])

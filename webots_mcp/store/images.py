@@ -8,15 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-
-_COLUMNS: Final = "id, run_id, sim_time_s, wall_time_s, kind, device, path, width, height, bytes"
-_NEWEST: Final = (
-    f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND kind = :kind "
-    "AND (:device IS NULL OR device = :device) ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_DEVICES: Final = (
-    "SELECT DISTINCT device FROM image WHERE run_id = ? AND kind = 'camera' AND device IS NOT NULL"
-)
+from webots_mcp.store.rows import columns_of
 
 
 @dataclass(frozen=True)
@@ -37,6 +29,16 @@ class StoredImage:
     def file(self, data_dir: Path) -> Path:
         """The file itself; see `inside` for the errors."""
         return inside(data_dir, self.path)
+
+
+_COLUMNS: Final = columns_of(StoredImage)
+_NEWEST: Final = (
+    f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND kind = :kind "
+    "AND (:device IS NULL OR device = :device) ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_DEVICES: Final = (
+    "SELECT DISTINCT device FROM image WHERE run_id = ? AND kind = 'camera' AND device IS NOT NULL"
+)
 
 
 def inside(data_dir: Path, path: str) -> Path:

@@ -4,21 +4,10 @@ from __future__ import annotations
 
 import sqlite3
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 from webots_mcp.errors import UnknownRunError
-
-_COLUMNS: Final = (
-    "id, session_id, robot_id, world, basic_time_step_ms, start_reason, started_wall_time_s, "
-    "started_sim_time_s, last_wall_time_s, last_sim_time_s, ended_wall_time_s, end_reason, rows"
-)
-_CURRENT: Final = f"SELECT {_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
-_BY_ID: Final = f"SELECT {_COLUMNS} FROM run WHERE id = ?"
-_SINCE: Final = f"SELECT {_COLUMNS} FROM run WHERE robot_id = ? AND id >= ? ORDER BY id"
-_NEWEST_IDS: Final = (
-    "SELECT id FROM run WHERE :robot_id IS NULL OR robot_id = :robot_id ORDER BY id DESC LIMIT 10"
-)
-_COUNT: Final = "SELECT count(*) FROM run WHERE robot_id = ?"
+from webots_mcp.store.rows import columns_of
 
 
 @dataclass(frozen=True)
@@ -38,6 +27,16 @@ class Run:
     ended_wall_time_s: float | None
     end_reason: str | None
     rows: int
+
+
+_COLUMNS: Final = columns_of(Run)
+_CURRENT: Final = f"SELECT {_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
+_BY_ID: Final = f"SELECT {_COLUMNS} FROM run WHERE id = ?"
+_OF_ROBOT: Final = f"SELECT {_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id"
+_NEWEST_IDS: Final = (
+    "SELECT id FROM run WHERE :robot_id IS NULL OR robot_id = :robot_id ORDER BY id DESC LIMIT 10"
+)
+_COUNT: Final = "SELECT count(*) FROM run WHERE robot_id = ?"
 
 
 def current_run(connection: sqlite3.Connection, robot_id: int) -> Run | None:
@@ -63,10 +62,9 @@ def fetch_run(connection: sqlite3.Connection, run_id: int, robot_id: int | None 
     return Run(*row)
 
 
-def runs_since(connection: sqlite3.Connection, robot_id: int, first_run_id: int) -> list[Run]:
-    """The robot's runs from that id on, oldest first."""
-    rows: list[Any] = connection.execute(_SINCE, (robot_id, first_run_id)).fetchall()
-    return [Run(*row) for row in rows]
+def runs_of(connection: sqlite3.Connection, robot_id: int) -> list[Run]:
+    """All runs of the robot, oldest first."""
+    return [Run(*row) for row in connection.execute(_OF_ROBOT, (robot_id,)).fetchall()]
 
 
 def count_runs(connection: sqlite3.Connection, robot_id: int) -> int:

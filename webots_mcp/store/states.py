@@ -5,33 +5,11 @@ from __future__ import annotations
 import itertools
 import json
 import sqlite3
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, cast
 
 from webots_mcp.errors import InvalidInputError
-
-_COLUMNS: Final = "id, run_id, sim_time_s, wall_time_s, data, odd"
-_NEWEST: Final = (
-    f"SELECT {_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_RECENT_TIMES: Final = (
-    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
-)
-# Simulation time bounds the search to the index; the id then cuts off what came before.
-_WINDOW_IDS: Final = (
-    "SELECT id FROM state WHERE run_id = :run_id AND sim_time_s >= :from_sim_time_s "
-    "AND id > :after_id ORDER BY sim_time_s, id"
-)
-_BY_ID: Final = f"SELECT {_COLUMNS} FROM state WHERE id = ?"
-_NEWEST_ID: Final = "SELECT coalesce(max(id), 0) FROM state"
-
-PACE_ROWS: Final = 6
-PACE_WINDOW_S: Final = 5.0
-_PACE_WINDOW_ROWS: Final = 500
-_SHOWN_KEYS: Final = 20
-_SHOWN_KEY_CHARACTERS: Final = 40
+from webots_mcp.store.rows import columns_of
 
 
 @dataclass(frozen=True)
@@ -57,31 +35,39 @@ class State:
         return json.loads(self.odd) if self.odd else {}
 
 
+_COLUMNS: Final = columns_of(State)
+_NEWEST: Final = (
+    f"SELECT {_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_RECENT_TIMES: Final = (
+    "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
+)
+_BY_ID: Final = f"SELECT {_COLUMNS} FROM state WHERE id = ?"
+_OF_RUN: Final = f"SELECT {_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s, id"
+
+PACE_ROWS: Final = 6
+PACE_WINDOW_S: Final = 5.0
+_PACE_WINDOW_ROWS: Final = 500
+_SHOWN_KEYS: Final = 20
+_SHOWN_KEY_CHARACTERS: Final = 40
+
+
 def newest_state(connection: sqlite3.Connection, run_id: int) -> State | None:
     """The latest row of a run."""
     row = connection.execute(_NEWEST, (run_id,)).fetchone()
     return State(*row) if row else None
 
 
-def newest_state_id(connection: sqlite3.Connection) -> int:
-    """A cursor: rows recorded from now on have greater ids."""
-    return int(connection.execute(_NEWEST_ID).fetchone()[0])
+def fetch_state(connection: sqlite3.Connection, state_id: int) -> State | None:
+    """The row of that id; None where it was deleted."""
+    row = connection.execute(_BY_ID, (state_id,)).fetchone()
+    return State(*row) if row else None
 
 
-def state_ids_after(
-    connection: sqlite3.Connection, run_id: int, after_id: int, from_sim_time_s: float
-) -> list[int]:
-    """The ids of a run's rows after that one, in order; read from the index alone."""
-    values = {"run_id": run_id, "after_id": after_id, "from_sim_time_s": from_sim_time_s}
-    return [row[0] for row in connection.execute(_WINDOW_IDS, values).fetchall()]
-
-
-def fetch_states(connection: sqlite3.Connection, ids: Iterable[int]) -> Iterator[State]:
-    """The rows of those ids, one by one; one that was deleted meanwhile is left out."""
-    for state_id in ids:
-        row = connection.execute(_BY_ID, (state_id,)).fetchone()
-        if row is not None:
-            yield State(*row)
+def states_of(connection: sqlite3.Connection, run_id: int) -> list[State]:
+    """All rows of a run, in order."""
+    return [State(*row) for row in connection.execute(_OF_RUN, (run_id,)).fetchall()]
 
 
 def recent_interval_s(connection: sqlite3.Connection, run_id: int) -> float | None:

@@ -10,10 +10,10 @@ from contextlib import closing, contextmanager
 from typing import Any, Final
 
 from webots_mcp.connection import Role, connect
-from webots_mcp.contract import Database
+from webots_mcp.contract import LOG_LEVELS, Database
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.schema import schema_version
-from webots_mcp.store.events import Event, events_after
+from webots_mcp.store.events import Event, newest_events
 from webots_mcp.store.history.columns import read_columns
 from webots_mcp.store.history.deadline import Deadline
 from webots_mcp.store.history.event import KINDS, EventOptions, Kind
@@ -24,10 +24,10 @@ from webots_mcp.store.history.registry import Signal, registered
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.history.signals import resolve_signals
 from webots_mcp.store.history.subject import Subject, find_subject
-from webots_mcp.store.logs import LEVELS, LogFilter, LogLine, newest_lines
-from webots_mcp.store.queue import CommandQueue, commands_since
-from webots_mcp.store.runs import runs_since
-from webots_mcp.store.states import fetch_states, state_ids_after
+from webots_mcp.store.logs import LogFilter, LogLine, newest_lines
+from webots_mcp.store.queue import CommandQueue, list_commands
+from webots_mcp.store.runs import runs_of
+from webots_mcp.store.states import fetch_state, states_of
 from webots_mcp.store.window import Window
 from webots_mcp.testing.commands import RecordedCommand
 from webots_mcp.testing.signals import RecordedSignal
@@ -63,7 +63,7 @@ class Recording:
     def runs(self) -> list[Recording]:
         """The recording of each run of the robot, oldest first: a reset begins the next one."""
         with self._subject() as (connection, subject):
-            runs = runs_since(connection, subject.robot_id, 0)
+            runs = runs_of(connection, subject.robot_id)
         return [Recording(self.database, robot=subject.robot, run_id=run.id) for run in runs]
 
     # -- what was published --------------------------------------------------------------------
@@ -100,15 +100,14 @@ class Recording:
     def states(self) -> list[dict[str, Any]]:
         """What was published, row by row; "nan", "inf" and the like where JSON holds null."""
         with self._subject() as (connection, subject):
-            ids = state_ids_after(connection, subject.run_id, 0, -math.inf)
-            return [state.value() for state in fetch_states(connection, ids)]
+            return [state.value() for state in states_of(connection, subject.run_id)]
 
     # -- what happened -------------------------------------------------------------------------
 
     def events(self, kind: str | None = None) -> list[Event]:
         """What the bridge noticed in the run, in order: all, or those of a kind (`pause`, ...)."""
         with self._subject() as (connection, subject):
-            found = events_after(connection, subject.run_id, 0, _NO_LIMIT)
+            found = newest_events(connection, subject.run_id, _NO_LIMIT)
         return [event for event in found if kind in (None, event.kind)]
 
     def find_events(self, *kinds: Kind, **options: Any) -> list[FoundEvent]:
@@ -138,8 +137,8 @@ class Recording:
         Raises:
             InvalidInputError: There is no such level.
         """
-        if level not in LEVELS:
-            raise InvalidInputError(f"no log level {level!r}; there is {', '.join(LEVELS)}")
+        if level not in LOG_LEVELS:
+            raise InvalidInputError(f"no log level {level!r}; there is {', '.join(LOG_LEVELS)}")
         with self._subject() as (connection, subject):
             window = Window(-math.inf, math.inf)
             asked = LogFilter(subject.run_id, window, text, lowest_level=level)
@@ -150,8 +149,8 @@ class Recording:
     def commands(self, action: str | None = None) -> list[RecordedCommand]:
         """The commands to the robot, oldest first: all, or those of an action."""
         with self._subject() as (connection, subject):
-            found = commands_since(connection, subject.robot_id, -math.inf)
-        kept = [command for command in found if action in (None, command.action)]
+            found = list_commands(connection, subject.robot_id, limit=_NO_LIMIT)
+        kept = [command for command in reversed(found) if action in (None, command.action)]
         return [RecordedCommand(self.database, command.id) for command in kept]
 
     def send(self, action: str, /, **params: Any) -> RecordedCommand:
@@ -208,4 +207,5 @@ class Recording:
 
     def _state(self, state_id: int) -> str:
         with closing(self._connect("reader")) as connection:
-            return next(fetch_states(connection, [state_id])).data
+            state = fetch_state(connection, state_id)
+        return state.data if state else "deleted since"

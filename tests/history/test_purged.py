@@ -54,7 +54,7 @@ def test_a_run_of_which_only_rollups_are_left_still_has_an_overview(
     keep_rows(rover, tmp_path, 900)
     assert rover.execute("SELECT count(*) FROM state WHERE run_id = 1").fetchone() == (0,)
     run = overview(rover)
-    assert run.numbers[0].count == [*[100] * 9, 50, 100]
+    assert run.numbers[0].count == [*[100] * 9, 50, 100, 100]
     assert run.age_s > 0
 
 
@@ -89,6 +89,9 @@ def test_a_run_of_which_only_rollups_are_left_is_found_by_wall_time(
     assert [segment.run_id for segment in found.segments] == [1]
     assert found.segments[0].end_s == pytest.approx(60, abs=0.2)
     assert "the rows of run 1 were purged" in found.notes[0]
+    whole = resolve_range(rover, run_id=1, wall_start=WALL_START_S - 9)
+    (run,) = query_history(rover, whole, ["pose.0"]).runs
+    assert run.rows == 1150
 
 
 def test_where_rows_were_purged_events_do_not_claim_to_have_looked_at_them(

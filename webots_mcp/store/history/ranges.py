@@ -67,11 +67,6 @@ class Segment:
         """Where the range ends for what is not a state row."""
         return math.inf if self.open_end else self.end_s
 
-    @property
-    def bounded_by_wall(self) -> bool:
-        """Whether rows of the same simulation time may be partly outside."""
-        return math.isfinite(self.wall_start_s) or math.isfinite(self.wall_end_s)
-
 
 @dataclass(frozen=True)
 class TimeRange:

@@ -26,6 +26,12 @@ from webots_mcp.store.history.summary import Summary, merge, summarise
 _FIRST_AFTER: Final = (
     "SELECT sim_time_s FROM state WHERE id > ? AND +run_id = ? ORDER BY id LIMIT 1"
 )
+# Time stood still right at the start, partly before it in wall time.
+_STOOD_BEFORE: Final = (
+    "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s = ? AND wall_time_s < ?)"
+)
+# Without any, the last bucket of the run was purged: of it the rollup is all there is.
+_ROWS_FROM: Final = "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ?)"
 
 
 class Pieces:
@@ -94,7 +100,7 @@ def read_pieces(
 ) -> Pieces:
     """Read a stretch of any length; only rows that are not in a whole rollup are looked at."""
     pieces = Pieces(signals)
-    span = _whole_buckets(segment)
+    span = _whole_buckets(connection, segment)
     if not span:
         pieces.add_rows(read_columns(connection, segment, signals, deadline))
         return pieces
@@ -118,9 +124,14 @@ def rows_after(connection: sqlite3.Connection, segment: Segment, mark: int) -> S
     return replace(segment, start_s=max(segment.start_s, first[0]))
 
 
-def _whole_buckets(segment: Segment) -> range:
+def _whole_buckets(connection: sqlite3.Connection, segment: Segment) -> range:
     """The buckets that lie wholly inside."""
     first = math.ceil(segment.start_s / BUCKET_S)
-    if segment.bounded_by_wall and first == bucket_of(segment.start_s):
-        first += 1  # time may have stood still right there, partly before the range
-    return range(first, bucket_of(segment.end_s))
+    if first == bucket_of(segment.start_s):
+        start = (segment.run_id, segment.start_s, segment.wall_start_s)
+        first += connection.execute(_STOOD_BEFORE, start).fetchone()[0]
+    end = bucket_of(segment.end_s)
+    if segment.open_end:
+        rows_left = connection.execute(_ROWS_FROM, (segment.run_id, end * BUCKET_S)).fetchone()[0]
+        end += not rows_left
+    return range(first, end)

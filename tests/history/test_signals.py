@@ -9,9 +9,11 @@ import pytest
 from tests.history.recording import Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.history.leaves import Place, flatten, places
+from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.history.signals import catalogue, list_signals, resolve_signals
 from webots_mcp.store.history.subject import find_subject
+from webots_mcp.store.history.trends import trends
 
 
 def test_every_leaf_has_a_dotted_name() -> None:
@@ -75,6 +77,37 @@ def test_an_unknown_name_is_answered_with_near_ones(rover: sqlite3.Connection) -
         resolve_signals(known, ["front"])
     with pytest.raises(InvalidInputError, match="no signal is named"):
         resolve_signals(known, [])
+
+
+def test_rows_that_do_not_hold_a_signal_have_no_value_of_it(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(40):
+        recorder.publish(float(step), {"x": step} | ({"lidar": 1.0} if step < 10 else {}))
+        if step in (4, 25):
+            shares = {signal.name: signal.null_share for signal in list_signals(empty).signals}
+            roll(empty)
+            rolled = {signal.name: signal.null_share for signal in list_signals(empty).signals}
+            assert shares == rolled == {"lidar": max(0, 1 - 10 / (step + 1)), "x": 0.0}
+    assert list_signals(empty).signals[0].null_share == pytest.approx(0.75)
+
+
+@pytest.mark.parametrize("course", ["tn", "nt", "_t", "_n", "bn"])
+def test_a_signal_that_changes_its_kind_is_told_the_same_before_and_after_rolling(
+    empty: sqlite3.Connection, course: str
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(300):
+        kind = course[step * len(course) // 300]
+        value = {"t": "word", "n": step // 50, "b": step % 100 < 50, "_": None}[kind]
+        recorder.publish(step * 0.1, {"x": step, "value": value})
+    before = (list_signals(empty), trends(empty, resolve_range(empty)))
+    while not roll(empty, 50).done:
+        pass
+    assert (list_signals(empty), trends(empty, resolve_range(empty))) == before
 
 
 def test_rows_not_rolled_up_yet_are_in_the_list(empty: sqlite3.Connection) -> None:

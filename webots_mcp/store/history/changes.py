@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
@@ -19,6 +20,10 @@ MOST_VALUES: Final = 20
 _CHANGES: Final = (
     "SELECT sim_time_s, value FROM change WHERE run_id = ? AND signal_id = ? AND sim_time_s < ? "
     "ORDER BY state_id"
+)
+_FIRST_VALUE: Final = (
+    "SELECT first_sim_time_s FROM rollup WHERE run_id = ? AND signal_id = ? "
+    "AND first_sim_time_s IS NOT NULL ORDER BY bucket LIMIT 1"
 )
 
 
@@ -40,7 +45,7 @@ def change_points(
     The first point is the value in force when the segment begins; its time may lie before. They
     come from the change table, and from the rows after the watermark until the deadline.
     """
-    points = {signal.name: _stored(connection, segment, signal) for signal in signals}
+    points = {signal.name: _stored(connection, segment, signal, deadline) for signal in signals}
     mark = watermark(connection)
     before_end = Segment(segment.run_id, float("-inf"), segment.end_s)
     late = rows_after(connection, before_end, mark)
@@ -52,13 +57,34 @@ def change_points(
     return {name: _from(found, segment.start_s) for name, found in points.items()}
 
 
-def _stored(connection: sqlite3.Connection, segment: Segment, signal: Signal) -> list[Point]:
+def _stored(
+    connection: sqlite3.Connection, segment: Segment, signal: Signal, deadline: Deadline
+) -> list[Point]:
     if signal.id is None:
         return []
     rows = connection.execute(_CHANGES, (segment.run_id, signal.id, segment.end_s))
     if signal.kind == "bool":
         return [Point(time_s, None if value is None else value == "true") for time_s, value in rows]
-    return [Point(time_s, value) for time_s, value in rows]
+    points = [Point(time_s, value) for time_s, value in rows]
+    return [*_earlier(connection, segment, signal, points, deadline), *points]
+
+
+def _earlier(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signal: Signal,
+    points: list[Point],
+    deadline: Deadline,
+) -> list[Point]:
+    """The points from before the first stored one: then it was a number, which has none stored."""
+    first = connection.execute(_FIRST_VALUE, (segment.run_id, signal.id)).fetchone()
+    end_s = min(points[0].sim_time_s if points else math.inf, segment.end_s)
+    if first is None or first[0] is None or first[0] >= end_s:
+        return []
+    found: list[Point] = []
+    rows = read_columns(connection, Segment(segment.run_id, first[0], end_s), [signal], deadline)
+    _append_changes(found, zip(rows.times, rows.values[signal.name], strict=True))
+    return found
 
 
 def _append_changes(points: list[Point], rows: Iterable[tuple[float, object]]) -> None:

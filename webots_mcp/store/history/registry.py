@@ -133,6 +133,16 @@ def unregistered(column: BatchColumn) -> Signal | None:
     return Signal(None, column.robot_id, column.name, kind, unit, place.path, place.reduce)
 
 
+def seen_now(signal: Signal | None, column: BatchColumn) -> Signal | None:
+    """A signal as it is known after a column of it; None where it cannot be registered."""
+    if signal is None:
+        return unregistered(column)
+    kind = seen_in(column, signal.kind)
+    if kind == signal.kind:
+        return signal
+    return replace(signal, kind=kind, unit=unit_of(signal.name, kind))
+
+
 @lru_cache(maxsize=8)  # a row that brings one new name mostly brings several
 def _places_of(data: str) -> dict[str, Place]:
     return places(parse(data))

@@ -14,6 +14,7 @@ from collections.abc import Generator, Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.store.history.batch import Batch, BatchColumn
+from webots_mcp.store.history.columns import cleaned
 from webots_mcp.store.history.leaves import shown
 from webots_mcp.store.history.registry import Signal, enter_signals
 from webots_mcp.store.history.summary import Summary, merge, summarise
@@ -172,12 +173,14 @@ def _store(connection: sqlite3.Connection, batch: Batch) -> None:
         if signal is None:
             continue  # beyond the number of signals that a robot may have
         _store_buckets(connection, signal, column)
-        if signal.kind in ("bool", "text"):
+        if signal.kind not in ("num", "angle"):  # null may yet become text
             _store_changes(connection, signal, column)
 
 
 def _store_buckets(connection: sqlite3.Connection, signal: Signal, column: BatchColumn) -> None:
     _, times, values = zip(*column.points, strict=True)
+    if signal.kind == "text":
+        values = cleaned(signal, list(values))
     end = 0
     while (start := end) < len(times):
         bucket = bucket_of(times[start])
@@ -185,8 +188,17 @@ def _store_buckets(connection: sqlite3.Connection, signal: Signal, column: Batch
         summary = summarise(times[start:end], values[start:end], angle=signal.kind == "angle")
         key = (column.run_id, signal.id, bucket)
         before = connection.execute(_BUCKET, key).fetchone()
-        whole = merge([Summary._make(before), summary]) if before else summary
-        connection.execute(_SET_BUCKET, (*key, *whole))
+        if before is not None:
+            summary = merge([_of_kind(signal, Summary._make(before)), summary])
+        connection.execute(_SET_BUCKET, (*key, *summary))
+
+
+def _of_kind(signal: Signal, before: Summary) -> Summary:
+    """What was summed up while it was still a number is text now."""
+    if signal.kind != "text" or before.sum is None:
+        return before
+    kept = ("rows", "present", "first_sim_time_s", "last_sim_time_s")
+    return Summary(**{name: getattr(before, name) for name in kept})
 
 
 def _store_changes(connection: sqlite3.Connection, signal: Signal, column: BatchColumn) -> None:

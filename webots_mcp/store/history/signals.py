@@ -6,25 +6,30 @@ import difflib
 import fnmatch
 import sqlite3
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.history.batch import Batch, BatchColumn
+from webots_mcp.store.history.columns import cleaned
 from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.history.leaves import Kind, Value, flatten, parse, unit_of, widen
+from webots_mcp.store.history.leaves import Kind, Value, flatten, parse
 from webots_mcp.store.history.ranges import TimeRange
-from webots_mcp.store.history.registry import MAX_SIGNALS, Signal, by_name, registered, unregistered
+from webots_mcp.store.history.registry import MAX_SIGNALS, Signal, by_name, registered, seen_now
 from webots_mcp.store.history.rollup import watermark
 from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.subject import Subject, find_subject
 from webots_mcp.store.history.summary import Summary, summarise
 
-SAMPLED_ROWS: Final = 200  # newest rows not yet rolled up that are searched for new names
+SAMPLED_ROWS: Final = 200  # rows not yet rolled up that are searched for new names and kinds
 
 _NEWEST_ROWS: Final = (
     "SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC"
+)
+_OLDEST_AFTER: Final = (  # by ids, from the watermark on: see `tiers`
+    "SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE id > ? AND +run_id = ? "
+    "ORDER BY id LIMIT ?"
 )
 _TOTALS: Final = (
     "SELECT signal_id, sum(rows), sum(present), min(first_sim_time_s), max(last_sim_time_s), "
@@ -37,7 +42,8 @@ class SignalInfo:
     """What is known of a signal in a run (or a part of it).
 
     Attributes:
-        rows: State rows that held it; `null_share` of them without a value.
+        rows: State rows that held it.
+        null_share: Of the run's rows, those without a value.
         first_s: Simulation time of the first value; `last_s` of the last one.
         last: The value in the run's newest row; None where that has none.
     """
@@ -71,12 +77,12 @@ class SignalList:
 
 
 def catalogue(connection: sqlite3.Connection, subject: Subject) -> dict[str, Signal]:
-    """Every signal of the subject's robot: the registered, and those in the run's newest rows."""
+    """Every signal of the subject's robot: the registered, and those in rows not rolled up yet."""
     return _signals_in(connection, subject.robot_id, [subject.run_id])
 
 
 def known_signals(connection: sqlite3.Connection, time_range: TimeRange) -> dict[str, Signal]:
-    """Every signal of a range's robot: the registered, and those in the newest rows of each run."""
+    """Every signal of a range's robot: the registered, and those in rows not rolled up yet."""
     runs = [segment.run_id for segment in time_range.segments]
     return _signals_in(connection, time_range.robot_id, runs)
 
@@ -85,23 +91,26 @@ def _signals_in(
     connection: sqlite3.Connection, robot_id: int, run_ids: Sequence[int]
 ) -> dict[str, Signal]:
     known = registered(connection, robot_id)
-    new: dict[str, Signal] = {}
+    found = dict(known)
     for run_id in run_ids:
         for column in _unrolled_sample(connection, robot_id, run_id).columns():
-            signal = None if column.name in known else unregistered(column)
+            signal = seen_now(found.get(column.name), column)
             if signal is not None:
-                kind = widen(new.get(signal.name, signal).kind, signal.kind)
-                new[signal.name] = replace(signal, kind=kind, unit=unit_of(signal.name, kind))
-    return by_name([*known.values(), *new.values()]) if new else known
+                found[column.name] = signal
+    return found if len(found) == len(known) else by_name(list(found.values()))
 
 
 def _unrolled_sample(connection: sqlite3.Connection, robot_id: int, run_id: int) -> Batch:
-    """A run's newest rows after the watermark."""
+    """A run's rows after the watermark; of many the newest and the oldest."""
     mark = watermark(connection)
     batch = Batch()
     for state_id, *row in connection.execute(_NEWEST_ROWS, (run_id,)):
-        if state_id <= mark or batch.rows == SAMPLED_ROWS:
+        if state_id <= mark:
+            return batch
+        if batch.rows == SAMPLED_ROWS // 2:
             break
+        batch.add(state_id, robot_id, run_id, *row)
+    for state_id, *row in connection.execute(_OLDEST_AFTER, (mark, run_id, SAMPLED_ROWS // 2)):
         batch.add(state_id, robot_id, run_id, *row)
     return batch
 
@@ -171,16 +180,18 @@ def list_signals(
     """
     subject = find_subject(connection, robot, run_id)
     stored = _stored(connection, subject.run_id)
-    late, notes = _late(connection, subject, deadline_s)
+    batch, notes = _late(connection, subject, deadline_s)
+    late = {column.name: column for column in batch.columns()}
     known = registered(connection, subject.robot_id)
-    new = [signal for column in late.values() if (signal := unregistered(column))]
-    known = {**{signal.name: signal for signal in new}, **known}
+    now = (seen_now(known.get(name), column) for name, column in late.items())
+    known |= {signal.name: signal for signal in now if signal}
     there = {name: signal for name, signal in known.items() if signal.id in stored or name in late}
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
     matching.sort(key=lambda signal: signal.name)
     newest = _newest_values(connection, subject.run_id)
+    rows = max((total.rows for total in stored.values()), default=0) + batch.rows
     infos = tuple(
-        _info(signal, stored.get(signal.id), late.get(signal.name), newest.get(signal.name))
+        _info(signal, rows, stored.get(signal.id), late.get(signal.name), newest.get(signal.name))
         for signal in matching[:limit]
     )
     if len(known) >= MAX_SIGNALS:
@@ -201,7 +212,7 @@ def _stored(connection: sqlite3.Connection, run_id: int) -> dict[int | None, Sum
 
 def _late(
     connection: sqlite3.Connection, subject: Subject, deadline_s: float
-) -> tuple[dict[str, BatchColumn], list[str]]:
+) -> tuple[Batch, list[str]]:
     """The run's rows after the watermark, newest first, until the deadline."""
     mark = watermark(connection)
     batch = Batch()
@@ -214,7 +225,7 @@ def _late(
             notes.append(f"rows up to {row[0]:g} s are not counted: they are not rolled up yet")
             break
         batch.add(state_id, subject.robot_id, subject.run_id, *row)
-    return {column.name: column for column in batch.columns()}, notes
+    return batch, notes
 
 
 def _newest_values(connection: sqlite3.Connection, run_id: int) -> dict[str, Value]:
@@ -223,23 +234,23 @@ def _newest_values(connection: sqlite3.Connection, run_id: int) -> dict[str, Val
 
 
 def _info(
-    signal: Signal, stored: Summary | None, late: BatchColumn | None, last: Value
+    signal: Signal, run_rows: int, stored: Summary | None, late: BatchColumn | None, last: Value
 ) -> SignalInfo:
     parts = [stored] if stored else []
     if late is not None:
         _, times, values = zip(*reversed(late.points), strict=True)
-        parts.append(summarise(times, values))
-    rows = sum(part.rows for part in parts)
+        parts.append(summarise(times, cleaned(signal, list(values))))
     held = [part for part in parts if part.present]
+    numeric = () if signal.kind == "text" else held
     return SignalInfo(
         name=signal.name,
         kind=signal.kind,
         unit=signal.unit,
-        rows=rows,
-        null_share=1 - sum(part.present for part in parts) / rows,
+        rows=sum(part.rows for part in parts),
+        null_share=1 - sum(part.present for part in parts) / run_rows,
         first_s=held[0].first_sim_time_s if held else None,
         last_s=held[-1].last_sim_time_s if held else None,
         last=last,
-        min=min((part.min for part in held if part.min is not None), default=None),
-        max=max((part.max for part in held if part.max is not None), default=None),
+        min=min((part.min for part in numeric if part.min is not None), default=None),
+        max=max((part.max for part in numeric if part.max is not None), default=None),
     )

@@ -1,4 +1,4 @@
-"""Alembic's entry: `webots_mcp.store.migrate` hands it a connection, the shell an -x database=."""
+"""Alembic's entry: `webots_mcp.store.migrate` hands it a connection."""
 
 from typing import Any
 

@@ -22,7 +22,7 @@ from mcp.types import CallToolResult, ImageContent, TextContent
 
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
-from webots_mcp.errors import NothingRecordedError
+from webots_mcp.errors import NothingRecordedError, WebotsMCPError
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 
@@ -62,6 +62,7 @@ def run(data_dir: Path = DEFAULT_DATA_DIR, *, keep: bool = False) -> None:
 
     Raises:
         NothingRecordedError: The controller did not come up.
+        WebotsMCPError: The server answered with an error.
     """
     _say(f"Starting {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
     with Simulation(DEFAULT_WORLD, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
@@ -103,7 +104,7 @@ async def _converse(data_dir: Path) -> None:
 
 @contextlib.asynccontextmanager
 async def _client(data_dir: Path) -> AsyncGenerator[Client, None]:
-    """A client on a server of its own; the server's log stays out of the conversation."""
+    """A client on a server of its own; what the server warns of appears on stderr."""
     server = StdioServerParameters(
         command=sys.executable,
         args=["-m", "webots_mcp", "serve", "--data-dir", str(data_dir)],
@@ -135,7 +136,7 @@ def _show(result: CallToolResult, duration_s: float) -> None:
                 _say(f"  [{block.mime_type}, {len(block.data) * 3 // 4} bytes]")
     _say(f"  ({duration_s:.2f} s)")
     if result.is_error:
-        raise NothingRecordedError("the demo's server answered with an error, see above")
+        raise WebotsMCPError("the demo's server answered with an error, see above")
 
 
 def _compact(value: object) -> str:

@@ -1,4 +1,7 @@
-"""Every error that this package raises on purpose.
+"""The errors that are about a recording, a question to it, or a command.
+
+Arguments of a wrong type or value are Python's TypeError and ValueError; the stand-in has a tree
+of its own.
 
     WebotsMCPError
     ├── DatabaseError               the file, not the question, is the problem
@@ -21,7 +24,7 @@ Each message names the value that was wrong and the next step to take.
 
 
 class WebotsMCPError(Exception):
-    """Root of all errors that this package raises on purpose."""
+    """Root of the errors about recordings, questions and commands."""
 
 
 class DatabaseError(WebotsMCPError):

@@ -21,7 +21,7 @@ from tests.data.test_import import Peer
 from webots_mcp.cli import main
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.retention import DEFAULT, Limit
-from webots_mcp.store.retention.notation import parse_limit, size_text
+from webots_mcp.store.retention.notation import limit_text, parse_limit, size_text
 
 Say = Callable[..., str]
 
@@ -240,6 +240,23 @@ def test_what_a_current_run_is_spared_does_not_depend_on_the_limit() -> None:
     assert parse_limit("0rows", DEFAULT.state).spared_rows == DEFAULT.state.spared_rows
     with pytest.raises(InvalidInputError):
         parse_limit("many", DEFAULT.state)
+
+
+@pytest.mark.parametrize("text", ["500.0 MB", "7200s", "100000rows", "2.50 GB,60s,3rows", "none"])
+def test_a_limit_is_written_as_it_is_read(text: str) -> None:
+    assert limit_text(parse_limit(text, Limit())) == text
+
+
+@pytest.mark.parametrize("command", ["prune", "serve"])
+def test_the_help_tells_the_limits_that_are_in_force(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    for kind in ("state", "rollup", "log", "event", "image"):
+        assert f"({limit_text(getattr(DEFAULT, kind))})" in text.partition(f"--{kind} LIMIT")[2]
+    assert f"({DEFAULT.outlive:g}; 0: for ever)" in text
 
 
 @pytest.mark.parametrize(

@@ -92,8 +92,7 @@ def prune(arguments: argparse.Namespace) -> None:
     """Delete what is beyond the limits, oldest first, and give the space back to the disk.
 
     A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
-    commas between, or none. Without it 1 GB of states, 1 GB of pictures, 100 MB of log lines and
-    100 MB of events are kept. Runs with a label or a note, and those marked by 'webots-mcp keep',
+    commas between, or none. Runs with a label or a note, and those marked by 'webots-mcp keep',
     lose nothing. Robots may record meanwhile. The MCP server does the same once a minute, with the
     limits that 'webots-mcp serve' was given.
     """

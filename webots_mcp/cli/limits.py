@@ -11,22 +11,45 @@ if TYPE_CHECKING:
     from webots_mcp.store.retention import Retention
 
 _KINDS: Final = {
-    "state": "recorded states (1GB)",
-    "rollup": "rollups and change points (none)",
-    "log": "log lines (100MB)",
-    "event": "events; its age also holds for commands (100MB)",
-    "image": "pictures with their files (1GB)",
+    "state": "recorded states",
+    "rollup": "rollups and change points",
+    "log": "log lines",
+    "event": "events; its age also holds for commands",
+    "image": "pictures with their files",
 }
+
+
+class _Default:
+    """What a limit is by default; looked up where a help shows it, because importing it costs."""
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __str__(self) -> str:
+        from webots_mcp.store.retention import DEFAULT, Limit
+        from webots_mcp.store.retention.notation import limit_text
+
+        value = getattr(DEFAULT, self._name)
+        return limit_text(value) if isinstance(value, Limit) else f"{value:g}"
+
+
 LIMITS: Final = (
     *(
-        argument(f"--{kind}", metavar="LIMIT", help=f"how much to keep of {what}")
+        argument(
+            f"--{kind}",
+            metavar="LIMIT",
+            default=_Default(kind),
+            help=f"how much to keep of {what} (%(default)s)",
+        )
         for kind, what in _KINDS.items()
     ),
     argument(
         "--outlive",
         type=float,
         metavar="TIMES",
-        help="keep what is left of a run so many times longer than its states (10; 0: for ever)",
+        default=_Default("outlive"),
+        help="keep what is left of a run so many times longer than its states (%(default)s; "
+        "0: for ever)",
     ),
 )
 
@@ -42,7 +65,10 @@ def retention_of(arguments: argparse.Namespace) -> Retention:
     from webots_mcp.store.retention import DEFAULT
     from webots_mcp.store.retention.notation import parse_limit
 
-    given = {kind: text for kind in _KINDS if (text := getattr(arguments, kind)) is not None}
-    limits = {kind: parse_limit(text, getattr(DEFAULT, kind)) for kind, text in given.items()}
-    outlive = DEFAULT.outlive if arguments.outlive is None else arguments.outlive
-    return replace(DEFAULT, **limits, outlive=outlive)
+    names = (*_KINDS, "outlive")
+    given = {
+        name: value for name in names if not isinstance(value := vars(arguments)[name], _Default)
+    }
+    for kind in given.keys() & _KINDS:
+        given[kind] = parse_limit(given[kind], getattr(DEFAULT, kind))
+    return replace(DEFAULT, **given)

@@ -50,6 +50,14 @@ def _parse_part(part: str, text: str) -> tuple[str, float]:
     )
 
 
+def limit_text(limit: Limit) -> str:
+    """A limit as `parse_limit` reads it; a size is rounded."""
+    parts = [size_text(limit.size_bytes)] if limit.size_bytes is not None else []
+    parts += [f"{limit.age_s:g}s"] if limit.age_s is not None else []
+    parts += [f"{limit.rows}rows"] if limit.rows is not None else []
+    return ",".join(parts) or "none"
+
+
 def size_text(size_bytes: float) -> str:
     """A size as a person reads it, in the units that `parse_limit` takes."""
     for unit in ("B", "kB", "MB"):

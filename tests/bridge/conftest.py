@@ -6,13 +6,15 @@ import json
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.bridge import recorder
 from webots_mcp.connection import connect
-from webots_mcp.contract import Database
+from webots_mcp.contract import DATABASE_NAME, Database
 from webots_mcp.standin import InProcessSupervisor
 
 STEP_MS = 16
@@ -77,6 +79,22 @@ def recording(database: MemoryDatabase) -> Recording:
 
 
 @pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "mcp_data" / DATABASE_NAME
+
+
+@pytest.fixture
+def filed(file: Path) -> Recording:
+    return Recording(file)
+
+
+@pytest.fixture
+def retry_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No waiting between tries, so that the tests need no sleep."""
+    monkeypatch.setattr(recorder, "_RETRY_INTERVAL_S", 0.0)
+
+
+@pytest.fixture
 def robot() -> InProcessSupervisor:
     return InProcessSupervisor("rover")
 
@@ -102,6 +120,17 @@ def drive(robot: InProcessSupervisor, bridge: MCPBridge) -> Callable[[int], None
             eager(bridge)
 
     return rounds
+
+
+def numbers(recording: Recording) -> list[int]:
+    """The `n` of all states, in order."""
+    return [state["n"] for state in recording.states()]
+
+
+def heartbeat_now(bridge: MCPBridge) -> None:
+    """The next call looks after the file, as it would half a second later."""
+    bridge._heart._next_s = 0.0  # pyright: ignore[reportPrivateUsage]
+    bridge.get_command()
 
 
 def eager(bridge: MCPBridge) -> dict[str, Any] | None:

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.bridge.conftest import STEP_MS, Recording, send
+from tests.bridge.conftest import STEP_MS, Recording, heartbeat_now, numbers, send
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import recorder
+from webots_mcp.bridge import backlog, recorder
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION
 from webots_mcp.schema import create_schema
@@ -29,29 +29,9 @@ NOT_ROOT = pytest.mark.skipif(
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
-    return tmp_path / "mcp_data" / DATABASE_NAME
-
-
-@pytest.fixture
-def filed(file: Path) -> Recording:
-    return Recording(file)
-
-
-@pytest.fixture
 def bridge(robot: InProcessSupervisor, file: Path) -> Iterator[MCPBridge]:
     with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
         yield bridge
-
-
-@pytest.fixture
-def retry_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """No waiting between tries, so that the tests need no sleep."""
-    monkeypatch.setattr(recorder, "_RETRY_INTERVAL_S", 0.0)
-
-
-def numbers(recording: Recording) -> list[int]:
-    return [state["n"] for state in recording.states()]
 
 
 def test_rows_that_meet_a_lock_wait_and_are_written_in_order(
@@ -80,7 +60,7 @@ def test_beyond_the_limit_the_oldest_rows_are_dropped_counted_and_told(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(recorder, "MAX_WAITING_ROWS", 10)
+    monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 10)
     other = connect(file, "writer")
     other.execute("BEGIN IMMEDIATE")
     for n in range(25):
@@ -365,12 +345,6 @@ def test_importing_the_bridge_needs_nothing_but_the_standard_library(tmp_path: P
     line = [sys.executable, "-I", "-S", "-c", program]
     done = subprocess.run(line, capture_output=True, text=True, cwd=tmp_path, check=True)
     assert done.stdout.strip() == "[]"
-
-
-def heartbeat_now(bridge: MCPBridge) -> None:
-    """The next call looks after the file, as it would half a second later."""
-    bridge._heart._next_s = 0.0  # pyright: ignore[reportPrivateUsage]
-    bridge.get_command()
 
 
 def poll_until(bridge: MCPBridge, reached: Callable[[], bool]) -> None:

@@ -45,7 +45,8 @@ class MCPBridge:
 
     After construction no method raises into the control loop (the environment variable
     `WEBOTS_MCP_STRICT=1` makes them raise) and none waits for a lock. What could not be recorded
-    is counted in `stats()` and said once on stderr.
+    is counted in `stats()` and said once on stderr. The methods belong to the loop's thread; only
+    `log` may be called from others too.
 
     Args:
         robot: The controller's `Robot` or `Supervisor`, or an instance of a subclass.
@@ -269,6 +270,11 @@ class MCPBridge:
         ended = "reload" if self._control.actions.reloading else "finished"
         self._recorder.close(reason or ended, self._clock.sim_time_s)
 
+    def _abandon(self) -> None:
+        """In a forked child: leave the session to the parent; what is published here is dropped."""
+        self._closed = True
+        self._recorder.abandon()
+
     def __enter__(self) -> MCPBridge:
         return self
 
@@ -287,9 +293,7 @@ class MCPBridge:
 
         self._clock = Clock(self._simulation)
         self._identity = identify(self.robot, self._simulation.supervisor, __version__)
-        self._recorder = Recorder(
-            self.database, self._identity, self._clock.run, strict=self._strict
-        )
+        self._recorder = Recorder(self.database, self._identity, self._clock, strict=self._strict)
         self._album = Album(self._recorder, self._clock, self.data_dir)
         self._journal = Journal(self._recorder, self._clock)
         self._heart = Heart(self._recorder, self._clock)
@@ -397,3 +401,13 @@ def _replace_bridge_of(robot: object) -> None:
     former = _bridges.get(id(robot))
     if former is not None:
         former.close("replaced")
+
+
+def _leave_to_parent() -> None:
+    for bridge in _bridges.values():
+        bridge._abandon()
+    _bridges.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import sqlite3
 import sys
 import time
+from pathlib import Path
 from typing import Final
 
 from webots_mcp.bridge.identity import Identity
@@ -14,7 +16,6 @@ from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION, Database, MemoryD
 from webots_mcp.schema import create_schema, require_current, schema_version
 
 _SQLITE_HEADER: Final = b"SQLite format 3\0"
-_DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
 
 
 def open_session(
@@ -64,9 +65,32 @@ def _migrate(database: Database) -> None:
     subprocess.run(line, check=False, capture_output=True, timeout=60, stdin=subprocess.DEVNULL)
 
 
-def is_damage(text: str) -> bool:
-    """Whether an error of SQLite says that the file itself is broken."""
-    return any(sign in text for sign in _DAMAGE)
+def identify_files(database: Database) -> tuple[int, ...]:
+    """Which files a database consists of at this moment, to notice when they are others."""
+    if isinstance(database, MemoryDatabase):
+        return ()
+    return (*_identify(f"{database}"), *_identify(f"{database}-wal"))
+
+
+def _identify(file: str) -> tuple[int, int]:
+    try:
+        status = os.stat(file)  # noqa: PTH116  (at each heartbeat: no Path objects)
+    except OSError:
+        return (0, 0)
+    return status.st_dev, status.st_ino
+
+
+def move_aside(database: Path) -> None:
+    """Give a damaged file, its log and its index another name.
+
+    Raises:
+        OSError: It cannot be moved.
+    """
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    for suffix in ("", "-wal", "-shm"):
+        damaged = database.with_name(database.name + suffix)
+        if damaged.exists():
+            damaged.rename(f"{database}.damaged-{stamp}{suffix}")
 
 
 def is_ours(database: Database) -> bool:

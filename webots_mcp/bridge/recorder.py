@@ -3,29 +3,32 @@
 One recorded row is one short transaction into the write-ahead log: a controller that is killed
 the next instant loses nothing. The control loop never waits: where another writer holds the lock
 at that moment, the row is kept and written, in order, with the next call. So is a row that meets
-a full disk, a read-only or a vanished file; those are tried again once a second. Beyond
-`MAX_WAITING_ROWS` or `MAX_WAITING_BYTES` the oldest are dropped, counted, and told as an event as
-soon as one can be written.
+a full disk, a read-only or a vanished file; those are tried again once a second. Beyond the limits
+of the backlog the oldest are dropped, and so is a row that the database refuses whatever comes;
+dropped rows are counted, and told as an event as soon as one can be written.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import sqlite3
-import sys
 import threading
 import time
-from collections import deque
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
+from webots_mcp.bridge.backlog import Backlog, Row, Values, bind
+from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.identity import Identity
-from webots_mcp.bridge.opening import is_damage, is_ours, open_session
+from webots_mcp.bridge.opening import identify_files, is_ours, move_aside, open_session
+from webots_mcp.bridge.pulse import Health, Pulse, write_pulse
 from webots_mcp.bridge.registration import Registration, deregister
-from webots_mcp.bridge.run import Run
-from webots_mcp.connection import journal_mode
-from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.bridge.run import Run, insert_run
+from webots_mcp.bridge.trouble import Trouble
+from webots_mcp.connection import is_busy, is_damage, journal_mode, transaction
+from webots_mcp.contract import Database
 from webots_mcp.errors import (
     DatabaseError,
     ForeignDatabaseError,
@@ -33,10 +36,9 @@ from webots_mcp.errors import (
     SchemaTooOldError,
 )
 
-MAX_WAITING_ROWS: Final = 10_000
-MAX_WAITING_BYTES: Final = 16_000_000
 _ROWS_PER_FLUSH: Final = 500  # about 5 ms: a loop that catches up must not stall over it
 _RETRY_INTERVAL_S: Final = 1.0
+_UNFIT: Final = (sqlite3.IntegrityError, sqlite3.DataError, UnicodeError, OverflowError)
 
 INSERT_STATE: Final = (
     "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, odd) VALUES (?, ?, ?, ?, ?)"
@@ -45,69 +47,63 @@ INSERT_EVENT: Final = (
     "INSERT INTO event (run_id, sim_time_s, wall_time_s, kind, name, data) "
     "VALUES (?, ?, ?, ?, ?, ?)"
 )
-_INSERT_RUN: Final = (
-    "INSERT INTO run (session_id, robot_id, world, basic_time_step_ms, start_reason, "
-    "started_wall_time_s, started_sim_time_s, last_wall_time_s, last_sim_time_s) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
-)
 _END_RUN: Final = (
     "UPDATE run SET end_reason = :reason, ended_wall_time_s = :now, last_wall_time_s = :now, "
     "last_sim_time_s = :sim_time, rows = :rows WHERE id = :run"
 )
-_BEAT_SESSION: Final = (
-    "UPDATE session SET last_seen_wall_time_s = ?, last_poll_wall_time_s = ?, "
-    "moved_wall_time_s = ?, sim_time_s = ?, hold = ?, rows_waiting = ?, rows_dropped = ?, "
-    "last_error = ? WHERE id = ?"
-)
-_BEAT_RUN: Final = "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, rows = ? WHERE id = ?"
 _END_SESSION: Final = (
     "UPDATE session SET ended_wall_time_s = ?, last_seen_wall_time_s = ?, end_reason = ?, "
     "hold = NULL, rows_waiting = 0, rows_dropped = ?, last_error = ? WHERE id = ?"
 )
 
 
-Values = tuple[Any, ...] | dict[str, Any]
-
-
-class Pulse(NamedTuple):
-    """What a heartbeat says of the loop."""
-
-    sim_time_s: float
-    last_poll_wall_time_s: float | None
-    moved_wall_time_s: float | None
-    hold: str | None
-
-
-class _Row(NamedTuple):
-    statement: str
-    run: Run | None
-    values: Values
+_of_parents: list[sqlite3.Connection | None] = []
 
 
 class Recorder:
-    """One connection, one session, and the rows that could not be written yet."""
+    """One connection, one session, and the rows that could not be written yet.
 
-    def __init__(self, database: Database, identity: Identity, run: Run, *, strict: bool) -> None:
+    The loop's thread, the maintainer's and any that logs share the connection: whoever uses it
+    holds the lock, and nobody waits for that either.
+    """
+
+    def __init__(
+        self, database: Database, identity: Identity, clock: Clock, *, strict: bool
+    ) -> None:
         self._database = database
         self._identity = identity
-        self._strict = strict
-        self._waiting: deque[_Row] = deque()
-        self._waiting_bytes = 0
-        self._unreported_drops = 0
+        self._clock = clock
+        self._trouble = Trouble(strict=strict)
+        self._backlog = Backlog()
         self._lock = threading.Lock()
-        self._said: set[str] = set()
-        self._file: tuple[int, int] | None = None
+        self._obstacle = "too many wait"
+        self._untold_drops = 0
+        self._seen_whole = 0
+        self._files: tuple[int, ...] = ()
         self._retry_at_s = 0.0
         self._off: str | None = None
-        self.run = run
+        self.run = clock.run
         self.connection: sqlite3.Connection | None = None
         self.registration: Registration | None = None
         self.actions: dict[str, str] = {}
         self.rows_written = 0
         self.rows_dropped = 0
-        self.last_error: str | None = None
         self.last_use_s = time.monotonic()
         self._open(patient=True)
+
+    @property
+    def rows_waiting(self) -> int:
+        """Rows kept in memory until the database can take them."""
+        return len(self._backlog.rows)
+
+    @property
+    def last_error(self) -> str | None:
+        """The newest thing that could not be recorded, and why."""
+        return self._trouble.last_error
+
+    def complain(self, kind: str, text: str) -> None:
+        """Remember what went wrong; say it on stderr once a kind; raise in strict mode."""
+        self._trouble.complain(kind, text)
 
     # -- writing -------------------------------------------------------------------------------
 
@@ -124,118 +120,161 @@ class Recorder:
             How many rows the statement changed, or None where it was put off.
         """
         self.last_use_s = time.monotonic()
-        if self._off is not None:
-            self.rows_dropped += 1
-            return None
         connection = self.connection
-        if connection is None or self._waiting or (run is not None and run.id is None):
-            self._keep(_Row(statement, run, values))
-            return 1 if self.flush() else None
+        if (
+            connection is None
+            or self._backlog.rows
+            or (run is not None and run.id is None)
+            or not self._lock.acquire(blocking=False)
+        ):
+            return self._keep(Row(statement, run, values))
         try:
-            changed = connection.execute(statement, _bind(run, values)).rowcount
-        except sqlite3.Error as error:
-            self._keep(_Row(statement, run, values))
-            self._put_off(error)
+            changed = connection.execute(statement, bind(run, values)).rowcount
+            self.rows_written += 1
+        except (sqlite3.Error, *_UNFIT) as error:
+            self._write_failed(Row(statement, run, values), error)
             return None
-        self.rows_written += 1
+        finally:
+            self._lock.release()
         return changed
+
+    def fetch(self, statement: str, values: Values) -> Sequence[Any]:
+        """The rows of a statement that writes; none while another thread writes.
+
+        Raises:
+            sqlite3.Error: It cannot be run, at least now.
+        """
+        if self.connection is None or not self._lock.acquire(blocking=False):
+            return ()
+        try:
+            return self.connection.execute(statement, values).fetchall()
+        finally:
+            self._lock.release()
 
     def flush(self) -> bool:
         """Write what is waiting, as much as one call may; True if nothing waits any more."""
-        if time.monotonic() < self._retry_at_s or not self._lock.acquire(blocking=False):
+        return self._exclusively(self._write_waiting) and not self._backlog.rows
+
+    def _exclusively(self, act: Callable[[], None]) -> bool:
+        """False, and nothing done, while another thread writes."""
+        if not self._lock.acquire(blocking=False):
             return False
         try:
-            if self.connection is not None or self._open(patient=False):
-                self._drain()
+            act()
         except sqlite3.Error as error:
             self._put_off(error)
         finally:
             self._lock.release()
-        return not self._waiting
+        return True
 
-    @property
-    def rows_waiting(self) -> int:
-        """Rows kept in memory until the database can take them."""
-        return len(self._waiting)
+    def _keep(self, row: Row) -> int | None:
+        if self._off is not None:
+            self._drop(row, self._off)
+            return None
+        self._backlog.add(row)
+        return 1 if self.flush() else None
 
-    def _keep(self, row: _Row) -> None:
-        self._waiting.append(row)
-        self._waiting_bytes += _weight(row)
-        while len(self._waiting) > MAX_WAITING_ROWS or self._waiting_bytes > MAX_WAITING_BYTES:
-            self._drop(self._waiting.popleft())
+    def _write_failed(self, row: Row, error: Exception) -> None:
+        if _is_unfit(error):
+            self._drop(row, str(error))
+        elif isinstance(error, sqlite3.Error):
+            self._backlog.add(row)
+            self._put_off(error)
 
-    def _drop(self, row: _Row) -> None:
-        self._waiting_bytes -= _weight(row)
-        self.rows_dropped += 1
-        self._unreported_drops += 1
-        self.complain("dropped", f"rows are being dropped: {self.last_error or 'buffer full'}")
+    def _write_waiting(self) -> None:
+        while self._backlog.is_over_limit():
+            self._drop(self._backlog.remove_oldest(), self._obstacle)
+        if time.monotonic() < self._retry_at_s:
+            return
+        if self.connection is not None or self._open(patient=False):
+            self._drain()
 
     def _drain(self) -> None:
         """Write the oldest rows in one transaction, in order; they are forgotten after it."""
         assert self.connection is not None
-        batch = [self._waiting[i] for i in range(min(len(self._waiting), _ROWS_PER_FLUSH))]
-        fresh = [row.run for row in batch if row.run is not None and row.run.id is None]
-        self.connection.execute("BEGIN IMMEDIATE")
+        batch = self._backlog.oldest(_ROWS_PER_FLUSH)
+        fresh = {row.run for row in batch if row.run is not None and row.run.id is None}
         try:
-            for row in batch:
-                self._write(self.connection, row)
-            self._tell_drops(self.connection)
-            self.connection.execute("COMMIT")
+            with transaction(self.connection):
+                unfit = [self._write(self.connection, row) for row in batch]
+                self._tell_drops(self.connection)
         except BaseException:
             for run in fresh:
                 run.id = None
-            _roll_back(self.connection)
             raise
-        self._unreported_drops = 0
-        self.rows_written += len(batch)
-        for row in batch:
-            self._waiting.popleft()
-            self._waiting_bytes -= _weight(row)
+        self._untold_drops = 0
+        self.rows_written += unfit.count(None)
+        for _ in batch:
+            self._backlog.remove_oldest()
+        for row, why in zip(batch, unfit, strict=True):
+            if why is not None:
+                self._drop(row, why)
 
-    def _write(self, connection: sqlite3.Connection, row: _Row) -> None:
-        if row.run is not None and row.run.id is None:
-            self._insert_run(connection, row.run)
-        connection.execute(row.statement, _bind(row.run, row.values))
+    def _write(self, connection: sqlite3.Connection, row: Row) -> str | None:
+        """Write the row; or why the database will never take it, which stops no other row."""
+        try:
+            if row.run is not None and row.run.id is None:
+                self._insert_run(connection, row.run)
+            connection.execute(row.statement, bind(row.run, row.values))
+        except _UNFIT as error:
+            if not _is_unfit(error):
+                raise
+            return str(error)
+        return None
 
     def _insert_run(self, connection: sqlite3.Connection, run: Run) -> None:
         assert self.registration is not None
-        begun = (run.started_wall_time_s, run.started_sim_time_s)
-        where = (self._identity.world, self._identity.basic_time_step_ms, run.start_reason)
-        owner = (self.registration.session_id, self.registration.robot_id)
-        run.id = connection.execute(_INSERT_RUN, (*owner, *where, *begun, *begun)).lastrowid
+        insert_run(connection, run, self.registration, self._identity)
+
+    # -- dropping ------------------------------------------------------------------------------
+
+    def _drop(self, row: Row, why: str) -> None:
+        if row.statement == INSERT_STATE and row.run is not None:
+            row.run.rows -= 1
+        self._count_dropped(1, why)
+
+    def _drop_waiting(self, why: str) -> None:
+        while self._backlog.rows:
+            self._drop(self._backlog.remove_oldest(), why)
+
+    def _count_dropped(self, rows: int, why: str) -> None:
+        self.rows_dropped += rows
+        self._untold_drops += rows
+        self._obstacle = why
+        self.complain(f"dropped: {why}", f"rows are being dropped: {why}")
 
     def _tell_drops(self, connection: sqlite3.Connection) -> None:
-        if not self._unreported_drops:
+        if not self._untold_drops:
             return
         if self.run.id is None:
             self._insert_run(connection, self.run)
-        data = json.dumps({"rows": self._unreported_drops, "why": self.last_error})
-        now = (self.run.started_sim_time_s, time.time())
-        connection.execute(INSERT_EVENT, (self.run.id, *now, "dropped", None, data))
+        data = json.dumps({"rows": self._untold_drops, "why": self._obstacle})
+        event = (self.run.id, self._sim_time_s, time.time(), "dropped", None, data)
+        connection.execute(INSERT_EVENT, event)
+
+    @property
+    def _sim_time_s(self) -> float:
+        """The newest simulation time of the run that is recorded."""
+        clock = self._clock
+        return clock.sim_time_s if clock.run is self.run else clock.ended_sim_time_s
 
     # -- heartbeat and end ---------------------------------------------------------------------
 
     def beat(self, pulse: Pulse) -> None:
         """Say that the loop is alive. Skipped while rows wait: a late heartbeat tells nothing."""
-        self._look_after_file()
-        if self._waiting and not self.flush():
+        self._exclusively(self._look_after_files)
+        if self._backlog.rows and not self.flush():
             return
+        self._exclusively(lambda: self._beat(pulse))
+
+    def _beat(self, pulse: Pulse) -> None:
         if self.connection is None or self.registration is None or self.run.id is None:
             return
-        now = time.time()
-        session = (now, pulse.last_poll_wall_time_s, pulse.moved_wall_time_s, pulse.sim_time_s)
-        health = (pulse.hold, self.rows_waiting, self.rows_dropped, self.last_error)
-        try:
-            self.connection.execute("BEGIN IMMEDIATE")
-            self.connection.execute(
-                _BEAT_SESSION, (*session, *health, self.registration.session_id)
-            )
-            beat_run = (now, pulse.sim_time_s, self.run.rows, self.run.id)
-            self.connection.execute(_BEAT_RUN, beat_run)
-            self.connection.execute("COMMIT")
-        except sqlite3.Error as error:
-            _roll_back(self.connection)
-            self._put_off(error)
+        if self._untold_drops:
+            self._drain()
+        health = Health(self.rows_waiting, self.rows_dropped, self.last_error)
+        with transaction(self.connection):
+            write_pulse(self.connection, pulse, health, self.registration.session_id, self.run)
 
     def update_actions(self) -> None:
         """Publish the names and docstrings of the registered custom actions."""
@@ -247,71 +286,65 @@ class Recorder:
     def end_run(self, reason: str, sim_time_s: float) -> None:
         """The current run is over, as of the simulation time that was seen last."""
         times = {"now": time.time(), "sim_time": sim_time_s}
-        self.record(_END_RUN, self.run, {"reason": reason, **times, "rows": self.run.rows})
+        self.record(_END_RUN, self.run, {"reason": reason, **times})
+
+    def end(self, reason: str, sim_time_s: float) -> None:
+        """Run and session are over; what is recorded until `close` still belongs to them."""
+        self.end_run(reason, sim_time_s)
+        if self.registration is not None:
+            now, health = time.time(), (self.rows_dropped, self.last_error)
+            values = (now, now, reason, *health, self.registration.session_id)
+            self.record(_END_SESSION, None, values)
 
     def close(self, reason: str, sim_time_s: float) -> None:
         """Write what waits (trying for up to a second), end run and session, close the file."""
-        now = time.time()
-        self.end_run(reason, sim_time_s)
-        if self.registration is not None:
-            health = (self.rows_dropped, self.last_error)
-            values = (now, now, reason, *health, self.registration.session_id)
-            self.record(_END_SESSION, None, values)
+        self.end(reason, sim_time_s)
         deadline_s = time.monotonic() + 1
         while not self.flush() and self.connection is not None and time.monotonic() < deadline_s:
             time.sleep(0.005)
-        self._disconnect()
-        self._off = "closed"
+        with self._lock:
+            self._disconnect()
+            self._off = self._off or "the bridge is closed"
+            self._drop_waiting(self._obstacle)
+
+    def abandon(self) -> None:
+        """In a forked child: connection and session belong to the parent, which goes on."""
+        _of_parents.append(self.connection)  # not even closed: SQLite forbids any use
+        self.connection = self.registration = None
+        self._lock = threading.Lock()  # the thread that may have held it was not forked
+        self._backlog = Backlog()
+        self._off = "a forked process does not record for its parent"
 
     # -- trouble -------------------------------------------------------------------------------
 
-    def complain(self, kind: str, text: str) -> None:
-        """Remember what went wrong; say it on stderr once a kind; raise in strict mode."""
-        self.last_error = text
-        if kind not in self._said:
-            self._said.add(kind)
-            print(f"webots-mcp: {text}", file=sys.stderr, flush=True)  # noqa: T201
-        if self._strict:
-            raise DatabaseError(text)
-
     def _put_off(self, error: sqlite3.Error) -> None:
         """Decide how a failed write goes on: at once, in a second, or with a new file."""
-        text = str(error)
-        if "locked" in text:
+        self._obstacle = text = str(error)
+        if is_busy(error):
             return  # another writer, this instant: the next call tries again
         self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
-        if is_damage(text):
-            self._move_aside(text)
+        if is_damage(error):
+            self._replace_files(text)
         elif "no such table" in text or "FOREIGN KEY" in text:
             self._start_over(f"the database lost this session ({text})")
         else:
             self.complain(text, f"not recorded yet, trying again each second: {text}")
 
-    def _look_after_file(self) -> None:
+    def _look_after_files(self) -> None:
         """A deleted or replaced file still takes rows, which nobody would ever see."""
-        if self.connection is None or self._file is None or self._file == self._identify_file():
+        if self.connection is None:
             return
-        self._start_over("the database file was deleted or replaced")
+        if self._files == identify_files(self._database):
+            self._seen_whole = self.rows_written
+        else:
+            self._start_over("the database file or its write-ahead log was deleted or replaced")
 
-    def _identify_file(self) -> tuple[int, int] | None:
-        if isinstance(self._database, MemoryDatabase):
-            return None
-        try:
-            status = os.stat(self._database)  # noqa: PTH116  (a heartbeat: no Path objects)
-        except OSError:
-            return (0, 0)
-        return status.st_dev, status.st_ino
-
-    def _move_aside(self, why: str) -> None:
-        """Keep a damaged file, with its log and index, under another name; begin a new one."""
+    def _replace_files(self, why: str) -> None:
+        """Keep a damaged database under another name; begin a new one."""
         assert isinstance(self._database, Path)
         self._disconnect()
-        stamp = time.strftime("%Y%m%d-%H%M%S")
         try:
-            for suffix in ("", "-wal", "-shm"):
-                damaged = self._database.with_name(self._database.name + suffix)
-                if damaged.exists():
-                    damaged.rename(f"{self._database}.damaged-{stamp}{suffix}")
+            move_aside(self._database)
         except OSError as error:
             self.complain("damaged", f"{self._database} is damaged and cannot be moved: {error}")
             return
@@ -320,16 +353,23 @@ class Recorder:
     def _start_over(self, why: str) -> None:
         """Record into a database that knows nothing of this session yet."""
         self._disconnect()
-        for row in self._waiting:
-            if row.run is not None:
-                row.run.id = None
-        self.run.id = None
         self._retry_at_s = 0.0
+        waiting = tuple(self._backlog.rows)
+        states = Counter(row.run for row in waiting if row.statement == INSERT_STATE)
+        for run in {self.run, *(row.run for row in waiting if row.run is not None)}:
+            run.id, run.rows = None, states[run]
         data = json.dumps({"why": why})
-        now = (self.run.started_sim_time_s, time.time())
-        self._waiting.appendleft(_Row(INSERT_EVENT, self.run, (*now, "storage", None, data)))
-        self._waiting_bytes += _weight(self._waiting[0])
+        event = (self._sim_time_s, time.time(), "storage", None, data)
+        self._backlog.add_first(Row(INSERT_EVENT, self.run, event))
+        self._lose_what_was_not_seen(why)
         self.complain("storage", f"{why}; recording goes on in a new database")
+
+    def _lose_what_was_not_seen(self, why: str) -> None:
+        """Rows that were written since the files were last seen in their place."""
+        lost = self.rows_written - self._seen_whole
+        self.rows_written = self._seen_whole
+        if lost:
+            self._count_dropped(lost, why)
 
     def _disconnect(self) -> None:
         if self.registration is not None:
@@ -348,13 +388,13 @@ class Recorder:
         try:
             self._enter(patient)
         except (ForeignDatabaseError, SchemaTooNewError, SchemaTooOldError) as error:
-            self._off = str(error)
-            self.complain("off", f"not recording into {self._database}: {error}")
+            self._give_up(str(error))
         except (DatabaseError, sqlite3.Error, OSError) as error:
+            self._obstacle = str(error)
             self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
-            if is_damage(str(error)):
+            if is_damage(error):
                 return self._replace_damaged(str(error))
-            if "locked" not in str(error):
+            if not is_busy(error):
                 self.complain(f"open {type(error).__name__}", f"not recording yet: {error}")
         return self.connection is not None
 
@@ -362,7 +402,7 @@ class Recorder:
         actions = json.dumps(self.actions, ensure_ascii=False)
         opened = open_session(self._database, self._identity, actions, patient=patient)
         self.connection, self.registration = opened
-        self._file = self._identify_file()
+        self._files = identify_files(self._database)
         mode = journal_mode(self.connection)
         if mode not in ("wal", "memory"):
             self.complain(
@@ -374,25 +414,17 @@ class Recorder:
     def _replace_damaged(self, why: str) -> bool:
         """A damaged database, or a file of our name, is moved aside; any other file is not ours."""
         if is_ours(self._database):
-            self._move_aside(why)
+            self._replace_files(why)
             return self.connection is None and self._retry_at_s == 0 and self._open(patient=False)
-        self._off = why
-        self.complain("off", f"not recording into {self._database}: {why}; choose another file")
+        self._give_up(f"{why}; choose another file")
         return False
 
-
-def _bind(run: Run | None, values: Values) -> Values:
-    if run is None:
-        return values
-    return (run.id, *values) if isinstance(values, tuple) else {"run": run.id, **values}
-
-
-def _weight(row: _Row) -> int:
-    """About the bytes that a waiting row holds: its texts."""
-    values = row.values if isinstance(row.values, tuple) else row.values.values()
-    return 200 + sum(len(value) for value in values if isinstance(value, str))
+    def _give_up(self, why: str) -> None:
+        self._off = f"not recording into {self._database}: {why}"
+        self.complain("off", self._off)
+        self._drop_waiting(self._off)
 
 
-def _roll_back(connection: sqlite3.Connection) -> None:
-    if connection.in_transaction:
-        connection.execute("ROLLBACK")
+def _is_unfit(error: Exception) -> bool:
+    """Whether the row itself is refused, whatever state the database is in."""
+    return isinstance(error, _UNFIT) and "FOREIGN KEY" not in str(error)

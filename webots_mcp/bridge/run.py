@@ -2,7 +2,18 @@
 
 from __future__ import annotations
 
+import sqlite3
 import time
+from typing import Final
+
+from webots_mcp.bridge.identity import Identity
+from webots_mcp.bridge.registration import Registration
+
+_INSERT_RUN: Final = (
+    "INSERT INTO run (session_id, robot_id, world, basic_time_step_ms, start_reason, "
+    "started_wall_time_s, started_sim_time_s, last_wall_time_s, last_sim_time_s) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+)
 
 
 class Run:
@@ -16,3 +27,13 @@ class Run:
         self.start_reason = start_reason
         self.started_sim_time_s = sim_time_s
         self.started_wall_time_s = time.time()
+
+
+def insert_run(
+    connection: sqlite3.Connection, run: Run, owner: Registration, identity: Identity
+) -> None:
+    """Write the run's row, from which on its id is known."""
+    begun = (run.started_wall_time_s, run.started_sim_time_s)
+    where = (identity.world, identity.basic_time_step_ms, run.start_reason)
+    values = (owner.session_id, owner.robot_id, *where, *begun, *begun)
+    run.id = connection.execute(_INSERT_RUN, values).lastrowid

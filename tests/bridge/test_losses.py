@@ -1,0 +1,224 @@
+"""Rows that are lost are counted and told, and cost no other row."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.bridge.conftest import STEP_MS, Recording, heartbeat_now, numbers
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.bridge import backlog
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.standin import InProcessSupervisor
+
+POSIX = pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be deleted there")
+
+
+@pytest.fixture
+def bridge(robot: InProcessSupervisor, file: Path) -> Iterator[MCPBridge]:
+    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
+        yield bridge
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_stderr_that_takes_nothing_does_not_end_the_robot(tmp_path: Path) -> None:
+    program = (
+        "import sys\n"
+        "from webots_mcp import MCPBridge, MemoryDatabase\n"
+        "from webots_mcp.standin import InProcessSupervisor\n"
+        "bridge = MCPBridge(InProcessSupervisor('rover'), database=MemoryDatabase())\n"
+        "bridge.publish([1], force=True)\n"
+        "sys.stderr = None\n"
+        "bridge.log('text', level='loud')\n"
+        "print('drove on')\n"
+    )
+    with Path("/dev/full").open("w") as full:
+        line = [sys.executable, "-c", program]
+        done = subprocess.run(
+            line, stdout=subprocess.PIPE, stderr=full, cwd=tmp_path, text=True, check=False
+        )
+    assert done.stdout == "drove on\n"
+
+
+def test_the_last_error_stays_short_however_many_rows_are_dropped(
+    bridge: MCPBridge, file: Path, filed: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 1)
+    other = connect(file, "writer")
+    other.execute("BEGIN IMMEDIATE")
+    for n in range(50):
+        bridge.publish({"n": n})
+    assert bridge.stats().last_error == "rows are being dropped: database is locked"
+    other.execute("COMMIT")
+    other.close()
+    bridge.publish({"n": 50})
+    (told,) = filed.rows("SELECT data FROM event WHERE kind = 'dropped'")
+    assert json.loads(told)["why"] == "database is locked"
+
+
+def test_a_run_counts_the_rows_that_are_in_the_database(
+    bridge: MCPBridge, file: Path, filed: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 3)
+    other = connect(file, "writer")
+    other.execute("BEGIN IMMEDIATE")
+    for n in range(9):
+        bridge.publish({"n": n})
+    other.execute("COMMIT")
+    other.close()
+    heartbeat_now(bridge)
+    assert numbers(filed) == [6, 7, 8]
+    assert filed.rows("SELECT rows FROM run") == [3]
+
+
+def test_what_is_told_of_dropped_rows_is_stamped_with_the_time_of_now(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    file: Path,
+    filed: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 1)
+    other = connect(file, "writer")
+    other.execute("BEGIN IMMEDIATE")
+    for n in range(5):
+        robot.step(STEP_MS)
+        bridge.publish({"n": n})
+    other.execute("COMMIT")
+    other.close()
+    bridge.publish({"n": 5})
+    told = filed.rows("SELECT sim_time_s FROM event WHERE kind = 'dropped'")
+    assert told == [pytest.approx(5 * STEP_MS / 1000)]
+
+
+@POSIX
+@pytest.mark.usefixtures("retry_at_once")
+def test_rows_that_went_into_a_deleted_file_are_counted_as_dropped(
+    robot: InProcessSupervisor, bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    for n in range(3):
+        bridge.publish({"n": n})
+    heartbeat_now(bridge)
+    for part in file.parent.glob(f"{DATABASE_NAME}*"):
+        part.unlink()
+    robot.step(STEP_MS)
+    for n in range(3, 7):
+        bridge.publish({"n": n})
+    heartbeat_now(bridge)
+    bridge.publish({"n": 7})
+    heartbeat_now(bridge)
+    assert numbers(filed) == [7]
+    assert bridge.stats().rows_dropped == 4
+    assert filed.rows("SELECT rows FROM run") == [1]
+    told = filed.rows(
+        "SELECT sim_time_s, json_extract(data, '$.rows') FROM event WHERE name IS NULL"
+    )
+    assert (pytest.approx(STEP_MS / 1000), 4) in told
+
+
+@POSIX
+@pytest.mark.usefixtures("retry_at_once")
+def test_a_write_ahead_log_that_was_deleted_is_noticed(bridge: MCPBridge, file: Path) -> None:
+    bridge.publish({"n": 0})
+    Path(f"{file}-wal").unlink()
+    bridge.publish({"n": 1})
+    heartbeat_now(bridge)
+    assert bridge.stats().rows_dropped == 1
+    assert "write-ahead log was deleted" in (bridge.stats().last_error or "")
+
+
+@pytest.mark.usefixtures("retry_at_once")
+def test_a_row_that_the_database_refuses_is_dropped_and_stops_no_other(
+    robot: InProcessSupervisor, bridge: MCPBridge, filed: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bridge.publish({"n": 0})
+    with monkeypatch.context() as patch:
+        patch.setattr(robot, "getTime", lambda: math.nan)
+        bridge.publish({"n": 1})
+    bridge.publish({"n": 2})
+    assert numbers(filed) == [0, 2]
+    assert bridge.stats().rows_waiting == 0
+    assert bridge.stats().rows_dropped > 0
+
+
+def test_a_row_that_waits_with_a_lone_surrogate_is_dropped_and_stops_no_other(
+    bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    bridge.publish({"n": 0, "\ud800": "a"})
+    other = connect(file, "writer")
+    other.execute("BEGIN IMMEDIATE")
+    bridge.publish({"n": 1, "\ud800": "b"})
+    other.execute("COMMIT")
+    other.close()
+    bridge.publish({"n": 2, "\ud800": "c"})
+    assert numbers(filed) == [0, 1, 2]
+    assert bridge.stats().rows_waiting == 0
+
+
+def test_what_is_published_after_the_end_is_counted_and_said(
+    bridge: MCPBridge, capfd: pytest.CaptureFixture[str]
+) -> None:
+    bridge.close()
+    dropped = bridge.stats().rows_dropped
+    bridge.publish({"n": 1})
+    bridge.log("late")
+    assert bridge.stats().rows_dropped == dropped + 2
+    assert capfd.readouterr().err.count("the bridge is closed") == 1
+
+
+def test_rows_of_several_threads_are_all_written_or_still_counted(
+    bridge: MCPBridge, filed: Recording
+) -> None:
+    def write(thread: int) -> None:
+        for n in range(200):
+            bridge.log(f"{thread} {n}")
+
+    threads = [threading.Thread(target=write, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    while any(thread.is_alive() for thread in threads):
+        heartbeat_now(bridge)
+    bridge.log("last")
+    assert filed.rows("SELECT count(*) FROM log WHERE source = 'controller'") == [801]
+    assert bridge.stats().rows_waiting == 0
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_child_that_ends_leaves_the_session_of_its_parent_alone(tmp_path: Path) -> None:
+    program = (
+        "import os, sys\n"
+        "from webots_mcp import MCPBridge\n"
+        "from webots_mcp.standin import InProcessSupervisor\n"
+        f"bridge = MCPBridge(InProcessSupervisor('rover'), {str(tmp_path)!r}, 1)\n"
+        "bridge.publish({'n': 0})\n"
+        "child = os.fork()\n"
+        "if child == 0:\n"
+        "    bridge.publish({'n': 'child'})\n"
+        "    bridge.get_command()\n"
+        "    sys.exit(0)\n"
+        "os.waitpid(child, 0)\n"
+        "bridge.publish({'n': 1})\n"
+        "os._exit(0)\n"
+    )
+    subprocess.run([sys.executable, "-W", "ignore", "-c", program], check=True)
+    recording = Recording(tmp_path / DATABASE_NAME)
+    assert recording.rows("SELECT end_reason FROM session") == [None]
+    assert numbers(recording) == [0, 1]
+
+
+def test_a_database_in_memory_has_no_files_that_could_vanish(
+    robot: InProcessSupervisor, database: MemoryDatabase
+) -> None:
+    with MCPBridge(robot, throttle_interval=1, database=database) as bridge:
+        bridge.publish({"n": 0})
+        heartbeat_now(bridge)
+        assert bridge.stats().rows_dropped == 0

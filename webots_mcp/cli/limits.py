@@ -66,9 +66,8 @@ def retention_of(arguments: argparse.Namespace) -> Retention:
     from webots_mcp.store.retention.notation import parse_limit
 
     names = (*_KINDS, "outlive")
-    given = {
-        name: value for name in names if not isinstance(value := vars(arguments)[name], _Default)
-    }
-    for kind in given.keys() & _KINDS:
+    asked = {name: getattr(arguments, name) for name in names}
+    given = {name: value for name, value in asked.items() if not isinstance(value, _Default)}
+    for kind in given.keys() & _KINDS.keys():
         given[kind] = parse_limit(given[kind], getattr(DEFAULT, kind))
     return replace(DEFAULT, **given)

@@ -8,11 +8,14 @@ from pathlib import Path
 
 import anyio
 
+import webots_mcp
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.cli import COMMANDS
 from webots_mcp.server import create_server
 
-README = (Path(__file__).parent.parent / "README.md").read_text("utf-8")
+CHECKOUT = Path(__file__).parent.parent
+INSTALLED = Path(webots_mcp.__file__).parent.parent
+README = (CHECKOUT / "README.md").read_text("utf-8")
 
 
 def test_it_names_every_tool_and_no_other() -> None:
@@ -39,4 +42,4 @@ def test_it_names_every_method_of_the_bridge() -> None:
 
 def test_the_files_it_links_to_exist() -> None:
     for target in re.findall(r"\]\(((?!http)[^)#]+)\)", README):
-        assert (Path(__file__).parent.parent / target).exists(), target
+        assert any((folder / target).exists() for folder in (CHECKOUT, INSTALLED)), target

@@ -337,7 +337,8 @@ def test_a_log_line_may_hold_any_text(bridge: MCPBridge, filed: Recording) -> No
 def test_importing_the_bridge_needs_nothing_but_the_standard_library(tmp_path: Path) -> None:
     package = Path(recorder.__file__).parents[2]
     program = (
-        f"import sys; sys.path.insert(0, {str(package)!r}); from webots_mcp import MCPBridge; "
+        f"import sys; sys.path.insert(0, {str(package)!r}); sys.modules['orjson'] = None; "
+        "from webots_mcp import MCPBridge; "
         "heavy = {'sqlmodel', 'sqlalchemy', 'alembic', 'mcp', 'pydantic', 'PIL', 'numpy', "
         "'subprocess', 'asyncio', 'dataclasses', 'controller'} & set(sys.modules); "
         "print(sorted(heavy))"

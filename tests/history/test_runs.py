@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import sqlite3
 import statistics
 from typing import Any
@@ -81,6 +82,25 @@ def test_distance_time_and_events_are_told_per_run(rover: sqlite3.Connection) ->
     assert first.time_by_mode_s == pytest.approx({"cruise": 76.9, "avoid": 35.0, "back_up": 8.0})
     assert first.events["stuck"] == 1 and first.events["gap"] == 1
     assert third.events == {}
+
+
+@pytest.mark.parametrize(("noise_m", "speed_m_s", "way_m"), [(0.01, 0, 0), (0.0005, 0.1, 14)])
+def test_the_noise_of_a_position_is_no_way(
+    empty: sqlite3.Connection, noise_m: float, speed_m_s: float, way_m: float
+) -> None:
+    noise = random.Random(7)
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    session_id = recorder.session(robot_id, "x")
+    empty.execute("BEGIN")
+    for _ in range(2):
+        recorder.run(session_id, robot_id)
+        for step in range(4376):
+            x, y = (noise.gauss(speed_m_s * step * 0.032, noise_m), noise.gauss(1, noise_m))
+            recorder.publish(step * 0.032, {"pose": [x, y]})
+    empty.execute("COMMIT")
+    for group in compare_runs(empty, [1, 2]).groups:
+        assert group.distance_m == pytest.approx(way_m, abs=0.03 * way_m + 0.6)
 
 
 def test_runs_before_and_after_the_last_edit_are_compared(rover: sqlite3.Connection) -> None:

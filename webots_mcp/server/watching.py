@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from webots_mcp.server.bounds import newest_runs
 from webots_mcp.server.fitting import figure
-from webots_mcp.store.history.columns import Columns, read_columns
+from webots_mcp.store.history.columns import read_columns
 from webots_mcp.store.history.deadline import Deadline
 from webots_mcp.store.history.event import EventOptions
-from webots_mcp.store.history.motion import find_motion, path_length
+from webots_mcp.store.history.motion import find_motion, path_length, places_of
 from webots_mcp.store.history.ranges import Segment, TimeRange, resolve_range
-from webots_mcp.store.history.series import signals_of
+from webots_mcp.store.history.signals import known_signals
 from webots_mcp.store.recording import View
 
 _ROW_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
@@ -65,7 +64,7 @@ def movement(view: View, found: TimeRange) -> dict[str, Any] | None:
 
     A jump to the start at a reset was not travelled, and a lost position is no place.
     """
-    known = {signal.name: signal for signal in signals_of(view.connection, found, ["*"])}
+    known = known_signals(view.connection, found)
     position = find_motion(known, EventOptions()).position
     if position is None:
         return None
@@ -74,7 +73,7 @@ def movement(view: View, found: TimeRange) -> dict[str, Any] | None:
         read_columns(view.connection, segment, position, deadline) for segment in found.segments
     ]
     names = [signal.name for signal in position]
-    places = [place for part in parts for place in _places(part, names)]
+    places = [place for part in parts for place in places_of(part, position)]
     if len(places) < 2:
         return None
     return {
@@ -84,9 +83,3 @@ def movement(view: View, found: TimeRange) -> dict[str, Any] | None:
         "distance": figure(math.fsum(path_length(part, position) for part in parts)),
         "displacement": figure(math.dist(places[0], places[-1])),
     }
-
-
-def _places(columns: Columns, names: Sequence[str]) -> Iterator[tuple[float, float]]:
-    for x, y in zip(*(columns.values[name] for name in names), strict=True):
-        if isinstance(x, (int, float)) and isinstance(y, (int, float)):
-            yield float(x), float(y)

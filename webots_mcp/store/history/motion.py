@@ -9,7 +9,6 @@ import statistics
 from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
@@ -20,6 +19,10 @@ from webots_mcp.store.history.leaves import Value
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.signals import resolve_signals
 
+NOISE_LEG: Final = 6.0  # standard deviations: one row in 8,000 is so far from another by noise
+LONGEST_NOISE_LEG_M: Final = 0.1  # beyond, it is rather a robot that turns between any two rows
+NOISE_ROWS: Final = 2000
+FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer of 400 digits)
 SETTLED_SHARE: Final = 0.2  # of stuck_m: within it of the stuck place is where it begins and ends
 
 _BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location", "")
@@ -226,12 +229,44 @@ def _stay(
     return Stay(times[first], times[last], *place, mode, commanded)
 
 
-def path_length(columns: Columns, position: tuple[Signal, Signal]) -> float:
-    """Metres travelled: the sum of the distances between rows that have a position."""
+def places_of(columns: Columns, position: tuple[Signal, Signal]) -> list[tuple[float, float]]:
+    """Where it was, of the rows that have a position."""
     x, y = (columns.values[signal.name] for signal in position)
-    places = [
+    return [
         (float(a), float(b))
         for a, b in zip(x, y, strict=True)
         if isinstance(a, (int, float)) and isinstance(b, (int, float))
+        if max(abs(a), abs(b)) <= FARTHEST_M
     ]
-    return sum(math.dist(a, b) for a, b in pairwise(places))
+
+
+def path_length(columns: Columns, position: tuple[Signal, Signal]) -> float:
+    """Metres travelled: the sum of legs that are longer than the noise of the position makes them.
+
+    From row to row a noise of 1 cm would add up to metres while the robot stands still.
+    """
+    places = places_of(columns, position)
+    if not places:
+        return 0.0
+    shortest_m = min(NOISE_LEG * _noise_m(places), LONGEST_NOISE_LEG_M)
+    length_m, counted = 0.0, places[0]
+    for place in places:
+        if (leg_m := math.dist(counted, place)) > shortest_m:
+            length_m += leg_m
+            counted = place
+    return length_m + math.dist(counted, places[-1])
+
+
+def _noise_m(places: Sequence[tuple[float, float]]) -> float:
+    """Standard deviation of the noise in x and in y: what is no steady motion over three rows.
+
+    The second difference of independent noise has a standard deviation of sqrt(6) times that of
+    the noise, and its length in the plane, of a Rayleigh distribution, the median 1.1774 times as
+    much. At most a few thousand rows are looked at.
+    """
+    every = range(0, len(places) - 2, len(places) // NOISE_ROWS + 1)
+    bends = [
+        math.dist((a[0] + c[0], a[1] + c[1]), (2 * b[0], 2 * b[1]))
+        for a, b, c in (places[index : index + 3] for index in every)
+    ]
+    return statistics.median(bends) / (1.1774 * math.sqrt(6)) if bends else 0.0

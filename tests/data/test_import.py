@@ -305,7 +305,7 @@ def test_a_robots_own_recording_is_not_mixed_with_an_import(
     peer.everything()
     import_folder(database, peer.folder, data_dir, "rover")
     peer.write("logs/controller.log", "[12:00:00] another\n")
-    with pytest.raises(InvalidInputError, match="choose another name with --robot"):
+    with pytest.raises(InvalidInputError, match="choose another name"):
         import_folder(database, peer.folder, data_dir, "rover")
 
 

@@ -15,12 +15,13 @@ from webots_mcp.store.history.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.series import RunHistory, query_history, signals_of
 from webots_mcp.store.history.signals import resolve_signals
+from webots_mcp.store.runs import fetch_run
 
 Known = dict[str, Signal]
 
 MOST_RUNS: Final = 4  # more lines of each signal could not be told apart
+_SHOWN_NAMES: Final = 10
 _POINTS: Final = 260  # of 3 pixels each: narrower, and the band hides behind the line
-_LABEL: Final = "SELECT label FROM run WHERE id = ?"
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def _part(
     connection: sqlite3.Connection, time_range: TimeRange, run: RunHistory, overlaid: bool
 ) -> Part:
     first_s, newest_s = recorded_bounds(connection, run.run_id) or (run.start_s, run.end_s)
-    label = connection.execute(_LABEL, (run.run_id,)).fetchone()[0]
+    label = fetch_run(connection, run.run_id).label
     name = f"run {run.run_id}" + (f" “{short(label)}”" if label else "")
     start_s, end_s = max(run.start_s, first_s), min(run.end_s, newest_s)
     origin_s = first_s if overlaid else 0.0
@@ -107,6 +108,13 @@ def title_of(parts: Sequence[Part]) -> str:
 
 def _seconds(time_s: float) -> str:
     return f"{time_s:.2f}".rstrip("0").rstrip(".")
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names of several, and how many more there are."""
+    unlike = list(dict.fromkeys(names))
+    more = len(unlike) - _SHOWN_NAMES
+    return ", ".join(unlike[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def known_signals(connection: sqlite3.Connection, ranges: Sequence[TimeRange]) -> Known:

@@ -13,13 +13,12 @@ from webots_mcp.plotting.canvas import LEAST_PX, Picture, Sheet, draw, media_typ
 from webots_mcp.plotting.curves import Curve, curve_of
 from webots_mcp.plotting.marks import event_lanes
 from webots_mcp.plotting.panels import MOST_PANELS, by_scale, by_signal
-from webots_mcp.plotting.parts import Part, known_signals, mode_signal, parts_of, title_of
+from webots_mcp.plotting.parts import Part, known_signals, listed, mode_signal, parts_of, title_of
 from webots_mcp.plotting.spans import Lane, Span, lane_of
 from webots_mcp.plotting.timeline import Timeline, paint_timeline
 from webots_mcp.store.history.ranges import TimeRange
 
 MOST_LANES: Final = 4
-_SHOWN_NAMES: Final = 10
 
 
 def plot_signals(
@@ -154,7 +153,7 @@ def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
     for part in parts:
         silent = [c.name for c in part.run.numbers if (part.run.run_id, c.name) not in drawn]
         if silent:
-            notes.append(f"without a value in {part.name}: {_listed(silent)}")
+            notes.append(f"without a value in {part.name}: {listed(silent)}")
         if part.run.cut_at_s is not None:
             notes.append(
                 f"{part.name} is drawn up to {part.run.cut_at_s:g} s only: it took too long"
@@ -180,13 +179,7 @@ def _left_out(names: Sequence[str]) -> list[str]:
     if not names:
         return []
     why = f"a picture has at most {MOST_PANELS} panels and {MOST_LANES} rows"
-    return [f"left out: {_listed(names)} ({why}); ask for them alone"]
-
-
-def _listed(names: Sequence[str]) -> str:
-    unlike = list(dict.fromkeys(names))
-    more = len(unlike) - _SHOWN_NAMES
-    return ", ".join(unlike[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")
+    return [f"left out: {listed(names)} ({why}); ask for them alone"]
 
 
 def _nothing(parts: Sequence[Part]) -> str:

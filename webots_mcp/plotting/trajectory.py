@@ -15,6 +15,7 @@ from webots_mcp.plotting.parts import (
     Known,
     Part,
     known_signals,
+    listed,
     mode_signal,
     one_signal,
     parts_of,
@@ -94,9 +95,10 @@ def _position(known: Known, named: tuple[str, str] | None) -> tuple[Signal, Sign
         return _number(known, named[0]), _number(known, named[1])
     position = find_motion(known, EventOptions()).position
     if position is None:
+        numbers = [name for name, signal in known.items() if signal.is_number]
         raise InvalidInputError(
-            f"no position was found among the {len(known)} signals: name its two signals, x and y "
-            "(webots_list_signals lists them)"
+            f"no position was found among the {len(known)} signals: name its two, x and y; "
+            f"numbers are {listed(numbers) or 'none of them'}"
         )
     return position
 

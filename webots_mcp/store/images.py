@@ -53,8 +53,8 @@ def inside(data_dir: Path, path: str) -> Path:
         raise InvalidInputError(f"{path!r} lies outside the data folder and is not opened")
     if not file.is_file():
         raise NothingRecordedError(
-            f"{file} was recorded, but the file is gone: only the newest pictures are kept, and "
-            "the server may have been started with another --data-dir than the controller"
+            f"{file} was recorded, but the file is gone: only the newest pictures are kept; or "
+            "this is not the data folder that the controller records into"
         )
     return file
 

@@ -27,6 +27,7 @@ class Run:
     ended_wall_time_s: float | None
     end_reason: str | None
     rows: int
+    label: str | None
 
 
 _COLUMNS: Final = columns_of(Run)

@@ -110,11 +110,11 @@ def _require_new(connection: sqlite3.Connection, instance: str, folder: Path, ro
             f"{folder} was imported before, as run {before[0]} of robot {before[1]!r}"
         )
     if not robot.strip():
-        raise InvalidInputError("the robot needs a name: give one with --robot")
+        raise InvalidInputError("the robot needs a name to be recorded under, not an empty one")
     if connection.execute(_KNOWN_ROBOT, (robot,)).fetchone():
         raise InvalidInputError(
             f"there is a robot {robot!r} already, whose newest run this would seem to be: choose "
-            "another name with --robot"
+            "another name"
         )
 
 

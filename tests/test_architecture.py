@@ -20,11 +20,13 @@ ALLOWED = {
     "bundled": set[str](),
     "connection": {"contract", "errors"},
     "schema": {"connection", "contract", "errors"},
-    "settlement": {"contract"},
+    "liveness": set[str](),
+    "settlement": {"contract", "liveness"},
     "maintenance": {"connection", "errors", "schema"},
     "standin": {"standin", "bundled"},
 }
-STDLIB = {"contract", "errors", "bundled", *ALLOWED["maintenance"], "settlement", "maintenance"}
+ENTRIES = {"bundled", "maintenance", "settlement"}
+STDLIB = {*ENTRIES, *ALLOWED["maintenance"], *ALLOWED["settlement"]}
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["store"] = STDLIB | {"store"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}

@@ -5,12 +5,11 @@ Standard library only, because the bridge imports it inside a robot's controller
 
 from __future__ import annotations
 
-import os
 import sqlite3
-import sys
-from typing import Any, Final
+from typing import Final
 
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, host_name
+from webots_mcp.liveness import process_alive
 
 EXPIRE: Final = (
     "UPDATE command SET status = 'expired', finished_wall_time_s = :now, "
@@ -25,15 +24,22 @@ END_SESSION: Final = (
     "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, hold = NULL, "
     "end_reason = :reason WHERE id = :id AND ended_wall_time_s IS NULL"
 )
-# Judged from outside: the rows are counted, because the dead process could not say how many.
+# Judged from outside: the rows are counted, because the dead process could not say how many; and
+# its last row may be younger than its last heartbeat.
+_LAST_ROW: Final = (
+    "coalesce((SELECT {0} FROM state WHERE run_id = run.id ORDER BY sim_time_s DESC LIMIT 1), {1})"
+)
+_LAST_S: Final = f"max(last_wall_time_s, {_LAST_ROW.format('wall_time_s', 'last_wall_time_s')})"
 END_RUNS: Final = (
-    "UPDATE run SET ended_wall_time_s = last_wall_time_s, end_reason = :reason, "
+    f"UPDATE run SET ended_wall_time_s = {_LAST_S}, last_wall_time_s = {_LAST_S}, "
+    f"last_sim_time_s = max(last_sim_time_s, {_LAST_ROW.format('sim_time_s', 'last_sim_time_s')}), "
+    "end_reason = :reason, "
     "rows = purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
     "WHERE session_id = :id AND ended_wall_time_s IS NULL"
 )
 _OPEN_SESSIONS: Final = (
-    "SELECT id, pid, host, EXISTS (SELECT 1 FROM command WHERE session_id = session.id "
-    "AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
+    "SELECT id, pid, host, last_seen_wall_time_s, EXISTS (SELECT 1 FROM command "
+    "WHERE session_id = session.id AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
     "FROM session WHERE ended_wall_time_s IS NULL"
 )
 _CLAIMED_BY_ENDED: Final = (
@@ -53,8 +59,8 @@ def settle(connection: sqlite3.Connection, now_s: float) -> None:
     The caller opens the transaction, or accepts that each statement is one of its own.
     """
     connection.execute(EXPIRE, {"now": now_s})
-    for session_id, pid, host, reloading in connection.execute(_OPEN_SESSIONS).fetchall():
-        if host == host_name() and not process_alive(pid):
+    for session_id, pid, host, seen_s, reloading in connection.execute(_OPEN_SESSIONS).fetchall():
+        if host == host_name() and not process_alive(pid, seen_s):
             end_session(connection, session_id, "reload" if reloading else "crashed")
     for command_id, issued_s in connection.execute(_CLAIMED_BY_ENDED).fetchall():
         if issued_s is None:
@@ -70,40 +76,3 @@ def end_session(connection: sqlite3.Connection, session_id: int, reason: str) ->
     """End a session that another process left open, and its runs, as of their last sign of life."""
     connection.execute(END_SESSION, {"id": session_id, "reason": reason})
     connection.execute(END_RUNS, {"id": session_id, "reason": reason})
-
-
-def process_alive(pid: int) -> bool:
-    """Whether a process of this host still runs (a pid may have been given to another since)."""
-    if sys.platform == "win32":
-        return _windows_process_alive(pid)
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except PermissionError:
-        return True
-    return not _is_zombie(pid)
-
-
-def _is_zombie(pid: int) -> bool:
-    """A process that ended but was not yet waited for still has a pid; only Linux tells cheaply."""
-    try:
-        with open(f"/proc/{pid}/stat", "rb") as file:  # noqa: PTH123  (no pathlib in the loop)
-            return file.read().rpartition(b") ")[2][:1] == b"Z"
-    except OSError:
-        return False
-
-
-def _windows_process_alive(pid: int) -> bool:
-    """os.kill(pid, 0) would end the process on Windows; asking for its exit code does not."""
-    import ctypes
-
-    query_limited_information, still_active = 0x1000, 259
-    kernel: Any = getattr(ctypes, "WinDLL")("kernel32")  # noqa: B009  (exists on Windows only)
-    handle = kernel.OpenProcess(query_limited_information, False, pid)
-    if not handle:
-        return False
-    code = ctypes.c_ulong()
-    kernel.GetExitCodeProcess(handle, ctypes.byref(code))
-    kernel.CloseHandle(handle)
-    return code.value == still_active

@@ -99,7 +99,7 @@ async def test_a_failure_is_an_error_whose_words_stay_in_a_data_field(
     [
         ({"last_poll_wall_time_s": None}, "never calls bridge.get_command()"),
         ({"last_poll_wall_time_s": time.time() - 60}, "last called bridge.get_command()"),
-        ({"last_seen_wall_time_s": time.time() - 60}, "paused by hand"),
+        ({"last_seen_wall_time_s": time.time() - 2.5}, "paused by hand"),
         ({"ended_wall_time_s": time.time(), "end_reason": "crashed"}, "no live controller"),
         ({}, "longer timeout_s"),
     ],

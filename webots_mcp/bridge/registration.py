@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
 from typing import Final, NamedTuple
 
@@ -10,6 +11,7 @@ from webots_mcp import settlement
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.connection import transaction
 from webots_mcp.contract import REMOTE_SILENCE_S
+from webots_mcp.liveness import process_alive
 
 _KNOWN_ROBOT: Final = (
     "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
@@ -20,12 +22,17 @@ _OPEN_SESSIONS: Final = (
     "SELECT s.id, s.pid, s.host, s.last_seen_wall_time_s FROM session s "
     "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
-# A successor in the same Webots means a reload; so does one after a reload that was asked for.
+# A successor in the same Webots, soon after, means a reload; so does one after a reload that was
+# asked for. One that was killed counts only where Webots may have done it: it kills a controller
+# that does not end within a second, while any other was killed and started by somebody.
 _RELOADED: Final = (
     "SELECT 1 FROM session WHERE id = (SELECT max(id) FROM session WHERE robot_id = :robot) "
-    "AND instance = :instance UNION SELECT 1 FROM command WHERE robot_id = :robot "
+    "AND instance = :instance AND coalesce(ended_wall_time_s, last_seen_wall_time_s) > :earliest "
+    "AND (:in_webots OR end_reason <> 'crashed') "
+    "UNION SELECT 1 FROM command WHERE robot_id = :robot "
     "AND status = 'claimed' AND action = 'reload' AND issued_wall_time_s IS NOT NULL"
 )
+_LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
 _NEW_SESSION: Final = (
     "INSERT INTO session (robot_id, pid, host, instance, controller, controller_sha256, "
     "git_commit, versions, supervisor, actions, started_wall_time_s, last_seen_wall_time_s) "
@@ -58,8 +65,7 @@ def register(
         settlement.settle(connection, now_s)
         name = _free_name(connection, identity, now_s)
         robot_id = _enter_robot(connection, identity, name, now_s)
-        values = {"robot": robot_id, "instance": identity.instance}
-        reloaded = connection.execute(_RELOADED, values).fetchone() is not None
+        reloaded = _is_reload(connection, identity, robot_id, now_s)
         session_id = _enter_session(connection, identity, robot_id, actions, now_s)
     _own_sessions.add(session_id)
     return Registration(robot_id, name, session_id, reloaded)
@@ -83,6 +89,18 @@ def _free_name(connection: sqlite3.Connection, identity: Identity, now_s: float)
         number += 1
 
 
+def _is_reload(
+    connection: sqlite3.Connection, identity: Identity, robot_id: int, now_s: float
+) -> bool:
+    values = {
+        "robot": robot_id,
+        "instance": identity.instance,
+        "earliest": now_s - _LONGEST_RELOAD_S,
+        "in_webots": "WEBOTS_INSTANCE_PATH" in os.environ,
+    }
+    return connection.execute(_RELOADED, values).fetchone() is not None
+
+
 def _is_living(session: tuple[int, int, str, float], identity: Identity, now_s: float) -> bool:
     """On this host the process tells; on another only a recent heartbeat does."""
     session_id, pid, host, last_seen_s = session
@@ -90,7 +108,7 @@ def _is_living(session: tuple[int, int, str, float], identity: Identity, now_s: 
         return now_s - last_seen_s < REMOTE_SILENCE_S
     if pid == identity.pid:
         return session_id in _own_sessions
-    return settlement.process_alive(pid)
+    return process_alive(pid, last_seen_s)
 
 
 def _enter_robot(

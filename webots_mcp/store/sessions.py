@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.contract import HEARTBEAT_LATE_S, REMOTE_SILENCE_S, host_name
-from webots_mcp.settlement import process_alive
+from webots_mcp.liveness import process_alive
 
 _COLUMNS: Final = (
     "id, robot_id, pid, host, instance, controller, controller_sha256, git_commit, versions, "
@@ -56,7 +56,7 @@ class Session:
         if self.ended_wall_time_s is not None:
             return False
         if self.host == host_name():
-            return process_alive(self.pid)
+            return process_alive(self.pid, self.last_seen_wall_time_s)
         return now_s - self.last_seen_wall_time_s < REMOTE_SILENCE_S
 
     def heartbeat_is_fresh(self, now_s: float) -> bool:

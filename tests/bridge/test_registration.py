@@ -1,0 +1,140 @@
+"""What a new controller process takes over from the one before it, and what it does not."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.bridge.conftest import Recording
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.connection import connect
+from webots_mcp.standin import InProcessSupervisor
+
+DAY_S = 86_400.0
+
+
+def change(recording: Recording, sql: str, *values: object) -> None:
+    connection = connect(recording.database, "writer")
+    connection.execute(sql, values)
+    connection.close()
+
+
+def leave_open(database: MemoryDatabase, recording: Recording, pid: int, seen_s: float) -> None:
+    """A session that never ended, of a process with that pid, last seen then."""
+    MCPBridge(InProcessSupervisor("rover"), database=database).close()
+    change(
+        recording,
+        "UPDATE session SET ended_wall_time_s = NULL, end_reason = NULL, pid = ?, "
+        "started_wall_time_s = ?, last_seen_wall_time_s = ?",
+        pid,
+        seen_s - 60,
+        seen_s,
+    )
+    change(recording, "UPDATE run SET ended_wall_time_s = NULL, end_reason = NULL")
+
+
+@pytest.fixture
+def another_process() -> Iterator[int]:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
+        yield process.pid
+
+
+def start_again(database: MemoryDatabase) -> str:
+    with MCPBridge(InProcessSupervisor("rover"), database=database) as bridge:
+        return bridge.robot_name
+
+
+@pytest.mark.skipif(sys.platform == "darwin", reason="macOS does not tell when a process started")
+def test_a_crashed_session_whose_pid_another_process_has_by_now_frees_its_name(
+    database: MemoryDatabase, recording: Recording, another_process: int
+) -> None:
+    leave_open(database, recording, another_process, time.time() - DAY_S)
+    assert start_again(database) == "rover"
+    assert recording.rows("SELECT end_reason FROM session ORDER BY id") == ["crashed", "finished"]
+
+
+def test_a_controller_that_lives_keeps_its_name_however_it_is_called_by_others(
+    database: MemoryDatabase, recording: Recording, another_process: int
+) -> None:
+    leave_open(database, recording, another_process, time.time())
+    assert start_again(database) == "rover#2"
+
+
+@pytest.mark.skipif(not Path("/proc/1/stat").exists(), reason="needs a process of long ago")
+def test_a_controller_that_was_silent_for_long_but_lives_keeps_its_name(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    since_boot_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    leave_open(database, recording, 1, time.time() - min(since_boot_s / 100, DAY_S))
+    assert start_again(database) == "rover#2"
+
+
+def begun(recording: Recording) -> list[str]:
+    return recording.rows("SELECT start_reason FROM run ORDER BY id")
+
+
+def test_a_start_a_day_later_is_no_reload(database: MemoryDatabase, recording: Recording) -> None:
+    start_again(database)
+    change(
+        recording,
+        "UPDATE session SET ended_wall_time_s = ended_wall_time_s - ?, "
+        "last_seen_wall_time_s = last_seen_wall_time_s - ?",
+        *(DAY_S, DAY_S),
+    )
+    start_again(database)
+    assert begun(recording) == ["start", "start"]
+
+
+@pytest.mark.parametrize(("instance", "told"), [(None, "start"), ("webots-1", "reload")])
+def test_a_start_after_a_kill_is_a_reload_only_where_webots_may_have_killed(
+    database: MemoryDatabase,
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+    instance: str | None,
+    told: str,
+) -> None:
+    if instance is None:
+        monkeypatch.delenv("WEBOTS_INSTANCE_PATH", raising=False)
+    else:
+        monkeypatch.setenv("WEBOTS_INSTANCE_PATH", instance)
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        ended.wait()
+    leave_open(database, recording, ended.pid, time.time())
+    start_again(database)
+    assert begun(recording) == ["start", told]
+    assert recording.rows("SELECT end_reason FROM session ORDER BY id") == ["crashed", "finished"]
+
+
+def test_a_run_that_ends_by_a_crash_lasts_until_its_last_row(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    bridge = MCPBridge(InProcessSupervisor("rover"), throttle_interval=1, database=database)
+    for _ in range(50):
+        bridge.robot.step(16)
+        bridge.publish({"x": 1})
+    bridge.close()
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        ended.wait()
+    now_s = time.time()
+    change(
+        recording,
+        "UPDATE session SET ended_wall_time_s = NULL, end_reason = NULL, pid = ?",
+        ended.pid,
+    )
+    change(
+        recording,
+        "UPDATE run SET ended_wall_time_s = NULL, last_wall_time_s = ?, last_sim_time_s = 0.1",
+        now_s - 60,
+    )
+    start_again(database)
+    sql = (
+        "SELECT ended_wall_time_s = s.wall_time_s, last_wall_time_s = s.wall_time_s, "
+        "last_sim_time_s FROM run JOIN (SELECT run_id, max(wall_time_s) AS wall_time_s FROM state "
+        "GROUP BY run_id) s ON s.run_id = run.id WHERE run.id = 1"
+    )
+    assert recording.rows(sql) == [(1, 1, pytest.approx(0.8))]

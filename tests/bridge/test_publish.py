@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import collections
 import copy
 import dataclasses
 import enum
 import json
 import math
 import sqlite3
+import uuid
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -122,7 +124,9 @@ def test_a_value_that_cannot_be_stored_costs_that_value_and_is_logged_once(
     assert state == {"x": 1, "handle": None, "raw": "YWJj", "(1, 2)": "tuple"}
     assert bridge.stats().values_replaced == 6
     logged = recording.rows("SELECT message FROM log WHERE source = 'bridge'")
-    assert [line.split()[0] for line in logged] == ["handle", "raw"]
+    assert logged == ["handle could not be stored: type object"]
+    (odd, *_) = recording.rows("SELECT odd FROM state")
+    assert json.loads(odd) == {"handle": "type object", "raw": "bytes"}
 
 
 @pytest.mark.usefixtures("encoder")
@@ -131,6 +135,15 @@ def test_a_huge_array_costs_itself_and_not_the_row(bridge: MCPBridge, recording:
     assert recording.states() == [{"x": 1, "image": None, "list": None}]
     (odd,) = recording.rows("SELECT odd FROM state")
     assert json.loads(odd) == {"image": "array[921600]", "list": "array[400000]"}
+
+
+@pytest.mark.usefixtures("encoder")
+def test_a_picture_as_nested_lists_costs_itself_and_not_the_row(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish({"x": 1, "depth": [[0.123456] * 640 for _ in range(480)]})
+    assert recording.states() == [{"x": 1, "depth": None}]
+    assert recording.rows("SELECT odd FROM state") == ['{"depth":"array[307200]"}']
 
 
 def test_a_state_that_contains_itself_is_cut(bridge: MCPBridge, recording: Recording) -> None:
@@ -149,15 +162,132 @@ def test_the_callers_dict_is_never_changed(bridge: MCPBridge) -> None:
     assert repr(state) == repr(before)
 
 
-def test_an_object_that_fails_while_it_is_read_costs_itself(
+class Broken:
+    def tolist(self) -> list[int]:
+        raise RuntimeError("no data")
+
+
+class Unconnected:
+    def __getattr__(self, name: str) -> object:
+        raise RuntimeError("not connected")
+
+
+class Picture:
+    size = (640, 480)
+
+
+class MuteError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError("no text")
+
+
+class Sullen:
+    def tolist(self) -> list[int]:
+        raise MuteError
+
+
+class Unreadable(dict[str, int]):
+    def items(self) -> Any:
+        raise RuntimeError("no items")
+
+    __iter__ = keys = values = items
+
+
+BROKEN = (Broken(), Unconnected(), Picture(), Sullen(), 10**5000, Mode)
+
+
+@pytest.mark.usefixtures("encoder")
+@pytest.mark.parametrize("value", BROKEN, ids=lambda value: type(value).__name__)
+def test_whatever_an_object_does_it_costs_itself_and_is_counted(
+    bridge: MCPBridge, recording: Recording, value: object
+) -> None:
+    bridge.publish({"x": 1, "value": value})
+    bridge.publish({"x": 2, "values": [value]})
+    assert recording.states() == [{"x": 1, "value": None}, {"x": 2, "values": [None]}]
+    assert bridge.stats().values_replaced == 2
+    assert recording.rows("SELECT count(*) FROM log WHERE source = 'bridge'") == [2]
+
+
+@pytest.mark.usefixtures("encoder")
+def test_a_key_without_text_costs_itself(bridge: MCPBridge, recording: Recording) -> None:
+    class Key:
+        def __str__(self) -> str:
+            raise RuntimeError("no text")
+
+    bridge.publish({"x": 1, "by key": {Key(): 2, 3: 4}})
+    assert recording.states() == [{"x": 1, "by key": {"<Key>": 2, "3": 4}}]
+    assert recording.rows("SELECT odd FROM state") == ['{"by key.<Key>":"key"}']
+
+
+def test_a_state_that_cannot_be_read_at_all_is_a_row_that_says_why(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(encoding, "orjson", None)
+    encoded = encoding.encode(Unreadable(x=1))
+    assert encoded == ("{}", {"": "type Unreadable: no items"})
+
+
+@pytest.mark.usefixtures("encoder")
+def test_an_array_of_another_library_is_stored_whatever_its_size_means(
     bridge: MCPBridge, recording: Recording
 ) -> None:
-    class Broken:
-        def tolist(self) -> list[int]:
-            raise RuntimeError("no data")
+    class Tensor:
+        shape = (2,)
 
-    bridge.publish({"x": 1, "broken": Broken()})
-    assert recording.states() == [{"x": 1, "broken": None}]
+        def size(self) -> tuple[int]:
+            return (2,)
+
+        def tolist(self) -> list[int]:
+            return [1, 2]
+
+    bridge.publish({"tensor": Tensor()})
+    assert recording.states() == [{"tensor": [1, 2]}]
+
+
+@pytest.mark.usefixtures("encoder")
+def test_both_encoders_store_the_same(bridge: MCPBridge, recording: Recording) -> None:
+    @dataclasses.dataclass
+    class Arm:
+        angle_rad: float
+        _offset_rad: float
+        joints: ClassVar[int] = 6
+
+    bridge.publish(
+        {
+            "arm": Arm(0.5, 0.25),
+            "id": uuid.UUID(int=3),
+            "last": collections.deque([1, 2]),
+            "range": range(3),
+        }
+    )
+    assert recording.states() == [
+        {
+            "arm": {"angle_rad": 0.5, "_offset_rad": 0.25},
+            "id": "00000000-0000-0000-0000-000000000003",
+            "last": [1, 2],
+            "range": [0, 1, 2],
+        }
+    ]
+    assert recording.rows("SELECT odd FROM state") == [None]
+
+
+@pytest.mark.usefixtures("encoder")
+def test_an_integer_beyond_64_bits_is_read_as_the_nearest_float(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish({"id": 2**100, "gap": math.nan})
+    assert recording.rows("SELECT data ->> '$.id' FROM state") == [float(2**100)]
+    assert recording.states()[0]["id"] == 2**100
+
+
+@pytest.mark.usefixtures("encoder")
+def test_a_scan_with_several_kinds_of_gaps_names_each(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish({"scan": [0.5, math.inf, math.nan]})
+    assert recording.states() == [{"scan": [0.5, None, None]}]
+    (odd,) = recording.rows("SELECT odd FROM state")
+    assert json.loads(odd) == {"scan.1": "inf", "scan.2": "nan"}
 
 
 def test_a_dataclass_may_be_the_whole_state(bridge: MCPBridge, recording: Recording) -> None:

@@ -9,7 +9,7 @@ from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.encoding import Encoded, encode
 from webots_mcp.bridge.recorder import INSERT_EVENT, INSERT_STATE, Recorder
 
-NOT_FINITE: Final = ("nan", "inf", "-inf")
+_NOT_LOST: Final = ("nan", "inf", "-inf", "bytes", "surrogate")
 _MOST_LOST_PATHS: Final = 20
 _INSERT_LOG: Final = (
     "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
@@ -50,10 +50,10 @@ class Journal:
         self._recorder.record(INSERT_EVENT, self._clock.run, row)
 
     def _count_replaced(self, odd: dict[str, str]) -> None:
-        """NaN and infinity are everyday; a value that was lost is said once a path."""
+        """Named in `odd` all the same; a value that is not in the row is said once a path."""
         self.values_replaced += len(odd)
         for path, kind in odd.items():
-            if kind in NOT_FINITE or path in self._lost or len(self._lost) >= _MOST_LOST_PATHS:
+            if kind in _NOT_LOST or path in self._lost or len(self._lost) >= _MOST_LOST_PATHS:
                 continue
             self._lost.add(path)
             self.log("warning", "bridge", f"{path or 'state'} could not be stored: {kind}")

@@ -17,6 +17,7 @@ from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
 from webots_mcp.store.queue import Command, CommandQueue, fetch_command
 from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.robots import robot_name
 from webots_mcp.store.status import SILENT
 
 Report = Callable[[float, float, str], Awaitable[None]]
@@ -110,10 +111,7 @@ class Dispatcher:
 
     def _answer(self, command: Command, waited_s: float) -> CommandAnswer:
         with self._recording.reader() as connection:
-            name = connection.execute(
-                "SELECT name FROM robot WHERE id = ?", (command.robot_id,)
-            ).fetchone()[0]
-            view = look(connection, name)
+            view = look(connection, robot_name(connection, command.robot_id))
             return CommandAnswer(
                 **view.header(),
                 command_id=command.id,

@@ -23,7 +23,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.queue import any_unfinished
-from webots_mcp.store.robots import Robot, resolve_robot
+from webots_mcp.store.robots import Robot, resolve_robot, robot_name
 from webots_mcp.store.runs import Run, current_run, fetch_run
 from webots_mcp.store.sessions import Session
 from webots_mcp.store.states import State, newest_state
@@ -201,7 +201,7 @@ def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None =
     """A view over an open connection; see `Recording.view`."""
     now_s = time.time()
     if robot is None and run_id is not None:
-        robot = _owner(connection, fetch_run(connection, run_id))
+        robot = robot_name(connection, fetch_run(connection, run_id).robot_id)
     try:
         chosen = resolve_robot(connection, robot, now_s)
     except NothingRecordedError as error:
@@ -214,11 +214,6 @@ def view_of(connection: sqlite3.Connection, robot: Robot, run_id: int | None, no
     current = current_run(connection, robot.id)
     run = current if run_id is None else fetch_run(connection, run_id, robot.id)
     return View(connection, robot, run, run == current, now_s)
-
-
-def _owner(connection: sqlite3.Connection, run: Run) -> str:
-    row = connection.execute("SELECT name FROM robot WHERE id = ?", (run.robot_id,)).fetchone()
-    return str(row[0])
 
 
 def name_of(database: Database) -> str:

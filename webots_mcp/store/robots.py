@@ -15,6 +15,7 @@ _ALL: Final = (
     "SELECT id, name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s "
     "FROM robot ORDER BY id"
 )
+_NAME: Final = "SELECT name FROM robot WHERE id = ?"
 _SHOWN_NAMES: Final = 20
 
 
@@ -35,6 +36,11 @@ class Robot:
 def list_robots(connection: sqlite3.Connection, now_s: float) -> list[Robot]:
     """Every robot ever seen, in the order in which they first appeared."""
     return [_robot(connection, row, now_s) for row in connection.execute(_ALL).fetchall()]
+
+
+def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
+    """The name of the robot of that id, which has to exist."""
+    return connection.execute(_NAME, (robot_id,)).fetchone()[0]
 
 
 def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float) -> Robot:

@@ -6,6 +6,7 @@ import sqlite3
 from typing import Final, NamedTuple
 
 from webots_mcp.contract import BUILT_IN_ACTIONS, HEARTBEAT_INTERVAL_S, PAUSED
+from webots_mcp.store.robots import robot_name
 from webots_mcp.store.runs import Run
 from webots_mcp.store.sessions import Session, companions
 from webots_mcp.store.states import recent_interval_s
@@ -151,8 +152,8 @@ def _hold_since_beat(connection: sqlite3.Connection, session: Session) -> str | 
 
 
 def _held_elsewhere(connection: sqlite3.Connection, holder: Session) -> str:
-    name = connection.execute("SELECT name FROM robot WHERE id = ?", (holder.robot_id,)).fetchone()
-    return f"the simulation is held by robot {name[0]!r}: resume it there"
+    name = robot_name(connection, holder.robot_id)
+    return f"the simulation is held by robot {name!r}: resume it there"
 
 
 def _still_moving_s(connection: sqlite3.Connection, run: Run | None) -> float:

@@ -5,13 +5,10 @@ from __future__ import annotations
 import sqlite3
 import time
 from dataclasses import dataclass
-from typing import Final
 
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.store.robots import resolve_robot
+from webots_mcp.store.robots import resolve_robot, robot_name
 from webots_mcp.store.runs import current_run, fetch_run
-
-_NAME: Final = "SELECT name FROM robot WHERE id = ?"
 
 
 @dataclass(frozen=True)
@@ -35,7 +32,7 @@ def find_subject(
     """
     if run_id is not None and robot is None:
         robot_id = fetch_run(connection, run_id).robot_id
-        return Subject(robot_id, connection.execute(_NAME, (robot_id,)).fetchone()[0], run_id)
+        return Subject(robot_id, robot_name(connection, robot_id), run_id)
     found = resolve_robot(connection, robot, time.time())
     if run_id is not None:
         return Subject(found.id, found.name, fetch_run(connection, run_id, found.id).id)

@@ -17,41 +17,11 @@ from typing import Any, Final, TypeVar
 from webots_mcp.connection import is_busy
 from webots_mcp.contract import COMMAND_TIME_TO_LIVE_S, FINAL_STATUSES
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.rows import columns_of
 
 MAX_PARAMS_BYTES: Final = 65_536
 # A writer connection waits 5 s for the lock by itself; then the statement is sent again.
 _ATTEMPTS: Final = 3
-
-_COLUMNS: Final = (
-    "id, robot_id, action, params, status, requested_by, created_wall_time_s, "
-    "expires_wall_time_s, claimed_wall_time_s, claimed_sim_time_s, session_id, "
-    "issued_wall_time_s, finished_wall_time_s, finished_sim_time_s, result, error"
-)
-_ENQUEUE: Final = (
-    "INSERT INTO command (robot_id, action, params, status, requested_by, idempotency_key, "
-    "created_wall_time_s, expires_wall_time_s) "
-    "VALUES (:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires) "
-    "ON CONFLICT (idempotency_key) DO NOTHING"
-)
-_BY_KEY: Final = f"SELECT {_COLUMNS} FROM command WHERE idempotency_key = ?"
-_BY_ID: Final = f"SELECT {_COLUMNS} FROM command WHERE id = ?"
-_CANCEL: Final = (
-    "UPDATE command SET status = 'cancelled', finished_wall_time_s = :now, error = :why "
-    "WHERE id = :id AND status = 'pending'"
-)
-_NEWEST: Final = (
-    f"SELECT {_COLUMNS} FROM command WHERE robot_id = :robot_id "
-    "AND (:before_id IS NULL OR id < :before_id) AND (:status IS NULL OR status = :status) "
-    "ORDER BY id DESC LIMIT :limit"
-)
-_CREATED_SINCE: Final = (
-    f"SELECT {_COLUMNS} FROM command WHERE robot_id = ? AND created_wall_time_s >= ? ORDER BY id"
-)
-# Two questions, so that each is answered by its partial index.
-_UNFINISHED: Final = (
-    "SELECT EXISTS (SELECT 1 FROM command WHERE status = 'pending') "
-    "OR EXISTS (SELECT 1 FROM command WHERE status = 'claimed')"
-)
 
 
 @dataclass(frozen=True)
@@ -86,6 +56,31 @@ class Command:
             return json.loads(self.result) if self.result is not None else None
         except ValueError:
             return None
+
+
+_COLUMNS: Final = columns_of(Command)
+_ENQUEUE: Final = (
+    "INSERT INTO command (robot_id, action, params, status, requested_by, idempotency_key, "
+    "created_wall_time_s, expires_wall_time_s) "
+    "VALUES (:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires) "
+    "ON CONFLICT (idempotency_key) DO NOTHING"
+)
+_BY_KEY: Final = f"SELECT {_COLUMNS} FROM command WHERE idempotency_key = ?"
+_BY_ID: Final = f"SELECT {_COLUMNS} FROM command WHERE id = ?"
+_CANCEL: Final = (
+    "UPDATE command SET status = 'cancelled', finished_wall_time_s = :now, error = :why "
+    "WHERE id = :id AND status = 'pending'"
+)
+_NEWEST: Final = (
+    f"SELECT {_COLUMNS} FROM command WHERE robot_id = :robot_id "
+    "AND (:before_id IS NULL OR id < :before_id) AND (:status IS NULL OR status = :status) "
+    "ORDER BY id DESC LIMIT :limit"
+)
+# Two questions, so that each is answered by its partial index.
+_UNFINISHED: Final = (
+    "SELECT EXISTS (SELECT 1 FROM command WHERE status = 'pending') "
+    "OR EXISTS (SELECT 1 FROM command WHERE status = 'claimed')"
+)
 
 
 class CommandQueue:
@@ -176,7 +171,10 @@ def list_commands(
     status: str | None = None,
     before_id: int | None = None,
 ) -> list[Command]:
-    """The robot's newest commands, newest first; `before_id` pages towards older ones."""
+    """The robot's newest commands, newest first; with a limit of -1 all of them.
+
+    `before_id` pages towards older ones.
+    """
     values = {
         "robot_id": robot_id,
         "status": status,
@@ -184,14 +182,6 @@ def list_commands(
         "before_id": before_id,
     }
     return [Command(*row) for row in connection.execute(_NEWEST, values).fetchall()]
-
-
-def commands_since(
-    connection: sqlite3.Connection, robot_id: int, wall_time_s: float
-) -> list[Command]:
-    """The robot's commands created since then, oldest first."""
-    rows = connection.execute(_CREATED_SINCE, (robot_id, wall_time_s)).fetchall()
-    return [Command(*row) for row in rows]
 
 
 def any_unfinished(connection: sqlite3.Connection) -> bool:

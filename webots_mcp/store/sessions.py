@@ -9,19 +9,7 @@ from typing import Any, Final
 
 from webots_mcp.contract import HEARTBEAT_LATE_S, REMOTE_SILENCE_S, host_name
 from webots_mcp.liveness import process_alive
-
-_COLUMNS: Final = (
-    "id, robot_id, pid, host, instance, controller, controller_sha256, git_commit, versions, "
-    "supervisor, actions, started_wall_time_s, last_seen_wall_time_s, last_poll_wall_time_s, "
-    "moved_wall_time_s, sim_time_s, hold, rows_waiting, rows_dropped, last_error, "
-    "ended_wall_time_s, end_reason"
-)
-_NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
-_BY_ID: Final = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
-_COMPANIONS: Final = (
-    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND host = :host "
-    "AND id <> :id AND ended_wall_time_s IS NULL ORDER BY id"
-)
+from webots_mcp.store.rows import columns_of
 
 
 @dataclass(frozen=True)
@@ -62,6 +50,15 @@ class Session:
     def heartbeat_is_fresh(self, now_s: float) -> bool:
         """Whether its loop gave a sign of life lately."""
         return now_s - self.last_seen_wall_time_s <= HEARTBEAT_LATE_S
+
+
+_COLUMNS: Final = columns_of(Session)
+_NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
+_BY_ID: Final = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
+_COMPANIONS: Final = (
+    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND host = :host "
+    "AND id <> :id AND ended_wall_time_s IS NULL ORDER BY id"
+)
 
 
 def newest_session(connection: sqlite3.Connection, robot_id: int) -> Session | None:

@@ -59,13 +59,44 @@ def test_an_exception_in_a_handler_is_the_commands_error(
     assert error.startswith("ValueError: arm is folded (test_commands.py, line ")
 
 
-def test_a_result_that_json_cannot_hold_does_not_lose_the_answer(
+def test_a_result_that_json_cannot_hold_is_answered_and_says_what_was_replaced(
     bridge: MCPBridge, recording: Recording
 ) -> None:
-    bridge.register_command("read", lambda _: {"range": float("inf"), "raw": object()})
+    bridge.register_command("read", lambda _: {"range": float("inf"), "raw": object(), "n": 1})
     sent = recording.send("read")
     eager(bridge)
-    assert recording.fate(sent)[:2] == ("done", {"range": None, "raw": None})
+    status, result, replaced = recording.fate(sent)
+    assert (status, result) == ("done", {"range": None, "raw": None, "n": 1})
+    assert replaced is not None and "range (inf), raw (type object)" in replaced
+    assert recording.rows("SELECT level, message FROM log") == [
+        ("warning", f"command {sent} (read): {replaced}")
+    ]
+
+
+class SpeechlessError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (SpeechlessError(), "SpeechlessError: (without words: its str() raised RuntimeError)"),
+        (FileNotFoundError("/data/\udcff.txt"), "FileNotFoundError: /data/?.txt"),
+    ],
+)
+def test_an_exception_that_cannot_be_written_as_it_is_still_fails_its_command(
+    bridge: MCPBridge, recording: Recording, error: Exception, said: str
+) -> None:
+    def fail(command: dict[str, Any]) -> None:
+        raise error
+
+    bridge.register_command("grip", fail)
+    sent = recording.send("grip")
+    eager(bridge)
+    status, _, text = recording.fate(sent)
+    assert status == "failed"
+    assert text is not None and text.startswith(said)
 
 
 def test_an_unknown_action_is_refused_with_the_known_ones(
@@ -163,6 +194,36 @@ def test_step_runs_the_users_own_loop_so_often_and_pauses_again(
     assert result["sim_time_s"] == pytest.approx(from_s + 5 * 0.016)
     assert result["mode"] == "pause"
     assert [recording.fate(c)[0] for c in (pause, resume)] == ["done", "done"]
+
+
+@pytest.mark.parametrize(("asked", "in_a_round", "of_rounds"), [(4, 2, 1), (3, 1, 5)])
+def test_steps_are_those_of_the_simulation_however_often_the_loop_asks(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    asked: int,
+    in_a_round: int,
+    of_rounds: int,
+) -> None:
+    step = recording.send("step", steps=asked)
+    eager(bridge)
+    from_s = robot.getTime()
+    resume: int | None = None
+    for i in range(1, 11):
+        robot.step(STEP_MS)
+        bridge.publish({"n": i})
+        if i >= asked and resume is None:
+            resume = recording.send("resume")  # or the hold would last for ever
+        if i % of_rounds == 0:
+            for _ in range(in_a_round):
+                bridge.get_command()
+        if recording.fate(step)[0] == "done":
+            break
+    _, result, error = recording.fate(step)
+    assert error is None
+    assert result["steps"] == (asked if of_rounds == 1 else of_rounds)
+    assert result["advanced_s"] == pytest.approx(result["steps"] * STEP_MS / 1000)
+    assert result["sim_time_s"] == pytest.approx(from_s + result["advanced_s"])
 
 
 def test_a_pause_in_the_middle_of_steps_says_that_they_were_interrupted(
@@ -271,6 +332,30 @@ def test_reset_state_runs_the_callbacks_or_says_that_there_are_none(
     eager(bridge)
     assert calls == [1]
     assert recording.fate(sent)[:2] == ("done", {"callbacks": 1})
+
+
+def test_reset_state_fails_where_a_callback_did(
+    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
+) -> None:
+    calls: list[int] = []
+    with MCPBridge(robot, database=database) as bridge:
+        bridge.on_reload(lambda: 1 // 0)
+        bridge.on_reload(lambda: calls.append(1))
+        sent = recording.send("reset_state")
+        eager(bridge)
+    status, _, error = recording.fate(sent)
+    assert (status, calls) == ("failed", [1])
+    assert error is not None
+    assert error.startswith("1 of 2 callbacks failed: ZeroDivisionError: ")
+
+
+def test_a_callback_may_ask_for_commands_itself(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.on_reload(lambda: eager(bridge))
+    bridge.register_command("greet", lambda _: "hello")
+    sent, inside = recording.send("reset_state"), recording.send("greet")
+    eager(bridge)
+    assert recording.fate(sent) == ("done", {"callbacks": 1}, None)
+    assert recording.fate(inside) == ("done", "hello", None)
 
 
 def test_a_screenshot_is_done_when_its_file_is_complete(

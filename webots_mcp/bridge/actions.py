@@ -7,12 +7,12 @@ the hold), returns the command's result, or raises the command's error.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.commands import Command, CommandQueue
+from webots_mcp.bridge.commands import Command, CommandQueue, describe
 from webots_mcp.bridge.hold import Hold
 from webots_mcp.bridge.pictures import Album, complete_png_size
 from webots_mcp.bridge.simulation import Simulation
@@ -20,6 +20,7 @@ from webots_mcp.contract import MAX_STEPS, SCREENSHOT_FOLDER
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 Progress = Generator[None, None, object]
+CallBack = Callable[[], Sequence[Exception | None]]
 
 _SCREENSHOT_TIMEOUT_S: Final = 10.0
 _RESET_TIMEOUT_S: Final = 10.0
@@ -36,7 +37,7 @@ class Actions:
         hold: Hold,
         clock: Clock,
         album: Album,
-        call_back: Callable[[], int],
+        call_back: CallBack,
     ) -> None:
         self._simulation = simulation
         self._queue = queue
@@ -80,15 +81,18 @@ class Actions:
         return {"mode": self._simulation.mode_name, "sim_time_s": self._clock.sim_time_s}
 
     def _step(self, command: Command) -> Progress:
-        """Let the user's loop come round `steps` times, each with its own step, then hold."""
+        """Let the user's loop come round `steps` times, each with its own step, then hold.
+
+        A loop that does not ask for commands in every round makes more; those made are told.
+        """
         steps = _whole_number(command.params, "steps", 1, MAX_STEPS)
-        from_s = self._clock.sim_time_s
+        from_s, from_step = self._clock.sim_time_s, self._clock.steps_seen
         self._hold.release(command, stepping=True)
-        for _ in range(steps):
+        while (made := self._clock.steps_seen - from_step) < steps:
             yield
         self._hold.take(command)
         advanced_s = round(self._clock.sim_time_s - from_s, 6)
-        return {"steps": steps, "advanced_s": advanced_s, **self._mode()}
+        return {"steps": made, "advanced_s": advanced_s, **self._mode()}
 
     def _reset(self, command: Command) -> Progress:
         """Ask for the reset; done when simulation time went back, which takes a physics step."""
@@ -133,12 +137,16 @@ class Actions:
         return self._album.add_screenshot(path, *size)
 
     def _reset_state(self, command: Command) -> Progress:
-        called = self._call_back()
-        if not called:
+        outcomes = self._call_back()
+        if not outcomes:
             raise CommandRefusedError(
                 "nothing to reset: this controller registered no callback with bridge.on_reload()"
             )
-        return {"callbacks": called}
+        if errors := [describe(error) for error in outcomes if error is not None]:
+            raise CommandRefusedError(
+                f"{len(errors)} of {len(outcomes)} callbacks failed: {'; '.join(errors)}"
+            )
+        return {"callbacks": len(outcomes)}
         yield
 
 

@@ -9,10 +9,15 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final, cast
 
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.errors import WebotsMCPError
+
+_MOST_NAMED: Final = 10
 
 # An indexed read takes no lock. An UPDATE takes the write lock even where it matches nothing, so
 # it is made only after this said that there is something.
@@ -106,13 +111,17 @@ class CommandQueue:
         while not self._recorder.flush() and time.monotonic() < deadline_s:
             time.sleep(0.002)
 
-    def succeed(self, command: Command, result: object, sim_time_s: float) -> None:
-        """Write `done` with the result."""
-        self._finish(command, "done", encode(result).text, None, sim_time_s)
+    def succeed(self, command: Command, result: object, sim_time_s: float) -> str | None:
+        """Write `done` with the result, and what of it had to be replaced, which is returned."""
+        encoded = encode(result)
+        replaced = _name_replaced(encoded.odd)
+        self._finish(command, "done", encoded.text, replaced, sim_time_s)
+        return replaced
 
     def fail(self, command: Command, error: str, sim_time_s: float) -> None:
-        """Write `failed` with the reason."""
-        self._finish(command, "failed", None, error, sim_time_s)
+        """Write `failed` with the reason; no encoding has the surrogates of a broken file name."""
+        text = error.encode("utf-8", "replace").decode()
+        self._finish(command, "failed", None, text, sim_time_s)
 
     def _finish(
         self, command: Command, status: str, result: str | None, error: str | None, at_s: float
@@ -123,3 +132,33 @@ class CommandQueue:
                 f"command {command.id}",
                 f"command {command.id} ({command.action}) was judged lost before it was {status}",
             )
+
+
+def describe(error: Exception) -> str:
+    """What was wrong; for an exception of the user's own code also its kind and place."""
+    text = _text_of(error)
+    if isinstance(error, WebotsMCPError):
+        return text
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    if frame is None:
+        return f"{type(error).__name__}: {text}"
+    place = Path(frame.tb_frame.f_code.co_filename).name
+    return f"{type(error).__name__}: {text} ({place}, line {frame.tb_lineno})"
+
+
+def _text_of(error: Exception) -> str:
+    try:
+        return str(error)
+    except Exception as failure:  # noqa: BLE001  (an exception of the user's own kind)
+        return f"(without words: its str() raised {type(failure).__name__})"
+
+
+def _name_replaced(odd: Mapping[str, str]) -> str | None:
+    """The parts of a result that JSON cannot hold, by path and kind."""
+    if not odd:
+        return None
+    named = [f"{path or 'all of it'} ({kind})" for path, kind in list(odd.items())[:_MOST_NAMED]]
+    more = f" and {len(odd) - _MOST_NAMED} more" if len(odd) > _MOST_NAMED else ""
+    return f"replaced in the result, which JSON cannot hold as it was: {', '.join(named)}{more}"

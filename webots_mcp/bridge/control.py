@@ -5,12 +5,11 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.bridge.actions import Actions, Progress
+from webots_mcp.bridge.actions import Actions, CallBack, Progress
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.commands import Command, CommandQueue
+from webots_mcp.bridge.commands import Command, CommandQueue, describe
 from webots_mcp.bridge.heart import Heart
 from webots_mcp.bridge.hold import PUMP_INTERVAL_S, Hold
 from webots_mcp.bridge.journal import Journal
@@ -19,7 +18,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.connection import is_busy
 from webots_mcp.contract import BUILT_IN_ACTIONS
-from webots_mcp.errors import CommandRefusedError, WebotsMCPError
+from webots_mcp.errors import CommandRefusedError
 
 Handler = Callable[[dict[str, Any]], object]
 
@@ -37,13 +36,14 @@ class Control:
         clock: Clock,
         journal: Journal,
         album: Album,
-        call_back: Callable[[], int],
+        call_back: CallBack,
         heart: Heart,
     ) -> None:
         self._simulation = simulation
         self._recorder = recorder
         self._clock = clock
         self._heart = heart
+        self._journal = journal
         self._queue = CommandQueue(recorder)
         self._hold = Hold(simulation, journal, heart)
         self.actions = Actions(simulation, self._queue, self._hold, clock, album, call_back)
@@ -114,7 +114,7 @@ class Control:
             else:
                 self._succeed(command, self._run_handler(command))
         except Exception as error:  # noqa: BLE001  (whatever a handler raises is the answer)
-            self._fail(command, _describe(error))
+            self._fail(command, error)
 
     def _run_handler(self, command: Command) -> object:
         handler = self._handlers.get(command.action)
@@ -131,34 +131,29 @@ class Control:
             self._advance(command)
 
     def _advance(self, command: Command) -> None:
+        """Go on with a built-in action; a callback of the user's in it may come back to here."""
+        progress = self._under_way.pop(command, None)
+        if progress is None:
+            return
         try:
-            next(self._under_way[command])
+            next(progress)
+            self._under_way[command] = progress
         except StopIteration as end:
             self._succeed(command, end.value)
         except Exception as error:  # noqa: BLE001  (whatever went wrong is the answer)
-            self._fail(command, _describe(error))
+            self._fail(command, error)
 
     def _interrupt_steps(self, by: Command) -> None:
         for command in [c for c in self._under_way if c.action == "step"]:
-            self._fail(command, f"interrupted by command {by.id} ({by.action})")
+            del self._under_way[command]
+            reason = CommandRefusedError(f"interrupted by command {by.id} ({by.action})")
+            self._fail(command, reason)
 
     def _succeed(self, command: Command, result: object) -> None:
-        self._under_way.pop(command, None)
-        self._queue.succeed(command, result, self._clock.sim_time_s)
+        replaced = self._queue.succeed(command, result, self._clock.sim_time_s)
+        if replaced is not None:
+            text = f"command {command.id} ({command.action}): {replaced}"
+            self._journal.log("warning", "bridge", text)
 
-    def _fail(self, command: Command, error: str) -> None:
-        self._under_way.pop(command, None)
-        self._queue.fail(command, error, self._clock.sim_time_s)
-
-
-def _describe(error: Exception) -> str:
-    """What was wrong; for an exception of the user's own code also its kind and place."""
-    if isinstance(error, WebotsMCPError):
-        return str(error)
-    frame = error.__traceback__
-    while frame is not None and frame.tb_next is not None:
-        frame = frame.tb_next
-    if frame is None:
-        return f"{type(error).__name__}: {error}"
-    place = Path(frame.tb_frame.f_code.co_filename).name
-    return f"{type(error).__name__}: {error} ({place}, line {frame.tb_lineno})"
+    def _fail(self, command: Command, error: Exception) -> None:
+        self._queue.fail(command, describe(error), self._clock.sim_time_s)

@@ -371,13 +371,17 @@ class MCPBridge:
             self._reload_unfired = False
             self._call_back()
 
-    def _call_back(self) -> int:
+    def _call_back(self) -> list[Exception | None]:
+        """Run the callbacks; what each one raised, if anything."""
+        outcomes: list[Exception | None] = []
         for callback in self._callbacks:
             try:
                 callback()
+                outcomes.append(None)
             except Exception as error:  # noqa: BLE001, PERF203  (the next one still has to run)
                 self._failed("on_reload callback", error)
-        return len(self._callbacks)
+                outcomes.append(error)
+        return outcomes
 
     def _measure(self, duration_s: float) -> None:
         self._published += 1

@@ -51,7 +51,7 @@ class RecordedCommand:
 
     @property
     def error(self) -> str | None:
-        """Why it failed; None where it did not."""
+        """Why it failed, or what of its result had to be replaced; else None."""
         return self._fetch().error
 
     def _fetch(self) -> Command:

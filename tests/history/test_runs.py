@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.history.recording import Recorder, record_rover
+from tests.history.recording import WALL_PER_SIM, Recorder, record_rover
 from webots_mcp.errors import (
     InvalidInputError,
     NothingRecordedError,
@@ -38,6 +38,33 @@ def test_a_long_list_comes_in_pages(rover: sqlite3.Connection) -> None:
     assert ([run.run_id for run in page.runs], page.cursor) == ([3, 2], 2)
     page = list_runs(rover, limit=2, before_id=page.cursor)
     assert ([run.run_id for run in page.runs], page.cursor) == ([1], None)
+
+
+def test_a_run_that_goes_on_counts_its_newest_rows(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    run_id = recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(20):
+        recorder.publish(float(step), {"x": step})
+        if step == 9:
+            beat = "UPDATE run SET rows = 10, last_sim_time_s = 9.0, last_wall_time_s = ?"
+            empty.execute(beat, (recorder.wall_s,))
+    run = run_info(empty, run_id)
+    assert (run.rows, run.duration_s, run.wall_duration_s) == (20, 19.0, 19.0 * WALL_PER_SIM)
+
+
+def test_a_pause_is_no_part_of_the_real_time_factor(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    run_id = recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder.publish(0.0, {"x": 0})
+    assert run_info(empty, run_id).real_time_factor is None
+    recorder.insert("event", **recorder.at(2.0), kind="pause")
+    recorder.run_start_s += 20
+    recorder.insert("event", **recorder.at(2.0), kind="resume")
+    recorder.publish(5.0, {"x": 1})
+    run = run_info(empty, run_id)
+    assert (run.held_s, run.real_time_factor) == (20.0, 1 / WALL_PER_SIM)
 
 
 def test_a_note_stays_with_its_run(empty: sqlite3.Connection) -> None:
@@ -131,9 +158,12 @@ def test_runs_of_two_robots_can_be_compared(empty: sqlite3.Connection) -> None:
         robot_id = recorder.robot(name)
         recorder.run(recorder.session(robot_id, "x"), robot_id)
         for step in range(30):
-            recorder.publish(float(step), {"filler_" + name: 0, "x": x + step % 2})
-    (x, *_) = compare_runs(empty, [1, 2], names=["x"]).differences
+            recorder.publish(float(step), {"filler_" + name: 0, "x": x + step % 2, "scan": None})
+    comparison = compare_runs(empty, [1, 2], names=["x", "scan"])
+    (x, *_) = comparison.differences
     assert x.mean == [1.5, 3.5]
+    assert comparison.notes == ("these are runs of different robots: a, b",)
+    assert comparison.only_in == {}
 
 
 @pytest.mark.parametrize("run_ids", [[], [1], [1, 1], list(range(1, 12))])

@@ -239,7 +239,7 @@ async def test_before_and_after_the_last_edit_are_compared(story: Path) -> None:
     assert after["distance_m"] == pytest.approx(17.97, abs=0.01)
     differences = {row["signal"]: row for row in rows_of(answer["differences"])}
     assert differences["commanded_m_s"]["mean"] == [0.2, 0.3]
-    assert "target" not in differences
+    assert "target" not in differences and "are equal" in answer["hint"]
 
 
 async def test_a_label_is_kept_and_can_be_taken_away(story: Path, tmp_path: Path) -> None:

@@ -42,15 +42,16 @@ from webots_mcp.store.history.compare import (
     compare_code,
     compare_runs,
 )
-from webots_mcp.store.history.runs import MOST_RUNS, RunInfo, annotate_run, list_runs
+from webots_mcp.store.history.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace
 from webots_mcp.store.recording import Recording, View, look
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "started", "began_by", "ended_by", "duration_s",
-    "real_time_factor", "rows", "notable", "controller", "sha256", "git_commit", "world", "note",
+    "real_time_factor", "rows", "purged_rows", "notable", "controller", "sha256", "git_commit",
+    "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
-    "name", "runs", "labels", "sha256", "ended_by", "duration_s", "real_time_factor",
+    "name", "robot", "runs", "labels", "sha256", "ended_by", "duration_s", "real_time_factor",
     "distance_m", "time_by_mode_s", "events",
 )  # fmt: skip
 DIFFERENCE_COLUMNS: Final = (
@@ -103,7 +104,8 @@ class RunTools:
         """Two or more runs beside each other; the first is the reference. What differs most first.
 
         Without run_ids: the runs before and after the last edit of the controller's file. Duration,
-        distance, time per mode, events of each kind, and how far each signal is apart.
+        distance, time per mode, events of each kind, and each signal's effect: how far its mean is
+        from the reference's, in standard deviations (0.8 is large).
         """
         with self._recording.view(robot, run_ids[0] if run_ids else None) as view:
             return answer_about(
@@ -154,6 +156,7 @@ def run_row(run: RunInfo) -> list[Any]:
         seconds(run.duration_s),
         figure(run.real_time_factor),
         run.rows,
+        run.purged_rows or None,
         shown(run.notable) or None,
         short_name(_file(run.controller)),
         run.controller_sha256 and run.controller_sha256[:_SHOWN_HASH],
@@ -203,21 +206,24 @@ def _compared(
 
 
 def _groups(found: Comparison) -> Table | None:
-    return without_empty(GROUP_COLUMNS, [_group_row(group) for group in found.groups])
+    robots = {run.robot for group in found.groups for run in group.runs}
+    rows = [_group_row(group, told_robot=len(robots) > 1) for group in found.groups]
+    return without_empty(GROUP_COLUMNS, rows)
 
 
-def _group_row(group: Group) -> list[Any]:
+def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
     labels = [short_name(run.label) for run in group.runs if run.label]
     hashes = dict.fromkeys((run.controller_sha256 or "")[:_SHOWN_HASH] for run in group.runs)
-    wall_s = sum(run.wall_duration_s for run in group.runs)
+    driven_s = sum(run.wall_duration_s - run.held_s for run in group.runs)
     return [
         group.name,
+        short_name(group.runs[0].robot) if told_robot else None,
         [run.run_id for run in group.runs],
         labels or None,
         ", ".join(hashes) or None,
         ", ".join(dict.fromkeys(run.end_reason or _GOING_ON for run in group.runs)),
         seconds(group.duration_s),
-        figure(group.duration_s / wall_s) if wall_s > 0 else None,
+        figure(pace(group.duration_s, driven_s)),
         figure(group.distance_m),
         shown({value: round(time_s, 3) for value, time_s in group.time_by_mode_s.items()}) or None,
         group.events or None,
@@ -240,5 +246,7 @@ def _hint(found: Comparison, told: int, differing: int, only_in: int) -> str | N
     more = told < differing or differing == len(found.differences) < found.total
     hints = [f"the {told} that differ most of {found.total}: limit or signals for others"] * more
     hints += ["no numeric signal differs"] * (differing == 0)
+    equal = 0 if more else found.total - differing
+    hints += [f"the means of the other {equal} are equal"] * (equal > 0 and differing > 0)
     hints += [f"{only_in} signals are in some groups only"] * (only_in > _MOST_ONLY_IN)
     return "; ".join(hints) or None

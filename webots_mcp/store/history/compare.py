@@ -201,15 +201,28 @@ def _compare(
     told = tuple(
         _group(connection, name, found, options, deadline) for name, found in parts.items()
     )
-    late = f"the time of {deadline_s:g} s was over: not all rows were looked at"
+    notes = _notes([run for group in told for run in group.runs])
+    if deadline.passed:
+        notes.append(f"the time of {deadline_s:g} s was over: not all rows were looked at")
     return Comparison(
         groups=told,
         compared_s=compared_s,
         differences=tuple(shared[:limit]),
         total=len(shared),
         only_in=_only_in(differences, list(groups)),
-        notes=(late,) if deadline.passed else (),
+        notes=tuple(notes),
     )
+
+
+def _notes(runs: Sequence[RunInfo]) -> list[str]:
+    notes: list[str] = []
+    robots = list(dict.fromkeys(run.robot for run in runs))
+    if len(robots) > 1:
+        notes.append(f"these are runs of different robots: {', '.join(robots)}")
+    purged = [str(run.run_id) for run in runs if run.purged_rows]
+    if purged:
+        notes.append(f"rows of run {', '.join(purged)} were purged: events and distance lack them")
+    return notes
 
 
 @dataclass(frozen=True)
@@ -304,7 +317,7 @@ def _only_in(
     return {
         each.name: tuple(group for group, count in zip(groups, each.count, strict=True) if count)
         for each in differences
-        if not all(each.count)
+        if any(each.count) and not all(each.count)
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import time
 from dataclasses import dataclass
@@ -18,9 +19,15 @@ MAX_NOTE: Final = 4000
 
 _RUNS: Final = (
     "SELECT r.id, b.name, r.session_id, s.controller, s.controller_sha256, s.git_commit, r.world, "
-    "r.start_reason, r.end_reason, r.started_wall_time_s, r.last_wall_time_s, "
+    "r.start_reason, r.end_reason, r.label, r.note, r.purged_rows, "
+    # Rows, times and what was said last are those of a heartbeat, which newer rows may follow.
+    "r.rows + CASE WHEN r.ended_wall_time_s IS NULL THEN (SELECT count(*) FROM state "
+    "WHERE run_id = r.id AND sim_time_s > CASE WHEN r.rows > 0 THEN r.last_sim_time_s "
+    "ELSE -9e999 END) ELSE 0 END, "
+    "r.started_wall_time_s, max(r.last_wall_time_s, coalesce((SELECT wall_time_s FROM state "
+    "WHERE run_id = r.id ORDER BY sim_time_s DESC, id DESC LIMIT 1), 0)), "
     "r.started_sim_time_s, max(r.last_sim_time_s, coalesce((SELECT max(sim_time_s) FROM state "
-    "WHERE run_id = r.id), r.started_sim_time_s)), r.rows, r.label, r.note "
+    "WHERE run_id = r.id), r.started_sim_time_s)) "
     "FROM run r JOIN session s ON s.id = r.session_id JOIN robot b ON b.id = r.robot_id "
 )
 _PAGE: Final = (
@@ -39,6 +46,10 @@ _NOTABLE: Final = (
     "AND c.claimed_wall_time_s BETWEEN r.started_wall_time_s AND r.last_wall_time_s "
     "GROUP BY status"
 )
+_HOLDS: Final = (
+    "SELECT kind, wall_time_s FROM event WHERE run_id = ? AND kind IN ('pause', 'resume') "
+    "ORDER BY id"
+)
 _ANNOTATE: Final = (
     "UPDATE run SET label = CASE WHEN :label IS NULL THEN label ELSE nullif(:label, '') END, "
     "note = CASE WHEN :note IS NULL THEN note ELSE nullif(:note, '') END WHERE id = :run"
@@ -52,8 +63,8 @@ class RunInfo:
     Attributes:
         end_reason: None while it goes on.
         duration_s: Simulated seconds.
-        real_time_factor: Simulated seconds per second of wall time; None if no time passed.
-        rows: State rows, as of the last heartbeat while it goes on.
+        held_s: Of the wall time, that for which the simulation was paused by a command.
+        rows: State rows, of which retention has deleted `purged_rows`.
         notable: How often what needs attention was stored: warnings, errors, dropped rows,
             failed or lost commands, trouble with storage.
     """
@@ -67,14 +78,20 @@ class RunInfo:
     world: str | None
     start_reason: str
     end_reason: str | None
-    started_wall_time_s: float
-    wall_duration_s: float
-    duration_s: float
-    real_time_factor: float | None
-    rows: int
     label: str | None
     note: str | None
+    purged_rows: int
+    rows: int
+    started_wall_time_s: float
+    wall_duration_s: float
+    held_s: float
+    duration_s: float
     notable: dict[str, int]
+
+    @property
+    def real_time_factor(self) -> float | None:
+        """Simulated seconds per second of wall time, but for the time it was held."""
+        return pace(self.duration_s, self.wall_duration_s - self.held_s)
 
 
 @dataclass(frozen=True)
@@ -152,7 +169,7 @@ def annotate_run(
         InvalidInputError: Neither is given, or one is too long.
     """
     if label is None and note is None:
-        raise InvalidInputError("give a label or a note (an empty text takes it away)")
+        raise InvalidInputError("give a label or a note")
     for name, text, longest in (("label", label, MAX_LABEL), ("note", note, MAX_NOTE)):
         if text is not None and len(text) > longest:
             raise InvalidInputError(
@@ -163,17 +180,29 @@ def annotate_run(
     return run_info(connection, run_id)
 
 
+def pace(duration_s: float, wall_s: float) -> float | None:
+    """The real-time factor; None for less than a second of wall time, which tells nothing."""
+    return duration_s / wall_s if wall_s >= 1 else None
+
+
 def _info(connection: sqlite3.Connection, row: tuple[Any, ...]) -> RunInfo:
-    *what, started_wall_s, last_wall_s, started_s, last_s, rows, label, note = row
-    wall_s, duration_s = last_wall_s - started_wall_s, last_s - started_s
+    *what, started_wall_s, last_wall_s, started_s, last_s = row
     return RunInfo(
         *what,
         started_wall_time_s=started_wall_s,
-        wall_duration_s=wall_s,
-        duration_s=duration_s,
-        real_time_factor=duration_s / wall_s if wall_s > 0 else None,
-        rows=rows,
-        label=label,
-        note=note,
+        wall_duration_s=last_wall_s - started_wall_s,
+        held_s=_held_s(connection, row[0], last_wall_s),
+        duration_s=last_s - started_s,
         notable=dict(connection.execute(_NOTABLE, {"run": row[0]}).fetchall()),
     )
+
+
+def _held_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> float:
+    held_s, since_s = 0.0, math.inf
+    for kind, wall_s in (*connection.execute(_HOLDS, (run_id,)), ("resume", end_wall_s)):
+        if kind == "pause":
+            since_s = min(since_s, wall_s)
+        else:
+            held_s += max(0.0, wall_s - since_s)
+            since_s = math.inf
+    return held_s

@@ -15,34 +15,22 @@ in their processes. Importing this package makes it importable here as well.
 - `InProcessRobot` and `InProcessSupervisor` are robots for unit tests, without any process.
 """
 
-import sys
-from pathlib import Path
+from __future__ import annotations
 
-LIBRARY = Path(__file__).parent / "lib"
-"""The folder that holds the `controller` package; it belongs in front of PYTHONPATH."""
-
-_loaded = sys.modules.get("controller")
-if _loaded is not None and str(LIBRARY) not in str(_loaded.__file__):
-    raise ImportError(
-        f"another package named controller is loaded, from {_loaded.__file__}: import "
-        "webots_mcp.standin before it, or leave Webots' own out of PYTHONPATH"
-    )
-if str(LIBRARY) not in sys.path:
-    sys.path.insert(0, str(LIBRARY))
-
-from webots_mcp.standin.errors import (  # noqa: E402 - needs the path above
+from webots_mcp.standin.controller_path import LIBRARY  # first: the others import `controller`
+from webots_mcp.standin.errors import (
     ControllerEndedError,
     StandInError,
     WorldError,
     WouldBlockError,
 )
-from webots_mcp.standin.in_process import (  # noqa: E402
+from webots_mcp.standin.in_process import (
     InProcessRobot,
     InProcessSimulation,
     InProcessSupervisor,
 )
-from webots_mcp.standin.simulation import Simulation  # noqa: E402
-from webots_mcp.standin.simulator import Mode  # noqa: E402
+from webots_mcp.standin.simulation import Simulation
+from webots_mcp.standin.simulator import Mode
 
 __all__ = [
     "LIBRARY",

@@ -84,11 +84,6 @@ class Controller:
         return self.process is not None and self.process.exit_code is None
 
     @property
-    def is_connected(self) -> bool:
-        """Whether a `Robot` object of the process talks to the simulation."""
-        return self.connection is not None
-
-    @property
     def was_started(self) -> bool:
         """Whether there is nothing to start any more."""
         return self.process is not None or self.file is None

@@ -15,6 +15,7 @@ from typing import TypeVar
 
 from controller.wire import ADDRESS_FILE
 
+from webots_mcp.standin.controller_path import LIBRARY
 from webots_mcp.standin.controllers import Controller, Launch, controllers_of
 from webots_mcp.standin.errors import StandInError
 from webots_mcp.standin.runner import Runner
@@ -22,7 +23,6 @@ from webots_mcp.standin.simulator import Mode, Robot, Simulator
 from webots_mcp.standin.world import load_world
 
 _MODES = {"pause": Mode.PAUSE, "realtime": Mode.REAL_TIME, "fast": Mode.FAST}
-_LIBRARY = Path(__file__).parent / "lib"
 _NOTICE_S = 0.002
 _RECHECK_S = 0.05
 _CONSOLE_LINES = 10_000
@@ -73,7 +73,7 @@ class Simulation:
         self._clean_up = weakref.finalize(self, shutil.rmtree, self._instance, True)
         overrides = {name: Path(file) for name, file in (controllers or {}).items()}
         launch = Launch(
-            _LIBRARY,
+            LIBRARY,
             self._instance,
             python,
             environment or {},

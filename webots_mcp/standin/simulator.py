@@ -77,11 +77,6 @@ class Robot:
         return self.vehicle.body.yaw_rad
 
     @property
-    def wheel_positions_rad(self) -> list[float]:
-        """How far each joint has turned."""
-        return [joint.position_rad for joint in self.vehicle.joints]
-
-    @property
     def collisions(self) -> int:
         """How often it began to touch something that does not give way."""
         return self.vehicle.collisions

@@ -18,8 +18,8 @@ from webots_mcp.server.history_results import MonitorAnswer
 from webots_mcp.server.parameters import RobotName
 from webots_mcp.server.tools.events import fitting_events
 from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
-from webots_mcp.server.watching import movement, window_from
-from webots_mcp.store.history.event import KINDS, EventOptions, Kind
+from webots_mcp.server.watching import Window, movement, window_from
+from webots_mcp.store.history.event import KINDS, Event, EventOptions, Kind
 from webots_mcp.store.history.events import choose, find_events
 from webots_mcp.store.history.trends import trends
 from webots_mcp.store.recording import Recording, View
@@ -104,7 +104,7 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     budget = BUDGET // 2 // max(len(told), 1)
     options = EventOptions(kinds=_WATCHED_KINDS)
     found = find_events(view.connection, window.around, options, limit=_MOST_EVENTS)
-    happened = [event for event in found.events if event.wall_time_s >= wall_start_s]
+    happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     shown = choose(happened, _SHOWN_EVENTS)
     events, left_out = fitting_events(shown, BUDGET // 2, view)
     rows = sum(run.rows for run in told)
@@ -117,6 +117,13 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
         "notes": notes_of(window.rows.notes),
         "hint": _hint(rows, len(happened) - len(shown) + left_out, view),
     }
+
+
+def _in_window(event: Event, window: Window, wall_start_s: float) -> bool:
+    """Whether it began in the window, or had begun before and lasted into it."""
+    starts = (each.start_s for each in window.rows.segments if each.run_id == event.run_id)
+    lasted = event.start_s < min(starts, default=math.inf) <= event.end_s
+    return event.wall_time_s >= wall_start_s or lasted
 
 
 def _hint(rows: int, left_out: int, view: View) -> str | None:

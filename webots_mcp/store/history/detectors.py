@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -17,7 +17,7 @@ from webots_mcp.store.history.shapes import unwrap
 from webots_mcp.store.history.signals import resolve_signals
 from webots_mcp.store.history.spans import MOSTLY, Beyond, Flat, Silent, Span
 from webots_mcp.store.history.stored import wall_time_at
-from webots_mcp.store.history.summary import usable_numbers
+from webots_mcp.store.history.summary import Summary, usable_numbers
 from webots_mcp.store.history.views import View
 
 DETECTED: Final[tuple[Kind, ...]] = (
@@ -26,6 +26,9 @@ DETECTED: Final[tuple[Kind, ...]] = (
 
 OF_NUMBERS: Final = frozenset[Kind]({"silent", "flat", "jump", "oscillation"})
 
+_OF_RUN: Final = (
+    "SELECT sum(rows), sum(present), sum(changes) FROM rollup WHERE run_id = ? AND signal_id = ?"
+)
 # What a robot swings with; sensors swing by nature while it drives.
 _SWINGING: Final = re.compile(
     r"(^|[._])(heading|yaw|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"
@@ -58,6 +61,13 @@ class Search:
         wall_s = wall_time_at(self.connection, run_id, start_s)
         ongoing = end_s >= self.ended_s > start_s
         return Event(kind, run_id, start_s, end_s, wall_s, name, details, ongoing)
+
+    def any_of(self, signal: Signal, here: Summary, holds: Callable[[Summary], bool]) -> bool:
+        """Whether it holds of a signal in the segment, or else in the run as far as rolled up."""
+        if holds(here):
+            return True
+        of_run = self.connection.execute(_OF_RUN, (self.segment.run_id, signal.id)).fetchone()
+        return of_run[0] is not None and holds(Summary(*of_run))
 
 
 def stuck_events(search: Search) -> Iterator[Event]:
@@ -92,8 +102,8 @@ def threshold_events(search: Search) -> Iterator[Event]:
 def silent_events(search: Search) -> Iterator[Event]:
     """A signal that mostly has a value had none."""
     for signal in search.numbers:
-        summary = search.view.summary(signal)
-        if summary.rows * MOSTLY <= summary.present < summary.rows:
+        here = search.view.summary(signal)
+        if here.present < here.rows and search.any_of(signal, here, _mostly_present):
             for span in search.view.spans(signal, Silent()):
                 if span.end_s - span.start_s >= search.options.silent_s:
                     yield search.event("silent", span.start_s, span.end_s, signal.name)
@@ -103,10 +113,18 @@ def flat_events(search: Search) -> Iterator[Event]:
     """A signal that mostly changes had exactly the same value."""
     least_s = max(search.options.flat_s, search.view.shortest_rest_s)
     for signal in search.numbers:
-        summary = search.view.summary(signal)
-        if MOSTLY * summary.present <= summary.changes < summary.present - 1:
+        here = search.view.summary(signal)
+        if here.changes < here.present - 1 and search.any_of(signal, here, _mostly_changing):
             spans = search.view.spans(signal, Flat())
             yield from _flat(search, signal, spans, least_s)
+
+
+def _mostly_present(summary: Summary) -> bool:
+    return summary.present >= MOSTLY * summary.rows > 0
+
+
+def _mostly_changing(summary: Summary) -> bool:
+    return summary.changes >= MOSTLY * summary.present > 0
 
 
 def _flat(search: Search, signal: Signal, spans: list[Span], least_s: float) -> Iterator[Event]:

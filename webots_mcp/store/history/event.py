@@ -26,7 +26,7 @@ class Event:
             threshold, silent (no value), flat, jump, oscillation; command, log, noticed (by the
             bridge), image.
         end_s: Equal to the start for what has no duration; of a change when the value ended.
-        ongoing: It lasted until the end of what was looked at.
+        ongoing: It lasts up to the newest row of the run; of a command, it is not finished.
         name: The signal, the action, the level or the device that it is about.
         details: What there is to say about it, by kind.
         around: Values of a few signals when it began.

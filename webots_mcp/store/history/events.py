@@ -6,13 +6,13 @@ import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.history.detectors import DETECTED, DETECTORS, OF_NUMBERS, Search
+from webots_mcp.store.history.detection import Detection
 from webots_mcp.store.history.event import Event, EventOptions, Kind
 from webots_mcp.store.history.leaves import Value, flatten, parse
-from webots_mcp.store.history.motion import Motion, find_motion
+from webots_mcp.store.history.motion import find_motion
 from webots_mcp.store.history.ranges import Segment, TimeRange, just_after, recorded_bounds
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.signals import known_signals, resolve_signals
@@ -26,7 +26,6 @@ from webots_mcp.store.history.stored import (
     noticed_events,
     run_events,
 )
-from webots_mcp.store.history.views import view_of
 
 MOST_AROUND: Final = 6  # values that are told with an event
 
@@ -62,7 +61,7 @@ def find_events(
     around: Sequence[str] | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> Events:
-    """What happened in a range.
+    """What happened in a range: with its true begin and end, also where it reaches out of it.
 
     Up to 30,000 rows of a run are all looked at. Of a longer range the rollups and the change
     table tell where to look, and the notes say what may have been missed.
@@ -107,13 +106,15 @@ def collect(
         UnknownSignalError: A name in the options meets nothing.
     """
     known = known_signals(connection, time_range)
-    motion = find_motion(known, options)
     deadline = Deadline(deadline_s)
     notes = list(time_range.notes)
     found: list[Event] = []
     for segment in time_range.segments:
         found += _stored(connection, segment, known, options, deadline)
-        found += _detected(connection, segment, known, motion, options, deadline, notes)
+        recorded = _recorded(connection, segment)
+        if recorded is not None:
+            detection = Detection(connection, known, options, deadline, *recorded.bounds)
+            found += detection.events_touching(recorded.segment, notes)
     return found, notes
 
 
@@ -133,7 +134,7 @@ def _stored(
     deadline: Deadline,
 ) -> Iterator[Event]:
     """Events of the kinds that tables tell."""
-    recorded = _clipped(connection, segment)
+    recorded = _recorded(connection, segment)
     signals = resolve_signals(known, options.signals) if known else []
     if "run" in options.kinds:
         yield from run_events(connection, segment)
@@ -146,47 +147,26 @@ def _stored(
     if "image" in options.kinds:
         yield from image_events(connection, segment)
     if "gap" in options.kinds and recorded is not None:
-        yield from gap_events(connection, recorded, deadline)
+        yield from gap_events(connection, recorded.segment, deadline)
     if "change" in options.kinds and recorded is not None:
-        yield from change_events(connection, recorded, signals, deadline)
+        newest_s = recorded.bounds[1]
+        yield from change_events(connection, recorded.segment, newest_s, signals, deadline)
 
 
-def _detected(
-    connection: sqlite3.Connection,
-    segment: Segment,
-    known: dict[str, Signal],
-    motion: Motion,
-    options: EventOptions,
-    deadline: Deadline,
-    notes: list[str],
-) -> list[Event]:
-    """Events of the kinds that values tell."""
-    recorded = _clipped(connection, segment)
-    kinds = [kind for kind in DETECTED if kind in options.kinds]
-    if recorded is None or not kinds:
-        return []
-    matching = resolve_signals(known, options.signals) if known else []
-    numbers = [signal for signal in matching if signal.is_number and set(kinds) & OF_NUMBERS]
-    limits = [
-        signal for each in options.thresholds for signal in resolve_signals(known, [each.signal])
-    ]
-    needed = list({signal.name: signal for signal in (*numbers, *motion.signals, *limits)}.values())
-    view = view_of(connection, recorded, needed, deadline)
-    bounds = recorded_bounds(connection, segment.run_id)
-    ended_s = bounds[1] if bounds else recorded.end_s
-    search = Search(connection, recorded, known, numbers, motion, options, view, ended_s)
-    found = [event for kind in kinds for event in DETECTORS[kind](search)]
-    notes += view.notes
-    return found
+class _Recorded(NamedTuple):
+    """The part of a segment that was recorded, and the simulation times of the whole recording."""
+
+    segment: Segment
+    bounds: tuple[float, float]
 
 
-def _clipped(connection: sqlite3.Connection, segment: Segment) -> Segment | None:
-    """The part of a segment in which there are rows."""
+def _recorded(connection: sqlite3.Connection, segment: Segment) -> _Recorded | None:
+    """None where nothing of a segment was recorded."""
     bounds = recorded_bounds(connection, segment.run_id)
     if bounds is None or bounds[1] < segment.start_s or bounds[0] >= segment.end_s:
         return None
     start_s, end_s = max(segment.start_s, bounds[0]), min(segment.end_s, just_after(bounds[1]))
-    return replace(segment, start_s=start_s, end_s=end_s)
+    return _Recorded(replace(segment, start_s=start_s, end_s=end_s), bounds)
 
 
 def in_order(event: Event) -> tuple[float, int, float]:

@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
-from webots_mcp.store.history.changes import Point, change_points
+from webots_mcp.store.history.changes import change_points
 from webots_mcp.store.history.columns import exceeds, read_columns
 from webots_mcp.store.history.deadline import Deadline
 from webots_mcp.store.history.event import LEVELS, Event, EventOptions
 from webots_mcp.store.history.gaps import rhythm_in, rhythm_of, with_rows_around
-from webots_mcp.store.history.ranges import Segment
+from webots_mcp.store.history.ranges import Segment, just_after
 from webots_mcp.store.history.registry import Signal
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
@@ -95,27 +95,25 @@ def gap_events(connection: sqlite3.Connection, segment: Segment, deadline: Deadl
 def change_events(
     connection: sqlite3.Connection,
     segment: Segment,
+    newest_s: float,
     signals: Sequence[Signal],
     deadline: Deadline,
 ) -> Iterator[Event]:
-    """Changes of text and flags, each as long as the new value lasted."""
+    """Changes of text and flags, each as long as the new value lasted, up to the newest row."""
     states = [signal for signal in signals if not signal.is_number]
-    for name, points in change_points(connection, segment, states, deadline).items():
-        yield from _changes_of(connection, segment, name, points[-MOST_CHANGES - 1 :])
-
-
-def _changes_of(
-    connection: sqlite3.Connection, segment: Segment, name: str, points: list[Point]
-) -> Iterator[Event]:
-    for index, (before, point) in enumerate(pairwise(points)):
-        if point.sim_time_s < segment.start_s:
-            continue
-        last = index + 2 == len(points)
-        end_s = segment.end_s if last else points[index + 2].sim_time_s
-        wall_s = wall_time_at(connection, segment.run_id, point.sim_time_s)
-        details = {"before": before.value, "after": point.value}
-        place = (segment.run_id, point.sim_time_s, end_s, wall_s)
-        yield Event("change", *place, name, details, ongoing=last)
+    whole = Segment(segment.run_id, segment.start_s, just_after(newest_s))
+    for name, points in change_points(connection, whole, states, deadline).items():
+        ends_s = [*(point.sim_time_s for point in points[2:]), None]
+        changes = [
+            (before, point, end_s)
+            for (before, point), end_s in zip(pairwise(points), ends_s, strict=False)
+            if segment.start_s <= point.sim_time_s < segment.end_s
+        ]
+        for before, point, end_s in changes[-MOST_CHANGES:]:
+            place = (segment.run_id, point.sim_time_s, newest_s if end_s is None else end_s)
+            wall_s = wall_time_at(connection, segment.run_id, point.sim_time_s)
+            details = {"before": before.value, "after": point.value}
+            yield Event("change", *place, wall_s, name, details, ongoing=end_s is None)
 
 
 def log_events(

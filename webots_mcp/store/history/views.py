@@ -6,6 +6,7 @@ Both views answer the same questions, so that a detector is written once.
 from __future__ import annotations
 
 import functools
+import math
 import sqlite3
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ from typing import Final, Protocol
 from webots_mcp.store.history.columns import Columns, exceeds, read_columns
 from webots_mcp.store.history.deadline import Deadline
 from webots_mcp.store.history.gaps import GAP_INTERVALS, rhythm_of
-from webots_mcp.store.history.ranges import Segment
+from webots_mcp.store.history.ranges import Segment, just_after
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.rollup import BUCKET_S, bucket_of, watermark
 from webots_mcp.store.history.sampling import MOST_SAMPLES, newest_part, read_sampled
@@ -156,6 +157,7 @@ class LongView:
             self.notes.append(f"stuck for less than {2 * every_s:.3g} s may be missed")
         plain = [signal for signal in signals if signal.is_plain]
         found = read_sampled(self._connection, self._segment, plain, every_s, self._deadline)
+        self._add_newest(found, plain, every_s)
         if found.cut:
             reached_s = found.times[-1] if found.times else self._segment.start_s
             self.notes.append(f"the time was over: stuck was searched up to {reached_s:g} s only")
@@ -221,6 +223,19 @@ class LongView:
     def _rests(self, signal: Signal) -> bool:
         values = (self._span[0], signal.id, *self._span[1:])
         return bool(self._connection.execute(_RESTS, values).fetchone()[0])
+
+    def _add_newest(self, found: Columns, signals: Sequence[Signal], every_s: float) -> None:
+        """The rows after the last sample: who is stuck may be so up to the newest one."""
+        after_s = found.times[-1] if found.times and not found.cut else math.inf
+        part = replace(
+            self._segment, start_s=just_after(max(after_s, self._segment.end_s - 2 * every_s))
+        )
+        newest = read_columns(self._connection, part, signals, self._deadline)
+        found.ids += newest.ids
+        found.times += newest.times
+        found.walls += newest.walls
+        for signal in signals:
+            found.values[signal.name] += newest.values[signal.name]
 
     def _cut(self) -> None:
         self.notes.append("the time was over before all was searched: ask for less time or kinds")

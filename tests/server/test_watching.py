@@ -74,3 +74,32 @@ async def test_what_was_logged_after_the_last_row_is_told(
         answer = await ask(client, "webots_monitor", lookback_s=5)
     (event,) = [row for row in rows_of(answer["events"]) if row["kind"] == "log"]
     assert event["details"]["message"] == "the arm is blocked"
+
+
+async def test_what_began_before_the_window_and_goes_on_is_told_with_its_begin(
+    connect: Connect, rover: RecordedRobot
+) -> None:
+    for step in range(200):
+        x = min(step * 0.1, 5.0)
+        state = {"pose": [x, 0.0], "commanded_m_s": 1.0}
+        rover.state(step * 0.1, state, at=rover.now + step * 0.1)
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_s=4)
+    (stuck,) = [row for row in rows_of(answer["events"]) if row["kind"] == "stuck"]
+    assert (stuck["start_s"], stuck["duration_s"]) == (pytest.approx(5.0, abs=0.2), 14.9)
+    assert stuck["ongoing"]
+
+
+async def test_over_a_reset_the_movement_is_told_run_by_run(
+    connect: Connect, rover: RecordedRobot
+) -> None:
+    drive(rover, [0, 0], [3, 4])
+    rover.end_run("reset")
+    rover.begin_run("reset")
+    drive(rover, [0, 0], [0, 1])
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_s=60)
+    first, second = answer["movement"]["runs"]
+    assert (first["to"], first["distance"], first["displacement"]) == ([3, 4], 5.0, 5.0)
+    assert (second["to"], second["distance"], second["displacement"]) == ([0, 1], 1.0, 1.0)
+    assert second["run_id"] == first["run_id"] + 1

@@ -9,11 +9,12 @@ from typing import Any, Final
 
 from webots_mcp.server.bounds import newest_runs
 from webots_mcp.server.fitting import figure
-from webots_mcp.store.history.columns import read_columns
+from webots_mcp.store.history.columns import Columns, read_columns
 from webots_mcp.store.history.deadline import Deadline
 from webots_mcp.store.history.event import EventOptions
 from webots_mcp.store.history.motion import find_motion, path_length, places_of
 from webots_mcp.store.history.ranges import Segment, TimeRange, resolve_range
+from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.signals import known_signals
 from webots_mcp.store.recording import View
 
@@ -62,7 +63,7 @@ def _standing(view: View, wall_start_s: float) -> Segment:
 def movement(view: View, found: TimeRange) -> dict[str, Any] | None:
     """Distance along the way and displacement, in the unit of the position; None without one.
 
-    A jump to the start at a reset was not travelled, and a lost position is no place.
+    Over several runs they are told run by run: the jump to the start at a reset was not travelled.
     """
     known = known_signals(view.connection, found)
     position = find_motion(known, EventOptions()).position
@@ -72,14 +73,21 @@ def movement(view: View, found: TimeRange) -> dict[str, Any] | None:
     parts = [
         read_columns(view.connection, segment, position, deadline) for segment in found.segments
     ]
-    names = [signal.name for signal in position]
-    places = [place for part in parts for place in places_of(part, position)]
+    names = {"position": [signal.name for signal in position]}
+    ways = {part.run_id: way for part in parts if (way := _way(part, position))}
+    if len(ways) > 1:
+        return names | {"runs": [{"run_id": run_id, **way} for run_id, way in ways.items()]}
+    return next((names | way for way in ways.values()), None)
+
+
+def _way(part: Columns, position: tuple[Signal, Signal]) -> dict[str, Any] | None:
+    """From where to where it went in one run; a lost position is no place."""
+    places = places_of(part, position)
     if len(places) < 2:
         return None
     return {
-        "position": names,
         "from": [figure(value) for value in places[0]],
         "to": [figure(value) for value in places[-1]],
-        "distance": figure(math.fsum(path_length(part, position) for part in parts)),
+        "distance": figure(path_length(part, position)),
         "displacement": figure(math.dist(places[0], places[-1])),
     }

@@ -1,5 +1,7 @@
 """Runs a world in the foreground: `python -m webots_mcp.standin WORLD`."""
 
+from __future__ import annotations
+
 import argparse
 import signal
 import sys

@@ -1,7 +1,9 @@
 """What the simulator answers to the messages of controllers."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from controller.wire import Message
 
@@ -11,7 +13,7 @@ from webots_mcp.standin.picture import Label
 from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
 from webots_mcp.standin.vrml import Node
 
-CUSTOM_DATA_TAG = 0
+CUSTOM_DATA_TAG: Final = 0
 """Stands for the robot itself where devices have their tags."""
 
 FieldReference = tuple[int, str]

@@ -1,8 +1,11 @@
 """What stands in the world and what happens when it touches."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import cos, hypot, sin
+from typing import Final
 
 from webots_mcp.standin.camera import SceneColors
 from webots_mcp.standin.frame import Frame, frame_of
@@ -10,8 +13,8 @@ from webots_mcp.standin.shapes import Block, Color, Disc, Shape
 from webots_mcp.standin.vrml import Node
 from webots_mcp.standin.world import World, children_of, descendants_of, own_frame
 
-_GEOMETRIES = ("Box", "Cylinder", "Sphere")
-_DEFAULT_COLOR: Color = (0.5, 0.5, 0.5)
+_GEOMETRIES: Final = ("Box", "Cylinder", "Sphere")
+_DEFAULT_COLOR: Final[Color] = (0.5, 0.5, 0.5)
 
 
 @dataclass(frozen=True)
@@ -42,7 +45,7 @@ class Footprint:
     radius_m: float
 
     @staticmethod
-    def around(parts: list[Part]) -> "Footprint":
+    def around(parts: list[Part]) -> Footprint:
         """The smallest disc around the rectangle that all parts fill."""
         at_and_half = [
             (part.frame.translation, _turned_half(part.frame, part.half_m)) for part in parts

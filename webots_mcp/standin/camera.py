@@ -1,12 +1,15 @@
 """Renders small camera pictures, one ray per column of pixels."""
 
+from __future__ import annotations
+
 from array import array
 from dataclasses import dataclass
 from math import cos, hypot, inf, sin, tan
+from typing import Final
 
 from webots_mcp.standin.shapes import Color, Shape, Target, targets_from
 
-_LIGHT = (0.8, 0.6)
+_LIGHT: Final = (0.8, 0.6)
 """Where the light comes from, so that the sides of a box differ."""
 
 

@@ -1,5 +1,7 @@
 """The simulator's end of a controller's socket."""
 
+from __future__ import annotations
+
 import socket
 from contextlib import suppress
 

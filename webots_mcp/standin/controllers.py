@@ -1,16 +1,19 @@
 """The controllers of a world: which program each robot runs, and how far it is."""
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from webots_mcp.standin.connection import Connection
 from webots_mcp.standin.process import ControllerProcess
 from webots_mcp.standin.simulator import Robot, Simulator
 
-_NOBODY = ("", "<none>", "void", "<generic>")
-_EXTERN = "<extern>"
+_NOBODY: Final = ("", "<none>", "void", "<generic>")
+_EXTERN: Final = "<extern>"
 
 
 @dataclass(frozen=True)

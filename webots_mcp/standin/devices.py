@@ -1,9 +1,11 @@
 """The devices of a simulated robot: what they measure, and what they let a controller set."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import cos, inf, nan, pi, sin
-from typing import Any
+from typing import Any, Final
 
 from webots_mcp.standin import camera
 from webots_mcp.standin.arena import Arena, Body
@@ -300,7 +302,7 @@ class Camera(Device):
         return b"" if self._seen is None else camera.render(self._seen, self.site.arena.colors)
 
 
-_BY_NODE_TYPE: dict[str, Callable[[int, Node, Site], Device]] = {
+_BY_NODE_TYPE: Final[dict[str, Callable[[int, Node, Site], Device]]] = {
     "RotationalMotor": Motor,
     "PositionSensor": PositionSensor,
     "DistanceSensor": DistanceSensor,

@@ -6,6 +6,8 @@ StandInError
 └── ControllerEndedError  the API was used after `step` had returned -1
 """
 
+from __future__ import annotations
+
 
 class StandInError(Exception):
     """Anything the stand-in refuses to do."""

@@ -1,14 +1,16 @@
 """Places in space: a rotation matrix and a translation, put one after the other."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from math import atan2, cos, hypot, sin
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """A rotation by rows, as `Node.getOrientation` gives it."""
 Vector = tuple[float, float, float]
 
-UNTURNED: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+UNTURNED: Final[Matrix] = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 class Frame(NamedTuple):
@@ -32,7 +34,7 @@ class Frame(NamedTuple):
             r[6] * x + r[7] * y + r[8] * z + tz,
         )
 
-    def then(self, inner: "Frame") -> "Frame":
+    def then(self, inner: Frame) -> Frame:
         """A frame given in this frame, seen from outside."""
         a, b = self.rotation, inner.rotation
         rows = ((a[i], a[i + 1], a[i + 2]) for i in (0, 3, 6))

@@ -1,9 +1,11 @@
 """Robots for unit tests: the same classes, without a second process and without a socket."""
 
+from __future__ import annotations
+
 import threading
 from collections import deque
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 from controller.robot import Robot
 from controller.supervisor import Supervisor
@@ -21,10 +23,10 @@ from webots_mcp.standin.simulator import Mode, Simulator, Wanted
 from webots_mcp.standin.simulator import Robot as SimulatedRobot
 from webots_mcp.standin.world import load_world
 
-DEFAULT_WORLD = bundled("examples") / "worlds" / "arena.wbt"
+DEFAULT_WORLD: Final = bundled("examples") / "worlds" / "arena.wbt"
 """A 4 m x 4 m arena with a few obstacles and one two-wheeled robot, "rover"."""
 
-_LONGEST_STEP_MS = 1 << 31
+_LONGEST_STEP_MS: Final = 1 << 31
 
 
 class InProcessSimulation:
@@ -122,7 +124,7 @@ class InProcessSimulation:
             self._end(self._links)
             self._simulator = Simulator(load_world(path), self.mode, self.console.append)
 
-    def _end(self, links: "list[_LocalLink]") -> None:
+    def _end(self, links: list[_LocalLink]) -> None:
         for link in links:
             link.quit()
         self._links = [link for link in self._links if link not in links]
@@ -130,7 +132,7 @@ class InProcessSimulation:
 
     # Controllers ---------------------------------------------------------------------------------
 
-    def connect(self, name: str | None) -> "_LocalLink":
+    def connect(self, name: str | None) -> _LocalLink:
         """Connects a robot object to a robot of the world."""
         with self._changed:
             robot = self._found(name)
@@ -148,7 +150,7 @@ class InProcessSimulation:
             robots[0].node.fields["name"] = name
         return robots[0] if name is None else self._simulator.robot(name)
 
-    def take(self, link: "_LocalLink", message: Message) -> None:
+    def take(self, link: _LocalLink, message: Message) -> None:
         """Takes a controller's request, and lets time pass as far as it asks for."""
         with self._changed:
             reply = answer(self._simulator, link.robot, message)
@@ -156,7 +158,7 @@ class InProcessSimulation:
                 link.replies.append(reply)
             self._carry_out(self._simulator.wanted)
 
-    def wait(self, link: "_LocalLink") -> None:
+    def wait(self, link: _LocalLink) -> None:
         """Lets time pass until the controller has its answer.
 
         Raises:
@@ -174,7 +176,7 @@ class InProcessSimulation:
                 if self.mode is not Mode.PAUSE and not link.replies:
                     self._advance()
 
-    def leave(self, link: "_LocalLink") -> None:
+    def leave(self, link: _LocalLink) -> None:
         """Forgets a controller that is done."""
         with self._changed:
             if link in self._links:
@@ -257,7 +259,7 @@ class InProcessRobot(Robot):
         self,
         name: str | None = None,
         *,
-        world: "str | Path | InProcessSimulation" = DEFAULT_WORLD,
+        world: str | Path | InProcessSimulation = DEFAULT_WORLD,
     ) -> None:
         """Connects to a robot of a world.
 

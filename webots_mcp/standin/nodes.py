@@ -4,11 +4,14 @@ Written as Webots writes its own node files. Default sounds and textures are lef
 is heard. A world may use other fields of these nodes; they are read over.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass
+from typing import Final
 
 from webots_mcp.standin.vrml import Value, tokens_of
 
-_DEFINITIONS = """
+_DEFINITIONS: Final = """
 WorldInfo {
   MFString info []  SFString title ""  SFString window ""  SFVec3f northDirection 1 0 0
   SFFloat gravity 9.81  SFFloat basicTimeStep 32  SFFloat FPS 60
@@ -95,7 +98,7 @@ Lidar {
 }
 """
 
-NUMBERS_IN = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
+NUMBERS_IN: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
 """How many numbers make one value of a type; all other types take one."""
 
 
@@ -138,10 +141,10 @@ def _default(words: list[str]) -> Value:
     return [float(word) for word in words if word not in "[]"]
 
 
-NODE_TYPES = _definitions()
+NODE_TYPES: Final = _definitions()
 """Fields by node type."""
 
-DEVICE_TYPES = (
+DEVICE_TYPES: Final = (
     "RotationalMotor",
     "PositionSensor",
     "DistanceSensor",

@@ -1,5 +1,7 @@
 """How motors turn wheels and wheels move a robot."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass, field
 from math import cos, isinf, sin
 from typing import Any
@@ -26,7 +28,7 @@ class Joint:
     velocity_radps: float = 0.0
 
     @staticmethod
-    def of(node: Node) -> "Joint":
+    def of(node: Node) -> Joint:
         """The joint that a HingeJoint node describes; without a motor it stands still."""
         motors = [n for n in node.fields["device"] if n.type_name == "RotationalMotor"]
         fields: dict[str, Any] = motors[0].fields if motors else {}

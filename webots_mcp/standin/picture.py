@@ -1,10 +1,12 @@
 """The picture of the whole arena from above, for `Supervisor.exportImage`."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import cos, sin
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from webots_mcp.standin.arena import Arena, Body
 from webots_mcp.standin.shapes import Block, Color, Shape
@@ -12,9 +14,9 @@ from webots_mcp.standin.shapes import Block, Color, Shape
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
 
-SIZE_PX = (800, 600)
-_MARGIN_PX = 20
-_FORMATS = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
+SIZE_PX: Final = (800, 600)
+_MARGIN_PX: Final = 20
+_FORMATS: Final = {".png": "PNG", ".jpg": "JPEG", ".jpeg": "JPEG"}
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Chart:
     pixels_per_m: float
 
     @staticmethod
-    def of(shapes: list[Shape]) -> "Chart":
+    def of(shapes: list[Shape]) -> Chart:
         """The chart that shows all shapes, x to the right and y upwards."""
         corners = [corner for shape in shapes for corner in _outline(shape)] or [(-1.0, -1.0)]
         xs, ys = [x for x, _ in corners], [y for _, y in corners]
@@ -87,7 +89,7 @@ def save_picture(picture: Picture, arena: Arena, time_s: float, labels: Iterable
     image.save(picture.path, kind, quality=picture.quality)
 
 
-def _draw_floor(pen: "ImageDraw", chart: Chart, arena: Arena) -> None:
+def _draw_floor(pen: ImageDraw, chart: Chart, arena: Arena) -> None:
     corners = [c for body in arena.bodies for shape in body.shapes for c in _outline(shape)]
     if not corners:
         return
@@ -96,7 +98,7 @@ def _draw_floor(pen: "ImageDraw", chart: Chart, arena: Arena) -> None:
     pen.rectangle((left, top, right, bottom), fill=_rgb(arena.colors.floor))
 
 
-def _draw_body(pen: "ImageDraw", chart: Chart, body: Body) -> None:
+def _draw_body(pen: ImageDraw, chart: Chart, body: Body) -> None:
     for shape in body.shapes:
         _draw_shape(pen, chart, shape)
     radius = body.footprint.radius_m
@@ -107,7 +109,7 @@ def _draw_body(pen: "ImageDraw", chart: Chart, body: Body) -> None:
         pen.text(chart.at(x + radius, y + radius), body.name, fill=(0, 0, 0), font_size=14)
 
 
-def _draw_shape(pen: "ImageDraw", chart: Chart, shape: Shape) -> None:
+def _draw_shape(pen: ImageDraw, chart: Chart, shape: Shape) -> None:
     if isinstance(shape, Block):
         pen.polygon([chart.at(*corner) for corner in _outline(shape)], fill=_rgb(shape.color))
         return
@@ -115,7 +117,7 @@ def _draw_shape(pen: "ImageDraw", chart: Chart, shape: Shape) -> None:
     pen.circle(chart.at(shape.x, shape.y), radius_px, fill=_rgb(shape.color))
 
 
-def _draw_label(pen: "ImageDraw", label: Label) -> None:
+def _draw_label(pen: ImageDraw, label: Label) -> None:
     at = (label.x * SIZE_PX[0], label.y * SIZE_PX[1])
     rgb = (label.rgb >> 16 & 255, label.rgb >> 8 & 255, label.rgb & 255)
     pen.text(at, label.text, fill=rgb, font_size=max(label.size * SIZE_PX[1], 8.0))

@@ -1,13 +1,15 @@
 """One controller process: starting it, passing on what it prints, ending it."""
 
+from __future__ import annotations
+
 import os
 import subprocess
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import IO
+from typing import IO, Final
 
-_TERMINATION_S = 1.0
+_TERMINATION_S: Final = 1.0
 """How long a process may take to end after it was told to."""
 
 
@@ -20,7 +22,7 @@ class ControllerProcess:
         folder: Path,
         environment: Mapping[str, str],
         on_line: Callable[[str], None],
-        on_exit: Callable[["ControllerProcess"], None],
+        on_exit: Callable[[ControllerProcess], None],
     ) -> None:
         self._process = subprocess.Popen(
             command,

@@ -1,5 +1,7 @@
 """The loop that runs a simulation: serves controllers, keeps time, starts and ends processes."""
 
+from __future__ import annotations
+
 import hmac
 import secrets
 import selectors
@@ -11,7 +13,7 @@ from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from controller.wire import Message
 
@@ -22,9 +24,9 @@ from webots_mcp.standin.errors import StandInError, WorldError
 from webots_mcp.standin.simulator import Mode, Simulator
 from webots_mcp.standin.world import load_world
 
-_PATIENCE_S = 1.0
+_PATIENCE_S: Final = 1.0
 """How long Webots waits for a controller to ask for something, and then for it to exit."""
-_MAX_LAG_S = 0.1
+_MAX_LAG_S: Final = 0.1
 """Real time that is lost is caught up with at most so much."""
 
 

@@ -4,6 +4,8 @@ The stand-in is two-dimensional with heights: a box is a turned rectangle, a cyl
 disc, each between a bottom and a top.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import hypot, inf, sqrt
@@ -27,7 +29,7 @@ class Edge(NamedTuple):
     start_m: float
     """Where the edge begins, measured along (ex, ey)."""
     length_m: float
-    shape: "Shape"
+    shape: Shape
 
     def distance_m(self, dx: float, dy: float) -> float:
         """How far the ray in direction (dx, dy) runs until it hits; inf if it does not."""
@@ -51,7 +53,7 @@ class Circle(NamedTuple):
     radius_m: float
     gap_m2: float
     """Squared distance to the centre minus squared radius."""
-    shape: "Shape"
+    shape: Shape
 
     def distance_m(self, dx: float, dy: float) -> float:
         """How far the ray in direction (dx, dy) runs until it hits; inf if it does not."""
@@ -69,7 +71,7 @@ class Circle(NamedTuple):
 class Here(NamedTuple):
     """A shape that the point is inside of."""
 
-    shape: "Shape"
+    shape: Shape
 
     def distance_m(self, dx: float, dy: float) -> float:
         """Nothing: the ray ends where it starts."""

@@ -1,5 +1,7 @@
 """A running simulation with real controller processes."""
 
+from __future__ import annotations
+
 import shutil
 import sys
 import tempfile
@@ -11,7 +13,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import TypeVar
+from typing import Final, TypeVar
 
 from controller.wire import ADDRESS_FILE
 
@@ -22,10 +24,10 @@ from webots_mcp.standin.runner import Runner
 from webots_mcp.standin.simulator import Mode, Robot, Simulator
 from webots_mcp.standin.world import load_world
 
-_MODES = {"pause": Mode.PAUSE, "realtime": Mode.REAL_TIME, "fast": Mode.FAST}
-_NOTICE_S = 0.002
-_RECHECK_S = 0.05
-_CONSOLE_LINES = 10_000
+_MODES: Final = {"pause": Mode.PAUSE, "realtime": Mode.REAL_TIME, "fast": Mode.FAST}
+_NOTICE_S: Final = 0.002
+_RECHECK_S: Final = 0.05
+_CONSOLE_LINES: Final = 10_000
 
 T = TypeVar("T")
 
@@ -90,7 +92,7 @@ class Simulation:
 
     # Life ----------------------------------------------------------------------------------------
 
-    def start(self) -> "Simulation":
+    def start(self) -> Simulation:
         """Starts the controllers and, unless it is to be paused, time."""
         address = self._instance / ADDRESS_FILE  # the folder is this user's alone
         address.write_text(f"{self._runner.open()} {self._runner.token}", encoding="utf-8")
@@ -106,7 +108,7 @@ class Simulation:
             self._thread.join()
         self._clean_up()
 
-    def __enter__(self) -> "Simulation":
+    def __enter__(self) -> Simulation:
         return self.start()
 
     def __exit__(

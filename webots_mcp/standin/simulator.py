@@ -4,6 +4,8 @@ Whoever drives a `Simulator` makes the physics steps (`advance`) and carries out
 simulation wants done to itself (`wanted`).
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from enum import IntEnum
 from math import ceil

@@ -1,19 +1,21 @@
 """Reads the VRML dialect of .wbt files into a tree of nodes; knows nothing of what nodes mean."""
 
+from __future__ import annotations
+
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from webots_mcp.standin.errors import WorldError
 
 Value: TypeAlias = "bool | str | Node | list[float] | list[Value] | None"
 """A field as written: numbers are always a list of floats, `[...]` is a list of anything."""
 
-_TOKEN = re.compile(r'[\s,]+|#[^\n]*|(?P<token>"(?:[^"\\]|\\.)*"|[\[\]{}]|[^\s\[\]{}",#]+)')
-_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
-_NAME = re.compile(r"[A-Za-z_][^\s\"'#,.\[\]\\{}]*\Z")
-_WORDS: dict[str, bool | None] = {"TRUE": True, "FALSE": False, "NULL": None}
+_TOKEN: Final = re.compile(r'[\s,]+|#[^\n]*|(?P<token>"(?:[^"\\]|\\.)*"|[\[\]{}]|[^\s\[\]{}",#]+)')
+_NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\Z")
+_NAME: Final = re.compile(r"[A-Za-z_][^\s\"'#,.\[\]\\{}]*\Z")
+_WORDS: Final[dict[str, bool | None]] = {"TRUE": True, "FALSE": False, "NULL": None}
 
 
 class Token(NamedTuple):

@@ -1,5 +1,7 @@
 """A world: the scene tree with typed fields, read from a .wbt file."""
 
+from __future__ import annotations
+
 from collections.abc import Iterator
 from copy import deepcopy
 from pathlib import Path

@@ -1,5 +1,7 @@
 """A stand-in for Webots' Python package `controller`; its simulator is webots_mcp.standin."""
 
+from __future__ import annotations
+
 from .camera import Camera
 from .device import Device, Sensor
 from .field import Field

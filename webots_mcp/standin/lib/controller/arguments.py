@@ -1,5 +1,7 @@
 """What `ctypes` makes of arguments in the real package: the same types, the same refusals."""
 
+from __future__ import annotations
+
 import ctypes
 from typing import Any
 

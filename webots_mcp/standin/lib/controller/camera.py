@@ -2,6 +2,8 @@
 
 # ruff: noqa: N802 - the names are those of Webots
 
+from __future__ import annotations
+
 from pathlib import Path
 
 from .arguments import integer, number, text
@@ -13,7 +15,7 @@ class Camera(Sensor):
 
     _c_name = "camera"
 
-    def __init__(self, name: "int | str", sampling_period: "int | None" = None) -> None:
+    def __init__(self, name: int | str, sampling_period: int | None = None) -> None:
         super().__init__(name, sampling_period)
         self._fov: float = self._description.get("fov", 0.0)
 

@@ -1,5 +1,7 @@
 """The lines that the real library writes to the C stderr, past Python's `sys.stderr`."""
 
+from __future__ import annotations
+
 import os
 
 

@@ -2,6 +2,8 @@
 
 # ruff: noqa: N802, N803 - the names are those of Webots
 
+from __future__ import annotations
+
 from typing import Any
 
 from . import session as library
@@ -16,7 +18,7 @@ class Device:
     `GPS("gps")` finds the device by name; the robot itself makes its devices by tag.
     """
 
-    def __init__(self, name: "int | str") -> None:
+    def __init__(self, name: int | str) -> None:
         session = library.current
         if session is None:
             raise RuntimeError("there are no devices before Robot() was made")
@@ -24,7 +26,7 @@ class Device:
         self._description = self._found(name)
         self._tag: int = self._description.get("tag", 0)
 
-    def _found(self, name: "int | str") -> dict[str, Any]:
+    def _found(self, name: int | str) -> dict[str, Any]:
         for description in self._session.robot["devices"]:
             if name in (description["tag"], description["name"]):
                 return description
@@ -70,7 +72,7 @@ class Sensor(Device):
     _c_name = "device"
     """As in the names of the C functions, for messages."""
 
-    def __init__(self, name: "int | str", sampling_period: "int | None" = None) -> None:
+    def __init__(self, name: int | str, sampling_period: int | None = None) -> None:
         super().__init__(name)
         if isinstance(name, str):  # by name: enables, as the real package does
             basic_ms = int(self._session.robot["basic_time_step"])

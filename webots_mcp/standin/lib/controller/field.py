@@ -2,7 +2,9 @@
 
 # ruff: noqa: N802 - the names are those of Webots
 
-from typing import TYPE_CHECKING, Any, cast
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from .arguments import integer, number
 from .console import say
@@ -12,8 +14,8 @@ from .session import Session
 if TYPE_CHECKING:
     from .node import Node
 
-_LENGTHS = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
-_TYPES: "dict[str, tuple[type, ...]]" = {
+_LENGTHS: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
+_TYPES: Final[dict[str, tuple[type, ...]]] = {
     "Bool": (bool, int),
     "Int32": (int,),
     "Float": (float,),
@@ -30,7 +32,7 @@ class Field:
     MF_BOOL, MF_INT32, MF_FLOAT, MF_VEC2F, MF_VEC3F = range(17, 22)
     MF_ROTATION, MF_COLOR, MF_STRING, MF_NODE = range(22, 26)
 
-    def __init__(self, session: Session, node_id: int, name: str, found: "tuple[str, int]") -> None:
+    def __init__(self, session: Session, node_id: int, name: str, found: tuple[str, int]) -> None:
         self._session = session
         self._key = (node_id, name)
         self._type_name, self._count = found
@@ -78,7 +80,7 @@ class Field:
             return self._read(self._type_name, None)
         return [self._read(self._type_name, index) for index in range(self._count)]
 
-    def _read(self, type_name: str, index: "int | None") -> Any:
+    def _read(self, type_name: str, index: int | None) -> Any:
         if not self._is(type_name, "get"):
             return None
         if index is not None and not -self._count <= integer(index) < self._count:
@@ -95,7 +97,7 @@ class Field:
             return int(value)
         return [*value] if isinstance(value, (list, tuple)) else value
 
-    def _write(self, type_name: str, index: "int | None", value: Any) -> None:
+    def _write(self, type_name: str, index: int | None, value: Any) -> None:
         if not self._is(type_name, "set"):
             return
         if not _fits(type_name[2:], value):
@@ -142,7 +144,7 @@ class Field:
         """The value."""
         return self._read("SFString", None)
 
-    def getSFNode(self) -> "Node | None":
+    def getSFNode(self) -> Node | None:
         """The node; None for NULL."""
         return self._read("SFNode", None)
 
@@ -162,7 +164,7 @@ class Field:
         """One entry."""
         return self._read("MFString", index)
 
-    def getMFNode(self, index: int) -> "Node | None":
+    def getMFNode(self, index: int) -> Node | None:
         """One entry; -1 is the last."""
         return self._read("MFNode", index)
 

@@ -2,6 +2,8 @@
 
 # ruff: noqa: N802 - the names are those of Webots
 
+from __future__ import annotations
+
 import ctypes
 from math import cos, sin
 from typing import Any, NamedTuple
@@ -37,7 +39,7 @@ class Lidar(Sensor):
             raise ValueError("NULL pointer access")
         return [*ranges]
 
-    def _ranges(self) -> "list[float] | None":
+    def _ranges(self) -> list[float] | None:
         return self._value(None, "get_range_image") and self._session.fetch(self._tag)
 
     @property

@@ -2,6 +2,8 @@
 
 # ruff: noqa: N802 - the names are those of Webots
 
+from __future__ import annotations
+
 from math import isinf, isnan
 
 from .arguments import number
@@ -15,7 +17,7 @@ class Motor(Device):
 
     ROTATIONAL, LINEAR = range(2)
 
-    def __init__(self, name: "int | str") -> None:
+    def __init__(self, name: int | str) -> None:
         super().__init__(name)
         self._position = 0.0
         self._velocity: float = self._description.get("max_velocity", 0.0)
@@ -121,7 +123,7 @@ class Motor(Device):
         """`Motor.ROTATIONAL`."""
         return self.ROTATIONAL
 
-    def getPositionSensor(self) -> "PositionSensor | None":
+    def getPositionSensor(self) -> PositionSensor | None:
         """The sensor of the same joint; None if there is none."""
         name = self._description["position_sensor"]
         for description in self._session.robot["devices"]:

@@ -2,6 +2,8 @@
 
 # ruff: noqa: N802, N803 - the names are those of Webots
 
+from __future__ import annotations
+
 from math import nan
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +28,7 @@ class _NodeTypes(type):
 class Node(metaclass=_NodeTypes):
     """A node of the scene tree; a null node (no rights) answers with defaults."""
 
-    def __init__(self, session: Session, found: "Sequence[Any]") -> None:
+    def __init__(self, session: Session, found: Sequence[Any]) -> None:
         self._session = session
         self._id, self._type_name, self._def_name = found
 
@@ -85,14 +87,14 @@ class Node(metaclass=_NodeTypes):
         """The DEF name, empty if there is none."""
         return self.getDef()
 
-    def getParentNode(self) -> "Node | None":
+    def getParentNode(self) -> Node | None:
         """The node around this one; None for the root."""
         found = self._session.ask("node_get_parent_node", self._id)
         return None if found is None else Node(self._session, found)
 
     # Fields --------------------------------------------------------------------------------------
 
-    def getField(self, fieldName: str) -> "Field | None":
+    def getField(self, fieldName: str) -> Field | None:
         """A field by name; None if the node has no such field."""
         found = self._session.ask("node_get_field", self._id, text(fieldName))
         return None if found is None else Field(self._session, self._id, fieldName, found)
@@ -101,7 +103,7 @@ class Node(metaclass=_NodeTypes):
         """How many fields the node has."""
         return len(self._session.ask("node_get_field_names", self._id, default=[]))
 
-    def getFieldByIndex(self, index: int) -> "Field | None":
+    def getFieldByIndex(self, index: int) -> Field | None:
         """A field by its place; None beyond the last."""
         names: list[str] = self._session.ask("node_get_field_names", self._id, default=[])
         return self.getField(names[index]) if 0 <= integer(index) < len(names) else None

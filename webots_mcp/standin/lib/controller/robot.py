@@ -2,9 +2,11 @@
 
 # ruff: noqa: N802 - the names are those of Webots
 
+from __future__ import annotations
+
 import signal
 import threading
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 from . import session as library
 from .arguments import integer, text
@@ -17,7 +19,7 @@ from .sensors import GPS, DistanceSensor, InertialUnit, PositionSensor
 from .session import Link, Session
 from .socket_link import SocketLink
 
-_DEVICE_CLASSES: dict[str, type[Device]] = {
+_DEVICE_CLASSES: Final[dict[str, type[Device]]] = {
     "Motor": Motor,
     "PositionSensor": PositionSensor,
     "DistanceSensor": DistanceSensor,
@@ -26,17 +28,17 @@ _DEVICE_CLASSES: dict[str, type[Device]] = {
     "Lidar": Lidar,
     "Camera": Camera,
 }
-_DEADLY_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
+_DEADLY_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 
 
 class Robot:
     """The robot that this process controls; a process has one."""
 
-    created: ClassVar["Robot | None"] = None
+    created: ClassVar[Robot | None] = None
     """The first robot that was made."""
 
     _session: Session
-    devices: "dict[str, Device]"
+    devices: dict[str, Device]
     """All devices by name."""
 
     def __init__(self) -> None:
@@ -49,7 +51,7 @@ class Robot:
         self._by_tag = {d["tag"]: _DEVICE_CLASSES[d["kind"]](d["tag"]) for d in described}
         self.devices = {device.name: device for device in self._by_tag.values()}
 
-    def _connect(self) -> "Link | None":
+    def _connect(self) -> Link | None:
         if Robot.created is not None:
             say("Error: Only one instance of the Robot class should be created.")
             self._session = Robot.created._session
@@ -63,7 +65,7 @@ class Robot:
 
     # Time ----------------------------------------------------------------------------------------
 
-    def step(self, time_step: "int | None" = None) -> int:
+    def step(self, time_step: int | None = None) -> int:
         """Lets time pass.
 
         Args:
@@ -76,7 +78,7 @@ class Robot:
         """
         return self._session.step(self._duration_ms(time_step))
 
-    def stepBegin(self, time_step: "int | None" = None) -> int:
+    def stepBegin(self, time_step: int | None = None) -> int:
         """The first half of `step`: asks for time to pass and returns at once."""
         self._session.begin_step(self._duration_ms(time_step))
         return 0
@@ -85,7 +87,7 @@ class Robot:
         """The second half of `step`: waits until time has passed."""
         return self._session.end_step()
 
-    def _duration_ms(self, time_step: "int | None") -> int:
+    def _duration_ms(self, time_step: int | None) -> int:
         return int(self.getBasicTimeStep()) if time_step is None else integer(time_step)
 
     def getTime(self) -> float:

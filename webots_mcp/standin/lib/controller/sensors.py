@@ -2,12 +2,15 @@
 
 # ruff: noqa: N802 - the names are those of Webots
 
+from __future__ import annotations
+
 from math import cos, hypot, nan, sin
+from typing import Final
 
 from .console import say
 from .device import Device, Sensor
 
-_MEMORY = [0.4375, -0.0625, 1.2890625, 0.734375]
+_MEMORY: Final = [0.4375, -0.0625, 1.2890625, 0.734375]
 """What stands in the memory that Webots reads before an InertialUnit's first value: any numbers."""
 
 
@@ -29,7 +32,7 @@ class PositionSensor(Sensor):
         """0: rotational."""
         return 0
 
-    def getMotor(self) -> "Device | None":
+    def getMotor(self) -> Device | None:
         """None and a line on stderr: broken in Webots' Python package."""
         say("Error: wb_position_sensor_get_brake(): no brake.")
         return None

@@ -1,13 +1,15 @@
 """The state of the controller library: what it was told, and what it has yet to send."""
 
+from __future__ import annotations
+
 import os
 import threading
-from typing import Any, NoReturn, Protocol
+from typing import Any, Final, NoReturn, Protocol
 
 from .console import say
 from .wire import Message
 
-CUSTOM_DATA_TAG = 0
+CUSTOM_DATA_TAG: Final = 0
 """Stands for the robot itself where devices have their tags."""
 
 
@@ -181,7 +183,7 @@ class Session:
             self.link.exit()
 
 
-current: "Session | None" = None
+current: Session | None = None
 """The session of the process's one robot; devices made by name belong to it."""
 
 

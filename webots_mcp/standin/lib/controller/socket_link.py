@@ -1,5 +1,7 @@
 """The connection of a controller process to the simulator that started it."""
 
+from __future__ import annotations
+
 import os
 from pathlib import Path
 from typing import Any, NoReturn

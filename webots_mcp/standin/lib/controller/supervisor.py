@@ -2,14 +2,16 @@
 
 # ruff: noqa: N802 - the names are those of Webots
 
-from typing import Any
+from __future__ import annotations
+
+from typing import Any, Final
 
 from .arguments import integer, number, text
 from .console import say
 from .node import Node
 from .robot import Robot
 
-_NULL_NODE = (0, "", "")
+_NULL_NODE: Final = (0, "", "")
 
 
 class Supervisor(Robot):
@@ -29,23 +31,23 @@ class Supervisor(Robot):
         """The robot's own node."""
         return Node(self._session, self._session.ask("node_get_self") or _NULL_NODE)
 
-    def getFromDef(self, name: str) -> "Node | None":
+    def getFromDef(self, name: str) -> Node | None:
         """The node with this DEF name (`A.B`: B inside A); None if there is none."""
         return self._node(self._session.ask("node_get_from_def", text(name)))
 
-    def getFromId(self, id: int) -> "Node | None":  # noqa: A002 - Webots' name
+    def getFromId(self, id: int) -> Node | None:  # noqa: A002 - Webots' name
         """The node with this number; None if there is none."""
         return self._node(self._session.ask("node_get_from_id", integer(id)))
 
-    def getFromDevice(self, tag: int) -> "Node | None":
+    def getFromDevice(self, tag: int) -> Node | None:
         """The node of a device: wants `device.tag`, not the device."""
         return self._node(self._session.ask("node_get_from_device", integer(tag)))
 
-    def getSelected(self) -> "Node | None":
+    def getSelected(self) -> Node | None:
         """None: there is no window to select a node in."""
         return None
 
-    def _node(self, found: Any) -> "Node | None":
+    def _node(self, found: Any) -> Node | None:
         return None if found is None else Node(self._session, found)
 
     # The simulation ------------------------------------------------------------------------------
@@ -87,7 +89,7 @@ class Supervisor(Robot):
         """Loads another world after the next physics step."""
         self._session.ask("world_load", text(file))
 
-    def worldSave(self, file: "str | None" = None) -> int:
+    def worldSave(self, file: str | None = None) -> int:
         """0 and a line on stderr: the stand-in writes no worlds."""
         say("Error: wb_supervisor_world_save(): the stand-in writes no world files.")
         return 0

@@ -4,17 +4,19 @@
 because every Python 3 reads it. It is read only from a peer that has shown the simulation's token.
 """
 
+from __future__ import annotations
+
 import marshal
 import socket
 import struct
-from typing import Any, TypeAlias
+from typing import Any, Final, TypeAlias
 
 Message: TypeAlias = tuple[Any, ...]
 
-ADDRESS_FILE = "address"
+ADDRESS_FILE: Final = "address"
 """File in the instance folder: the port on this machine, a space, the token."""
 
-_LENGTH = struct.Struct("!I")
+_LENGTH: Final = struct.Struct("!I")
 
 
 def pack(message: Message) -> bytes:

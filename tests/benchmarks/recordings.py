@@ -40,7 +40,7 @@ def record(file: Path, rows: int) -> None:
         connection.executemany(_LOG, map(_log_line, lines))
         connection.execute("COMMIT")
         while not roll(connection, _ROLLED_ROWS).done:
-            pass
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
         connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording, heartbeat_now, numbers, send
-from webots_mcp import MCPBridge
+from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import backlog, recorder
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION
@@ -220,6 +220,19 @@ def test_strict_mode_raises_instead(
     blocked.write_text("")
     with pytest.raises(Exception, match="cannot be made"):
         MCPBridge(robot, data_dir=blocked / "below")
+
+
+@pytest.mark.parametrize("value", ["", "0", "false", "No", "off"])
+def test_strict_mode_can_be_switched_off_in_any_word(
+    robot: InProcessSupervisor,
+    database: MemoryDatabase,
+    monkeypatch: pytest.MonkeyPatch,
+    value: str,
+) -> None:
+    monkeypatch.setenv("WEBOTS_MCP_STRICT", value)
+    with MCPBridge(robot, throttle_interval=1, database=database) as bridge:
+        bridge.publish([1])  # type: ignore[arg-type]
+        assert bridge.stats().failures == 1
 
 
 def test_a_folder_that_cannot_be_made_costs_rows_only(

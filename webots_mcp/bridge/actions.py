@@ -16,7 +16,8 @@ from webots_mcp.bridge.commands import Command, CommandQueue, describe
 from webots_mcp.bridge.hold import Hold
 from webots_mcp.bridge.pictures import Album, complete_png_size
 from webots_mcp.bridge.simulation import Simulation
-from webots_mcp.contract import MAX_STEPS, SCREENSHOT_FOLDER
+from webots_mcp.bridge.throttle import Throttle
+from webots_mcp.contract import MAX_STEPS, SCREENSHOT_FOLDER, SUPERVISOR_ACTIONS
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 Progress = Generator[None, None, object]
@@ -38,6 +39,7 @@ class Actions:
         clock: Clock,
         album: Album,
         call_back: CallBack,
+        throttle: Throttle,
     ) -> None:
         self._simulation = simulation
         self._queue = queue
@@ -45,6 +47,7 @@ class Actions:
         self._clock = clock
         self._album = album
         self._call_back = call_back
+        self._throttle = throttle
         self.reloading = False
         self._generators: Final[dict[str, Callable[[Command], Progress]]] = {
             "pause": self._pause,
@@ -63,14 +66,17 @@ class Actions:
         Raises:
             CommandRefusedError: It needs a Supervisor and this robot is none.
         """
-        if command.action != "reset_state":
+        if command.action in SUPERVISOR_ACTIONS:
             self._simulation.require_supervisor(command.action)
         return self._generators[command.action](command)
 
     def _pause(self, command: Command) -> Progress:
+        """Hold at once; or after one more round where the state of this one was throttled."""
+        if self._throttle.stale and not self._hold.held:
+            self._throttle.want()
+            yield
         self._hold.take(command)
         return self._mode()
-        yield
 
     def _run(self, command: Command, mode: str) -> Progress:
         self._hold.release(command, mode)

@@ -16,6 +16,7 @@ from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.connection import is_busy
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.errors import CommandRefusedError
@@ -38,6 +39,7 @@ class Control:
         album: Album,
         call_back: CallBack,
         heart: Heart,
+        throttle: Throttle,
     ) -> None:
         self._simulation = simulation
         self._recorder = recorder
@@ -46,7 +48,9 @@ class Control:
         self._journal = journal
         self._queue = CommandQueue(recorder)
         self._hold = Hold(simulation, journal, heart)
-        self.actions = Actions(simulation, self._queue, self._hold, clock, album, call_back)
+        self.actions = Actions(
+            simulation, self._queue, self._hold, clock, album, call_back, throttle
+        )
         self._handlers: dict[str, Handler] = {}
         self._under_way: dict[Command, Progress] = {}
         self._next_poll_s = 0.0

@@ -152,7 +152,7 @@ _ORJSON_OPTIONS: Final[int] = (
 
 def _conversion(value: Any) -> Callable[[Any], object] | None:
     """How a value that is no plain JSON becomes some; the first rule that fits."""
-    if isinstance(value, type) or _item_count(value) > MOST_ITEMS:
+    if isinstance(value, (type, memoryview)) or _item_count(value) > MOST_ITEMS:
         return None
     return next((convert for name, convert in _CONVERSIONS if hasattr(value, name)), None)
 

@@ -21,9 +21,12 @@ from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.reloads import Reloads
 from webots_mcp.bridge.simulation import Simulation
-from webots_mcp.bridge.stats import BridgeStats
+from webots_mcp.bridge.stats import BridgeStats, PublishCost
+from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import (
+    LOG_LEVELS,
     STRICT_VARIABLE,
     Database,
     MemoryDatabase,
@@ -31,7 +34,7 @@ from webots_mcp.contract import (
 )
 from webots_mcp.maintenance import Maintainer
 
-LEVELS: Final = ("debug", "info", "warning", "error")
+_FALSE: Final = ("", "0", "false", "no", "off")
 _CALM_S: Final = 0.5  # a loop that recorded nothing for so long stands still
 
 
@@ -68,18 +71,21 @@ class MCPBridge:
         *,
         database: str | os.PathLike[str] | MemoryDatabase | None = None,
     ) -> None:
-        if throttle_interval < 1:
-            raise ValueError(f"throttle_interval must be 1 or more, got {throttle_interval!r}")
+        self._throttle = Throttle(throttle_interval)
         self.robot = robot
         self.database: Database
         self.data_dir: Path
         self.database, self.data_dir = resolve_database(database, data_dir)
-        self._interval = throttle_interval
-        self._strict = os.environ.get(STRICT_VARIABLE, "") not in ("", "0")
+        self._strict = os.environ.get(STRICT_VARIABLE, "").lower() not in _FALSE
+        self._closed = False
+        self._failures = 0
+        self._cost = PublishCost()
+        self._changes = Changes()
+        self._reloads = Reloads(self._failed)
         self._simulation = Simulation(robot)
         _replace_bridge_of(robot)
         self._start_recording()
-        self._reset_counters()
+        self._begin_first_run()
         _bridges[id(robot)] = self
         atexit.register(self.close)
 
@@ -88,22 +94,20 @@ class MCPBridge:
     def publish(self, state: Mapping[Any, Any], force: bool = False) -> None:
         """Record the robot's state: every `throttle_interval`-th call, or now with `force`.
 
+        The first call of a run is recorded as well, and each one while a command makes single
+        steps: what is shown of a paused robot is its newest state.
+
         Args:
             state: Nested dicts, sequences, numbers, texts, numpy arrays, dataclasses, ... What
                 JSON cannot hold is replaced and named (see `webots_mcp.bridge.encoding`). It is
                 never changed. When the call returns, the row is in the database.
             force: Record this call whatever its number.
         """
-        self._publish_calls += 1
         try:
             if self._clock.look():
                 self._begin_run()
-            if not force and self._publish_calls % self._interval:
-                self._publish_throttled += 1
-                return
-            started_s = time.perf_counter()
-            self._record_state(state)
-            self._measure(time.perf_counter() - started_s)
+            if self._throttle.admits(force or self._heart.hold is not None):
+                self._record_state(state)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("publish", error)
 
@@ -126,7 +130,7 @@ class MCPBridge:
             command = self._control.serve()
             self._heart.poll()
             if self._simulation.over:
-                self.close()
+                self._end()
             return command.as_dict() if command else None
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("get_command", error)
@@ -141,17 +145,13 @@ class MCPBridge:
             extra: More keys; they win over those read from the devices.
             include_time: Add the simulation time as `time` (seconds).
         """
-        if (self._publish_calls + 1) % self._interval:
-            self.publish({})
-            return
         try:
-            state = read_devices(self.robot)
+            if self._clock.look():
+                self._begin_run()
+            if self._throttle.admits(self._heart.hold is not None):
+                self._record_state({**self._read_devices(include_time), **(extra or {})})
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("auto_publish", error)
-            state = dict[str, object]()
-        if include_time:
-            state["time"] = self._simulation.time_s
-        self.publish({**state, **(extra or {})})
 
     # -- beside the state ----------------------------------------------------------------------
 
@@ -163,8 +163,8 @@ class MCPBridge:
             level: `debug`, `info`, `warning` or `error`; anything else counts as `info`.
         """
         try:
-            if level not in LEVELS:
-                known = ", ".join(LEVELS)
+            if level not in LOG_LEVELS:
+                known = ", ".join(LOG_LEVELS)
                 self._recorder.complain("level", f"log level {level!r} is none of {known}")
                 level = "info"
             self._journal.log(level, "controller", str(message))
@@ -210,18 +210,17 @@ class MCPBridge:
         A Supervisor's reset happens inside the same process (simulation time goes back); a reload
         starts a new one, which finds its predecessor in the database.
         """
-        self._callbacks.append(callback)
+        self._reloads.add(callback)
 
     def detect_reload(self) -> bool:
         """Whether the world was reloaded or reset since the last call; true once for each."""
         try:
             if self._clock.look():
                 self._begin_run()
-            self._fire_reload()
+            self._reloads.fire()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("detect_reload", error)
-        detected, self._reload_undetected = self._reload_undetected, False
-        return detected
+        return self._reloads.detect()
 
     # -- the bridge itself ---------------------------------------------------------------------
 
@@ -243,11 +242,11 @@ class MCPBridge:
             rows_written=recorder.rows_written,
             rows_waiting=recorder.rows_waiting,
             rows_dropped=recorder.rows_dropped,
-            publish_calls=self._publish_calls,
-            publish_throttled=self._publish_throttled,
+            publish_calls=self._throttle.calls,
+            publish_throttled=self._throttle.skipped,
             values_replaced=self._journal.values_replaced,
-            publish_mean_us=1e6 * self._publish_s / max(1, self._published),
-            publish_max_us=1e6 * self._publish_max_s,
+            publish_mean_us=self._cost.mean_us,
+            publish_max_us=self._cost.max_us,
             failures=self._failures,
             last_error=recorder.last_error,
         )
@@ -267,10 +266,9 @@ class MCPBridge:
         _bridges.pop(id(self.robot), None)
         if self._maintainer is not None:
             self._maintainer.stop()
-        ended = "reload" if self._control.actions.reloading else "finished"
-        self._recorder.close(reason or ended, self._clock.sim_time_s)
+        self._recorder.close(reason or self._end_reason, self._clock.sim_time_s)
 
-    def _abandon(self) -> None:
+    def leave_to_parent(self) -> None:
         """In a forked child: leave the session to the parent; what is published here is dropped."""
         self._closed = True
         self._recorder.abandon()
@@ -303,8 +301,9 @@ class MCPBridge:
             self._clock,
             self._journal,
             self._album,
-            self._call_back,
+            self._reloads.call_back,
             self._heart,
+            self._throttle,
         )
         self._maintainer = self._start_maintainer()
 
@@ -322,23 +321,13 @@ class MCPBridge:
         if recorder.rows_waiting and time.monotonic() - recorder.last_use_s > _CALM_S:
             recorder.flush()
 
-    def _reset_counters(self) -> None:
-        self._closed = False
-        self._callbacks: list[Callable[[], object]] = []
-        self._changes = Changes()
-        self._publish_calls = self._publish_throttled = self._published = 0
-        self._publish_s = self._publish_max_s = 0.0
-        self._failures = 0
-        registration = self._recorder.registration
+    def _begin_first_run(self) -> None:
+        run, registration = self._clock.run, self._recorder.registration
         reloaded = registration is not None and registration.reloaded
-        self._reload_undetected = self._reload_unfired = reloaded
-        self._enter_first_run("reload" if reloaded else "start")
-
-    def _enter_first_run(self, reason: str) -> None:
-        run = self._clock.run
-        run.start_reason = reason
-        self._journal.event(reason)
-        registration = self._recorder.registration
+        run.start_reason = "reload" if reloaded else "start"
+        self._journal.event(run.start_reason)
+        if reloaded:
+            self._reloads.happened()
         if registration is not None:
             times = {"now": time.time(), "sim_time": self._clock.sim_time_s}
             values = {**times, "robot": registration.robot_id}
@@ -349,13 +338,24 @@ class MCPBridge:
         self._recorder.end_run("reset", self._clock.ended_sim_time_s)
         self._recorder.run = self._clock.run
         self._changes.forget()
-        self._reload_undetected = self._reload_unfired = True
+        self._throttle.want()
+        self._reloads.happened()
         self._journal.event("reset")
-        self._fire_reload()
+        self._reloads.fire()
         self._heart.beat()
 
+    @property
+    def _end_reason(self) -> str:
+        return "reload" if self._control.actions.reloading else "finished"
+
+    def _end(self) -> None:
+        """Webots may kill the process from here on, or let the loop say its last words."""
+        self._heart.hold = None
+        self._recorder.end(self._end_reason, self._clock.sim_time_s)
+
     def _record_state(self, state: Mapping[Any, Any]) -> None:
-        self._fire_reload()
+        started_s = time.perf_counter()
+        self._reloads.fire()
         encoded = encode(state)
         if not encoded.text.startswith("{"):
             raise TypeError(f"publish() takes a dict, got {type(state).__name__}: {state!r:.80}")
@@ -364,29 +364,18 @@ class MCPBridge:
             for name, before, after in self._changes.look(state):
                 self._journal.event("change", {"from": before, "to": after}, name)
         self._heart.beat_if_due()
+        self._cost.add(time.perf_counter() - started_s)
 
-    def _fire_reload(self) -> None:
-        """Run the callbacks of `on_reload`, once for each reload or reset."""
-        if self._reload_unfired and self._callbacks:
-            self._reload_unfired = False
-            self._call_back()
-
-    def _call_back(self) -> list[Exception | None]:
-        """Run the callbacks; what each one raised, if anything."""
-        outcomes: list[Exception | None] = []
-        for callback in self._callbacks:
-            try:
-                callback()
-                outcomes.append(None)
-            except Exception as error:  # noqa: BLE001, PERF203  (the next one still has to run)
-                self._failed("on_reload callback", error)
-                outcomes.append(error)
-        return outcomes
-
-    def _measure(self, duration_s: float) -> None:
-        self._published += 1
-        self._publish_s += duration_s
-        self._publish_max_s = max(self._publish_max_s, duration_s)
+    def _read_devices(self, include_time: bool) -> dict[str, object]:
+        """What the devices say; without what cannot be read, which is counted."""
+        try:
+            state = read_devices(self.robot)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._failed("auto_publish", error)
+            state = dict[str, object]()
+        if include_time:
+            state["time"] = self._clock.sim_time_s
+        return state
 
     def _failed(self, method: str, error: Exception) -> None:
         """What the bridge could not do: counted and said once; raised in strict mode only."""
@@ -409,7 +398,7 @@ def _replace_bridge_of(robot: object) -> None:
 
 def _leave_to_parent() -> None:
     for bridge in _bridges.values():
-        bridge._abandon()
+        bridge.leave_to_parent()
     _bridges.clear()
 
 

@@ -18,3 +18,29 @@ class BridgeStats(NamedTuple):
     publish_max_us: float
     failures: int
     last_error: str | None
+
+
+class PublishCost:
+    """How long the recorded calls of `publish` took."""
+
+    def __init__(self) -> None:
+        self._calls = 0
+        self._total_s = 0.0
+        self._max_s = 0.0
+
+    def add(self, duration_s: float) -> None:
+        """Count one call."""
+        self._calls += 1
+        self._total_s += duration_s
+        if duration_s > self._max_s:
+            self._max_s = duration_s
+
+    @property
+    def mean_us(self) -> float:
+        """The mean so far; 0 before the first."""
+        return 1e6 * self._total_s / max(1, self._calls)
+
+    @property
+    def max_us(self) -> float:
+        """The longest so far."""
+        return 1e6 * self._max_s

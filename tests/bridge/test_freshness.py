@@ -1,0 +1,126 @@
+"""What is shown of a robot that stands still is its newest state, whatever the throttle."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.bridge.conftest import STEP_MS, Recording, eager, numbers
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.standin import InProcessSimulation, InProcessSupervisor
+
+
+@pytest.fixture
+def bridge(robot: InProcessSupervisor, database: MemoryDatabase) -> Iterator[MCPBridge]:
+    """One that records every fifth call."""
+    with MCPBridge(robot, database=database) as bridge:
+        yield bridge
+
+
+def come_round(robot: InProcessSupervisor, bridge: MCPBridge, n: int) -> None:
+    robot.step(STEP_MS)
+    bridge.publish({"n": n})
+    eager(bridge)
+
+
+def test_the_first_state_of_each_run_is_recorded(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    for n in range(3):
+        come_round(robot, bridge, n)
+    robot.simulationReset()
+    for n in range(10, 14):
+        come_round(robot, bridge, n)
+    first = recording.rows("SELECT min(data ->> '$.n') FROM state GROUP BY run_id")
+    assert first == [0, 10]
+
+
+def test_auto_publish_reads_the_devices_for_the_first_row_of_a_run(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    for _ in range(3):
+        robot.step(STEP_MS)
+        bridge.auto_publish()
+    robot.simulationReset()
+    robot.step(STEP_MS)
+    bridge.auto_publish()
+    assert [set(state) for state in recording.states()] == [{"sensors", "motors", "time"}] * 2
+
+
+def test_a_pause_shows_the_state_that_it_holds(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    for n in range(1, 8):
+        come_round(robot, bridge, n)
+    pause, resume = recording.send("pause"), recording.send("resume")
+    come_round(robot, bridge, 8)
+    come_round(robot, bridge, 9)
+    status, result, _ = recording.fate(pause)
+    assert (status, recording.fate(resume)[0]) == ("done", "done")
+    (newest,) = recording.rows("SELECT max(sim_time_s) FROM state")
+    assert newest == pytest.approx(result["sim_time_s"])
+    assert numbers(recording)[-1] == 9
+
+
+def test_a_pause_of_a_loop_that_records_every_state_holds_at_once(
+    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
+) -> None:
+    with MCPBridge(robot, throttle_interval=1, database=database) as bridge:
+        pause = recording.send("pause")
+        recording.send("resume")
+        come_round(robot, bridge, 1)
+        assert recording.fate(pause)[0] == "done"
+
+
+def test_every_state_of_single_steps_is_recorded(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    come_round(robot, bridge, 1)
+    step = recording.send("step", steps=3)
+    for n in range(2, 5):
+        come_round(robot, bridge, n)
+    recording.send("resume")
+    come_round(robot, bridge, 5)
+    assert recording.fate(step)[0] == "done"
+    assert numbers(recording) == [1, 3, 4, 5]
+
+
+def test_a_loop_that_was_quit_while_held_may_say_its_last_words(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    simulation = InProcessSimulation()
+    robot = InProcessSupervisor("rover", world=simulation)
+    bridge = MCPBridge(robot, throttle_interval=1, database=database)
+    bridge.register_command("quit", lambda _: simulation.quit())
+    recording.send("pause")
+    recording.send("quit")
+    come_round(robot, bridge, 1)
+    assert recording.rows("SELECT end_reason FROM session") == ["finished"]
+    assert recording.rows("SELECT end_reason FROM run") == ["finished"]
+    assert robot.step(STEP_MS) == -1
+    bridge.publish({"n": 2})
+    bridge.log("last words")
+    bridge.close()
+    assert numbers(recording) == [1, 2]
+    assert recording.rows("SELECT message FROM log WHERE source = 'controller'") == ["last words"]
+    assert recording.rows("SELECT end_reason, rows FROM run") == [("finished", 2)]
+
+
+def test_what_is_published_after_the_bridge_ended_with_the_process_is_said(tmp_path: Path) -> None:
+    program = (
+        "import atexit\n"
+        "from webots_mcp import MCPBridge\n"
+        "from webots_mcp.standin import InProcessSupervisor\n"
+        "atexit.register(lambda: bridge.publish({'n': 2}, force=True))\n"
+        f"bridge = MCPBridge(InProcessSupervisor('rover'), {str(tmp_path)!r})\n"
+        "bridge.publish({'n': 1})\n"
+    )
+    line = [sys.executable, "-c", program]
+    done = subprocess.run(line, capture_output=True, text=True, check=True)
+    assert done.stderr == "webots-mcp: rows are being dropped: the bridge is closed\n"
+    assert numbers(Recording(tmp_path / DATABASE_NAME)) == [1]

@@ -1,0 +1,37 @@
+"""Which calls of `publish` are recorded."""
+
+from __future__ import annotations
+
+
+class Throttle:
+    """Every so many calls one is recorded, and whenever somebody waits for the newest state.
+
+    Args:
+        interval: Every so many; the first call is always recorded.
+
+    Raises:
+        ValueError: The interval is less than 1.
+    """
+
+    def __init__(self, interval: int) -> None:
+        if interval < 1:
+            raise ValueError(f"throttle_interval must be 1 or more, got {interval!r}")
+        self._interval = interval
+        self._wanted = True
+        self.calls = 0
+        self.skipped = 0
+        self.stale = False  # what was published last is not what was recorded last
+
+    def want(self) -> None:
+        """Let the next call pass, whatever its number."""
+        self._wanted = True
+
+    def admits(self, force: bool) -> bool:
+        """Count a call; True if it is to be recorded."""
+        self.calls += 1
+        if self.calls % self._interval and not (force or self._wanted):
+            self.skipped += 1
+            self.stale = True
+            return False
+        self._wanted = self.stale = False
+        return True

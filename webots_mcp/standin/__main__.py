@@ -13,7 +13,7 @@ from webots_mcp.standin import Simulation, StandInError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Runs until the time is over, a supervisor quits, or Ctrl-C or SIGTERM arrives.
+    """Run until the time is over, a supervisor quits, or Ctrl-C or SIGTERM arrives.
 
     Returns:
         The exit status: that of `simulationQuit`, 0 otherwise, 2 for a world that cannot be used.

@@ -41,7 +41,7 @@ def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
 
 
 def answer(simulator: Simulator, robot: Robot, message: Message) -> Message | None:
-    """Answers a controller; None if the answer has to wait until simulated time has passed."""
+    """Answer a controller; None if the answer has to wait until simulated time has passed."""
     kind, *rest = message
     if kind == "step":
         return _step(simulator, robot, *rest)
@@ -91,7 +91,7 @@ class SupervisorRequests:
         self._robot = robot
 
     def carry_out(self, operation: str, arguments: list[Any]) -> Any:
-        """Answers one request by name."""
+        """Answer one request by name."""
         method: Callable[..., Any] = getattr(self, f"on_{operation}")
         return method(*arguments)
 
@@ -152,7 +152,7 @@ class SupervisorRequests:
         return self._shown(value) if isinstance(value, Node) else value
 
     def set_fields(self, field_sets: list[FieldSet]) -> None:
-        """Writes fields, and lets what they describe follow."""
+        """Write fields, and let what they describe follow."""
         for (node_id, name), index, value in field_sets:
             node = self._world.nodes[node_id]
             if index is None:
@@ -183,13 +183,13 @@ class SupervisorRequests:
         return [*body.velocity_mps, 0.0, 0.0, 0.0, body.yaw_rate_radps]
 
     def on_node_reset_physics(self, node_id: int) -> None:
-        """Takes a robot's speed away."""
+        """Take a robot's speed away."""
         for robot in self._simulator.robots:
             if robot.node is self._world.nodes[node_id]:
                 robot.vehicle.stop()
 
     def on_node_restart_controller(self, node_id: int) -> None:
-        """Ends a robot's controller and starts it again."""
+        """End a robot's controller and start it again."""
         node = self._world.nodes[node_id]
         if node.type_name == "Robot":
             self._simulator.wanted = Wanted("restart", robot=node.fields["name"])
@@ -207,33 +207,33 @@ class SupervisorRequests:
         self._simulator.mode = Mode(mode) if mode in [*Mode] else Mode.PAUSE
 
     def on_simulation_reset(self) -> None:
-        """Resets with the next physics step."""
+        """Reset with the next physics step."""
         self._simulator.ask_reset()
 
     def on_simulation_reset_physics(self) -> None:
-        """Stops everything that moves."""
+        """Stop everything that moves."""
         self._simulator.stop_motion()
 
     def on_world_reload(self) -> None:
-        """Reads the world again from its file."""
+        """Read the world again from its file."""
         self._simulator.wanted = Wanted("reload")
 
     def on_world_load(self, path: str) -> None:
-        """Loads another world after the next physics step."""
+        """Load another world after the next physics step."""
         self._simulator.ask_load(str(self._robot.folder / path))
 
     def on_simulation_quit(self, status: int) -> None:
-        """Ends the simulation."""
+        """End the simulation."""
         self._simulator.wanted = Wanted("quit", status=status)
 
     def on_export_image(self, path: str, quality: int) -> None:
-        """Writes a picture of the arena; relative paths start from the controller's folder."""
+        """Write a picture of the arena; relative paths start from the controller's folder."""
         self._simulator.export(self._robot.folder / path, quality)
 
     def on_set_label(
         self, number: int, text: str, x: float, y: float, size: float, rgb: int
     ) -> None:
-        """Shows a text over the picture; an empty one takes it away."""
+        """Show a text over the picture; an empty one takes it away."""
         if text:
             self._simulator.labels[number] = Label(text, x, y, size, rgb)
         else:

@@ -76,7 +76,7 @@ class Body:
         self.stand(frame)
 
     def stand(self, frame: Frame) -> None:
-        """Puts the body where `frame` says, tilted as it may be."""
+        """Put the body where `frame` says, tilted as it may be."""
         self.x, self.y, self.z = frame.translation
         self.yaw_rad = frame.yaw_rad
         upright = frame_of((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -self.yaw_rad))
@@ -91,7 +91,7 @@ class Body:
         return frame_of((self.x, self.y, self.z), (0.0, 0.0, 1.0, self.yaw_rad))
 
     def move(self, x: float, y: float, yaw_rad: float) -> None:
-        """Moves the body on the plane and says so in its node."""
+        """Move the body on the plane and say so in its node."""
         if (x, y, yaw_rad) == (self.x, self.y, self.yaw_rad):
             return
         self.node.fields["translation"] = [x, y, self.z]
@@ -144,7 +144,7 @@ class Arena:
         ]
 
     def settle(self, body: Body) -> bool:
-        """Moves a body out of what it drove into; True if that did not give way."""
+        """Move a body out of what it drove into; True if that did not give way."""
         for movable in self._movable:
             self._push_away(movable, body)
         return self._clear(body)
@@ -157,7 +157,7 @@ class Arena:
                 self._clear(movable, pusher)
 
     def _clear(self, body: Body, pusher: Body | None = None) -> bool:
-        """Moves a body out of every obstacle; the pusher does not count as one."""
+        """Move a body out of every obstacle; the pusher does not count as one."""
         (x, y), touched = body.centre(), False
         for other in self._obstacles:
             if other is body or other is pusher:

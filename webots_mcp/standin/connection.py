@@ -17,7 +17,7 @@ class Connection:
         self.inbox = Inbox()
 
     def send(self, message: Message) -> None:
-        """Sends an answer; a controller that is gone is noticed when its socket is read."""
+        """Send an answer; a controller that is gone is noticed when its socket is read."""
         with suppress(OSError):
             self.stream.sendall(pack(message))
 

@@ -92,7 +92,7 @@ class Controller:
         return self.process is not None or self.file is None
 
     def kill(self) -> None:
-        """Ends the process at once, as a crash would."""
+        """End the process at once, as a crash would."""
         if self.process:
             self.process.kill()
 
@@ -118,7 +118,7 @@ class Controller:
         return self._was_told and (self.is_running or self.connection is not None)
 
     def start(self) -> None:
-        """Starts a process, if the robot has a controller file."""
+        """Start a process, if the robot has a controller file."""
         self.has_left = self._was_told = False
         self.process = None
         if self.file is None:
@@ -141,14 +141,14 @@ class Controller:
         )
 
     def tell_to_quit(self) -> None:
-        """Sends the one answer after which `step` returns -1."""
+        """Send the one answer after which `step` returns -1."""
         if self.connection and not self._was_told:
             self._was_told = True
             self.robot.remaining_ms = None
             self.connection.send(("quit",))
 
     def end(self) -> None:
-        """Ends the process by force, if it is still there."""
+        """End the process by force, if it is still there."""
         if self.process is None:
             return
         if self.is_running and self._was_told:

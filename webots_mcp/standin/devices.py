@@ -68,16 +68,16 @@ class Device:
         }
 
     def configure(self, setting: str, value: Any) -> None:
-        """Takes a setting from the controller."""
+        """Take a setting from the controller."""
         if setting == "period":
             self.period_ms, self._wait_ms = value, float(value)
 
     def make_due(self) -> None:
-        """Lets an enabled sensor measure at the end of the step under way."""
+        """Let an enabled sensor measure at the end of the step under way."""
         self._wait_ms = 0.0
 
     def is_due(self, passed_ms: float) -> bool:
-        """Lets time pass; True if it is time to measure."""
+        """Let time pass; True if it is time to measure."""
         if not self.period_ms:
             return False
         self._wait_ms -= passed_ms
@@ -101,7 +101,7 @@ class Motor(Device):
     kind = "Motor"
 
     def description(self) -> dict[str, Any]:
-        """Adds what the device's getters tell."""
+        """Add what the device's getters tell."""
         fields = self.node.fields
         sensors: list[Node] = self.site.joint.node.fields["device"] if self.site.joint else []
         names = [node.fields["name"] for node in sensors if node.type_name == "PositionSensor"]
@@ -115,7 +115,7 @@ class Motor(Device):
         }
 
     def configure(self, setting: str, value: Any) -> None:
-        """Takes a setting from the controller."""
+        """Take a setting from the controller."""
         joint = self.site.joint
         if joint is None:
             return
@@ -147,7 +147,7 @@ class DistanceSensor(Device):
         self.table: list[list[float]] = node.fields["lookupTable"] or [[0.0, 0.0, 0.0]]
 
     def description(self) -> dict[str, Any]:
-        """Adds what the device's getters tell."""
+        """Add what the device's getters tell."""
         values = [row[1] for row in self.table]
         return super().description() | {
             "min_value": min(values),
@@ -182,7 +182,7 @@ class Gps(Device):
         self._last: tuple[float, float, float] | None = None
 
     def make_due(self) -> None:
-        """Forgets the last place as well."""
+        """Forget the last place as well."""
         super().make_due()
         self._last = None
 
@@ -220,7 +220,7 @@ class Lidar(Device):
         self.field_of_view_rad: float = node.fields["fieldOfView"]
 
     def description(self) -> dict[str, Any]:
-        """Adds what the device's getters tell."""
+        """Add what the device's getters tell."""
         fields = self.node.fields
         return super().description() | {
             "resolution": self.resolution,
@@ -269,7 +269,7 @@ class Camera(Device):
         self.field_of_view_rad: float = node.fields["fieldOfView"]
 
     def description(self) -> dict[str, Any]:
-        """Adds what the device's getters tell."""
+        """Add what the device's getters tell."""
         fields = self.node.fields
         return super().description() | {
             "width": fields["width"],
@@ -279,7 +279,7 @@ class Camera(Device):
         }
 
     def configure(self, setting: str, value: Any) -> None:
-        """Takes a setting from the controller."""
+        """Take a setting from the controller."""
         super().configure(setting, value)
         if setting == "fov":
             self.field_of_view_rad = value

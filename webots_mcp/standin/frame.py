@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import atan2, cos, hypot, sin
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, cast
 
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """A rotation by rows, as `Node.getOrientation` gives it."""
@@ -38,10 +38,8 @@ class Frame(NamedTuple):
         """A frame given in this frame, seen from outside."""
         a, b = self.rotation, inner.rotation
         rows = ((a[i], a[i + 1], a[i + 2]) for i in (0, 3, 6))
-        product = tuple(
-            p * b[k] + q * b[k + 3] + r * b[k + 6] for p, q, r in rows for k in (0, 1, 2)
-        )
-        return Frame(product, self.point(inner.translation))  # type: ignore[arg-type]
+        product = (p * b[k] + q * b[k + 3] + r * b[k + 6] for p, q, r in rows for k in (0, 1, 2))
+        return Frame(cast("Matrix", tuple(product)), self.point(inner.translation))
 
 
 def rotation_matrix(axis_angle: Sequence[float]) -> Matrix:

@@ -40,7 +40,7 @@ class InProcessSimulation:
     """
 
     def __init__(self, world: str | Path = DEFAULT_WORLD, *, pause_timeout_s: float = 0.0) -> None:
-        """Loads a world, running fast.
+        """Load a world, running fast.
 
         Args:
             world: A .wbt file.
@@ -80,36 +80,36 @@ class InProcessSimulation:
     # A person's hands ----------------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Presses pause."""
+        """Press pause."""
         self._set_mode(Mode.PAUSE)
 
     def resume(self) -> None:
-        """Presses play."""
+        """Press play."""
         self._set_mode(Mode.REAL_TIME)
 
     def fast(self) -> None:
-        """Presses fast."""
+        """Press fast."""
         self._set_mode(Mode.FAST)
 
     def step(self) -> None:
-        """Makes one basic time step and pauses."""
+        """Make one basic time step and pause."""
         with self._changed:
             self._simulator.mode = Mode.PAUSE
             self._advance()
             self._changed.notify_all()
 
     def reset(self) -> None:
-        """Resets the world; controllers are ended, a new robot object may take their place."""
+        """Reset the world; controllers are ended, a new robot object may take their place."""
         with self._changed:
             self._end(self._links)
             self._simulator.reset()
 
     def reload(self) -> None:
-        """Reads the world from its file; controllers are ended as with `reset`."""
+        """Read the world from its file; controllers are ended as with `reset`."""
         self._load(self._simulator.world.path)
 
     def quit(self, status: int = 0) -> None:
-        """Ends the simulation: every `step` returns -1."""
+        """End the simulation: every `step` returns -1."""
         with self._changed:
             self.exit_status = status
             self._end(self._links)
@@ -133,7 +133,7 @@ class InProcessSimulation:
     # Controllers ---------------------------------------------------------------------------------
 
     def connect(self, name: str | None) -> _LocalLink:
-        """Connects a robot object to a robot of the world."""
+        """Connect a robot object to a robot of the world."""
         with self._changed:
             robot = self._found(name)
             if any(link.robot is robot for link in self._links):
@@ -151,7 +151,7 @@ class InProcessSimulation:
         return robots[0] if name is None else self._simulator.robot(name)
 
     def take(self, link: _LocalLink, message: Message) -> None:
-        """Takes a controller's request, and lets time pass as far as it asks for."""
+        """Take a controller's request, and let time pass as far as it asks for."""
         with self._changed:
             reply = answer(self._simulator, link.robot, message)
             if reply:
@@ -159,7 +159,7 @@ class InProcessSimulation:
             self._carry_out(self._simulator.wanted)
 
     def wait(self, link: _LocalLink) -> None:
-        """Lets time pass until the controller has its answer.
+        """Let time pass until the controller has its answer.
 
         Raises:
             WouldBlockError: The simulation is paused and nobody resumes it.
@@ -177,7 +177,7 @@ class InProcessSimulation:
                     self._advance()
 
     def leave(self, link: _LocalLink) -> None:
-        """Forgets a controller that is done."""
+        """Forget a controller that is done."""
         with self._changed:
             if link in self._links:
                 self._links.remove(link)
@@ -261,7 +261,7 @@ class InProcessRobot(Robot):
         *,
         world: str | Path | InProcessSimulation = DEFAULT_WORLD,
     ) -> None:
-        """Connects to a robot of a world.
+        """Connect to a robot of a world.
 
         Args:
             name: The robot's name; None: the first robot. If the world has one robot only, that

@@ -50,11 +50,11 @@ class Joint:
         self.hold()
 
     def hold(self) -> None:
-        """Makes the motor hold where the joint is."""
+        """Make the motor hold where the joint is."""
         self.target_rad, self.target_radps = self.position_rad, self.max_velocity_radps
 
     def turn(self, seconds: float) -> float:
-        """Turns for one time step; returns by how much, in radians."""
+        """Turn for one time step; returns by how much, in radians."""
         wanted = self._wanted_radps(seconds)
         if self.acceleration_radps2 > 0.0:
             change = self.acceleration_radps2 * seconds
@@ -110,13 +110,13 @@ class Vehicle:
         self.touching, self.collisions = False, 0
 
     def stop(self) -> None:
-        """Takes all speed away."""
+        """Take all speed away."""
         for joint in self.joints:
             joint.velocity_radps = 0.0
         self.body.velocity_mps, self.body.yaw_rate_radps = (0.0, 0.0), 0.0
 
     def drive(self, arena: Arena, seconds: float) -> None:
-        """Moves the robot for one time step.
+        """Move the robot for one time step.
 
         Wheels turn as their motors say, whatever is in the way: against a wall they spin, so that
         wheel sensors and GPS disagree as they do in reality.

@@ -65,7 +65,7 @@ class Chart:
 
 
 def save_picture(picture: Picture, arena: Arena, time_s: float, labels: Iterable[Label]) -> None:
-    """Draws the arena and writes the file; the format is the extension's.
+    """Draw the arena and write the file; the format is the extension's.
 
     Raises:
         ValueError: The extension is neither .png nor .jpg.

@@ -49,11 +49,11 @@ class ControllerProcess:
         return self._process.returncode
 
     def kill(self) -> None:
-        """Ends the process at once, as a crash would."""
+        """End the process at once, as a crash would."""
         self._process.kill()
 
     def end(self) -> None:
-        """Terminates the process, the hard way if need be, and waits until it is gone."""
+        """Terminate the process, the hard way if need be, and wait until it is gone."""
         if self.exit_code is None:
             self._process.terminate()
         try:

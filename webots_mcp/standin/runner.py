@@ -13,7 +13,7 @@ from concurrent.futures import CancelledError, Future
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from controller.wire import Message
 
@@ -55,7 +55,7 @@ class Runner:
         self._bell_rope: socket.socket
 
     def open(self) -> int:
-        """Opens the door for controllers; returns its port."""
+        """Open the door for controllers; returns its port."""
         self._selector = selectors.DefaultSelector()
         door = socket.create_server(("127.0.0.1", 0))
         bell, self._bell_rope = socket.socketpair()
@@ -66,7 +66,7 @@ class Runner:
     # From other threads --------------------------------------------------------------------------
 
     def call(self, function: Callable[[], Any]) -> Any:
-        """Has the loop call a function between two physics steps; returns what it returns.
+        """Have the loop call a function between two physics steps; returns what it returns.
 
         Raises:
             StandInError: The simulation has ended.
@@ -82,14 +82,14 @@ class Runner:
             raise StandInError("the simulation has ended") from None
 
     def wake(self) -> None:
-        """Lets the loop look around, if it waits."""
+        """Let the loop look around, if it waits."""
         with suppress(OSError):
             self._bell_rope.send(b"!")
 
     # The loop ------------------------------------------------------------------------------------
 
     def run(self) -> None:
-        """Runs until somebody quits."""
+        """Run until somebody quits."""
         try:
             if self.simulator.mode is not Mode.PAUSE:
                 self._start_controllers()
@@ -222,25 +222,25 @@ class Runner:
     # A person's hands, to be used through `call` -------------------------------------------------
 
     def set_mode(self, mode: Mode) -> None:
-        """Pauses or runs."""
+        """Pause or run."""
         self.simulator.mode = mode
         self._after_mode_change()
 
     def step(self) -> None:
-        """Makes one basic time step and pauses."""
+        """Make one basic time step and pause."""
         self.simulator.mode = Mode.PAUSE
         self._steps_asked += 1
         self._after_mode_change()
 
     def reset(self) -> None:
-        """Resets the world and starts all controllers again."""
+        """Reset the world and start all controllers again."""
         self._end(self.controllers)
         self.simulator.reset()
         self._start_controllers()
         self._notify()
 
     def load(self, path: Path) -> None:
-        """Reads a world and starts its controllers; a bad world is named and the old one stays."""
+        """Read a world and start its controllers; a bad world is named and the old one stays."""
         self._end(self.controllers)
         try:
             world = load_world(path)
@@ -254,7 +254,7 @@ class Runner:
         self._notify()
 
     def quit(self, status: int) -> None:
-        """Ends the simulation."""
+        """End the simulation."""
         self.exit_status = status
 
     def _after_mode_change(self) -> None:
@@ -283,7 +283,7 @@ class Runner:
         self.exit_status = self.exit_status or 0
         self._end(self.controllers)
         for key in [*self._selector.get_map().values()]:
-            key.fileobj.close()  # type: ignore[union-attr]
+            cast("socket.socket", key.fileobj).close()
         self._selector.close()
         self._over = True
         self._bell_rope.close()

@@ -49,7 +49,7 @@ class Simulation:
         controllers: Mapping[str, str | Path] | None = None,
         python: str = sys.executable,
     ) -> None:
-        """Loads a world; nothing runs before `start` or `with`.
+        """Load a world; nothing runs before `start` or `with`.
 
         Args:
             world: A .wbt file, best in a project: `worlds/x.wbt` beside `controllers/`.
@@ -93,7 +93,7 @@ class Simulation:
     # Life ----------------------------------------------------------------------------------------
 
     def start(self) -> Simulation:
-        """Starts the controllers and, unless it is to be paused, time."""
+        """Start the controllers and, unless it is to be paused, time."""
         address = self._instance / ADDRESS_FILE  # the folder is this user's alone
         address.write_text(f"{self._runner.open()} {self._runner.token}", encoding="utf-8")
         self._thread.start()
@@ -177,7 +177,7 @@ class Simulation:
         return controller.launch.environment_of(controller.robot)
 
     def wait_for(self, condition: Callable[[], T], timeout_s: float = 10.0) -> T:
-        """Waits until something is the case; looks whenever something has happened.
+        """Wait until something is the case; looks whenever something has happened.
 
         Args:
             condition: Is called in this thread until its value is true.
@@ -202,31 +202,31 @@ class Simulation:
     # A person's hands ----------------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Presses pause."""
+        """Press pause."""
         self._runner.call(lambda: self._runner.set_mode(Mode.PAUSE))
 
     def resume(self) -> None:
-        """Presses play: real time."""
+        """Press play: real time."""
         self._runner.call(lambda: self._runner.set_mode(Mode.REAL_TIME))
 
     def fast(self) -> None:
-        """Presses fast."""
+        """Press fast."""
         self._runner.call(lambda: self._runner.set_mode(Mode.FAST))
 
     def step(self) -> None:
-        """Presses step: one basic time step as soon as all controllers have asked, then pause."""
+        """Press step: one basic time step as soon as all controllers have asked, then pause."""
         self._runner.call(self._runner.step)
 
     def reset(self) -> None:
-        """Resets the world and starts all controllers again."""
+        """Reset the world and start all controllers again."""
         self._runner.call(self._runner.reset)
 
     def reload(self) -> None:
-        """Reads the world from its file again and starts all controllers again."""
+        """Read the world from its file again and start all controllers again."""
         self._runner.call(lambda: self._runner.load(self._runner.simulator.world.path))
 
     def quit(self, status: int = 0) -> None:
-        """Closes the window."""
+        """Close the window."""
         self._runner.call(lambda: self._runner.quit(status))
 
     # From the simulation's threads ---------------------------------------------------------------

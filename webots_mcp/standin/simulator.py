@@ -89,7 +89,7 @@ class Robot:
         return self.vehicle.touching
 
     def forget_controller(self) -> None:
-        """Makes ready for another controller: no request, no sensor enabled, motors still."""
+        """Make ready for another controller: no request, no sensor enabled, motors still."""
         self.remaining_ms, self.ahead_ms = None, 0.0
         self.fresh.clear()
         for device in self.devices.values():
@@ -142,7 +142,7 @@ class Simulator:
         return next(robot for robot in self.robots if robot.node is node)
 
     def ask_step(self, robot: Robot, duration_ms: int) -> bool:
-        """Takes a controller's request to simulate; True if that much has passed already."""
+        """Take a controller's request to simulate; True if that much has passed already."""
         basic = self.world.basic_time_step_ms
         robot.remaining_ms = ceil(duration_ms / basic) * basic - robot.ahead_ms
         return self._is_over(robot)
@@ -157,7 +157,7 @@ class Simulator:
         return True
 
     def advance(self) -> list[Robot]:
-        """Makes one physics step; returns the robots whose controllers have waited for it."""
+        """Make one physics step; returns the robots whose controllers have waited for it."""
         basic = self.world.basic_time_step_ms
         for robot in self.robots:
             robot.vehicle.drive(self.arena, basic / 1000.0)
@@ -184,7 +184,7 @@ class Simulator:
         return self._is_over(robot)
 
     def reset(self) -> None:
-        """Puts everything back to the start of the world, at time 0; controllers go on."""
+        """Put everything back to the start of the world, at time 0; controllers go on."""
         self._reset_asked = False
         self.time_ms = 0.0
         for node, (translation, rotation) in self._start.items():
@@ -198,26 +198,26 @@ class Simulator:
                 device.make_due()
 
     def stand_anew(self, body: Body) -> None:
-        """Lets a body follow its node's fields."""
+        """Let a body follow its node's fields."""
         frame = self.world.frame_of(body.node)
         assert frame is not None
         body.stand(frame)
 
     def stop_motion(self) -> None:
-        """Takes the speed of everything away."""
+        """Take the speed of everything away."""
         for robot in self.robots:
             robot.vehicle.stop()
 
     def ask_reset(self) -> None:
-        """Resets at the end of the next physics step."""
+        """Reset at the end of the next physics step."""
         self._reset_asked = True
 
     def ask_load(self, path: str) -> None:
-        """Loads another world after the next physics step."""
+        """Load another world after the next physics step."""
         self._load_asked = Wanted("load", path)
 
     def export(self, path: Path, quality: int) -> None:
-        """Writes a picture: at once when paused, else with the next rendering."""
+        """Write a picture: at once when paused, else with the next rendering."""
         self._pictures.append(Picture(path, quality))
         if self.mode is Mode.PAUSE:
             self._render()

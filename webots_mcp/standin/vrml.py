@@ -36,7 +36,7 @@ class Node:
 
 
 def tokens_of(text: str) -> Iterator[Token]:
-    """Splits a world into words; comments, commas and white space fall away."""
+    """Split a world into words; comments, commas and white space fall away."""
     line, position = 1, 0
     while position < len(text):
         match = _TOKEN.match(text, position)
@@ -159,7 +159,7 @@ def _word(token: Token) -> bool | str | None:
 
 
 def parse(text: str) -> list[Node]:
-    """Reads the text of a .wbt file.
+    """Read the text of a .wbt file.
 
     Args:
         text: The whole file.

@@ -86,7 +86,7 @@ class World:
 
 
 def load_world(path: str | Path) -> World:
-    """Reads a .wbt file.
+    """Read a .wbt file.
 
     Raises:
         WorldError: The file is missing, not text, or not a world that the stand-in can use.
@@ -154,7 +154,7 @@ def _typed(value: Value, name: str, definition: FieldDefinition, node: Node) -> 
         ) from None
 
 
-def _single(value: Value, kind: str) -> Value:
+def _single(value: Value, kind: str) -> Any:
     if kind in ("Bool", "String", "Node"):
         expected = {"Bool": bool, "String": str, "Node": (Node, type(None))}[kind]
         if not isinstance(value, expected):
@@ -165,7 +165,7 @@ def _single(value: Value, kind: str) -> Value:
         raise ValueError(kind)
     if kind in NUMBERS_IN:
         return numbers
-    return int(numbers[0]) if kind == "Int32" else numbers[0]  # type: ignore[return-value]
+    return int(numbers[0]) if kind == "Int32" else numbers[0]
 
 
 def _several_numbers(value: Value, kind: str) -> Value:
@@ -181,7 +181,7 @@ def _several_numbers(value: Value, kind: str) -> Value:
 def _numbers(value: Value) -> list[float]:
     if not isinstance(value, list) or not all(isinstance(item, float) for item in value):
         raise TypeError("numbers")
-    return [*value]  # type: ignore[list-item]
+    return [*cast("list[float]", value)]
 
 
 def _shown(value: Value) -> str:

@@ -24,7 +24,7 @@ class Rehearsal(InProcessSimulation):
     """
 
     def __init__(self, world: str | Path = DEFAULT_WORLD, *, duration_s: float = math.inf) -> None:
-        """Loads a world, running fast.
+        """Load a world, running fast.
 
         Args:
             world: A .wbt file.

@@ -37,7 +37,7 @@ class RecordedSimulation(Simulation):
         environment: Mapping[str, str] | None = None,
         console: Callable[[str], object] | None = None,
     ) -> None:
-        """Loads a world; nothing runs before `start` or `with`.
+        """Load a world; nothing runs before `start` or `with`.
 
         Args:
             world: A .wbt file.
@@ -67,7 +67,7 @@ class RecordedSimulation(Simulation):
         """What the controllers recorded; `recording.robot(name)` where there are several."""
 
     def run_for(self, duration_s: float, timeout_s: float = 60.0) -> None:
-        """Runs for that much simulated time, then pauses.
+        """Run for that much simulated time, then pause.
 
         It returns earlier where somebody else pauses or quits the simulation.
 

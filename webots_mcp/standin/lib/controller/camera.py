@@ -105,7 +105,7 @@ class Camera(Sensor):
         self.setFov(fov)
 
     def saveImage(self, filename: str, quality: int) -> int:
-        """Writes the last picture to a .png or .jpg file: 0, or -1 if that fails."""
+        """Write the last picture to a .png or .jpg file: 0, or -1 if that fails."""
         path, quality = Path(text(filename)), integer(quality)
         if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
             return -1

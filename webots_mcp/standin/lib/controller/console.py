@@ -6,5 +6,5 @@ import os
 
 
 def say(line: str) -> None:
-    """Writes one line to the process's standard error."""
+    """Write one line to the process's standard error."""
     os.write(2, f"{line}\n".encode())

@@ -79,11 +79,11 @@ class Sensor(Device):
             self.enable(basic_ms if sampling_period is None else sampling_period)
 
     def enable(self, samplingPeriod: int) -> None:
-        """Measures every so many milliseconds, from the next step on; 0 disables."""
+        """Measure every so many milliseconds, from the next step on; 0 disables."""
         self._session.enable(self._tag, max(integer(samplingPeriod), 0))
 
     def disable(self) -> None:
-        """Measures no longer; the last value stays."""
+        """Measure no longer; the last value stays."""
         self.enable(0)
 
     def getSamplingPeriod(self) -> int:

@@ -169,51 +169,51 @@ class Field:
         return self._read("MFNode", index)
 
     def setSFBool(self, value: bool) -> None:
-        """Sets the value with the next step."""
+        """Set the value with the next step."""
         self._write("SFBool", None, value)
 
     def setSFInt32(self, value: int) -> None:
-        """Sets the value with the next step."""
+        """Set the value with the next step."""
         self._write("SFInt32", None, value)
 
     def setSFFloat(self, value: float) -> None:
-        """Sets the value with the next step; an int is refused with a line on stderr."""
+        """Set the value with the next step; an int is refused with a line on stderr."""
         self._write("SFFloat", None, value)
 
     def setSFVec2f(self, values: list[float]) -> None:
-        """Sets two numbers with the next step; a tuple is refused with a line on stderr."""
+        """Set two numbers with the next step; a tuple is refused with a line on stderr."""
         self._write("SFVec2f", None, values)
 
     def setSFVec3f(self, values: list[float]) -> None:
-        """Sets three numbers with the next step; a tuple is refused with a line on stderr."""
+        """Set three numbers with the next step; a tuple is refused with a line on stderr."""
         self._write("SFVec3f", None, values)
 
     def setSFRotation(self, values: list[float]) -> None:
-        """Sets axis and angle with the next step; a tuple is refused with a line on stderr."""
+        """Set axis and angle with the next step; a tuple is refused with a line on stderr."""
         self._write("SFRotation", None, values)
 
     def setSFColor(self, values: list[float]) -> None:
-        """Sets red, green and blue with the next step; a tuple is refused with a line on stderr."""
+        """Set red, green and blue with the next step; a tuple is refused with a line on stderr."""
         self._write("SFColor", None, values)
 
     def setSFString(self, value: str) -> None:
-        """Sets the value with the next step."""
+        """Set the value with the next step."""
         self._write("SFString", None, value)
 
     def setMFFloat(self, index: int, value: float) -> None:
-        """Sets one entry with the next step."""
+        """Set one entry with the next step."""
         self._write("MFFloat", index, value)
 
     def setMFVec3f(self, index: int, values: list[float]) -> None:
-        """Sets one entry with the next step."""
+        """Set one entry with the next step."""
         self._write("MFVec3f", index, values)
 
     def setMFColor(self, index: int, values: list[float]) -> None:
-        """Sets one entry with the next step."""
+        """Set one entry with the next step."""
         self._write("MFColor", index, values)
 
     def setMFString(self, index: int, value: str) -> None:
-        """Sets one entry with the next step."""
+        """Set one entry with the next step."""
         self._write("MFString", index, value)
 
 
@@ -225,5 +225,5 @@ def _as_sent(value: Any) -> Any:
 
 def _fits(kind: str, value: Any) -> bool:
     if kind in _LENGTHS:
-        return isinstance(value, list) and len(value) == _LENGTHS[kind]  # type: ignore[arg-type]
+        return isinstance(value, list) and len(cast("list[Any]", value)) == _LENGTHS[kind]
     return isinstance(value, _TYPES.get(kind, ()))

@@ -60,11 +60,11 @@ class Lidar(Sensor):
         return [self.getLayerRangeImage(i) for i in range(self.getNumberOfLayers())]
 
     def enablePointCloud(self) -> None:
-        """Lets `getPointCloud` work."""
+        """Let `getPointCloud` work."""
         self._with_points = True
 
     def disablePointCloud(self) -> None:
-        """Lets `getPointCloud` work no longer."""
+        """Let `getPointCloud` work no longer."""
         self._with_points = False
 
     def isPointCloudEnabled(self) -> bool:

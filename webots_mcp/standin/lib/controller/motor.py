@@ -24,13 +24,13 @@ class Motor(Device):
         self._acceleration: float = self._description.get("acceleration", -1.0)
 
     def setPosition(self, position: float) -> None:
-        """Turns to an angle in radians; inf lets the motor run with `setVelocity`."""
+        """Turn to an angle in radians; inf lets the motor run with `setVelocity`."""
         if self._usable(position := number(position), "set_position"):
             self._position = position
             self._session.change(self._tag, "position", position)
 
     def setVelocity(self, velocity: float) -> None:
-        """Sets the speed in radians a second; the motor keeps within its `maxVelocity`."""
+        """Set the speed in radians a second; the motor keeps within its `maxVelocity`."""
         if not self._usable(velocity := number(velocity), "set_velocity"):
             return
         if velocity < 0.0 and not isinf(self._position):
@@ -43,7 +43,7 @@ class Motor(Device):
         self._session.change(self._tag, "velocity", velocity)
 
     def setAcceleration(self, acceleration: float) -> None:
-        """Limits how fast the speed changes, in radians a second squared; -1: no limit."""
+        """Limit how fast the speed changes, in radians a second squared; -1: no limit."""
         if self._usable(acceleration := number(acceleration), "set_acceleration"):
             self._acceleration = acceleration
             self._session.change(self._tag, "acceleration", acceleration)

@@ -146,9 +146,9 @@ class Node(metaclass=_NodeTypes):
         return self.getVelocity()
 
     def restartController(self) -> None:
-        """Ends the controller of this Robot node and starts it again."""
+        """End the controller of this Robot node and start it again."""
         self._session.ask("node_restart_controller", self._id)
 
     def resetPhysics(self) -> None:
-        """Takes the node's speed away."""
+        """Take the node's speed away."""
         self._session.ask("node_reset_physics", self._id)

@@ -66,7 +66,7 @@ class Robot:
     # Time ----------------------------------------------------------------------------------------
 
     def step(self, time_step: int | None = None) -> int:
-        """Lets time pass.
+        """Let time pass.
 
         Args:
             time_step: Milliseconds of simulated time, rounded up to a multiple of the basic time
@@ -163,7 +163,7 @@ class Robot:
         return self._session.custom_data
 
     def setCustomData(self, data: str) -> None:
-        """Sets the `customData` field with the next step."""
+        """Set the `customData` field with the next step."""
         self._session.set_custom_data(text(data))
 
     @property

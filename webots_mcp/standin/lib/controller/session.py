@@ -20,11 +20,11 @@ class Link(Protocol):
     """What the simulator told about the robot and its devices."""
 
     def send(self, message: Message) -> None:
-        """Sends a request."""
+        """Send a request."""
         ...
 
     def receive(self) -> Message:
-        """Waits for an answer."""
+        """Wait for an answer."""
         ...
 
     def exit(self) -> NoReturn:
@@ -32,7 +32,7 @@ class Link(Protocol):
         ...
 
     def close(self) -> None:
-        """Says farewell."""
+        """Say farewell."""
         ...
 
 
@@ -64,7 +64,7 @@ class Session:
     # Between requests ----------------------------------------------------------------------------
 
     def change(self, tag: int, setting: str, value: Any) -> None:
-        """Notes a setting or a command that goes out with the next step."""
+        """Note a setting or a command that goes out with the next step."""
         with self.lock:
             self._changes[tag, setting] = value
 
@@ -73,7 +73,7 @@ class Session:
         self.custom_data = self._changes[CUSTOM_DATA_TAG, "customData"] = data
 
     def enable(self, tag: int, period_ms: int) -> None:
-        """Sets a sampling period; 0 disables."""
+        """Set a sampling period; 0 disables."""
         self.change(tag, "period", period_ms)
         self.periods_ms[tag] = period_ms
 
@@ -83,14 +83,14 @@ class Session:
             return self._values.get(tag, default)
 
     def set_field(self, field: tuple[int, str], index: int | None, value: Any) -> None:
-        """Notes a field change that goes out with the next step or field read."""
+        """Note a field change that goes out with the next step or field read."""
         with self.lock:
             self._field_sets[field, index] = value
 
     # Requests ------------------------------------------------------------------------------------
 
     def begin_step(self, duration_ms: int) -> None:
-        """Asks the simulator to let time pass."""
+        """Ask the simulator to let time pass."""
         with self.lock:
             self._exit_if_over()
             if self._quitting:
@@ -101,7 +101,7 @@ class Session:
             self._in_step = True
 
     def end_step(self) -> int:
-        """Waits until that time has passed; -1 if the simulator ends the controller."""
+        """Wait until that time has passed; -1 if the simulator ends the controller."""
         with self.lock:
             reply: Message = ("quit",) if self._quitting else self._stepped or self.link.receive()
             self._stepped, self._in_step = None, False
@@ -123,11 +123,11 @@ class Session:
                 self._in_step = False
 
     def ask(self, operation: str, *arguments: Any, default: Any = None) -> Any:
-        """Makes a request that is answered at once, also while the simulation is paused."""
+        """Make a request that is answered at once, also while the simulation is paused."""
         return self._ask(operation, arguments, [], default)
 
     def read_field(self, field: tuple[int, str], index: int | None) -> Any:
-        """Reads a field; changes that were not sent yet go first."""
+        """Read a field; changes that were not sent yet go first."""
         with self.lock:
             if (field, index) in self._field_sets:
                 return self._field_sets[field, index]
@@ -188,5 +188,5 @@ current: Session | None = None
 
 
 def exit_process(status: int) -> NoReturn:
-    """Ends the process as C `exit` ends it: no exception, no `finally`, no atexit, no flush."""
+    """End the process as C `exit` ends it: no exception, no `finally`, no atexit, no flush."""
     os._exit(status)

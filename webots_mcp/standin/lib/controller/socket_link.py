@@ -24,14 +24,14 @@ class SocketLink:
         self.description: dict[str, Any] = answer
 
     def send(self, message: Message) -> None:
-        """Sends a request; if the simulator is gone, so is this process."""
+        """Send a request; if the simulator is gone, so is this process."""
         try:
             self._socket.sendall(pack(message))
         except OSError:
             exit_process(1)
 
     def receive(self) -> Message:
-        """Waits for an answer; if the simulator goes away meanwhile, so does this process."""
+        """Wait for an answer; if the simulator goes away meanwhile, so does this process."""
         while (message := self._inbox.take()) is None:
             try:
                 data = self._socket.recv(1 << 20)
@@ -47,7 +47,7 @@ class SocketLink:
         exit_process(0)
 
     def close(self) -> None:
-        """Lets the simulator know that this controller is done."""
+        """Let the simulator know that this controller is done."""
         self._socket.close()
 
 

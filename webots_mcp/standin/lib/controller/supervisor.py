@@ -57,7 +57,7 @@ class Supervisor(Robot):
         return self._session.mode
 
     def simulationSetMode(self, mode: int) -> None:
-        """Pauses, runs in real time or runs fast; any other number pauses."""
+        """Pause, run in real time or run fast; any other number pauses."""
         self._session.ask("simulation_set_mode", integer(mode))
 
     @property
@@ -70,23 +70,23 @@ class Supervisor(Robot):
         self.simulationSetMode(mode)
 
     def simulationReset(self) -> None:
-        """Resets the world at the end of the next physics step; controllers go on."""
+        """Reset the world at the end of the next physics step; controllers go on."""
         self._session.ask("simulation_reset")
 
     def simulationResetPhysics(self) -> None:
-        """Stops everything that moves."""
+        """Stop everything that moves."""
         self._session.ask("simulation_reset_physics")
 
     def simulationQuit(self, status: int) -> None:
-        """Ends the simulation with an exit status."""
+        """End the simulation with an exit status."""
         self._session.ask("simulation_quit", integer(status))
 
     def worldReload(self) -> None:
-        """Reads the world from its file again; the next step returns -1."""
+        """Read the world from its file again; the next step returns -1."""
         self._session.ask("world_reload")
 
     def worldLoad(self, file: str) -> None:
-        """Loads another world after the next physics step."""
+        """Load another world after the next physics step."""
         self._session.ask("world_load", text(file))
 
     def worldSave(self, file: str | None = None) -> int:
@@ -97,7 +97,7 @@ class Supervisor(Robot):
     # Pictures ------------------------------------------------------------------------------------
 
     def exportImage(self, filename: str, quality: int) -> None:
-        """Has the simulator write a .png or .jpg picture, with the next rendering."""
+        """Have the simulator write a .png or .jpg picture, with the next rendering."""
         filename, quality = text(filename), integer(quality)
         if not 1 <= quality <= 100:
             say(f"Error: wb_supervisor_export_image(): quality {quality} is not between 1 and 100.")
@@ -115,7 +115,7 @@ class Supervisor(Robot):
         transparency: float = 0.0,
         font: str = "Arial",
     ) -> None:
-        """Writes a text over the picture: number 0 to 99; x, y and size from 0 to 1."""
+        """Write a text over the picture: number 0 to 99; x, y and size from 0 to 1."""
         if not 0 <= integer(id) <= 99:
             say(f"Error: wb_supervisor_set_label(): id {id} is not between 0 and 99.")
             return

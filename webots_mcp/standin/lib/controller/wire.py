@@ -32,7 +32,7 @@ class Inbox:
         self._arrived = bytearray()
 
     def feed(self, data: bytes) -> None:
-        """Takes what the socket gave."""
+        """Take what the socket gave."""
         self._arrived += data
 
     def take(self) -> Message | None:

@@ -165,8 +165,9 @@ def _leaps(search: Search) -> Iterator[Event]:
 
 
 def oscillation_events(search: Search) -> Iterator[Event]:
-    """It went to and fro: heading, wheels, speed, position and the like."""
-    signals = [signal for signal in search.numbers if _SWINGING.search(signal.name)]
+    """It went to and fro: heading, wheels, speed, position and the like, and what is asked for."""
+    asked = search.options.signals != EventOptions.signals
+    signals = [each for each in search.numbers if asked or _SWINGING.search(each.name)]
     columns = search.view.newest(signals)
     for signal in signals:
         times, numbers = usable_numbers(columns.times, columns.values[signal.name])

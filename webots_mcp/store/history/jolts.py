@@ -9,11 +9,13 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
+from webots_mcp.store.history.gaps import rhythm_of
 from webots_mcp.store.history.shapes import MOST_IRREGULAR
 
 MOST_JUMPS_SHARE: Final = 0.001  # more of them are how the signal is
 LEAST_STEPS: Final = 10
 POSITION_STEPS: Final = 5.0  # a position jumps by so many times its 99th percentile step
+WHOLE_TURNS: Final = (math.tau, 360.0)
 TURN_SHARE: Final = 0.2  # of the range (5th to 95th percentile): what turns by less is noise
 
 
@@ -49,7 +51,9 @@ def find_jumps(
 
     Compared is with the steps that are not zero, of which there have to be ten: for counters and
     commanded values a step is what they do. Where more than one in a thousand steps (and more
-    than three) stand out, none is told.
+    than three) stand out, none is told. After a gap a step may be larger by as many times as the
+    gap is longer than the usual interval; and the step of an angle over the end of its scale (pi,
+    180 degrees, 360 degrees) is as large as what is left of a whole turn.
 
     Args:
         times: Of the values.
@@ -63,13 +67,27 @@ def find_jumps(
         return []
     median = sizes[len(sizes) // 2]
     limit = median + score * median / 0.6745
+    wide = [index for index, step in enumerate(steps) if step > limit]
     found = [
         Jump(times[index + 1], values[index], values[index + 1])
-        for index, step in enumerate(steps)
-        if step > limit
+        for index, intervals in zip(wide, _intervals(times, wide), strict=True)
+        if _step(values[index], values[index + 1]) > limit * intervals
     ]
     jumps = list(_with_return(found))
     return jumps if len(jumps) <= max(3, MOST_JUMPS_SHARE * len(steps)) else []
+
+
+def _intervals(times: Sequence[float], indexes: Sequence[int]) -> list[float]:
+    """How many usual intervals, at least one, lie between each of those rows and the next."""
+    usual_s = (rhythm_of(times).interval_s if indexes else None) or math.inf
+    return [max(1.0, (times[index + 1] - times[index]) / usual_s) for index in indexes]
+
+
+def _step(before: float, after: float) -> float:
+    """How far it is from one to the other; the short way round where they may be angles."""
+    far = abs(after - before)
+    turns = (turn for turn in WHOLE_TURNS if max(abs(before), abs(after)) <= turn and far <= turn)
+    return min((far, *(turn - far for turn in turns)))
 
 
 def _with_return(jumps: Sequence[Jump]) -> Iterator[Jump]:
@@ -92,14 +110,20 @@ def find_leaps(
 ) -> list[tuple[float, float]]:
     """Times and lengths of steps of a position that no driving explains.
 
-    Longer than `at_least_m`, and than five times the 99th percentile of all steps.
+    Longer than `at_least_m`, and than five times the 99th percentile of all steps; after a gap, by
+    as many times as it is longer than the usual interval.
     """
     steps = [math.dist(before, after) for before, after in pairwise(places)]
     if not steps:
         return []
     usual_m = sorted(steps)[min(len(steps) - 1, int(0.99 * len(steps)))]
     limit_m = max(at_least_m, POSITION_STEPS * usual_m if len(steps) > 100 else 0.0)
-    return [(times[i + 1], step) for i, step in enumerate(steps) if step > limit_m]
+    long = [index for index, step in enumerate(steps) if step > limit_m]
+    return [
+        (times[index + 1], steps[index])
+        for index, intervals in zip(long, _intervals(times, long), strict=True)
+        if steps[index] > limit_m * intervals
+    ]
 
 
 def find_to_and_fro(

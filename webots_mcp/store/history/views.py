@@ -36,7 +36,10 @@ _COUNTS: Final = (
     "WHERE run_id = ? AND bucket >= ? AND bucket < ? GROUP BY signal_id"
 )
 _USUAL_RANGE: Final = f"SELECT avg(max - min) {_OF_SIGNAL}"
-_WIDEST: Final = f"SELECT bucket, max - min {_OF_SIGNAL} ORDER BY 2 DESC LIMIT ?"
+_WIDEST: Final = (  # also at its border with the bucket before
+    "SELECT bucket, max(max - min, abs(first - lag(last, 1, first) OVER (ORDER BY bucket))) "
+    f"{_OF_SIGNAL} AND first IS NOT NULL ORDER BY 2 DESC LIMIT ?"
+)
 _RESTS: Final = f"SELECT EXISTS (SELECT 1 {_OF_SIGNAL} AND min = max AND present = rows)"
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import closing
@@ -96,10 +95,8 @@ def test_a_lock_that_another_holds_is_waited_for_without_waiting(
     work = purge(recorded.connection, wanted, recorded.folder)
     with closing(connect(file, "writer")) as other:
         other.execute("BEGIN IMMEDIATE")
-        started_s = time.monotonic()
-        for _ in range(5):
+        for _ in range(5):  # each comes back while the lock is still held
             assert next(work).rows == Counter()
-        assert time.monotonic() - started_s < 1
         other.execute("COMMIT")
     assert [done.rows.total() for done in work][-1] == 1000
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sqlite3
 import sys
-import time
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -89,14 +88,12 @@ def test_all_but_reading_is_refused_and_changes_nothing(tmp_path: Path, statemen
 
 
 def test_a_recursion_without_end_is_cut(rover: sqlite3.Connection) -> None:
-    began = time.monotonic()
     with pytest.raises(InvalidInputError, match=r"no row within 0\.2 s"):
         query_sql(
             rover,
             "WITH a(n) AS (SELECT 1 UNION ALL SELECT n + 1 FROM a) SELECT max(n) FROM a",
             deadline_s=0.2,
         )
-    assert time.monotonic() - began < 5
     assert query_sql(rover, "SELECT 1").rows == ((1,),)
 
 

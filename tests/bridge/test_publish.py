@@ -341,6 +341,22 @@ def test_auto_publish_reads_enabled_devices_only(
     assert state["time"] == pytest.approx(0.032)
 
 
+def test_motors_are_recorded_in_the_unit_of_their_kind(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    lift = robot.getDevice("left wheel motor")
+    monkeypatch.setattr(lift, "getType", lambda: lift.LINEAR)
+    lift.setVelocity(0.5)
+    bridge.auto_publish()
+    motors = recording.states()[0]["motors"]
+    assert set(motors["right wheel motor"]) == {"target_position_rad", "target_velocity_rad_s"}
+    assert set(motors["left wheel motor"]) == {"target_position_m", "target_velocity_m_s"}
+    assert motors["left wheel motor"]["target_velocity_m_s"] == 0.5
+
+
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text() | st.binary(max_size=8),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(), inner, max_size=4),

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording
 from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.bridge import identity
 from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
 
 
@@ -160,6 +163,47 @@ def test_an_object_that_owns_the_robot_is_refused_with_the_way_to_its_robot(
 
     with pytest.raises(TypeError, match=r"MCPBridge\(x\.robot\)"):
         MCPBridge(Owner(), database=database)
+
+
+class Wrapper:
+    """As in reinforcement learning: it owns the robot and passes on all that it does not have."""
+
+    def __init__(self, inner: InProcessSupervisor) -> None:
+        self.inner = inner
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.inner, name)
+
+
+class PassingEnvironment(Wrapper):
+    def step(self, action: str) -> tuple[float, bool]:
+        return 0.5, self.inner.step(STEP_MS) == -1
+
+
+@pytest.mark.parametrize("wrapper", [Wrapper, PassingEnvironment])
+def test_an_object_that_passes_on_to_the_robot_is_refused_with_the_way_to_its_robot(
+    robot: InProcessSupervisor, database: MemoryDatabase, wrapper: type[Wrapper]
+) -> None:
+    with pytest.raises(TypeError, match=r"MCPBridge\(x\.inner\)"):
+        MCPBridge(wrapper(robot), database=database)
+
+
+def test_a_git_head_that_is_no_text_costs_the_commit_only(tmp_path: Path) -> None:
+    (tmp_path / ".git").mkdir()
+    (tmp_path / ".git" / "HEAD").write_bytes(b"\xff\xfe")
+    assert identity._git_commit(tmp_path) is None  # pyright: ignore[reportPrivateUsage]
+
+
+def test_a_path_whose_bytes_are_no_text_is_recorded_readably(
+    robot: InProcessSupervisor,
+    database: MemoryDatabase,
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(identity, "controller_file", lambda: Path("/robots/\udcff/rover.py"))
+    with MCPBridge(robot, database=database):
+        pass
+    assert recording.rows("SELECT controller FROM session") == [str(Path("/robots/?/rover.py"))]
 
 
 def test_a_wrong_database_or_interval_is_refused(robot: InProcessSupervisor) -> None:

@@ -27,7 +27,6 @@ _READERS: Final[dict[str, Callable[[Any], object]]] = {
     "RangeFinder": lambda device: _summarise_ranges(device),
     "TouchSensor": lambda device: _read_touch(device),
 }
-_MOTORS: Final = ("Motor", "RotationalMotor", "LinearMotor")
 
 
 def read_devices(robot: Any) -> dict[str, object]:
@@ -35,7 +34,8 @@ def read_devices(robot: Any) -> dict[str, object]:
 
     Returns:
         `sensors`: device name to value (float, list of floats, or for a lidar its summary);
-        `motors`: device name to `target_position_rad` and `target_velocity_rad_s`;
+        `motors`: device name to `target_position_rad` and `target_velocity_rad_s`, of a linear
+            motor `target_position_m` and `target_velocity_m_s`;
         `pose`: [x_m, y_m, yaw_rad] from the first GPS and inertial unit, where both are enabled.
     """
     devices: dict[str, Any] = getattr(robot, "devices", None) or {}
@@ -43,7 +43,7 @@ def read_devices(robot: Any) -> dict[str, object]:
     motors = {
         name: _commanded(device)
         for name, device in devices.items()
-        if type(device).__name__ in _MOTORS
+        if type(device).__name__ == "Motor"
     }
     state: dict[str, object] = {"sensors": sensors}
     if motors:
@@ -62,9 +62,11 @@ def _read(device: Any) -> object:
 
 
 def _commanded(motor: Any) -> dict[str, float]:
+    """Webots has one class for both kinds of motor."""
+    unit = "m" if motor.getType() == motor.LINEAR else "rad"
     return {
-        "target_position_rad": motor.getTargetPosition(),
-        "target_velocity_rad_s": motor.getVelocity(),
+        f"target_position_{unit}": motor.getTargetPosition(),
+        f"target_velocity_{unit}_s": motor.getVelocity(),
     }
 
 

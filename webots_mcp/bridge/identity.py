@@ -37,12 +37,12 @@ def identify(robot: Any, supervisor: bool, version: str) -> Identity:
         kind="Supervisor" if supervisor else "Robot",
         supervisor=supervisor,
         devices={str(name): type(device).__name__ for name, device in _devices(robot).items()},
-        world=str(robot.getWorldPath()) if hasattr(robot, "getWorldPath") else None,
+        world=_plain_text(robot.getWorldPath()) if hasattr(robot, "getWorldPath") else None,
         basic_time_step_ms=float(robot.getBasicTimeStep()),
         pid=os.getpid(),
         host=host_name(),
         instance=_instance(),
-        controller=str(controller) if controller else None,
+        controller=_plain_text(controller) if controller else None,
         controller_sha256=_sha256(controller) if controller else None,
         git_commit=_git_commit(controller.parent) if controller else None,
         versions={
@@ -58,6 +58,11 @@ def controller_file() -> Path | None:
     main = getattr(sys.modules.get("__main__"), "__file__", None) or sys.argv[0]
     path = Path(main).absolute() if main else None
     return path if path and path.is_file() else None
+
+
+def _plain_text(path: object) -> str:
+    """A path's bytes need not be text; what the database holds must be."""
+    return str(path).encode("utf-8", "replace").decode()
 
 
 def _devices(robot: Any) -> dict[str, Any]:
@@ -94,7 +99,7 @@ def _git_commit(folder: Path) -> str | None:
         for place in (folder, *folder.parents):
             if (place / ".git").exists():
                 return _head(_git_dir(place / ".git"))
-    except OSError:
+    except (OSError, ValueError):  # not to be read, or no text
         return None
     return None
 

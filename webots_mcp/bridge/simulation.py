@@ -8,6 +8,7 @@ from typing import Any, Final
 from webots_mcp.errors import CommandRefusedError
 
 _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
+_INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # of wrappers
 QUIT: Final = -1
 
 
@@ -100,22 +101,24 @@ def _answer_quit(*_: object, **__: object) -> int:
 
 
 def _require_robot(robot: Any) -> None:
-    missing = [name for name in _ROBOT_METHODS if not callable(getattr(robot, name, None))]
+    missing = [name for name in _ROBOT_METHODS if not _has_method(robot, name)]
     if not missing:
         return
-    inside = next(
-        (
-            name
-            for name in ("robot", "supervisor", "_robot")
-            if callable(getattr(getattr(robot, name, None), "getBasicTimeStep", None))
-        ),
-        None,
-    )
+    inside = next((name for name in _INSIDE if _is_robot(getattr(robot, name, None))), None)
     hint = f"; give its attribute: MCPBridge(x.{inside})" if inside else ""
     raise TypeError(
-        f"MCPBridge needs a Webots Robot or Supervisor; {type(robot).__name__} has no "
+        f"MCPBridge needs a Webots Robot or Supervisor; the class {type(robot).__name__} has no "
         f"{', '.join(missing)}{hint}"
     )
+
+
+def _is_robot(value: object) -> bool:
+    return all(_has_method(value, name) for name in _ROBOT_METHODS)
+
+
+def _has_method(robot: object, name: str) -> bool:
+    """Of its class: an object that passes everything on to its robot is none itself."""
+    return callable(getattr(type(robot), name, None))
 
 
 def _may_supervise(robot: Any) -> bool:

@@ -5,6 +5,7 @@ Standard library only, because the bridge imports it inside a robot's controller
 
 from __future__ import annotations
 
+import os
 import sqlite3
 from collections.abc import Generator
 from contextlib import contextmanager
@@ -105,6 +106,24 @@ def is_busy(error: Exception) -> bool:
 def is_damage(error: Exception) -> bool:
     """Whether SQLite says that the file itself is broken, or never was a database."""
     return isinstance(error, sqlite3.DatabaseError) and any(s in str(error) for s in _DAMAGE)
+
+
+def identify_files(database: Database) -> tuple[int, ...]:
+    """Which files a database consists of at this moment.
+
+    A connection to files that were deleted or replaced still works, on what nobody else sees.
+    """
+    if isinstance(database, MemoryDatabase):
+        return ()
+    return (*_identify(f"{database}"), *_identify(f"{database}-wal"))
+
+
+def _identify(file: str) -> tuple[int, int]:
+    try:
+        status = os.stat(file)  # noqa: PTH116  (at each heartbeat: no Path objects)
+    except OSError:
+        return (0, 0)
+    return status.st_dev, status.st_ino
 
 
 def _file_uri(file: Database, create: bool) -> str:

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect, is_busy
+from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect, identify_files, is_busy
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.schema import require_current
 
@@ -65,6 +65,7 @@ class Maintainer(threading.Thread):
         self._on_tick = on_tick
         self._work = work
         self._connection: sqlite3.Connection | None = None
+        self._files: tuple[int, ...] = ()
         self._ending = threading.Event()
         self._held_before = False
         self._interval_s = HURRIED_INTERVAL_S
@@ -97,11 +98,13 @@ class Maintainer(threading.Thread):
         self._interval_s = INTERVAL_S
         if self._on_tick is not None:
             self._on_tick()
-        if not self._database.exists():
+        if self._files != identify_files(self._database):
             self._disconnect()
+        if not self._database.exists():
             return False
         if self._connection is None:
             self._connection = self._connect()
+            self._files = identify_files(self._database)
         held = self._hold_lease(self._connection)
         # A lease that was just taken from another: give a checkpoint of theirs time to end.
         if held and self._held_before:

@@ -85,8 +85,7 @@ class CommandQueue:
             return None
         ids = {"session": registration.session_id, "robot": registration.robot_id}
         times = {"now": now, "sim_time": sim_time_s}
-        # fetchall: a RETURNING that is not read to its end keeps the write lock
-        rows = connection.execute(CLAIM, {**ids, **times}).fetchall()
+        rows = recorder.fetch(CLAIM, {**ids, **times})
         return self._read(rows[0], registration.session_id, sim_time_s) if rows else None
 
     def _read(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 import sys
 import time
@@ -63,21 +62,6 @@ def _migrate(database: Database) -> None:
 
     line = [sys.executable, "-m", "webots_mcp", "migrate", "--database", str(database)]
     subprocess.run(line, check=False, capture_output=True, timeout=60, stdin=subprocess.DEVNULL)
-
-
-def identify_files(database: Database) -> tuple[int, ...]:
-    """Which files a database consists of at this moment, to notice when they are others."""
-    if isinstance(database, MemoryDatabase):
-        return ()
-    return (*_identify(f"{database}"), *_identify(f"{database}-wal"))
-
-
-def _identify(file: str) -> tuple[int, int]:
-    try:
-        status = os.stat(file)  # noqa: PTH116  (at each heartbeat: no Path objects)
-    except OSError:
-        return (0, 0)
-    return status.st_dev, status.st_ino
 
 
 def move_aside(database: Path) -> None:

@@ -22,12 +22,18 @@ from typing import Any, Final
 from webots_mcp.bridge.backlog import Backlog, Row, Values, bind
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.identity import Identity
-from webots_mcp.bridge.opening import identify_files, is_ours, move_aside, open_session
+from webots_mcp.bridge.opening import is_ours, move_aside, open_session
 from webots_mcp.bridge.pulse import Health, Pulse, write_pulse
 from webots_mcp.bridge.registration import Registration, deregister
 from webots_mcp.bridge.run import Run, insert_run
 from webots_mcp.bridge.trouble import Trouble
-from webots_mcp.connection import is_busy, is_damage, journal_mode, transaction
+from webots_mcp.connection import (
+    identify_files,
+    is_busy,
+    is_damage,
+    journal_mode,
+    transaction,
+)
 from webots_mcp.contract import Database
 from webots_mcp.errors import (
     DatabaseError,
@@ -78,6 +84,7 @@ class Recorder:
         self._lock = threading.Lock()
         self._obstacle = "too many wait"
         self._untold_drops = 0
+        self._dropped_because = ""
         self._seen_whole = 0
         self._files: tuple[int, ...] = ()
         self._retry_at_s = 0.0
@@ -146,7 +153,7 @@ class Recorder:
         """
         if self.connection is None or not self._lock.acquire(blocking=False):
             return ()
-        try:
+        try:  # fetchall: a RETURNING that is not read to its end keeps the write lock
             return self.connection.execute(statement, values).fetchall()
         finally:
             self._lock.release()
@@ -240,7 +247,7 @@ class Recorder:
     def _count_dropped(self, rows: int, why: str) -> None:
         self.rows_dropped += rows
         self._untold_drops += rows
-        self._obstacle = why
+        self._dropped_because = why
         self.complain(f"dropped: {why}", f"rows are being dropped: {why}")
 
     def _tell_drops(self, connection: sqlite3.Connection) -> None:
@@ -248,7 +255,7 @@ class Recorder:
             return
         if self.run.id is None:
             self._insert_run(connection, self.run)
-        data = json.dumps({"rows": self._untold_drops, "why": self._obstacle})
+        data = json.dumps({"rows": self._untold_drops, "why": self._dropped_because})
         event = (self.run.id, self._sim_time_s, time.time(), "dropped", None, data)
         connection.execute(INSERT_EVENT, event)
 

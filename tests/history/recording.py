@@ -22,6 +22,8 @@ import math
 import sqlite3
 from typing import Any
 
+from tests.store.recorded import insert
+
 WALL_START_S = 1_700_000_000.0
 INTERVAL_S = 0.1
 WALL_PER_SIM = 0.5
@@ -39,11 +41,7 @@ class Recorder:
         self.run_id = 0
 
     def insert(self, table: str, **values: Any) -> int:
-        names, marks = ", ".join(values), ", ".join("?" * len(values))
-        statement = f"INSERT INTO {table} ({names}) VALUES ({marks})"
-        row_id = self.connection.execute(statement, tuple(values.values())).lastrowid
-        assert row_id is not None
-        return row_id
+        return insert(self.connection, table, values)
 
     def robot(self, name: str) -> int:
         seen = {"first_seen_wall_time_s": self.wall_s, "last_seen_wall_time_s": self.wall_s}
@@ -85,7 +83,7 @@ class Recorder:
         return {"run_id": self.run_id, "sim_time_s": time_s, "wall_time_s": self.wall_s}
 
     def publish(self, time_s: float, state: dict[str, Any], odd: dict[str, str] | None = None):
-        text = json.dumps(state, allow_nan=False)
+        text = json.dumps(state, allow_nan=False, ensure_ascii=False)
         self.insert("state", **self.at(time_s), data=text, odd=json.dumps(odd) if odd else None)
 
     def end_run(self, reason: str) -> None:

@@ -35,7 +35,7 @@ state: st.SearchStrategy[dict[str, Any]] = st.fixed_dictionaries(
     optional={
         "speed": finite | st.none(),
         "yaw": angle,
-        "pose": st.lists(finite, max_size=4),
+        "offsets": st.lists(finite, max_size=4),
         "mode": st.sampled_from(["cruise", "turn", None]),
         "nested": st.fixed_dictionaries({"bumper": st.booleans()}),
         "lidar": st.lists(finite, min_size=15, max_size=19),
@@ -196,8 +196,9 @@ def test_a_row_that_cannot_be_stored_costs_itself_and_not_the_rollup(
     robot_id = recorder.robot("r")
     recorder.run(recorder.session(robot_id, "x"), robot_id)
     for step in range(20):
-        half_a_character = "\ud800" if step in (7, 8) else "a"
-        recorder.publish(float(step), {"x": step, "text": half_a_character})
+        half_a_character = "\\ud800" if step in (7, 8) else "a"
+        data = f'{{"x": {step}, "text": "{half_a_character}"}}'
+        recorder.insert("state", **recorder.at(float(step)), data=data)
     while not roll(empty, 3).done:
         pass
     counted = empty.execute("SELECT name, rows FROM signal ORDER BY name").fetchall()

@@ -89,6 +89,24 @@ def test_odd_values_are_named(rover: sqlite3.Connection) -> None:
     assert sum(front.count) == 30
 
 
+def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(30):
+        state = {"short": [None, step, None if step < 9 else 1], "long": [1.0] * 30 + [None]}
+        odd = {"short.*": "nan", "long.*": "inf"}
+        recorder.publish(float(step), state, odd if step < 20 else {"short.0": "inf"})
+    roll(empty)
+    run = ask(empty, "short", "long.mean")
+    assert column(run, "short.0").odd == {"nan": 20, "inf": 10}
+    assert column(run, "short.1").odd == {}
+    assert column(run, "short.2").odd == {"nan": 9}
+    assert column(run, "long.mean").odd == {"inf": 20}
+    counted = dict(empty.execute("SELECT name, odd_rows FROM signal WHERE name LIKE 'short%'"))
+    assert counted == {"short.0": 30, "short.1": 0, "short.2": 9}
+
+
 def test_a_reduced_array_is_a_signal_like_any_other(rover: sqlite3.Connection, tier: str) -> None:
     run = ask(rover, "lidar.min", "lidar.argmin", start_s=50.0, end_s=80.0)
     lidar = column(run, "lidar.min")

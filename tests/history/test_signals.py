@@ -9,6 +9,7 @@ import pytest
 from tests.history.recording import Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.history.leaves import Place, flatten, places
+from webots_mcp.store.history.pages import query_rows
 from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.history.signals import catalogue, list_signals, resolve_signals
@@ -67,6 +68,42 @@ def test_a_branch_means_all_below_it(rover: sqlite3.Connection) -> None:
     known = catalogue(rover, find_subject(rover))
     names = [signal.name for signal in resolve_signals(known, ["pose", "sensors.*", "mode"])]
     assert names == ["pose.0", "pose.1", "sensors.front", "sensors.bumper", "mode"]
+
+
+STRANGE = (
+    'q"uote', "back\\slash", "new\nline", "nul\0", "apo's", "ünï😀", "", " ", "a.b", "[0]", "x[1]",
+    "$", "*", "st*r", "%", "?", "1", "n.'\"", "..",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("rolled", [False, True])
+def test_whatever_a_key_is_called_it_is_a_signal(empty: sqlite3.Connection, rolled: bool) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(30):
+        flat = {name: step + index for index, name in enumerate(STRANGE)}
+        recorder.publish(float(step), {**flat, "deep": flat})
+    if rolled:
+        roll(empty)
+    names = {*STRANGE, *(f"deep.{name}" for name in STRANGE)}
+    assert {signal.name for signal in list_signals(empty).signals} == names
+    for index, name in enumerate(STRANGE):
+        for asked in (name, f"deep.{name}"):
+            page = query_rows(empty, resolve_range(empty), [asked], limit=2)
+            assert page.values[asked] == [index, index + 1]
+
+
+def test_a_key_called_like_the_default_pattern_does_not_hide_the_others(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder.publish(0.0, {"*": 1, "x": 2, "a": {"*": 3, "b": 4}})
+    known = catalogue(empty, find_subject(empty))
+    assert [signal.name for signal in resolve_signals(known, ["*"])] == ["*", "x", "a.*", "a.b"]
+    assert [signal.name for signal in resolve_signals(known, ["a.*"])] == ["a.*", "a.b"]
 
 
 def test_an_unknown_name_is_answered_with_near_ones(rover: sqlite3.Connection) -> None:

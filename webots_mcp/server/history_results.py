@@ -42,9 +42,8 @@ class NumberSeries(BaseModel):
     count: list[int] | None = Field(
         default=None, description="Values per bucket, where they are not those of the run."
     )
-    whole: list[float | None] | None = Field(
-        default=None, description="Over the range: min, at (s), max, at (s), mean."
-    )
+    whole: dict[str, float | None] | None = Field(default=None, description="Over the range.")
+    silent: bool | None = Field(default=None, description="True: no value in the range.")
     odd: dict[str, int] | None = Field(
         default=None, description="How often nan, inf, ... stood there."
     )

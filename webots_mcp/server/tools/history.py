@@ -56,7 +56,7 @@ from webots_mcp.store.recording import Recording, View
 
 _SHOWN_GAPS: Final = 10
 _CELL_CHARACTERS: Final = 28  # of a bucket of a numeric signal: min, max, mean and last
-_SIGNAL_CHARACTERS: Final = 160  # of a signal, beside its buckets
+_SIGNAL_CHARACTERS: Final = 200  # of a signal, beside its buckets
 
 
 class HistoryTools:
@@ -178,6 +178,8 @@ def _number_series(
     columns: NumberColumns, counts: list[int] | None, *, rows_only: bool
 ) -> NumberSeries:
     odd = columns.odd or None
+    if not columns.whole.present:
+        return NumberSeries(silent=True, odd=odd)
     if rows_only:
         return NumberSeries(unit=columns.unit, value=figures(columns.last), odd=odd)
     whole = columns.whole
@@ -190,13 +192,13 @@ def _number_series(
         mean=figures(columns.mean),
         last=figures(columns.last),
         count=None if columns.count == counts else columns.count,
-        whole=[
-            figure(whole.min),
-            seconds(whole.min_sim_time_s),
-            figure(whole.max),
-            seconds(whole.max_sim_time_s),
-            figure(whole.direction if columns.kind == "angle" else whole.mean),
-        ],
+        whole={
+            "min": figure(whole.min),
+            "min_at_s": seconds(whole.min_sim_time_s),
+            "max": figure(whole.max),
+            "max_at_s": seconds(whole.max_sim_time_s),
+            "mean": figure(whole.direction if columns.kind == "angle" else whole.mean),
+        },
         odd=odd,
     )
 

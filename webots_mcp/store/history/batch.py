@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import cast
+from typing import Final, cast
 
-from webots_mcp.store.history.leaves import REDUCTIONS, Value, flatten, parse
+from webots_mcp.store.history.leaves import (
+    LONGEST_SPREAD_ARRAY,
+    REDUCTIONS,
+    Value,
+    flatten,
+    parse,
+)
+
+ANY_ITEM: Final = "*"
 
 Point = tuple[int, float, Value]  # state id, simulation time, value
 
@@ -56,9 +64,10 @@ class Batch:
                 column.first_wall_time_s = wall_time_s
             column.points.append((state_id, sim_time_s, value))
             column.last_wall_time_s = wall_time_s
-        for name in odd_names(odd):
-            if name in columns:
-                columns[name].odd_rows += 1
+        reasons = odd_names(odd)
+        for name in reasons.keys() & columns.keys():
+            state, _, value = columns[name].points[-1]
+            columns[name].odd_rows += state == state_id and is_odd(reasons, name, value)
 
     def columns(self) -> Iterator[BatchColumn]:
         """Every signal of every run."""
@@ -67,13 +76,24 @@ class Batch:
 
 
 def odd_names(odd: str | None) -> dict[str, str]:
-    """What was odd (nan, inf, ...) by signal: by its own name, or by an item of its array."""
+    """What was odd (nan, inf, ...) by signal: by its own name, or by an item of its array.
+
+    Of an array in which all nulls are of one kind it is told of every item, and under `name.*`.
+    """
     if odd is None:
         return {}
     reasons: dict[str, str] = {}
     for path, reason in cast("dict[str, str]", parse(odd)).items():
-        reasons[path] = reason
         array, _, item = path.rpartition(".")
-        if item.isdecimal():
+        if item == ANY_ITEM:
+            reasons.update((f"{array}.{index}", reason) for index in range(LONGEST_SPREAD_ARRAY))
+        if item == ANY_ITEM or item.isdecimal():
             reasons.update((f"{array}.{reduction}", reason) for reduction in REDUCTIONS)
+        reasons[path] = reason
     return reasons
+
+
+def is_odd(reasons: dict[str, str], name: str, value: Value) -> bool:
+    """Whether a value is what the reasons of its row are about: of `name.*` only the nulls are."""
+    array, _, item = name.rpartition(".")
+    return not item.isdecimal() or value is None or f"{array}.{ANY_ITEM}" not in reasons

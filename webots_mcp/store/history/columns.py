@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from webots_mcp.store.history.batch import odd_names
+from webots_mcp.store.history.batch import is_odd, odd_names
 from webots_mcp.store.history.deadline import Deadline
 from webots_mcp.store.history.leaves import Value, flatten, parse, reduce_text, shown
 from webots_mcp.store.history.ranges import Segment
@@ -82,7 +82,7 @@ def read_columns(
         limit: At most so many rows; -1 for all.
     """
     columns = Columns(segment.run_id, values={signal.name: [] for signal in signals})
-    decode = len(signals) > MAX_EXTRACTED or any(signal.mixed for signal in signals)
+    decode = len(signals) > MAX_EXTRACTED or any(signal.decoded for signal in signals)
     read = _read_decoded if decode else _read_extracted
     bounds = (segment.run_id, segment.start_s, segment.end_s)
     parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id, limit)
@@ -111,7 +111,7 @@ def _read_extracted(
     query = f"SELECT id, sim_time_s, wall_time_s, odd{extracts} {_IN_SEGMENT}"
     for chunk in _chunks(connection, query, (*paths, *parameters), columns, deadline):
         read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
-        _extend(columns, signals, read[:3], read[3])
+        _extend(columns, read[:3])
         by_path = dict(zip(paths, read[4:], strict=True))
         reduced = {
             path: [reduce_text(text) for text in by_path[path]]
@@ -123,6 +123,7 @@ def _read_extracted(
             else:
                 rows = reduced[signal.path]
                 columns.values[signal.name].extend([row.get(signal.reduce) for row in rows])
+        _count_odd(columns, signals, read[3])
 
 
 def _read_decoded(
@@ -136,10 +137,11 @@ def _read_decoded(
     for chunk in _chunks(connection, query, parameters, columns, deadline):
         read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
         leaves = [flatten(parse(data)) for data in read[4]]
-        _extend(columns, signals, read[:3], read[3])
+        _extend(columns, read[:3])
         for signal in signals:
             name = signal.name
             columns.values[name].extend([row.get(name) for row in leaves])
+        _count_odd(columns, signals, read[3])
 
 
 def _chunks(
@@ -157,24 +159,20 @@ def _chunks(
             return
 
 
-def _extend(
-    columns: Columns,
-    signals: Sequence[Signal],
-    heads: Sequence[tuple[Any, ...]],
-    odds: Sequence[str | None],
-) -> None:
+def _extend(columns: Columns, heads: Sequence[tuple[Any, ...]]) -> None:
     for column, read in zip((columns.ids, columns.times, columns.walls), heads, strict=True):
         column.extend(read)
-    if any(odds):
-        for odd in filter(None, odds):
-            _count_odd(columns, signals, odd)
 
 
-def _count_odd(columns: Columns, signals: Sequence[Signal], odd: str) -> None:
-    reasons = odd_names(odd)
-    for signal in signals:
-        if signal.name in reasons:
-            columns.odd.setdefault(signal.name, Counter())[reasons[signal.name]] += 1
+def _count_odd(columns: Columns, signals: Sequence[Signal], odds: Sequence[str | None]) -> None:
+    """Count what was odd in the newest rows, whose values are there."""
+    if not any(odds):
+        return
+    for row, odd in enumerate(odds, len(columns.ids) - len(odds)):
+        reasons = odd_names(odd)
+        for name in [signal.name for signal in signals if signal.name in reasons]:
+            if is_odd(reasons, name, columns.values[name][row]):
+                columns.odd.setdefault(name, Counter())[reasons[name]] += 1
 
 
 def cleaned(signal: Signal, values: list[Value]) -> list[Value]:

@@ -14,11 +14,13 @@ LONGEST_SPREAD_ARRAY: Final = 16  # a longer one is reduced: nobody asks for lid
 REDUCTIONS: Final = ("count", "min", "max", "mean", "argmin")
 MAX_TEXT: Final = 200  # characters of a text value that are kept and compared
 MAX_ANGLE_RAD: Final = 6.3  # a value beyond is in degrees, or turns were counted
+MAX_YAW_RAD: Final = 3.2  # the third item of a pose that goes beyond is no yaw
 
 _INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
 _ANGLE_NAME: Final = re.compile(
     r"(^|[._])(yaw|heading|theta|bearing|roll|pitch)(_rad)?(\.\d+)?$", re.IGNORECASE
 )
+_THIRD_OF_POSE: Final = re.compile(r"(^|\.)pose\.2$", re.IGNORECASE)
 _UNIT_SUFFIXES: Final = {
     "_rad_s": "rad/s", "_radps": "rad/s", "_m_s": "m/s", "_mps": "m/s", "_m_s2": "m/s²",
     "_mps2": "m/s²", "_rad": "rad",
@@ -109,17 +111,15 @@ def reduce_text(text: object) -> dict[str, Value]:
 
 
 def places(state: dict[str, Any]) -> dict[str, Place]:
-    """Where each leaf of a state stands; the same names as `flatten`, but slower.
-
-    Left out are names with a quote, a backslash or a control character: no JSON path reaches them.
-    """
+    """Where each leaf of a state stands; the same names as `flatten`, but slower."""
     found: dict[str, Place] = {}
-    _locate("", "$", state, found)
-    return {name: place for name, place in found.items() if _reachable(name)}
+    for key, value in state.items():
+        _locate(key, f"$.{_step(key)}", value, found)
+    return found
 
 
 def _locate(name: str, path: str, value: Any, found: dict[str, Place]) -> None:
-    prefix = f"{name}." if name else ""
+    prefix = f"{name}."
     if isinstance(value, dict):
         for key, item in cast("dict[str, Any]", value).items():
             _locate(prefix + key, f"{path}.{_step(key)}", item, found)
@@ -134,22 +134,37 @@ def _locate(name: str, path: str, value: Any, found: dict[str, Place]) -> None:
 
 
 def _step(key: str) -> str:
-    return key if key.isidentifier() and key.isascii() else f'"{key}"'
+    if key.isidentifier() and key.isascii():
+        return key
+    return f'"{key}"' if is_reachable(key) else json.dumps(key, ensure_ascii=False)
 
 
-def _reachable(name: str) -> bool:
+def is_reachable(name: str) -> bool:
+    """Whether a JSON path finds that name whatever the version of SQLite, however it is escaped."""
     return not any(character in '"\\' or character < " " for character in name)
 
 
-def kind_of(name: str, value: Value) -> Kind:
-    """What a single value says about its signal; an angle also by the signal's name."""
+def kind_of(name: str, value: Value, *, planar: bool = False) -> Kind:
+    """What a single value says about its signal; an angle also by the signal's name.
+
+    Args:
+        name: Of the signal.
+        value: One that it had.
+        planar: It is the yaw of a pose `[x, y, yaw]`, if it is an angle at all.
+    """
     if value is None:
         return "null"
     if isinstance(value, bool):
         return "bool"
     if isinstance(value, str):
         return "text"
-    return "angle" if _ANGLE_NAME.search(name) and abs(value) <= MAX_ANGLE_RAD else "num"
+    limit = MAX_YAW_RAD if planar else MAX_ANGLE_RAD if _ANGLE_NAME.search(name) else -1.0
+    return "angle" if abs(value) <= limit else "num"
+
+
+def may_be_yaw(name: str) -> bool:
+    """Whether it is the third item of a `pose`; of three items it is the yaw, of more z."""
+    return bool(_THIRD_OF_POSE.search(name))
 
 
 def widen(known: Kind, seen: Kind) -> Kind:

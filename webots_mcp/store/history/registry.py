@@ -10,7 +10,17 @@ from functools import lru_cache
 from typing import Any, Final, cast
 
 from webots_mcp.store.history.batch import Batch, BatchColumn
-from webots_mcp.store.history.leaves import Kind, Place, kind_of, parse, places, unit_of, widen
+from webots_mcp.store.history.leaves import (
+    Kind,
+    Place,
+    is_reachable,
+    kind_of,
+    may_be_yaw,
+    parse,
+    places,
+    unit_of,
+    widen,
+)
 from webots_mcp.store.history.summary import usable_numbers
 
 MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
@@ -39,7 +49,8 @@ class Signal:
         id: In the register; None for one that was seen only in rows after the watermark.
         path: For `json_extract(state.data, path)`.
         reduce: None, or how the long array at `path` becomes one number.
-        mixed: Its array was at times long enough to be reduced.
+        decoded: Rows must be decoded to read it: its array was at times long enough to be
+            reduced, or its name holds what the paths of SQLite before 3.45 do not reach.
     """
 
     id: int | None
@@ -49,12 +60,12 @@ class Signal:
     unit: str | None
     path: str
     reduce: str | None
-    mixed: bool = False
+    decoded: bool = False
 
     @property
     def is_plain(self) -> bool:
         """Whether `json_extract` alone gives the same as `flatten`."""
-        return self.reduce is None and not self.mixed
+        return self.reduce is None and not self.decoded
 
     @property
     def is_number(self) -> bool:
@@ -72,15 +83,18 @@ def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
     """The signals by name, with what they tell about each other."""
     arrays = tuple({f"{signal.path}[" for signal in signals if signal.reduce})
     return {
-        signal.name: replace(signal, mixed=True) if signal.path.startswith(arrays) else signal
+        signal.name: replace(signal, decoded=True)
+        if signal.path.startswith(arrays) or not is_reachable(signal.name)
+        else signal
         for signal in signals
     }
 
 
 def seen_in(column: BatchColumn, known: Kind = "null") -> Kind:
     """The kind of a signal, after the values of this column."""
+    planar = may_be_yaw(column.name) and f"{column.name[:-1]}3" not in _places_of(column.sample)
     for value in _telling(column):
-        known = widen(known, kind_of(column.name, value))
+        known = widen(known, kind_of(column.name, value, planar=planar))
     return known
 
 
@@ -95,7 +109,7 @@ def _telling(column: BatchColumn) -> list[Any]:
 def enter_signals(connection: sqlite3.Connection, batch: Batch) -> dict[tuple[int, str], Signal]:
     """Enter the names of a batch that are new, count its rows, and return what is registered.
 
-    Names beyond `MAX_SIGNALS` of a robot, and names that no JSON path can reach, stay out.
+    Names beyond `MAX_SIGNALS` of a robot stay out.
     """
     by_signal: defaultdict[tuple[int, str], list[BatchColumn]] = defaultdict(list)
     for column in batch.columns():
@@ -124,7 +138,7 @@ def _enter(
 
 
 def unregistered(column: BatchColumn) -> Signal | None:
-    """A signal that is known from a column only; None where no JSON path reaches it."""
+    """A signal that is known from a column only; None where its value stands nowhere."""
     place = _places_of(column.sample).get(column.name)
     if place is None:
         return None

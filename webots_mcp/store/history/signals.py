@@ -137,7 +137,7 @@ def resolve_signals(known: dict[str, Signal], names: Sequence[str]) -> list[Sign
 
 
 def _meant(known: dict[str, Signal], name: str) -> Iterable[Signal]:
-    if name in known:
+    if "*" not in name and name in known:
         return (known[name],)
     pattern = name if "*" in name else f"{name}.*"
     escaped = pattern.replace("[", "[[]").replace("?", "[?]")

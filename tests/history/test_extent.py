@@ -76,3 +76,11 @@ def test_a_change_lasts_until_the_next_one_also_beyond_the_range(
     assert (help_needed.start_s, help_needed.end_s, help_needed.ongoing) == (200.0, 300.0, False)
     (cruise,) = told(standing, "change", start_s=290.0, end_s=310.0)
     assert (cruise.start_s, cruise.end_s, cruise.ongoing) == (300.0, 399.9, True)
+
+
+def test_two_limits_on_one_signal_are_two_events(standing: sqlite3.Connection) -> None:
+    limits = (Threshold("battery_v", below=5.0), Threshold("battery_v", below=4.0))
+    options = EventOptions(kinds=("threshold",), thresholds=limits)
+    found = find_events(standing, resolve_range(standing, start_s=250.0, end_s=255.0), options)
+    told = [(event.details["below"], event.start_s, event.end_s) for event in found.events]
+    assert sorted(told) == [(4.0, 200.0, 299.9), (5.0, 200.0, 299.9)]

@@ -10,7 +10,7 @@ from typing import Final
 
 from webots_mcp.store.history.deadline import Deadline
 from webots_mcp.store.history.detectors import DETECTED, DETECTORS, OF_NUMBERS, Search
-from webots_mcp.store.history.event import Event, EventOptions, Kind
+from webots_mcp.store.history.event import Event, EventOptions, Kind, Threshold
 from webots_mcp.store.history.motion import find_motion
 from webots_mcp.store.history.ranges import Segment, just_after
 from webots_mcp.store.history.registry import Signal
@@ -54,9 +54,21 @@ class Detection:
                 break
             reach_s = FARTHER * max(reach_s, 1.0)
             looked_at = self._around(segment, reach_s)
-            whole = self._events_in(looked_at, list({each.kind for each in cut}), [])
+            of_cut = self._only_for(cut)
+            whole = of_cut._events_in(looked_at, list({each.kind for each in cut}), [])
             events = [_longer(each, whole) if each in cut else each for each in events]
-        return list({(each.kind, each.name, each.start_s): each for each in events}.values())
+        return list({(*_subject(each), each.start_s): each for each in events}.values())
+
+    def _only_for(self, events: Sequence[Event]) -> Detection:
+        """The same for nothing but what these events are about."""
+        names = tuple({event.name for event in events if event.name is not None})
+        thresholds = tuple(
+            Threshold(event.name or "", event.details.get("above"), event.details.get("below"))
+            for event in events
+            if event.kind == "threshold"
+        )
+        options = replace(self.options, signals=names or ("*",), thresholds=thresholds)
+        return replace(self, options=options)
 
     def _least_s(self, kinds: Sequence[Kind]) -> float:
         """How long something of these kinds has to last; a shorter segment holds none."""
@@ -116,10 +128,15 @@ def _reaches_into(event: Event, segment: Segment) -> bool:
     return event.start_s < segment.end_s and event.end_s >= segment.start_s
 
 
+def _subject(event: Event) -> tuple[object, ...]:
+    """What it is about: two of one subject that overlap are the same."""
+    return event.kind, event.name, event.details.get("above"), event.details.get("below")
+
+
 def _longer(event: Event, others: Sequence[Event]) -> Event:
     """Together with the one of the others that it is a part of; itself where there is none."""
     for other in others:
-        alike = (other.kind, other.name) == (event.kind, event.name)
+        alike = _subject(other) == _subject(event)
         if alike and other.start_s <= event.end_s and event.start_s <= other.end_s:
             first = min(event, other, key=attrgetter("start_s"))
             last = max(other, event, key=attrgetter("end_s"))

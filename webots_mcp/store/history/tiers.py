@@ -76,11 +76,13 @@ class Pieces:
                 self.cut_at_s = span.start * BUCKET_S
                 return
             parts = self._parts[signal.name]
-            held = dict(buckets(connection, run_id, signal.id, span.start, span.stop))
-            for bucket in rows.keys() | held.keys():
-                summary = held.get(bucket, Summary())
-                whole = max(summary.rows, rows.get(bucket, 0))
-                parts[bucket].append(summary._replace(rows=whole))
+            missing = dict(rows)
+            for bucket, summary in buckets(connection, run_id, signal.id, span.start, span.stop):
+                whole = max(summary.rows, missing.pop(bucket, 0))
+                counted = summary if whole == summary.rows else summary._replace(rows=whole)
+                parts[bucket].append(counted)
+            for bucket, lacking in missing.items():
+                parts[bucket].append(Summary(lacking))
 
     def of(self, name: str) -> list[tuple[int, Summary]]:
         """The buckets of a signal that have rows, in order."""

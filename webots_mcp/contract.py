@@ -31,9 +31,10 @@ LOG_LEVELS: Final[tuple[LogLevel, ...]] = get_args(LogLevel)  # in rising order
 PAUSED: Final = "paused"  # how a bridge holds its controller's loop, as the session tells it
 STEPPING: Final = "stepping"
 
-BUILT_IN_ACTIONS: Final = (
-    "pause", "resume", "fast", "step", "reset", "reload", "screenshot", "reset_state",
+SUPERVISOR_ACTIONS: Final = (
+    "pause", "resume", "fast", "step", "reset", "reload", "screenshot",
 )  # fmt: skip
+BUILT_IN_ACTIONS: Final = (*SUPERVISOR_ACTIONS, "reset_state")
 
 COMMAND_TIME_TO_LIVE_S: Final = 10.0
 HEARTBEAT_INTERVAL_S: Final = 0.5  # how often a session says that its loop is alive

@@ -35,8 +35,9 @@ def schema_version(connection: sqlite3.Connection) -> int:
     if application_id == APPLICATION_ID:
         return int(version)
     if tables:
+        (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
         raise ForeignDatabaseError(
-            f"this SQLite database belongs to another application (application_id "
+            f"the SQLite database {file} belongs to another application (application_id "
             f"{application_id}, expected {APPLICATION_ID}); choose another file"
         )
     return 0

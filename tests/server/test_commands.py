@@ -99,11 +99,10 @@ async def test_a_failure_is_an_error_whose_words_stay_in_a_data_field(
     [
         ({"last_poll_wall_time_s": None}, "never calls bridge.get_command()"),
         ({"last_poll_wall_time_s": time.time() - 60}, "last called bridge.get_command()"),
-        ({"last_seen_wall_time_s": time.time() - 2.5}, "paused by hand"),
-        ({"ended_wall_time_s": time.time(), "end_reason": "crashed"}, "no live controller"),
+        ({"last_seen_wall_time_s": time.time() - 2.5}, "press play in Webots"),
         ({}, "longer timeout_s"),
     ],
-    ids=["never polls", "stopped polling", "silent", "gone", "busy"],
+    ids=["never polls", "stopped polling", "silent", "busy"],
 )
 async def test_what_nobody_claims_is_taken_back_and_the_reason_told(
     connect: Connect, recorded: Recorded, session: dict[str, Any], said: str
@@ -116,6 +115,94 @@ async def test_what_nobody_claims_is_taken_back_and_the_reason_told(
     assert "will not run" in answer["error"]
     assert said in answer["hint"]
     assert claim(recorded.connection, robot.id, robot.session_id) == []
+
+
+@pytest.mark.parametrize("end_reason", ["crashed", "finished"])
+async def test_a_robot_without_a_live_controller_refuses_at_once(
+    connect: Connect, recorded: Recorded, end_reason: str
+) -> None:
+    robot = recorded.robot(ended_wall_time_s=time.time(), end_reason=end_reason)
+    async with connect() as client:
+        text = await fail(client, "webots_world_reload")
+    assert "'rover' has no live controller" in text
+    assert "start it, then ask again" in text
+    assert list_commands(recorded.connection, robot.id, limit=1) == []
+
+
+async def test_a_robot_whose_world_is_being_reloaded_is_waited_for(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot(ended_wall_time_s=time.time(), end_reason="reload")
+    async with connect() as client:
+        text = await fail(client, "webots_send_command", action="go", timeout_s=0.2)
+    assert json.loads(text)["outcome"] == "cancelled"
+
+
+async def test_steering_through_a_plain_robot_is_refused_with_the_supervisor_to_ask(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot("rover", supervisor=0)
+    async with connect() as client:
+        alone = await fail(client, "webots_simulation_control", command="pause")
+        recorded.robot("referee")
+        beside = await fail(client, "webots_world_reset", robot="rover")
+    assert "pause needs a Supervisor and robot 'rover' is none: set the field" in alone
+    assert "'referee' is a Supervisor of this simulation: ask it (robot='referee')" in beside
+
+
+@pytest.mark.parametrize("command", ["pause", "step"])
+async def test_without_a_name_steering_goes_to_the_only_live_supervisor(
+    connect: Connect, controller: Callable[..., RecordedRobot], recorded: Recorded, command: str
+) -> None:
+    recorded.robot("rover", supervisor=0)
+    controller(("done", "{}", None), name="referee")
+    async with connect() as client:
+        answer = await ask(client, "webots_simulation_control", command=command)
+        assert answer["robot"] == "referee"
+        assert "'rover'" in await fail(client, "webots_send_command", action="go")
+
+
+async def test_a_robot_whose_simulation_another_one_holds_refuses_at_once(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot("rover", supervisor=0)
+    recorded.robot("referee", hold="paused")
+    async with connect() as client:
+        text = await fail(client, "webots_send_command", action="go", robot="rover")
+    assert "robot 'referee' holds their simulation; resume or step it there first" in text
+
+
+async def test_a_failed_action_is_answered_with_its_docstring(
+    connect: Connect, controller: Callable[..., RecordedRobot]
+) -> None:
+    actions = json.dumps({"go": "Drive on: `speed` in rad/s."})
+    controller(("failed", None, "KeyError: 'speed'"), actions=actions)
+    async with connect() as client:
+        answer = json.loads(await fail(client, "webots_send_command", action="go"))
+    assert answer["hint"] == "go: Drive on: `speed` in rad/s."
+
+
+async def test_what_was_replaced_in_a_result_is_a_hint_and_no_error(
+    connect: Connect, controller: Callable[..., RecordedRobot]
+) -> None:
+    controller(("done", '{"v": null}', "replaced in the result: v (nan)"))
+    async with connect() as client:
+        answer = await ask(client, "webots_send_command", action="go")
+    assert (answer["hint"], answer["result"]) == ("replaced in the result: v (nan)", {"v": None})
+    assert "error" not in answer
+
+
+async def test_a_command_behind_a_handler_that_is_at_work_is_told_which(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot(moved_wall_time_s=time.time() - 9)
+    slow = CommandQueue(recorded.connection).enqueue(robot.id, "slow")
+    assert claim(recorded.connection, robot.id, robot.session_id) == [slow.id]
+    async with connect() as client:
+        text = await fail(client, "webots_send_command", action="go", timeout_s=0.2)
+    answer = json.loads(text)
+    assert f"inside the handler of command {slow.id} (slow)" in answer["why"]
+    assert "until that handler has returned" in answer["hint"]
 
 
 async def test_what_is_under_way_at_the_deadline_is_left_alone(

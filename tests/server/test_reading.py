@@ -56,6 +56,18 @@ async def test_the_header_tells_the_time_before_the_first_state(
     assert "bridge.publish" in answer["hint"]
 
 
+async def test_a_new_run_without_a_state_points_to_the_one_before(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, {"x": 1})
+    earlier = robot.run_id
+    robot.begin_run("reset")
+    async with connect() as client:
+        answer = await ask(client, "webots_get_robot_state")
+    assert f"in an earlier one (run_id={earlier})" in answer["hint"]
+
+
 async def test_without_a_database_every_reading_tool_says_how_to_get_one(
     connect: Connect, file: Path
 ) -> None:
@@ -319,7 +331,8 @@ async def test_a_database_of_another_application_is_left_alone(
         other.execute("CREATE TABLE contact (name TEXT)")
     other.close()
     async with connect() as client:
-        assert "another application" in await fail(client, "webots_list_robots")
+        text = await fail(client, "webots_list_robots")
+    assert f"{file} belongs to another application" in text
 
 
 async def test_a_damaged_database_is_a_clear_error(

@@ -55,7 +55,8 @@ async def test_a_person_who_pauses_in_webots_is_one_of_the_reasons_told(
         text = await fail(client, "webots_simulation_control", command="resume", timeout_s=3)
         answer = json.loads(text)
         assert answer["outcome"] == "cancelled"
-        assert "paused by hand in Webots" in answer["hint"]
+        assert "paused by hand in Webots" in answer["why"]
+        assert "press play in Webots" in answer["hint"]
         assert answer["status"].startswith("stopped")
 
 

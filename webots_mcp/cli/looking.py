@@ -100,7 +100,7 @@ def _robot_as_text(robot: dict[str, Any]) -> str:
         time_text = f"simulation time {robot['sim_time_s']:.3f} s, {robot['age_s']:.1f} s old"
     lines = [
         f"{robot['robot']} ({robot['kind']}): {robot['status']}",
-        f"  run {robot['run_id']} of {robot['runs']} runs, {robot['rows']} rows, {time_text}",
+        f"  run {robot['run_id']} (recorded: {robot['runs']}), {robot['rows']} rows, {time_text}",
         f"  rows waiting {robot['rows_waiting']}, dropped {robot['rows_dropped']}",
     ]
     lines += [f"  {robot['why']}"] if robot["why"] else []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
@@ -11,14 +10,14 @@ from typing import Any, Final
 import anyio
 from anyio import to_thread
 
-from webots_mcp.contract import BUILT_IN_ACTIONS, HEARTBEAT_LATE_S
-from webots_mcp.errors import UnknownActionError
+from webots_mcp.contract import HEARTBEAT_LATE_S
+from webots_mcp.server.addressee import find_addressee
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
 from webots_mcp.store.queue import Command, CommandQueue, fetch_command
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
-from webots_mcp.store.status import SILENT
+from webots_mcp.store.status import handler_at_work
 
 Report = Callable[[float, float, str], Awaitable[None]]
 
@@ -30,7 +29,7 @@ _REPORT_INTERVAL_S: Final = 1.0
 # the command's own time to live end it, soon after anybody could still be waiting for it.
 _OUTLIVES_WAITING_S: Final = 1.0
 _ERROR_CHARACTERS: Final = 2_000
-_SHOWN_ACTIONS: Final = 30
+_INSTRUCTION_CHARACTERS: Final = 500
 
 
 @dataclass(frozen=True)
@@ -57,6 +56,7 @@ class Dispatcher:
 
         Raises:
             InvalidInputError: The robot, the action or its parameters are wrong.
+            CommandRefusedError: Nobody alive could run it.
             NothingRecordedError: There is no robot to ask.
         """
         started_s = time.monotonic()
@@ -75,8 +75,7 @@ class Dispatcher:
 
     def _enqueue(self, request: Request) -> Command:
         with self._recording.writer() as connection:
-            view = look(connection, request.robot)
-            _require_action(view, request.action)
+            view = find_addressee(connection, request.robot, request.action)
             return CommandQueue(connection).enqueue(
                 view.robot.id,
                 request.action,
@@ -119,7 +118,7 @@ class Dispatcher:
                 outcome=command.status,
                 waited_s=waited_s,
                 result=shown_result(command),
-                error=cut_text(command.error, _ERROR_CHARACTERS) if command.error else None,
+                error=_error(command),
                 hint=_hint(view, command),
             )
 
@@ -131,20 +130,10 @@ def shown_result(command: Command, budget: int = RESULT_BUDGET) -> Any:
     return shorten(command.decoded_result(), budget, WHOLE).value
 
 
-def _require_action(view: View, action: str) -> None:
-    """Refuse what the controller does not know.
-
-    A controller that has registered nothing may look at what get_command() returns: it gets all.
-    """
-    known = list(view.session.actions) if view.session else []
-    if not known or action in known or action in BUILT_IN_ACTIONS:
-        return
-    near = difflib.get_close_matches(action, [*known, *BUILT_IN_ACTIONS], n=3, cutoff=0.5)
-    offer = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
-    raise UnknownActionError(
-        f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its actions are "
-        f"{known[:_SHOWN_ACTIONS]}, built in are {list(BUILT_IN_ACTIONS)}"
-    )
+def _error(command: Command) -> str | None:
+    if command.status == "done" or command.error is None:
+        return None
+    return cut_text(command.error, _ERROR_CHARACTERS)
 
 
 def _progress(command: Command, waited_s: float) -> str:
@@ -153,25 +142,38 @@ def _progress(command: Command, waited_s: float) -> str:
 
 
 def _hint(view: View, command: Command) -> str | None:
-    """What an outcome means where it does not speak for itself."""
+    """What to do next where an outcome does not speak for itself."""
+    if command.status == "done":
+        return command.error  # what of the result had to be replaced
+    if command.status == "failed":
+        return _instructions(view, command.action)
     if command.status == "claimed":
         return (
             "the controller is still at it; webots_list_commands will show how it ended; do not "
             "send it again"
         )
-    if command.status in ("cancelled", "expired"):
-        return _why_unclaimed(view)
     if command.status == "lost":
         return "it may have run in part: look at the robot before you send it again"
-    return None
+    return _after_no_answer(view)
 
 
-def _why_unclaimed(view: View) -> str:
+def _instructions(view: View, action: str) -> str | None:
+    """The docstring of a custom action."""
+    text = view.session.actions.get(action) if view.session else None
+    return f"{action}: {cut_text(text, _INSTRUCTION_CHARACTERS)}" if text else None
+
+
+def _after_no_answer(view: View) -> str:
     session = view.session
     if session is None or not view.robot.live:
-        return f"no live controller: {view.status.why or 'it was never seen'}; start it first"
+        return "start its controller, then ask again"
+    if handler_at_work(view.connection, session, view.now_s):
+        return "wait until that handler has returned, then ask again"
     if not session.heartbeat_is_fresh(view.now_s):
-        return view.status.why or SILENT
+        return (
+            "press play in Webots if it is paused there: only a person can, while the controller "
+            "is inside step(); else see what its loop waits for"
+        )
     if session.last_poll_wall_time_s is None:
         return "the controller's loop never calls bridge.get_command(): add that line to its loop"
     silent_s = view.now_s - session.last_poll_wall_time_s

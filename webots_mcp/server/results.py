@@ -24,7 +24,7 @@ class Answer(BaseModel):
     )
     age_s: float | None = Field(default=None, description="Wall time since the newest data.")
     status: str | None = Field(
-        default=None, description="running, paused, 'stopped N s ago' or 'never seen'."
+        default=None, description="running, paused, starting, 'stopped N s ago', 'never seen'."
     )
     why: str | None = Field(default=None, description="What the status rests on.")
     hint: str | None = Field(default=None, description="What to do next.")

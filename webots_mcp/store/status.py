@@ -37,7 +37,7 @@ _ENDED: Final = {
     "crashed": "its controller process is gone without having finished (killed or crashed)",
     "replaced": "a newer session took its place",
 }
-SILENT: Final = (
+_SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
     "breakpoint, another controller looping, or an extern controller missing; from inside the "
     "simulation these look alike"
@@ -80,7 +80,7 @@ def judge(
         return Status(NEVER_SEEN)
     if not session.is_alive(now_s):
         return _stopped(session, now_s, _ENDED.get(session.end_reason or "crashed"))
-    if holder := _holder(connection, session, now_s):
+    if holder := find_holder(connection, session, now_s):
         return Status(PAUSED, None if holder is session else _held_elsewhere(connection, holder))
     fresh = session.heartbeat_is_fresh(now_s)
     if fresh and _hold_since_beat(connection, session) == "resume":
@@ -95,17 +95,17 @@ def judge(
 
 def _why_standing(connection: sqlite3.Connection, session: Session, now_s: float) -> str:
     """Why the time of a living controller, which its bridge does not hold, stands still."""
-    if inside := _handler_at_work(connection, session, now_s):
+    if inside := handler_at_work(connection, session, now_s):
         return inside
     if session.moved_wall_time_s is None:
         return _NOT_STARTED
     # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
     beaten_since_s = session.last_seen_wall_time_s - session.moved_wall_time_s
     alive = session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S
-    return _STANDING if alive else SILENT
+    return _STANDING if alive else _SILENT
 
 
-def _handler_at_work(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
+def handler_at_work(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
     """The custom action that the loop is inside of; it beats and steps only by itself there."""
     claimed = connection.execute(_CLAIMED, (session.robot_id, session.id)).fetchall()
     for command_id, action, since_s in claimed:
@@ -127,7 +127,7 @@ def _stopped(session: Session, now_s: float, why: str | None) -> Status:
     return Status(stopped_for(now_s - moved_s), why)
 
 
-def _holder(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:
+def find_holder(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:
     """The session whose bridge holds the loop: one that is held freezes its whole simulation."""
     for candidate in (session, *companions(connection, session, now_s)):
         if candidate.heartbeat_is_fresh(now_s) and _is_holding(connection, candidate):

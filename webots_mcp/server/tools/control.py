@@ -11,6 +11,7 @@ from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.contract import MAX_STEPS
+from webots_mcp.server.addressee import find_addressee
 from webots_mcp.server.boundary import ACTS, RESTARTS, reporter, tool
 from webots_mcp.server.dispatch import Dispatcher, Request
 from webots_mcp.server.keyboard import press_reset
@@ -51,7 +52,9 @@ class ControlTools:
         robot: RobotName = None,
         timeout_s: Annotated[
             float | None,
-            Field(ge=0.1, le=600, description="How long to wait; by default as long as it takes."),
+            Field(
+                ge=0.1, le=600, description="By default 10 s, for reload 30, for step up to 300."
+            ),
         ] = None,
     ) -> CommandAnswer:
         """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
@@ -107,8 +110,9 @@ class ControlTools:
             return _RELOAD_WAIT_S
         if command != "step":
             return _WAIT_S
-        with self._recording.view(robot) as view:
-            step_ms = (view.run.basic_time_step_ms if view.run else None) or 32.0
+        with self._recording.reader() as connection:
+            run = find_addressee(connection, robot, command).run
+            step_ms = (run.basic_time_step_ms if run else None) or 32.0
         return min(_WAIT_S + 2 * steps * step_ms / 1000, _LONGEST_STEP_WAIT_S)
 
     async def _reset_by_keys(self, robot: str | None, timeout_s: float) -> CommandAnswer:

@@ -27,6 +27,7 @@ _PUBLISH: Final = (
     "nothing was published in this run yet: call bridge.publish({...}) in the controller's loop "
     "(every 5th call is recorded, or each one with force=True)"
 )
+_EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND rows > 0"
 _EVENTS: Final = 10
 _SHOWN_ODD: Final = 20
 _SHOWN_DEVICES: Final = 30
@@ -58,7 +59,7 @@ class StateTools:
         """
         with self._recording.view(robot, run_id) as view:
             if view.state is None:
-                return StateAnswer(**view.header(), hint=_PUBLISH)
+                return StateAnswer(**view.header(), hint=_nothing_yet(view))
             short = shorten(view.state.value())
             hint = "webots_get_full_state(path=...) shows a part whole" if short.rule else None
             return StateAnswer(**view.header(), state=short.value, shortened=short.rule, hint=hint)
@@ -71,7 +72,7 @@ class StateTools:
         """
         with self._recording.view(robot, run_id) as view:
             if view.state is None:
-                return SensorsAnswer(**view.header(), hint=_PUBLISH)
+                return SensorsAnswer(**view.header(), hint=_nothing_yet(view))
             state = view.state.value()
             sensors = sensor_part(state, view.robot.devices)
             short = shorten(sensors)
@@ -101,7 +102,8 @@ class StateTools:
         """
         with self._recording.view(robot, run_id) as view:
             if view.state is None:
-                return FullStateAnswer(**view.header(), hint=_PUBLISH, recorder=_recorder(view))
+                hint, recorder = _nothing_yet(view), _recorder(view)
+                return FullStateAnswer(**view.header(), hint=hint, recorder=recorder)
             part = select(view.state.value(), path)
             answer = _page(part, path, offset, limit)
             answer |= view.header()
@@ -110,6 +112,18 @@ class StateTools:
                 answer |= {"odd": dict(odd) or None, "events": _events(view)}
                 answer |= {"recorder": _recorder(view)}
             return FullStateAnswer(**answer)
+
+
+def _nothing_yet(view: View) -> str:
+    """A robot that published before a reset will publish again."""
+    run_id = view.run.id if view.run else 0
+    earlier = view.connection.execute(_EARLIER, (view.robot.id, run_id)).fetchone()[0]
+    if earlier is None:
+        return _PUBLISH
+    return (
+        f"nothing was recorded in this run yet, but in an earlier one (run_id={earlier}): ask "
+        "again when the controller has published"
+    )
 
 
 def _page(part: Any, path: str, offset: int, limit: int) -> dict[str, Any]:

@@ -1,0 +1,103 @@
+"""Whose controller is to run a command; refused at once where it is known that none could."""
+
+from __future__ import annotations
+
+import difflib
+import sqlite3
+import time
+from typing import Final
+
+from webots_mcp.contract import BUILT_IN_ACTIONS, ISSUED_TIME_TO_LIVE_S, SUPERVISOR_ACTIONS
+from webots_mcp.errors import CommandRefusedError, UnknownActionError
+from webots_mcp.store.recording import View, look
+from webots_mcp.store.robots import list_robots, robot_name
+from webots_mcp.store.sessions import Session, companions
+from webots_mcp.store.status import find_holder
+
+_SHOWN_ACTIONS: Final = 30
+_MAKE_ONE: Final = (
+    "set the field 'supervisor' of its Robot node to TRUE and create it with Supervisor() instead "
+    "of Robot()"
+)
+
+
+def find_addressee(connection: sqlite3.Connection, robot: str | None, action: str) -> View:
+    """The robot that is to run an action.
+
+    Without a name it is the only live robot; for what steers the simulation, the only live
+    Supervisor.
+
+    Raises:
+        InvalidInputError: There is no such robot or action, or several robots are possible.
+        CommandRefusedError: It cannot run it: no controller of it lives, it is no Supervisor, or
+            another robot holds the simulation.
+        NothingRecordedError: No robot was ever seen.
+    """
+    if robot is None and action in SUPERVISOR_ACTIONS:
+        robot = _only_supervisor(connection)
+    view = look(connection, robot)
+    _require_action(view, action)
+    session = _require_live(view)
+    if action in SUPERVISOR_ACTIONS and not session.supervisor:
+        raise CommandRefusedError(_who_may(view, session, action))
+    _require_free(view, session, action)
+    return view
+
+
+def _only_supervisor(connection: sqlite3.Connection) -> str | None:
+    robots = [robot for robot in list_robots(connection, time.time()) if robot.live]
+    names = [robot.name for robot in robots if robot.session and robot.session.supervisor]
+    return names[0] if len(names) == 1 else None
+
+
+def _require_action(view: View, action: str) -> None:
+    """Refuse what the controller does not know.
+
+    A controller that has registered nothing may look at what get_command() returns: it gets all.
+    """
+    known = list(view.session.actions) if view.session else []
+    if not known or action in known or action in BUILT_IN_ACTIONS:
+        return
+    near = difflib.get_close_matches(action, [*known, *BUILT_IN_ACTIONS], n=3, cutoff=0.5)
+    offer = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
+    raise UnknownActionError(
+        f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its actions are "
+        f"{known[:_SHOWN_ACTIONS]}, built in are {list(BUILT_IN_ACTIONS)}"
+    )
+
+
+def _require_live(view: View) -> Session:
+    """Its session; one that asked for a reload has a successor soon, which will run the command."""
+    session = view.session
+    if session is not None and (view.robot.live or _is_reloading(session, view.now_s)):
+        return session
+    raise CommandRefusedError(
+        f"robot {view.robot.name!r} has no live controller: "
+        f"{view.status.why or 'it was never seen'}; start it, then ask again"
+    )
+
+
+def _is_reloading(session: Session, now_s: float) -> bool:
+    ended_s = session.ended_wall_time_s or session.last_seen_wall_time_s
+    return session.end_reason == "reload" and now_s - ended_s < ISSUED_TIME_TO_LIVE_S
+
+
+def _who_may(view: View, session: Session, action: str) -> str:
+    others = [s for s in companions(view.connection, session, view.now_s) if s.supervisor]
+    next_step = _MAKE_ONE
+    if others:
+        name = robot_name(view.connection, others[0].robot_id)
+        next_step = f"robot {name!r} is a Supervisor of this simulation: ask it (robot={name!r})"
+    return f"{action} needs a Supervisor and robot {view.robot.name!r} is none: {next_step}"
+
+
+def _require_free(view: View, session: Session, action: str) -> None:
+    """A loop whose simulation another robot holds does not come round until that lets go."""
+    holder = find_holder(view.connection, session, view.now_s)
+    if holder is None or holder.id == session.id:
+        return
+    name = robot_name(view.connection, holder.robot_id)
+    raise CommandRefusedError(
+        f"robot {view.robot.name!r} cannot run {action!r} now: robot {name!r} holds their "
+        f"simulation; resume or step it there first (robot={name!r})"
+    )

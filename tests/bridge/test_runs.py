@@ -60,11 +60,19 @@ def test_a_callback_that_fails_does_not_stop_the_loop_or_the_next_callback(
 ) -> None:
     calls: list[str] = []
 
+    class MuteError(Exception):
+        def __str__(self) -> str:
+            raise RuntimeError("no text")
+
     def fail() -> None:
         raise RuntimeError("broken callback")
 
+    def fail_without_text() -> None:
+        raise MuteError
+
     with MCPBridge(robot, database=database) as bridge:
         bridge.on_reload(fail)
+        bridge.on_reload(fail_without_text)
         bridge.on_reload(lambda: calls.append("second"))
         robot.step(STEP_MS)
         robot.step(STEP_MS)
@@ -73,7 +81,9 @@ def test_a_callback_that_fails_does_not_stop_the_loop_or_the_next_callback(
         robot.step(STEP_MS)
         bridge.publish({})
     assert calls == ["second"]
-    assert "broken callback" in capfd.readouterr().err
+    said = capfd.readouterr().err
+    assert "broken callback" in said
+    assert "MuteError" in said
 
 
 def test_a_successor_in_the_same_webots_is_a_reload(

@@ -7,7 +7,8 @@ from typing import Final
 
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.encoding import Encoded, encode
-from webots_mcp.bridge.recorder import INSERT_EVENT, INSERT_STATE, Recorder
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.run import INSERT_EVENT, INSERT_STATE
 
 _NOT_LOST: Final = ("nan", "inf", "-inf", "bytes", "surrogate")
 _MOST_LOST_PATHS: Final = 20

@@ -10,9 +10,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Final
 
+from webots_mcp.bridge import open_bridges
 from webots_mcp.bridge.changes import Changes
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.commands import CONFIRM_RELOAD
+from webots_mcp.bridge.commands import CONFIRM_RELOAD, describe
 from webots_mcp.bridge.control import Control, Handler
 from webots_mcp.bridge.devices import read_devices
 from webots_mcp.bridge.encoding import encode
@@ -83,10 +84,10 @@ class MCPBridge:
         self._changes = Changes()
         self._reloads = Reloads(self._failed)
         self._simulation = Simulation(robot)
-        _replace_bridge_of(robot)
+        open_bridges.close_former(robot)
         self._start_recording()
         self._begin_first_run()
-        _bridges[id(robot)] = self
+        open_bridges.enter(robot, self)
         atexit.register(self.close)
 
     # -- the loop ------------------------------------------------------------------------------
@@ -241,14 +242,14 @@ class MCPBridge:
         return BridgeStats(
             rows_written=recorder.rows_written,
             rows_waiting=recorder.rows_waiting,
-            rows_dropped=recorder.rows_dropped,
+            rows_dropped=recorder.drops.rows,
             publish_calls=self._throttle.calls,
             publish_throttled=self._throttle.skipped,
             values_replaced=self._journal.values_replaced,
             publish_mean_us=self._cost.mean_us,
             publish_max_us=self._cost.max_us,
             failures=self._failures,
-            last_error=recorder.last_error,
+            last_error=recorder.trouble.last_error,
         )
 
     def close(self, reason: str | None = None) -> None:
@@ -263,7 +264,7 @@ class MCPBridge:
             return
         self._closed = True
         atexit.unregister(self.close)
-        _bridges.pop(id(self.robot), None)
+        open_bridges.leave(self.robot)
         if self._maintainer is not None:
             self._maintainer.stop()
         self._recorder.close(reason or self._end_reason, self._clock.sim_time_s)
@@ -383,24 +384,4 @@ class MCPBridge:
         if self._strict:
             raise error
         kind = f"{method} {type(error).__name__}"
-        self._recorder.complain(kind, f"{method} failed: {type(error).__name__}: {error}")
-
-
-# One process has one robot; a second bridge on the same object takes over from the first.
-_bridges: dict[int, MCPBridge] = {}
-
-
-def _replace_bridge_of(robot: object) -> None:
-    former = _bridges.get(id(robot))
-    if former is not None:
-        former.close("replaced")
-
-
-def _leave_to_parent() -> None:
-    for bridge in _bridges.values():
-        bridge.leave_to_parent()
-    _bridges.clear()
-
-
-if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_leave_to_parent)
+        self._recorder.complain(kind, f"{method} failed: {describe(error)}")

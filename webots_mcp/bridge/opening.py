@@ -10,7 +10,7 @@ from typing import Final
 
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.registration import Registration, register
-from webots_mcp.connection import connect, never_wait
+from webots_mcp.connection import connect, journal_mode, never_wait
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION, Database, MemoryDatabase
 from webots_mcp.schema import create_schema, require_current, schema_version
 
@@ -62,6 +62,17 @@ def _migrate(database: Database) -> None:
 
     line = [sys.executable, "-m", "webots_mcp", "migrate", "--database", str(database)]
     subprocess.run(line, check=False, capture_output=True, timeout=60, stdin=subprocess.DEVNULL)
+
+
+def why_readers_block(connection: sqlite3.Connection) -> str | None:
+    """What is wrong with the place where the database lies; usually nothing."""
+    mode = journal_mode(connection)
+    if mode in ("wal", "memory"):
+        return None
+    return (
+        f"lies where SQLite cannot share memory (journal mode {mode}: a network drive, or across "
+        "Windows and WSL): readers will make rows wait"
+    )
 
 
 def move_aside(database: Path) -> None:

@@ -21,17 +21,17 @@ from typing import Any, Final
 
 from webots_mcp.bridge.backlog import Backlog, Row, Values, bind
 from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.drops import UNFIT, Drops, is_unfit
 from webots_mcp.bridge.identity import Identity
-from webots_mcp.bridge.opening import is_ours, move_aside, open_session
-from webots_mcp.bridge.pulse import Health, Pulse, write_pulse
+from webots_mcp.bridge.opening import is_ours, move_aside, open_session, why_readers_block
+from webots_mcp.bridge.pulse import END_RUN, END_SESSION, Health, Pulse, write_pulse
 from webots_mcp.bridge.registration import Registration, deregister
-from webots_mcp.bridge.run import Run, insert_run
+from webots_mcp.bridge.run import INSERT_EVENT, INSERT_STATE, Run, insert_run
 from webots_mcp.bridge.trouble import Trouble
 from webots_mcp.connection import (
     identify_files,
     is_busy,
     is_damage,
-    journal_mode,
     transaction,
 )
 from webots_mcp.contract import Database
@@ -44,24 +44,6 @@ from webots_mcp.errors import (
 
 _ROWS_PER_FLUSH: Final = 500  # about 5 ms: a loop that catches up must not stall over it
 _RETRY_INTERVAL_S: Final = 1.0
-_UNFIT: Final = (sqlite3.IntegrityError, sqlite3.DataError, UnicodeError, OverflowError)
-
-INSERT_STATE: Final = (
-    "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, odd) VALUES (?, ?, ?, ?, ?)"
-)
-INSERT_EVENT: Final = (
-    "INSERT INTO event (run_id, sim_time_s, wall_time_s, kind, name, data) "
-    "VALUES (?, ?, ?, ?, ?, ?)"
-)
-_END_RUN: Final = (
-    "UPDATE run SET end_reason = :reason, ended_wall_time_s = :now, last_wall_time_s = :now, "
-    "last_sim_time_s = :sim_time, rows = :rows WHERE id = :run"
-)
-_END_SESSION: Final = (
-    "UPDATE session SET ended_wall_time_s = ?, last_seen_wall_time_s = ?, end_reason = ?, "
-    "hold = NULL, rows_waiting = 0, rows_dropped = ?, last_error = ? WHERE id = ?"
-)
-
 
 _of_parents: list[sqlite3.Connection | None] = []
 
@@ -79,12 +61,11 @@ class Recorder:
         self._database = database
         self._identity = identity
         self._clock = clock
-        self._trouble = Trouble(strict=strict)
+        self.trouble = Trouble(strict=strict)
+        self.drops = Drops(self.trouble)
         self._backlog = Backlog()
         self._lock = threading.Lock()
         self._obstacle = "too many wait"
-        self._untold_drops = 0
-        self._dropped_because = ""
         self._seen_whole = 0
         self._files: tuple[int, ...] = ()
         self._retry_at_s = 0.0
@@ -94,7 +75,6 @@ class Recorder:
         self.registration: Registration | None = None
         self.actions: dict[str, str] = {}
         self.rows_written = 0
-        self.rows_dropped = 0
         self.last_use_s = time.monotonic()
         self._open(patient=True)
 
@@ -103,14 +83,9 @@ class Recorder:
         """Rows kept in memory until the database can take them."""
         return len(self._backlog.rows)
 
-    @property
-    def last_error(self) -> str | None:
-        """The newest thing that could not be recorded, and why."""
-        return self._trouble.last_error
-
     def complain(self, kind: str, text: str) -> None:
         """Remember what went wrong; say it on stderr once a kind; raise in strict mode."""
-        self._trouble.complain(kind, text)
+        self.trouble.complain(kind, text)
 
     # -- writing -------------------------------------------------------------------------------
 
@@ -138,7 +113,7 @@ class Recorder:
         try:
             changed = connection.execute(statement, bind(run, values)).rowcount
             self.rows_written += 1
-        except (sqlite3.Error, *_UNFIT) as error:
+        except (sqlite3.Error, *UNFIT) as error:
             self._write_failed(Row(statement, run, values), error)
             return None
         finally:
@@ -182,7 +157,7 @@ class Recorder:
         return 1 if self.flush() else None
 
     def _write_failed(self, row: Row, error: Exception) -> None:
-        if _is_unfit(error):
+        if is_unfit(error):
             self._drop(row, str(error))
         elif isinstance(error, sqlite3.Error):
             self._backlog.add(row)
@@ -191,7 +166,8 @@ class Recorder:
     def _write_waiting(self) -> None:
         while self._backlog.is_over_limit():
             self._drop(self._backlog.remove_oldest(), self._obstacle)
-        if time.monotonic() < self._retry_at_s:
+        nothing = not self._backlog.rows and not self.drops.untold
+        if nothing or time.monotonic() < self._retry_at_s:
             return
         if self.connection is not None or self._open(patient=False):
             self._drain()
@@ -209,7 +185,7 @@ class Recorder:
             for run in fresh:
                 run.id = None
             raise
-        self._untold_drops = 0
+        self.drops.untold = 0
         self.rows_written += unfit.count(None)
         for _ in batch:
             self._backlog.remove_oldest()
@@ -223,8 +199,8 @@ class Recorder:
             if row.run is not None and row.run.id is None:
                 self._insert_run(connection, row.run)
             connection.execute(row.statement, bind(row.run, row.values))
-        except _UNFIT as error:
-            if not _is_unfit(error):
+        except UNFIT as error:
+            if not is_unfit(error):
                 raise
             return str(error)
         return None
@@ -238,25 +214,19 @@ class Recorder:
     def _drop(self, row: Row, why: str) -> None:
         if row.statement == INSERT_STATE and row.run is not None:
             row.run.rows -= 1
-        self._count_dropped(1, why)
+        self.drops.count(1, why)
 
     def _drop_waiting(self, why: str) -> None:
         while self._backlog.rows:
             self._drop(self._backlog.remove_oldest(), why)
 
-    def _count_dropped(self, rows: int, why: str) -> None:
-        self.rows_dropped += rows
-        self._untold_drops += rows
-        self._dropped_because = why
-        self.complain(f"dropped: {why}", f"rows are being dropped: {why}")
-
     def _tell_drops(self, connection: sqlite3.Connection) -> None:
-        if not self._untold_drops:
+        if not self.drops.untold:
             return
         if self.run.id is None:
             self._insert_run(connection, self.run)
-        data = json.dumps({"rows": self._untold_drops, "why": self._dropped_because})
-        event = (self.run.id, self._sim_time_s, time.time(), "dropped", None, data)
+        now = (self._sim_time_s, time.time())
+        event = (self.run.id, *now, "dropped", None, self.drops.describe())
         connection.execute(INSERT_EVENT, event)
 
     @property
@@ -277,9 +247,9 @@ class Recorder:
     def _beat(self, pulse: Pulse) -> None:
         if self.connection is None or self.registration is None or self.run.id is None:
             return
-        if self._untold_drops:
+        if self.drops.untold:
             self._drain()
-        health = Health(self.rows_waiting, self.rows_dropped, self.last_error)
+        health = Health(self.rows_waiting, self.drops.rows, self.trouble.last_error)
         with transaction(self.connection):
             write_pulse(self.connection, pulse, health, self.registration.session_id, self.run)
 
@@ -293,15 +263,15 @@ class Recorder:
     def end_run(self, reason: str, sim_time_s: float) -> None:
         """The current run is over, as of the simulation time that was seen last."""
         times = {"now": time.time(), "sim_time": sim_time_s}
-        self.record(_END_RUN, self.run, {"reason": reason, **times})
+        self.record(END_RUN, self.run, {"reason": reason, **times})
 
     def end(self, reason: str, sim_time_s: float) -> None:
         """Run and session are over; what is recorded until `close` still belongs to them."""
         self.end_run(reason, sim_time_s)
         if self.registration is not None:
-            now, health = time.time(), (self.rows_dropped, self.last_error)
+            now, health = time.time(), (self.drops.rows, self.trouble.last_error)
             values = (now, now, reason, *health, self.registration.session_id)
-            self.record(_END_SESSION, None, values)
+            self.record(END_SESSION, None, values)
 
     def close(self, reason: str, sim_time_s: float) -> None:
         """Write what waits (trying for up to a second), end run and session, close the file."""
@@ -376,7 +346,7 @@ class Recorder:
         lost = self.rows_written - self._seen_whole
         self.rows_written = self._seen_whole
         if lost:
-            self._count_dropped(lost, why)
+            self.drops.count(lost, why)
 
     def _disconnect(self) -> None:
         if self.registration is not None:
@@ -410,13 +380,8 @@ class Recorder:
         opened = open_session(self._database, self._identity, actions, patient=patient)
         self.connection, self.registration = opened
         self._files = identify_files(self._database)
-        mode = journal_mode(self.connection)
-        if mode not in ("wal", "memory"):
-            self.complain(
-                "journal",
-                f"{self._database} lies where SQLite cannot share memory (journal mode {mode}: a "
-                "network drive, or across Windows and WSL): readers will make rows wait",
-            )
+        if (why := why_readers_block(self.connection)) is not None:
+            self.complain("journal", f"{self._database} {why}")
 
     def _replace_damaged(self, why: str) -> bool:
         """A damaged database, or a file of our name, is moved aside; any other file is not ours."""
@@ -430,8 +395,3 @@ class Recorder:
         self._off = f"not recording into {self._database}: {why}"
         self.complain("off", self._off)
         self._drop_waiting(self._off)
-
-
-def _is_unfit(error: Exception) -> bool:
-    """Whether the row itself is refused, whatever state the database is in."""
-    return isinstance(error, _UNFIT) and "FOREIGN KEY" not in str(error)

@@ -9,6 +9,13 @@ from typing import Final
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.registration import Registration
 
+INSERT_STATE: Final = (
+    "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, odd) VALUES (?, ?, ?, ?, ?)"
+)
+INSERT_EVENT: Final = (
+    "INSERT INTO event (run_id, sim_time_s, wall_time_s, kind, name, data) "
+    "VALUES (?, ?, ?, ?, ?, ?)"
+)
 _INSERT_RUN: Final = (
     "INSERT INTO run (session_id, robot_id, world, basic_time_step_ms, start_reason, "
     "started_wall_time_s, started_sim_time_s, last_wall_time_s, last_sim_time_s) "

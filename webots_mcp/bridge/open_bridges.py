@@ -1,0 +1,51 @@
+"""The bridges that are open in this process: one a robot, and none of a parent that forked it.
+
+A second bridge on the same robot takes over from the first.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Protocol
+
+
+class Bridge(Protocol):
+    """What is asked of a bridge here."""
+
+    def close(self, reason: str | None = None) -> None:
+        """End the session."""
+        ...
+
+    def leave_to_parent(self) -> None:
+        """In a forked child: leave the session to the parent."""
+        ...
+
+
+_bridges: dict[int, Bridge] = {}
+
+
+def enter(robot: object, bridge: Bridge) -> None:
+    """From now on this is the robot's bridge."""
+    _bridges[id(robot)] = bridge
+
+
+def leave(robot: object) -> None:
+    """The robot's bridge is closed."""
+    _bridges.pop(id(robot), None)
+
+
+def close_former(robot: object) -> None:
+    """Close the bridge that the robot had until now, if any."""
+    former = _bridges.get(id(robot))
+    if former is not None:
+        former.close("replaced")
+
+
+def _leave_to_parent() -> None:
+    for bridge in _bridges.values():
+        bridge.leave_to_parent()
+    _bridges.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_leave_to_parent)

@@ -71,7 +71,7 @@ def test_a_range_that_begins_before_the_first_row_left_says_so(
 def test_wall_time_reaches_into_what_was_purged(rover: sqlite3.Connection, tmp_path: Path) -> None:
     keep_rows(rover, tmp_path, 1500)
     start, end = WALL_START_S + 10, WALL_START_S + 40
-    found = resolve_range(rover, run_id=1, wall_start=start, wall_end=end)
+    found = resolve_range(rover, run_id=1, since=start, until=end)
     (segment,) = found.segments
     assert (segment.start_s, segment.end_s) == (
         pytest.approx(20, abs=0.2), pytest.approx(80, abs=0.2),
@@ -85,11 +85,11 @@ def test_a_run_of_which_only_rollups_are_left_is_found_by_wall_time(
     rover: sqlite3.Connection, tmp_path: Path
 ) -> None:
     keep_rows(rover, tmp_path, 900)
-    found = resolve_range(rover, wall_start=WALL_START_S, wall_end=WALL_START_S + 30)
+    found = resolve_range(rover, since=WALL_START_S, until=WALL_START_S + 30)
     assert [segment.run_id for segment in found.segments] == [1]
     assert found.segments[0].end_s == pytest.approx(60, abs=0.2)
     assert "the rows of run 1 were purged" in found.notes[0]
-    whole = resolve_range(rover, run_id=1, wall_start=WALL_START_S - 9)
+    whole = resolve_range(rover, run_id=1, since=WALL_START_S - 9)
     (run,) = query_history(rover, whole, ["pose.0"]).runs
     assert run.rows == 1150
 

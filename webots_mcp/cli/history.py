@@ -171,8 +171,8 @@ def plot(arguments: argparse.Namespace) -> None:
             start_s=arguments.start,
             end_s=arguments.end,
             last_s=arguments.last,
-            wall_start=arguments.since,
-            wall_end=arguments.until,
+            since=arguments.since,
+            until=arguments.until,
             image_format=plotting.image_format_of(file),
         )
     try:
@@ -216,8 +216,8 @@ def range_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> T
         start_s=arguments.start,
         end_s=arguments.end,
         last_s=arguments.last,
-        wall_start=arguments.since,
-        wall_end=arguments.until,
+        since=arguments.since,
+        until=arguments.until,
     )
 
 

@@ -28,8 +28,8 @@ def plot(
     start_s: float | None = None,
     end_s: float | None = None,
     last_s: float | None = None,
-    wall_start: float | str | None = None,
-    wall_end: float | str | None = None,
+    since: float | str | None = None,
+    until: float | str | None = None,
     bands: str | None = None,
     events: bool = True,
     width_px: int = WIDTH_PX,
@@ -48,8 +48,8 @@ def plot(
         start_s: The range, as of `resolve_range`; without any the whole run.
         end_s: See there.
         last_s: See there.
-        wall_start: See there.
-        wall_end: See there.
+        since: See there.
+        until: See there.
         bands: The text signal that stands behind the curves or colours the way; None for the mode,
             where there is one; "" for none (a trajectory is coloured by time then).
         events: Whether to mark events.
@@ -71,8 +71,8 @@ def plot(
             start_s=start_s,
             end_s=end_s,
             last_s=last_s,
-            wall_start=wall_start,
-            wall_end=wall_end,
+            since=since,
+            until=until,
         )
         for run_id in (tuple(dict.fromkeys(run_ids)) or (None,))
     ]

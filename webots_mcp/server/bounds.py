@@ -36,8 +36,8 @@ class Bounds:
             start_s=self.start_s,
             end_s=self.end_s,
             last_s=self.last_s,
-            wall_start=self.since,
-            wall_end=self.until,
+            since=self.since,
+            until=self.until,
         )
         if not found.segments:
             raise NothingRecordedError(

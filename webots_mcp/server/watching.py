@@ -37,7 +37,7 @@ class Window:
 
 def window_from(view: View, wall_start_s: float) -> Window:
     """The window of a robot from that wall time (Unix) on."""
-    found = resolve_range(view.connection, robot=view.robot.name, wall_start=wall_start_s)
+    found = resolve_range(view.connection, robot=view.robot.name, since=wall_start_s)
     found = newest_runs(found if found.segments else replace(found, notes=()))
     around = [
         replace(segment, start_s=_row_before(view.connection, segment))

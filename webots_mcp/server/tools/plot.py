@@ -65,8 +65,8 @@ class PlotTools:
                 start_s=start_s,
                 end_s=end_s,
                 last_s=last_s,
-                wall_start=since,
-                wall_end=until,
+                since=since,
+                until=until,
             )
             return [_caption(view, picture), Image(data=picture.data, format="png")]
 

@@ -5,7 +5,7 @@ A range is half-open, [start, end), and given in one of three ways:
 - in simulation seconds of one run (`start_s`, `end_s`; either may be left out, then the range
   reaches to the run's first row, or up to and with its newest),
 - in seconds back from a run's newest row (`last_s`; that row is in),
-- in wall time (`wall_start`, `wall_end`: ISO 8601 or Unix seconds), across the runs of a robot.
+- in wall time (`since`, `until`: ISO 8601 or Unix seconds), across the runs of a robot.
 
 Without `run_id` the run is the robot's newest. Simulation time begins again in each run, so a
 range over several runs is one segment per run.
@@ -93,8 +93,8 @@ def resolve_range(
     start_s: float | None = None,
     end_s: float | None = None,
     last_s: float | None = None,
-    wall_start: float | str | None = None,
-    wall_end: float | str | None = None,
+    since: float | str | None = None,
+    until: float | str | None = None,
 ) -> TimeRange:
     """Find what a range means in the recording.
 
@@ -103,11 +103,11 @@ def resolve_range(
         UnknownRobotError, AmbiguousRobotError, UnknownRunError: As they say.
         NothingRecordedError: The run has no state row yet.
     """
-    _reject_contradictions(start_s, end_s, last_s, wall_start, wall_end)
-    if wall_start is None and wall_end is None:
+    _reject_contradictions(start_s, end_s, last_s, since, until)
+    if since is None and until is None:
         subject = find_subject(connection, robot, run_id)
         return _in_simulation_time(connection, subject, start_s, end_s, last_s)
-    walls = (parse_wall_time(wall_start, -math.inf), parse_wall_time(wall_end, math.inf))
+    walls = (parse_wall_time(since, -math.inf), parse_wall_time(until, math.inf))
     _require_order(*walls, "since", "until")
     subject = find_subject(connection, robot, run_id)
     return _in_wall_time(connection, subject, run_id, *walls)
@@ -117,11 +117,11 @@ def _reject_contradictions(
     start_s: float | None,
     end_s: float | None,
     last_s: float | None,
-    wall_start: float | str | None,
-    wall_end: float | str | None,
+    since: float | str | None,
+    until: float | str | None,
 ) -> None:
     simulation = start_s is not None or end_s is not None
-    wall = wall_start is not None or wall_end is not None
+    wall = since is not None or until is not None
     if simulation + wall + (last_s is not None) > 1:
         raise InvalidRangeError(
             "the range is given in two ways: use start_s and end_s (simulation time), or last_s, "

@@ -21,8 +21,9 @@ ALLOWED = {
     "connection": {"contract", "errors"},
     "schema": {"connection", "contract", "errors"},
     "liveness": set[str](),
+    "notice": set[str](),
     "settlement": {"contract", "liveness"},
-    "maintenance": {"connection", "errors", "schema"},
+    "maintenance": {"connection", "errors", "notice", "schema"},
     "standin": {"standin", "bundled"},
 }
 ENTRIES = {"bundled", "maintenance", "settlement"}

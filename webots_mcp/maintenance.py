@@ -12,20 +12,21 @@ from __future__ import annotations
 
 import os
 import sqlite3
-import sys
 import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final
+from typing import Final, Literal
 
 from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect, identify_files, is_busy
 from webots_mcp.errors import WebotsMCPError
+from webots_mcp.notice import say
 from webots_mcp.schema import require_current
 
 INTERVAL_S: Final = 1.0
 HURRIED_INTERVAL_S: Final = 0.25  # while the log grows fast: a long one takes long to copy
 LEASE_S: Final = 5.0
+_LATEST_S: Final = 2 * LEASE_S  # one that ends later was taken before the clock was set back
 WAL_RESET_FIXED: Final = (3, 51, 3)
 WAL_LIMIT_BYTES: Final = 1_000_000
 FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
@@ -35,11 +36,14 @@ FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
 TAKE_LEASE: Final = (
     "INSERT INTO lease (name, holder, until_wall_time_s) VALUES ('maintainer', :holder, :until) "
     "ON CONFLICT (name) DO UPDATE SET holder = :holder, until_wall_time_s = :until "
-    "WHERE holder = :holder OR until_wall_time_s < :now "
+    "WHERE holder = :holder OR until_wall_time_s NOT BETWEEN :now AND :latest "
     "OR (:holder LIKE 'server %' AND holder LIKE 'bridge %')"
 )
 GIVE_LEASE_BACK: Final = "DELETE FROM lease WHERE name = 'maintainer' AND holder = ?"
 _HOLDER: Final = "SELECT holder, until_wall_time_s FROM lease WHERE name = 'maintainer'"
+
+
+Kind = Literal["server", "bridge", "prune"]
 
 
 class Maintainer(threading.Thread):
@@ -47,15 +51,15 @@ class Maintainer(threading.Thread):
 
     Args:
         database: The file; it may appear later.
-        kind: "server" or "bridge". A server takes the lease from a bridge.
-        on_tick: Called once an interval, lease or not; must not raise or wait.
+        kind: Who maintains. A server takes the lease from a bridge.
+        on_tick: Called once an interval, lease or not; must not wait.
         work: Called once an interval with a connection while the lease is held.
     """
 
     def __init__(
         self,
         database: Path,
-        kind: str,
+        kind: Kind,
         on_tick: Callable[[], object] | None = None,
         work: Callable[[sqlite3.Connection], object] | None = None,
     ) -> None:
@@ -71,9 +75,10 @@ class Maintainer(threading.Thread):
         self._interval_s = HURRIED_INTERVAL_S
         self._data_version = -1
         self._complained = ""
+        self.failures = 0  # rounds that were not finished
 
     def run(self) -> None:
-        """Tick until stopped; trouble with the file ends a tick, never the thread."""
+        """Tick until stopped; whatever goes wrong ends a tick, never the thread."""
         while not self._ending.wait(self._interval_s):
             self._tick_safely()
         self._give_back()
@@ -81,11 +86,12 @@ class Maintainer(threading.Thread):
     def _tick_safely(self) -> None:
         try:
             self.tick()
-        except (sqlite3.Error, WebotsMCPError, OSError) as error:
+        except Exception as error:  # noqa: BLE001  (`work` is anybody's)
             self._disconnect()
-            if not is_busy(error) and str(error) != self._complained:
-                self._complained = str(error)
-                print(f"webots-mcp: maintenance waits: {error}", file=sys.stderr)  # noqa: T201
+            self.failures += 1
+            if not is_busy(error) and repr(error) != self._complained:
+                self._complained = repr(error)
+                say(f"maintenance waits: {_described(error)}")
 
     def stop(self) -> None:
         """End the thread within an instant and give the lease back."""
@@ -128,17 +134,22 @@ class Maintainer(threading.Thread):
         """Renew at half time only, so that most ticks write nothing."""
         now = time.time()
         holder, until_s = connection.execute(_HOLDER).fetchone() or ("", 0.0)
-        if holder == self._holder and until_s - now > LEASE_S / 2:
+        if holder == self._holder and LEASE_S / 2 < until_s - now <= LEASE_S:
             return True
         outranked = holder.startswith("bridge ") and self._holder.startswith("server ")
-        if holder != self._holder and until_s >= now and not outranked:
+        if holder != self._holder and now <= until_s <= now + _LATEST_S and not outranked:
             return False
         if not holder:  # it was free: there is no checkpoint of another's to wait for
             self._held_before = True
         return self._take_lease(connection, now)
 
     def _take_lease(self, connection: sqlite3.Connection, now: float) -> bool:
-        values = {"holder": self._holder, "until": now + LEASE_S, "now": now}
+        values = {
+            "holder": self._holder,
+            "until": now + LEASE_S,
+            "now": now,
+            "latest": now + _LATEST_S,
+        }
         return connection.execute(TAKE_LEASE, values).rowcount > 0
 
     def _checkpoint(self, connection: sqlite3.Connection) -> None:
@@ -170,7 +181,7 @@ class Maintainer(threading.Thread):
         try:
             self._connection.execute(GIVE_LEASE_BACK, (self._holder,))
         except sqlite3.Error as error:
-            print(f"webots-mcp: the lease runs out by itself: {error}", file=sys.stderr)  # noqa: T201
+            say(f"the lease runs out by itself: {error}")
         self._disconnect()
 
     def _disconnect(self) -> None:
@@ -178,3 +189,10 @@ class Maintainer(threading.Thread):
             self._connection.close()
             self._connection = None
         self._held_before = False
+
+
+def _described(error: Exception) -> str:
+    """An error of the database or of ours speaks for itself; any other needs its kind."""
+    if isinstance(error, (sqlite3.Error, WebotsMCPError, OSError)):
+        return str(error)
+    return repr(error)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import sys
-
 from webots_mcp.errors import DatabaseError
+from webots_mcp.notice import say
 
 _MOST_CHARACTERS = 2000
 
@@ -27,16 +26,6 @@ class Trouble:
         self.last_error = text
         if kind not in self._said:
             self._said.add(kind)
-            _say(text)
+            say(text)
         if self._strict:
             raise DatabaseError(text)
-
-
-def _say(text: str) -> None:
-    """A stderr that is full, closed or (under pythonw) not there costs the line, not the robot."""
-    if sys.stderr is None:  # pyright: ignore[reportUnnecessaryComparison]
-        return
-    try:
-        print(f"webots-mcp: {text}", file=sys.stderr, flush=True)  # noqa: T201
-    except (OSError, ValueError):
-        return

@@ -13,8 +13,8 @@ from webots_mcp.store.history.event import EventOptions
 from webots_mcp.store.history.motion import find_motion
 from webots_mcp.store.history.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.history.registry import Signal
-from webots_mcp.store.history.series import RunHistory, query_history, signals_of
-from webots_mcp.store.history.signals import resolve_signals
+from webots_mcp.store.history.series import RunHistory, query_history
+from webots_mcp.store.history.signals import one_signal, signals_of
 from webots_mcp.store.runs import fetch_run
 
 Known = dict[str, Signal]
@@ -145,16 +145,3 @@ def mode_signal(known: Known, wanted: str | None) -> str | None:
     if signal.is_number:
         raise InvalidInputError(f"{wanted!r} holds numbers: a text or a flag colours a picture")
     return signal.name
-
-
-def one_signal(known: Known, name: str) -> Signal:
-    """The one signal that a name means.
-
-    Raises:
-        UnknownSignalError: There is none.
-        InvalidInputError: There are several.
-    """
-    signal, *more = resolve_signals(known, [name])
-    if more:
-        raise InvalidInputError(f"{name!r} means {len(more) + 1} signals: name one of them")
-    return signal

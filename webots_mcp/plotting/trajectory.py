@@ -17,7 +17,6 @@ from webots_mcp.plotting.parts import (
     known_signals,
     listed,
     mode_signal,
-    one_signal,
     parts_of,
     title_of,
 )
@@ -27,6 +26,7 @@ from webots_mcp.store.history.event import EventOptions
 from webots_mcp.store.history.motion import find_motion
 from webots_mcp.store.history.ranges import TimeRange
 from webots_mcp.store.history.registry import Signal
+from webots_mcp.store.history.signals import one_signal
 
 _FLAGS: Final = ("bumper", "collision", "collided", "contact", "touching", "stuck")
 

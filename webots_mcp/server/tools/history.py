@@ -50,8 +50,8 @@ from webots_mcp.store.history.series import (
     NumberColumns,
     RunHistory,
     query_history,
-    signals_of,
 )
+from webots_mcp.store.history.signals import signals_of
 from webots_mcp.store.recording import Recording, View
 
 _SHOWN_GAPS: Final = 10

@@ -11,13 +11,12 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.history.columns import Columns
 from webots_mcp.store.history.event import EventOptions
 from webots_mcp.store.history.gaps import GAP_INTERVALS, rhythm_of
 from webots_mcp.store.history.leaves import Value
 from webots_mcp.store.history.registry import Signal
-from webots_mcp.store.history.signals import resolve_signals
+from webots_mcp.store.history.signals import one_signal
 
 NOISE_LEG: Final = 6.0  # standard deviations: one row in 8,000 is so far from another by noise
 LONGEST_NOISE_LEG_M: Final = 0.1  # beyond, it is rather a robot that turns between any two rows
@@ -90,12 +89,7 @@ def find_motion(known: dict[str, Signal], options: EventOptions) -> Motion:
 
 
 def _named(known: dict[str, Signal], name: str | None) -> Signal | None:
-    if name is None:
-        return None
-    found = resolve_signals(known, [name])
-    if len(found) > 1:
-        raise InvalidInputError(f"{name!r} means {len(found)} signals; name one of them")
-    return found[0]
+    return None if name is None else one_signal(known, name)
 
 
 def _position(

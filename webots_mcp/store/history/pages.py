@@ -14,7 +14,7 @@ from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.history.leaves import Value
 from webots_mcp.store.history.ranges import TimeRange
 from webots_mcp.store.history.registry import Signal
-from webots_mcp.store.history.series import signals_of
+from webots_mcp.store.history.signals import signals_of
 from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.tiers import rows_after
 

@@ -16,9 +16,8 @@ from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.history.gaps import Gap
 from webots_mcp.store.history.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.history.registry import Signal
-from webots_mcp.store.history.signals import catalogue, resolve_signals
+from webots_mcp.store.history.signals import signals_of
 from webots_mcp.store.history.snapshot import in_one_snapshot
-from webots_mcp.store.history.subject import Subject
 from webots_mcp.store.history.summary import Summary, merge
 
 DEFAULT_POINTS: Final = 50
@@ -148,19 +147,6 @@ def query_history(
         for segment in time_range.segments
     ]
     return History(time_range.robot, tuple(runs), time_range.notes)
-
-
-def signals_of(
-    connection: sqlite3.Connection, time_range: TimeRange, names: Sequence[str]
-) -> list[Signal]:
-    """The signals of the range's robot that the names mean.
-
-    Raises:
-        UnknownSignalError, InvalidInputError: See `resolve_signals`.
-    """
-    run_id = time_range.segments[-1].run_id if time_range.segments else 0
-    subject = Subject(time_range.robot_id, time_range.robot, run_id)
-    return resolve_signals(catalogue(connection, subject), names)
 
 
 def _share(max_points: int, segment: Segment, total_s: float) -> int:

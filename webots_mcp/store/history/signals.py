@@ -136,6 +136,30 @@ def resolve_signals(known: dict[str, Signal], names: Sequence[str]) -> list[Sign
     return list(found.values())
 
 
+def signals_of(
+    connection: sqlite3.Connection, time_range: TimeRange, names: Sequence[str]
+) -> list[Signal]:
+    """The signals of the range's robot that the names mean.
+
+    Raises:
+        UnknownSignalError, InvalidInputError: See `resolve_signals`.
+    """
+    return resolve_signals(known_signals(connection, time_range), names)
+
+
+def one_signal(known: dict[str, Signal], name: str) -> Signal:
+    """The one signal that a name means.
+
+    Raises:
+        UnknownSignalError: There is none.
+        InvalidInputError: There are several.
+    """
+    signal, *more = resolve_signals(known, [name])
+    if more:
+        raise InvalidInputError(f"{name!r} means {len(more) + 1} signals: name one of them")
+    return signal
+
+
 def _meant(known: dict[str, Signal], name: str) -> Iterable[Signal]:
     if "*" not in name and name in known:
         return (known[name],)

@@ -13,8 +13,8 @@ from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.history.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.rollup import BUCKET_S
-from webots_mcp.store.history.series import signals_of
 from webots_mcp.store.history.shapes import find_spikes
+from webots_mcp.store.history.signals import signals_of
 from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.summary import summarise, usable_numbers
 from webots_mcp.store.history.tiers import Pieces, read_pieces

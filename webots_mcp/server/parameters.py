@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 from pydantic import AfterValidator, Field
 
+from webots_mcp import contract
 from webots_mcp.store.history.event import Kind
 
 
@@ -86,8 +87,7 @@ ShownLimit = Annotated[
     int | None,
     Field(ge=1, le=500, description="At most so many; by default as many as a short answer holds."),
 ]
-Level = Literal["debug", "info", "warning", "error"]
-LogLevel = Annotated[Level, Field(description="Log lines of this level and above.")]
+LogLevel = Annotated[contract.LogLevel, Field(description="Log lines of this level and above.")]
 Limit = Annotated[int, Field(ge=1, le=500, description="At most so many.")]
 RunIds = Annotated[
     list[_Id] | None,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final
 
 from pydantic import Field
 
+from webots_mcp.contract import LogLevel
 from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.parameters import Cursor, EndS, LastS, RobotName, RunId, StartS
 from webots_mcp.server.results import LogsAnswer, Table
@@ -17,8 +18,6 @@ from webots_mcp.store.window import resolve_window
 LOG_COLUMNS: Final = ("sim_time_s", "level", "message")
 _LONGEST_MESSAGE: Final = 500
 _BUDGET: Final = 6_000
-
-Level = Literal["debug", "info", "warning", "error"]
 
 
 class LogTools:
@@ -34,7 +33,9 @@ class LogTools:
         filter_text: Annotated[
             str, Field(max_length=200, description="Only lines that contain this text.")
         ] = "",
-        level: Annotated[Level | None, Field(description="This level and those above it.")] = None,
+        level: Annotated[
+            LogLevel | None, Field(description="This level and those above it.")
+        ] = None,
         last_s: LastS = None,
         start_s: StartS = None,
         end_s: EndS = None,

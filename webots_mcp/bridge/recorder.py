@@ -107,7 +107,7 @@ class Recorder:
             connection is None
             or self._backlog.rows
             or (run is not None and run.id is None)
-            or not self._lock.acquire(blocking=False)
+            or not self._lock.acquire(False)  # by name would take twice the time
         ):
             return self._keep(Row(statement, run, values))
         try:

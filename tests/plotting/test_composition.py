@@ -88,6 +88,15 @@ def test_events_are_of_the_drawn_signals_and_of_the_robot(rover: sqlite3.Connect
     assert (stuck.start_s, stuck.end_s) == pytest.approx((40, 52), abs=0.3)
 
 
+def test_of_an_event_that_reaches_out_of_the_range_the_part_in_it_is_drawn(
+    rover: sqlite3.Connection,
+) -> None:
+    part = whole(rover, start_s=45, end_s=50)
+    timeline, _ = compose_timeline(rover, [part], ["pose.0"])
+    (stuck,) = next(lane.spans for lane in timeline.events if lane.name == "stuck")
+    assert (stuck.start_s, stuck.end_s) == timeline.x_range == (45, 50)
+
+
 def test_a_unit_is_an_axis_and_so_is_a_scale(rover: sqlite3.Connection) -> None:
     timeline = timeline_of(rover, "pose", "battery_v", "heading")
     panels = [(panel.unit, panel.names) for panel in timeline.panels]

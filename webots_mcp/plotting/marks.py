@@ -37,19 +37,25 @@ def event_lanes(
 
 def _lane(kind: str, found: Events, part: Part) -> Lane:
     events = sorted((e for e in found.events if e.kind == kind), key=lambda event: event.start_s)
-    spans = [_span(event).moved(part.origin_s) for event in events]
+    spans = [_span(event, part).moved(part.origin_s) for event in events]
     return Lane(kind, spans, ())
 
 
-def _span(event: Event) -> Span:
+def _span(event: Event, part: Part) -> Span:
     """Named by what it is about: the signal, the action, the level, or what the bridge noticed."""
     what = event.details.get("what") if event.kind == "noticed" else event.name
-    return Span(str(what or ""), event.start_s, event.end_s)
+    return _within(Span(str(what or ""), event.start_s, event.end_s), part)
+
+
+def _within(span: Span, part: Part) -> Span:
+    """What of an event is in the picture: it may have begun before, and gone on."""
+    start_s = max(span.start_s, min(part.start_s, span.end_s))
+    return Span(span.value, start_s, min(span.end_s, max(part.end_s, start_s)))
 
 
 def stuck_mark(connection: sqlite3.Connection, part: Part, position: tuple[str, str]) -> Lane:
     """When the robot was stuck."""
     options = EventOptions(kinds=("stuck",), signals=position, position=position)
     found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=())
-    spans = [Span("stuck", event.start_s, event.end_s) for event in found.events]
+    spans = [_within(Span("stuck", e.start_s, e.end_s), part) for e in found.events]
     return Lane(f"stuck over {options.stuck_s:g} s", spans, ())

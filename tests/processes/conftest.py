@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -60,10 +61,11 @@ def start(tmp_path: Path, data_dir: Path) -> Iterator[Start]:
 
 @pytest.fixture
 def script(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
-    """Start a Python program of its own."""
+    """Start a Python program; each has a file of its own, which is not rewritten while it starts."""
+    numbers = itertools.count()
 
     def run(program: str, *arguments: object) -> subprocess.Popen[str]:
-        file = tmp_path / "program.py"
+        file = tmp_path / f"program-{next(numbers)}.py"
         file.write_text(program)
         return subprocess.Popen(
             [sys.executable, str(file), *map(str, arguments)],

@@ -61,7 +61,7 @@ def start(tmp_path: Path, data_dir: Path) -> Iterator[Start]:
 
 @pytest.fixture
 def script(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
-    """Start a Python program; each has a file of its own, which is not rewritten while it starts."""
+    """Start a Python program, from a file of its own: others may start at the same time."""
     numbers = itertools.count()
 
     def run(program: str, *arguments: object) -> subprocess.Popen[str]:

@@ -84,3 +84,18 @@ def test_two_limits_on_one_signal_are_two_events(standing: sqlite3.Connection) -
     found = find_events(standing, resolve_range(standing, start_s=250.0, end_s=255.0), options)
     told = [(event.details["below"], event.start_s, event.end_s) for event in found.events]
     assert sorted(told) == [(4.0, 200.0, 299.9), (5.0, 200.0, 299.9)]
+
+
+def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    for step in range(2000):
+        late = {"late_m": 1.0 + step} if step >= 1500 else {}
+        recorder.publish(round(step * 0.1, 6), {"x": step, **late})
+    recorder.end_run("finished")
+    roll(empty, 100_000)
+    asked = resolve_range(empty, start_s=70.0, end_s=80.0)
+    assert find_events(empty, asked, EventOptions(kinds=("silent",))).events == ()

@@ -22,6 +22,7 @@ CAMERA_FOLDER: Final = "camera"
 SCREENSHOT_FOLDER: Final = "screenshots"
 DATA_DIR_VARIABLE: Final = "WEBOTS_MCP_DATA_DIR"
 STRICT_VARIABLE: Final = "WEBOTS_MCP_STRICT"
+THROTTLE_VARIABLE: Final = "WEBOTS_MCP_THROTTLE_INTERVAL"
 
 CommandStatus = Literal["pending", "claimed", "done", "failed", "expired", "cancelled", "lost"]
 FINAL_STATUSES: Final = ("done", "failed", "expired", "cancelled", "lost")

@@ -28,30 +28,6 @@ def come_round(robot: InProcessSupervisor, bridge: MCPBridge, n: int) -> None:
     eager(bridge)
 
 
-def test_the_first_state_of_each_run_is_recorded(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
-) -> None:
-    for n in range(3):
-        come_round(robot, bridge, n)
-    robot.simulationReset()
-    for n in range(10, 14):
-        come_round(robot, bridge, n)
-    first = recording.rows("SELECT min(data ->> '$.n') FROM state GROUP BY run_id")
-    assert first == [0, 10]
-
-
-def test_auto_publish_reads_the_devices_for_the_first_row_of_a_run(
-    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
-) -> None:
-    for _ in range(3):
-        robot.step(STEP_MS)
-        bridge.auto_publish()
-    robot.simulationReset()
-    robot.step(STEP_MS)
-    bridge.auto_publish()
-    assert [set(state) for state in recording.states()] == [{"sensors", "motors", "time"}] * 2
-
-
 def test_a_pause_shows_the_state_that_it_holds(
     robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
 ) -> None:
@@ -87,7 +63,7 @@ def test_every_state_of_single_steps_is_recorded(
     recording.send("resume")
     come_round(robot, bridge, 5)
     assert recording.fate(step)[0] == "done"
-    assert numbers(recording) == [1, 3, 4, 5]
+    assert numbers(recording) == [3, 4, 5]
 
 
 def test_a_loop_that_was_quit_while_held_may_say_its_last_words(
@@ -118,7 +94,7 @@ def test_what_is_published_after_the_bridge_ended_with_the_process_is_said(tmp_p
         "from webots_mcp.standin import InProcessSupervisor\n"
         "atexit.register(lambda: bridge.publish({'n': 2}, force=True))\n"
         f"bridge = MCPBridge(InProcessSupervisor('rover'), {str(tmp_path)!r})\n"
-        "bridge.publish({'n': 1})\n"
+        "bridge.publish({'n': 1}, force=True)\n"
     )
     line = [sys.executable, "-c", program]
     done = subprocess.run(line, capture_output=True, text=True, check=True)

@@ -45,15 +45,15 @@ def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.setattr(encoding, "orjson", None)
 
 
-def test_the_first_and_every_nth_call_is_recorded_and_force_records_now(
+def test_every_nth_call_is_recorded_and_force_records_now(
     robot: InProcessSupervisor, recording: Recording
 ) -> None:
     with MCPBridge(robot, database=recording.database) as bridge:  # type: ignore[arg-type]
         for number in range(1, 12):
             bridge.publish({"number": number})
         bridge.publish({"number": 99}, force=True)
-        assert bridge.stats().publish_throttled == 8
-    assert [state["number"] for state in recording.states()] == [1, 5, 10, 99]
+        assert bridge.stats().publish_throttled == 9
+    assert [state["number"] for state in recording.states()] == [5, 10, 99]
 
 
 def test_extras_that_are_no_dict_do_not_stop_the_loop(

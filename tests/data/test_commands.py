@@ -64,14 +64,14 @@ def test_export_writes_csv_to_a_pipe(database: Path) -> None:
     line = [sys.executable, "-m", "webots_mcp", "export", "--database", str(database), "--run", "1"]
     done = subprocess.run(line, capture_output=True, text=True, timeout=60, check=True)
     rows = list(csv.DictReader(io.StringIO(done.stdout)))
-    assert len(rows) == 531
+    assert len(rows) == 530
     assert rows[0]["mode"] == "cruise"
     assert done.stderr == ""
 
 
 def test_export_takes_the_format_from_the_name(say: Say, tmp_path: Path) -> None:
     file = tmp_path / "run.jsonl"
-    assert say("export", "-o", str(file), "--since", "0") == f"{file}: 859 rows\n"
+    assert say("export", "-o", str(file), "--since", "0") == f"{file}: 858 rows\n"
     lines = [json.loads(line) for line in file.read_text().splitlines()]
     assert {line["run_id"] for line in lines} == {1, 2}
 
@@ -148,16 +148,16 @@ def test_a_dry_run_tells_what_would_go_and_deletes_nothing(say: Say, database: P
     text = say("prune", "--dry-run", "--state", "400rows")
     assert [line.split()[:2] for line in text.splitlines()] == [
         ["would", "go"],
-        ["state", "459"],
+        ["state", "458"],
     ]
     assert query(database, "SELECT count(*) FROM state") == before
 
 
 def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
     text = say("prune", "--state", "400rows", "--image", "none")
-    assert text.splitlines()[1].split()[:2] == ["state", "459"]
+    assert text.splitlines()[1].split()[:2] == ["state", "458"]
     assert query(database, "SELECT run_id, rows, purged_rows FROM robot_run") == [
-        (1, 531, 459),
+        (1, 530, 458),
         (2, 328, 0),
     ]
     assert query(database, "PRAGMA integrity_check") == [("ok",)]
@@ -172,7 +172,7 @@ def test_a_run_that_is_kept_is_named_and_stays(say: Say, database: Path) -> None
     )
     say("keep", "1", "--release")
     say("prune", "--state", "400rows")
-    assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(459,)]
+    assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(458,)]
 
 
 def test_prune_shrinks_the_file(say: Say, database: Path) -> None:

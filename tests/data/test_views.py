@@ -102,7 +102,7 @@ def test_runs_tell_durations_speed_and_rows(reader: sqlite3.Connection) -> None:
         "start_reason, end_reason FROM robot_run ORDER BY run_id"
     )
     first, second = rows(reader, sql)
-    assert first == ("rover", 19.984, 20, 531, 0, "start", "reset")
+    assert first == ("rover", 19.984, 20, 530, 0, "start", "reset")
     assert second == ("rover", pytest.approx(11.968), 12, 328, 0, "reset", "finished")
 
 

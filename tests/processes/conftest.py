@@ -78,10 +78,16 @@ def script(tmp_path: Path) -> Callable[..., subprocess.Popen[str]]:
     return run
 
 
+def last_numbers(simulation: Simulation) -> tuple[int, int]:
+    """The newest two numbers that a controller printed; -1 before the first."""
+    lines = (line.split()[-2:] for line in reversed(simulation.console))
+    numbers = (tuple(map(int, words)) for words in lines if "".join(words).isdigit())
+    return next((pair for pair in numbers if len(pair) == 2), (-1, -1))
+
+
 def last_number(simulation: Simulation) -> int:
     """The newest number that a controller printed; -1 before the first."""
-    words = [line.split()[-1] for line in reversed(simulation.console)]
-    return next((int(word) for word in words if word.isdigit()), -1)
+    return last_numbers(simulation)[1]
 
 
 def has_states(recording: Recording) -> bool:

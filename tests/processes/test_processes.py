@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from tests.bridge.conftest import Recording
-from tests.processes.conftest import Start, has_states, last_number
+from tests.processes.conftest import Start, has_states, last_number, last_numbers
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.settlement import settle
@@ -18,7 +18,8 @@ COUNTING = """
 n = 0
 while robot.step(16) != -1:
     bridge.publish({"n": n})
-    print(n, flush=True)  # only after publish() has returned
+    waiting = bridge.stats().rows_waiting  # another writer held the lock at that instant
+    print(waiting, n, flush=True)  # only after publish() has returned
     bridge.get_command()
     n += 1
 """
@@ -34,11 +35,28 @@ def test_a_controller_that_is_killed_loses_no_published_row(
     simulation.wait_for(lambda: last_number(simulation) >= rounds, timeout_s=30)
     simulation.controller("rover").kill()
     simulation.wait_for(lambda: simulation.controller("rover").exit_code is not None)
-    printed = last_number(simulation)
+    waiting, printed = last_numbers(simulation)
     recorded = [state["n"] for state in filed.states()]
     assert recorded == list(range(len(recorded)))
-    assert len(recorded) > printed
+    assert len(recorded) + waiting > printed
     assert filed.rows("PRAGMA integrity_check") == ["ok"]
+
+
+def test_an_exception_that_ends_a_controller_is_how_its_run_ended(
+    start: Start, filed: Recording
+) -> None:
+    simulation = start(
+        """
+robot.step(16)
+bridge.publish({"n": 1})
+{}["speed"]
+"""
+    )
+    simulation.wait_for(lambda: simulation.controller("rover").exit_code is not None, timeout_s=30)
+    assert filed.rows("SELECT end_reason FROM session") == ["crashed"]
+    assert filed.rows("SELECT end_reason FROM run") == ["crashed"]
+    (line,) = filed.rows("SELECT message FROM log WHERE level = 'error'")
+    assert line.startswith("the controller ended by KeyError: 'speed' (rover.py, line ")
 
 
 def test_a_killed_controllers_session_is_judged_and_its_command_is_lost(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import os
+import sys
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -20,6 +21,7 @@ from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.heart import Heart
 from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.open_bridges import OpenBridge
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.reloads import Reloads
@@ -29,6 +31,7 @@ from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import (
     LOG_LEVELS,
     STRICT_VARIABLE,
+    THROTTLE_VARIABLE,
     Database,
     MemoryDatabase,
     resolve_database,
@@ -55,7 +58,8 @@ class MCPBridge:
     Args:
         robot: The controller's `Robot` or `Supervisor`, or an instance of a subclass.
         data_dir: Folder of the database and the pictures; see `resolve_data_dir`.
-        throttle_interval: Every so many calls of `publish` one is recorded.
+        throttle_interval: Every so many calls of `publish` one is recorded; the environment
+            variable `WEBOTS_MCP_THROTTLE_INTERVAL` overrides it.
         database: A file, `":memory:"`, or a `MemoryDatabase` shared with a server; None for
             `webots.db` in the data folder.
 
@@ -72,7 +76,7 @@ class MCPBridge:
         *,
         database: str | os.PathLike[str] | MemoryDatabase | None = None,
     ) -> None:
-        self._throttle = Throttle(throttle_interval)
+        self._throttle = Throttle(int(os.environ.get(THROTTLE_VARIABLE) or throttle_interval))
         self.robot = robot
         self.database: Database
         self.data_dir: Path
@@ -87,16 +91,16 @@ class MCPBridge:
         open_bridges.close_former(robot)
         self._start_recording()
         self._begin_first_run()
-        open_bridges.enter(robot, self)
-        atexit.register(self.close)
+        open_bridges.enter(robot, OpenBridge(self.close, self._leave_to_parent))
+        atexit.register(self._close_at_exit)
 
     # -- the loop ------------------------------------------------------------------------------
 
     def publish(self, state: Mapping[Any, Any], force: bool = False) -> None:
         """Record the robot's state: every `throttle_interval`-th call, or now with `force`.
 
-        The first call of a run is recorded as well, and each one while a command makes single
-        steps: what is shown of a paused robot is its newest state.
+        Each call is recorded where a command pauses or makes single steps: what is shown of a
+        paused robot is its newest state.
 
         Args:
             state: Nested dicts, sequences, numbers, texts, numpy arrays, dataclasses, ... What
@@ -263,16 +267,11 @@ class MCPBridge:
         if self._closed:
             return
         self._closed = True
-        atexit.unregister(self.close)
+        atexit.unregister(self._close_at_exit)
         open_bridges.leave(self.robot)
         if self._maintainer is not None:
             self._maintainer.stop()
         self._recorder.close(reason or self._end_reason, self._clock.sim_time_s)
-
-    def leave_to_parent(self) -> None:
-        """In a forked child: leave the session to the parent; what is published here is dropped."""
-        self._closed = True
-        self._recorder.abandon()
 
     def __enter__(self) -> MCPBridge:
         return self
@@ -339,7 +338,6 @@ class MCPBridge:
         self._recorder.end_run("reset", self._clock.ended_sim_time_s)
         self._recorder.run = self._clock.run
         self._changes.forget()
-        self._throttle.want()
         self._reloads.happened()
         self._journal.event("reset")
         self._reloads.fire()
@@ -366,6 +364,22 @@ class MCPBridge:
                 self._journal.event("change", {"from": before, "to": after}, name)
         self._heart.beat_if_due()
         self._cost.add(time.perf_counter() - started_s)
+
+    def _leave_to_parent(self) -> None:
+        """In a forked child: leave the session to the parent; what is published here is dropped."""
+        self._closed = True
+        self._recorder.abandon()
+
+    def _close_at_exit(self) -> None:
+        """The interpreter ends; it keeps the exception that nobody caught, if that is why.
+
+        At a prompt it keeps the last one that was shown, which ended nothing.
+        """
+        error = None if hasattr(sys, "ps1") else getattr(sys, "last_value", None)
+        if isinstance(error, Exception):
+            self.log(f"the controller ended by {describe(error)}", "error")
+            self.close("crashed")
+        self.close()
 
     def _read_devices(self, include_time: bool) -> dict[str, object]:
         """What the devices say; without what cannot be read, which is counted."""

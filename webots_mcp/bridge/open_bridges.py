@@ -6,25 +6,26 @@ A second bridge on the same robot takes over from the first.
 from __future__ import annotations
 
 import os
-from typing import Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 
-class Bridge(Protocol):
-    """What is asked of a bridge here."""
+class OpenBridge(NamedTuple):
+    """What can be asked of a bridge here.
 
-    def close(self, reason: str | None = None) -> None:
-        """End the session."""
-        ...
+    Attributes:
+        close: End its session, for a reason.
+        abandon: In a forked child: leave the session to the parent.
+    """
 
-    def leave_to_parent(self) -> None:
-        """In a forked child: leave the session to the parent."""
-        ...
-
-
-_bridges: dict[int, Bridge] = {}
+    close: Callable[[str], object]
+    abandon: Callable[[], object]
 
 
-def enter(robot: object, bridge: Bridge) -> None:
+_bridges: dict[int, OpenBridge] = {}
+
+
+def enter(robot: object, bridge: OpenBridge) -> None:
     """From now on this is the robot's bridge."""
     _bridges[id(robot)] = bridge
 
@@ -43,7 +44,7 @@ def close_former(robot: object) -> None:
 
 def _leave_to_parent() -> None:
     for bridge in _bridges.values():
-        bridge.leave_to_parent()
+        bridge.abandon()
     _bridges.clear()
 
 

@@ -7,7 +7,7 @@ class Throttle:
     """Every so many calls one is recorded, and whenever somebody waits for the newest state.
 
     Args:
-        interval: Every so many; the first call is always recorded.
+        interval: Every so many.
 
     Raises:
         ValueError: The interval is less than 1.
@@ -17,7 +17,7 @@ class Throttle:
         if interval < 1:
             raise ValueError(f"throttle_interval must be 1 or more, got {interval!r}")
         self._interval = interval
-        self._wanted = True
+        self._wanted = False
         self.calls = 0
         self.skipped = 0
         self.stale = False  # what was published last is not what was recorded last

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from webots_mcp.connection import connect
-from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, THROTTLE_VARIABLE
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.schema import require_current
 from webots_mcp.standin import Mode, Simulation, StandInError
@@ -57,7 +57,11 @@ class RecordedSimulation(Simulation):
             mode="pause",
             console=console,
             controllers=controllers,
-            environment={DATA_DIR_VARIABLE: str(data_dir), **(environment or {})},
+            environment={
+                DATA_DIR_VARIABLE: str(data_dir),
+                THROTTLE_VARIABLE: "1",
+                **(environment or {}),
+            },
         )
         for name, file in (controllers or {}).items():
             self.controller(name)

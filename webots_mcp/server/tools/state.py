@@ -24,8 +24,8 @@ from webots_mcp.store.sessions import fetch_session
 from webots_mcp.store.states import State, select
 
 _PUBLISH: Final = (
-    "nothing was published in this run yet: call bridge.publish({...}) in the controller's loop "
-    "(every 5th call is recorded, or each one with force=True)"
+    "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "
+    "controller's loop every 5th is (throttle_interval), or each one with force=True"
 )
 _EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND rows > 0"
 _EVENTS: Final = 10

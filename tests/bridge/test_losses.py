@@ -190,6 +190,7 @@ def test_rows_of_several_threads_are_all_written(bridge: MCPBridge, filed: Recor
         thread.start()
     while any(thread.is_alive() for thread in threads):
         heartbeat_now(bridge)
+        threads[0].join(0.001)  # a loop that never waits would take the threads their turns
     flush(bridge)
     assert filed.rows("SELECT count(*) FROM log WHERE source = 'controller'") == [800]
     assert bridge.stats().rows_dropped == 0

@@ -49,6 +49,10 @@ class Clock:
         """From this moment on time moves; it counts as standing only after a while without."""
         self.moved_wall_time_s = time.time()
 
+    def newest_s(self, run: Run) -> float:
+        """The newest simulation time of the current run, or of the one before it."""
+        return self.sim_time_s if run is self.run else self.ended_sim_time_s
+
     def await_reset(self) -> None:
         """A reset was asked for. It comes with the end of the next physics step.
 

@@ -78,10 +78,8 @@ class CommandQueue:
                 database is in trouble.
         """
         recorder, now = self._recorder, time.time()
-        connection, registration = recorder.connection, recorder.registration
-        if connection is None or registration is None:
-            return None
-        if connection.execute(PEEK, (registration.robot_id, now)).fetchone() is None:
+        registration = recorder.registration
+        if registration is None or not recorder.fetch(PEEK, (registration.robot_id, now)):
             return None
         ids = {"session": registration.session_id, "robot": registration.robot_id}
         times = {"now": now, "sim_time": sim_time_s}

@@ -28,12 +28,7 @@ from webots_mcp.bridge.pulse import END_RUN, END_SESSION, Health, Pulse, write_p
 from webots_mcp.bridge.registration import Registration, deregister
 from webots_mcp.bridge.run import INSERT_EVENT, INSERT_STATE, Run, insert_run
 from webots_mcp.bridge.trouble import Trouble
-from webots_mcp.connection import (
-    identify_files,
-    is_busy,
-    is_damage,
-    transaction,
-)
+from webots_mcp.connection import identify_files, is_busy, is_damage, transaction
 from webots_mcp.contract import Database
 from webots_mcp.errors import (
     DatabaseError,
@@ -43,6 +38,7 @@ from webots_mcp.errors import (
 )
 
 _ROWS_PER_FLUSH: Final = 500  # about 5 ms: a loop that catches up must not stall over it
+_FLUSH_S: Final = 0.005  # beside busy threads each row may cost a turn of theirs
 _RETRY_INTERVAL_S: Final = 1.0
 
 _of_parents: list[sqlite3.Connection | None] = []
@@ -121,14 +117,14 @@ class Recorder:
         return changed
 
     def fetch(self, statement: str, values: Values) -> Sequence[Any]:
-        """The rows of a statement that writes; none while another thread writes.
+        """The rows that a statement reads or changes; none while another thread writes.
 
         Raises:
             sqlite3.Error: It cannot be run, at least now.
         """
         if self.connection is None or not self._lock.acquire(blocking=False):
             return ()
-        try:  # fetchall: a RETURNING that is not read to its end keeps the write lock
+        try:  # to the end: a RETURNING that is not read so far keeps the write lock
             return self.connection.execute(statement, values).fetchall()
         finally:
             self._lock.release()
@@ -179,7 +175,7 @@ class Recorder:
         fresh = {row.run for row in batch if row.run is not None and row.run.id is None}
         try:
             with transaction(self.connection):
-                unfit = [self._write(self.connection, row) for row in batch]
+                unfit = self._write_batch(self.connection, batch)
                 self._tell_drops(self.connection)
         except BaseException:
             for run in fresh:
@@ -187,11 +183,20 @@ class Recorder:
             raise
         self.drops.untold = 0
         self.rows_written += unfit.count(None)
-        for _ in batch:
-            self._backlog.remove_oldest()
-        for row, why in zip(batch, unfit, strict=True):
+        for why in unfit:
+            row = self._backlog.remove_oldest()
             if why is not None:
                 self._drop(row, why)
+
+    def _write_batch(self, connection: sqlite3.Connection, batch: list[Row]) -> list[str | None]:
+        """Of each row that there was time for, why it is never taken; None where it was."""
+        until_s = time.monotonic() + _FLUSH_S
+        unfit: list[str | None] = []
+        for row in batch:
+            unfit.append(self._write(connection, row))
+            if time.monotonic() > until_s:
+                break
+        return unfit
 
     def _write(self, connection: sqlite3.Connection, row: Row) -> str | None:
         """Write the row; or why the database will never take it, which stops no other row."""
@@ -225,15 +230,9 @@ class Recorder:
             return
         if self.run.id is None:
             self._insert_run(connection, self.run)
-        now = (self._sim_time_s, time.time())
+        now = (self._clock.newest_s(self.run), time.time())
         event = (self.run.id, *now, "dropped", None, self.drops.describe())
         connection.execute(INSERT_EVENT, event)
-
-    @property
-    def _sim_time_s(self) -> float:
-        """The newest simulation time of the run that is recorded."""
-        clock = self._clock
-        return clock.sim_time_s if clock.run is self.run else clock.ended_sim_time_s
 
     # -- heartbeat and end ---------------------------------------------------------------------
 
@@ -336,7 +335,7 @@ class Recorder:
         for run in {self.run, *(row.run for row in waiting if row.run is not None)}:
             run.id, run.rows = None, states[run]
         data = json.dumps({"why": why})
-        event = (self._sim_time_s, time.time(), "storage", None, data)
+        event = (self._clock.newest_s(self.run), time.time(), "storage", None, data)
         self._backlog.add_first(Row(INSERT_EVENT, self.run, event))
         self._lose_what_was_not_seen(why)
         self.complain("storage", f"{why}; recording goes on in a new database")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import sqlite3
 import subprocess
 import sys
@@ -61,6 +62,11 @@ def words(picture: Picture) -> set[str]:
     return {"".join(text.itertext()).strip() for text in texts}
 
 
+def drawn(picture: Picture) -> bytes:
+    """Without the names of clip paths: they are made of places whose last digits vary."""
+    return re.sub(rb'(#|id=")p[0-9a-f]{10}', rb"\1p", picture.data)
+
+
 @pytest.mark.parametrize("question", QUESTIONS.values(), ids=QUESTIONS)
 def test_every_kind_of_picture_is_a_png_of_the_size_that_was_asked_for(
     rover: sqlite3.Connection, question: Ask
@@ -82,7 +88,7 @@ def test_every_kind_of_picture_is_an_svg_that_is_the_same_each_time(
     picture = ask(rover, **question, image_format="svg")
     assert picture.media_type == "image/svg+xml"
     assert len(words(picture)) > 5
-    assert picture.data == ask(rover, **question, image_format="svg").data
+    assert drawn(picture) == drawn(ask(rover, **question, image_format="svg"))
 
 
 def test_a_picture_names_what_it_shows(rover: sqlite3.Connection) -> None:

@@ -371,10 +371,7 @@ class MCPBridge:
         self._recorder.abandon()
 
     def _close_at_exit(self) -> None:
-        """The interpreter ends; it keeps the exception that nobody caught, if that is why.
-
-        At a prompt it keeps the last one that was shown, which ended nothing.
-        """
+        """The interpreter keeps the exception that ends it; at a prompt it keeps others too."""
         error = None if hasattr(sys, "ps1") else getattr(sys, "last_value", None)
         if isinstance(error, Exception):
             self.log(f"the controller ended by {describe(error)}", "error")

@@ -1,0 +1,243 @@
+"""What the built-in actions do: pause, resume, step, fast, reset, reset_state, screenshot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from PIL import Image
+
+from tests.bridge.conftest import STEP_MS, Recording, eager
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.standin import InProcessRobot, InProcessSupervisor
+
+
+def test_pause_holds_the_loop_and_resume_lets_it_go(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    drive: Callable[[int], None],
+) -> None:
+    drive(2)
+    at_s = robot.getTime()
+    pause, resume = recording.send("pause"), recording.send("resume")
+    drive(1)
+    assert recording.fate(pause)[1] == {"mode": "pause", "sim_time_s": pytest.approx(at_s + 0.016)}
+    assert recording.fate(resume)[1]["mode"] == "real_time"
+    drive(1)
+    kinds = recording.rows("SELECT kind FROM event WHERE kind IN ('pause', 'resume') ORDER BY id")
+    assert kinds == ["pause", "resume"]
+
+
+def test_step_runs_the_users_own_loop_so_often_and_pauses_again(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    drive: Callable[[int], None],
+) -> None:
+    drive(1)
+    pause, step = recording.send("pause"), recording.send("step", steps=5)
+    drive(1)  # paused, then let go for five steps
+    from_s = robot.getTime()
+    drive(4)
+    assert recording.fate(step)[0] == "claimed"
+    assert robot.simulationGetMode() != robot.SIMULATION_MODE_PAUSE
+    resume = recording.send("resume")
+    drive(1)  # the fifth: held, until the resume is found
+    status, result, _ = recording.fate(step)
+    assert status == "done"
+    assert result["steps"] == 5
+    assert result["advanced_s"] == pytest.approx(5 * 0.016)
+    assert result["sim_time_s"] == pytest.approx(from_s + 5 * 0.016)
+    assert result["mode"] == "pause"
+    assert [recording.fate(c)[0] for c in (pause, resume)] == ["done", "done"]
+
+
+@pytest.mark.parametrize(("asked", "in_a_round", "of_rounds"), [(4, 2, 1), (3, 1, 5)])
+def test_steps_are_those_of_the_simulation_however_often_the_loop_asks(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    asked: int,
+    in_a_round: int,
+    of_rounds: int,
+) -> None:
+    step = recording.send("step", steps=asked)
+    eager(bridge)
+    from_s = robot.getTime()
+    resume: int | None = None
+    for i in range(1, 11):
+        robot.step(STEP_MS)
+        bridge.publish({"n": i})
+        if i >= asked and resume is None:
+            resume = recording.send("resume")  # or the hold would last for ever
+        if i % of_rounds == 0:
+            for _ in range(in_a_round):
+                bridge.get_command()
+        if recording.fate(step)[0] == "done":
+            break
+    _, result, error = recording.fate(step)
+    assert error is None
+    assert result["steps"] == (asked if of_rounds == 1 else of_rounds)
+    assert result["advanced_s"] == pytest.approx(result["steps"] * STEP_MS / 1000)
+    assert result["sim_time_s"] == pytest.approx(from_s + result["advanced_s"])
+
+
+def test_a_pause_in_the_middle_of_steps_says_that_they_were_interrupted(
+    bridge: MCPBridge, recording: Recording, drive: Callable[[int], None]
+) -> None:
+    step = recording.send("step", steps=100)
+    drive(3)
+    pause = recording.send("pause")
+    recording.send("resume")
+    drive(1)
+    status, _, error = recording.fate(step)
+    assert (status, error) == ("failed", f"interrupted by command {pause} (pause)")
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2.5, "three", True, 1_000_000])
+def test_a_step_count_out_of_bounds_is_refused(
+    bridge: MCPBridge, recording: Recording, steps: object
+) -> None:
+    sent = recording.send("step", steps=steps)
+    eager(bridge)
+    status, _, error = recording.fate(sent)
+    assert status == "failed"
+    assert error is not None and "steps must be a whole number from 1 to 100000" in error
+
+
+def test_fast_sets_the_fast_mode(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    robot.simulationSetMode(robot.SIMULATION_MODE_REAL_TIME)
+    sent = recording.send("fast")
+    eager(bridge)
+    assert robot.simulationGetMode() == robot.SIMULATION_MODE_FAST
+    assert recording.fate(sent)[1]["mode"] == "fast"
+
+
+def test_a_person_pressing_play_ends_the_hold(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.register_command("press_play", lambda _: robot.simulation.resume())
+    recording.send("pause")
+    recording.send("press_play")
+    eager(bridge)
+    assert robot.step(STEP_MS) == 0
+    notes = recording.rows("SELECT data FROM event WHERE kind = 'resume'")
+    assert "in Webots" in notes[0]
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_reset_is_done_when_time_went_back_and_names_the_new_run(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    drive: Callable[[int], None],
+    paused: bool,
+) -> None:
+    drive(10)
+    before = bridge.run_id
+    if paused:
+        recording.send("pause")
+    sent = recording.send("reset")
+    drive(2 if paused else 1)
+    drive(1)
+    status, result, _ = recording.fate(sent)
+    assert status == "done"
+    assert result["run_id"] == bridge.run_id != before
+    assert robot.getTime() < 0.1
+
+
+def test_a_reset_right_after_the_start_is_noticed_as_well(
+    bridge: MCPBridge, recording: Recording, drive: Callable[[int], None]
+) -> None:
+    drive(1)
+    sent = recording.send("reset")
+    drive(3)
+    assert recording.fate(sent)[0] == "done"
+    assert recording.rows("SELECT count(*) FROM run") == [2]
+
+
+@pytest.mark.parametrize("steps", [0, 1, 5])
+def test_a_loop_that_publishes_after_its_commands_sees_one_reset(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, steps: int
+) -> None:
+    for _ in range(steps):
+        robot.step(STEP_MS)
+        eager(bridge)
+        bridge.publish({"n": 1})
+    sent = recording.send("reset")
+    for _ in range(4):
+        eager(bridge)
+        bridge.publish({"n": 2})
+        robot.step(STEP_MS)
+    eager(bridge)
+    assert recording.fate(sent)[0] == "done"
+    assert recording.rows("SELECT start_reason FROM run ORDER BY id") == ["start", "reset"]
+
+
+def test_reset_state_runs_the_callbacks_or_says_that_there_are_none(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    refused = recording.send("reset_state")
+    eager(bridge)
+    assert "registered no callback" in (recording.fate(refused)[2] or "")
+    calls: list[int] = []
+    bridge.on_reload(lambda: calls.append(1))
+    sent = recording.send("reset_state")
+    eager(bridge)
+    assert calls == [1]
+    assert recording.fate(sent)[:2] == ("done", {"callbacks": 1})
+
+
+def test_reset_state_fails_where_a_callback_did(
+    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
+) -> None:
+    calls: list[int] = []
+    with MCPBridge(robot, database=database) as bridge:
+        bridge.on_reload(lambda: 1 // 0)
+        bridge.on_reload(lambda: calls.append(1))
+        sent = recording.send("reset_state")
+        eager(bridge)
+    status, _, error = recording.fate(sent)
+    assert (status, calls) == ("failed", [1])
+    assert error is not None
+    assert error.startswith("1 of 2 callbacks failed: ZeroDivisionError: ")
+
+
+def test_a_callback_may_ask_for_commands_itself(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.on_reload(lambda: eager(bridge))
+    bridge.register_command("greet", lambda _: "hello")
+    sent, inside = recording.send("reset_state"), recording.send("greet")
+    eager(bridge)
+    assert recording.fate(sent) == ("done", {"callbacks": 1}, None)
+    assert recording.fate(inside) == ("done", "hello", None)
+
+
+def test_a_screenshot_is_done_when_its_file_is_complete(
+    bridge: MCPBridge, recording: Recording, drive: Callable[[int], None]
+) -> None:
+    sent = recording.send("screenshot")
+    drive(3)
+    status, result, _ = recording.fate(sent)
+    assert status == "done"
+    file = bridge.data_dir / result["path"]
+    with Image.open(file) as picture:
+        assert picture.size == (result["width"], result["height"])
+    sql = "SELECT kind, path, bytes FROM image"
+    assert recording.rows(sql) == [("screenshot", result["path"], file.stat().st_size)]
+
+
+def test_a_plain_robot_refuses_what_needs_a_supervisor(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    actions = ("pause", "resume", "fast", "step", "reset", "reload", "screenshot")
+    with MCPBridge(InProcessRobot("rover"), database=database) as bridge:
+        for action in actions:
+            sent = recording.send(action)
+            eager(bridge)
+            status, _, error = recording.fate(sent)
+            assert status == "failed"
+            assert error is not None
+            assert error.startswith(f"{action} needs a Supervisor") and "Supervisor()" in error

@@ -140,4 +140,4 @@ def _why_nothing(view: View) -> str:
         )
     if view.status.why is None:
         return "nothing was recorded because the simulation is paused: resume it and watch again"
-    return f"nothing was recorded: {view.status.why}"
+    return "nothing was recorded, for the reason that stands under why; lookback_s tells the past"

@@ -31,6 +31,24 @@ def process_alive(pid: int, last_seen_wall_time_s: float) -> bool:
     return started_s <= last_seen_wall_time_s + _TOLERANCE_S
 
 
+def process_identity(pid: int) -> str | None:
+    """Which process of this host that pid names now, whatever the wall clock is set to.
+
+    A pid comes back; its boot and its start within that boot do not. On Windows the creation
+    time, which setting the clock does not change afterwards. None where there is no such process
+    or the system does not tell (macOS).
+    """
+    if sys.platform == "win32":
+        created = _windows_creation(pid)
+        return f"{created}" if created else None
+    try:
+        ticks = _linux_stat(pid)[19]
+        with open("/proc/sys/kernel/random/boot_id", "rb") as file:  # noqa: PTH123
+            return f"{file.read().decode().strip()} {int(ticks)}"
+    except (OSError, IndexError, ValueError):
+        return None
+
+
 def _posix_start(pid: int) -> float | None:
     """Unix time of the process' start, 0 where it is not told, None where there is no process."""
     try:
@@ -43,13 +61,9 @@ def _posix_start(pid: int) -> float | None:
 
 
 def _linux_start(pid: int) -> float | None:
-    """See proc_pid_stat(5): the state is the third field, the start in clock ticks the 22nd.
-
-    A process that ended but was not yet waited for ("Z") still has a pid.
-    """
+    """A process that ended but was not yet waited for ("Z") still has a pid."""
     try:
-        with open(f"/proc/{pid}/stat", "rb") as file:  # noqa: PTH123  (no pathlib in the loop)
-            fields = file.read().rpartition(b") ")[2].split()
+        fields = _linux_stat(pid)
         if fields[0] == b"Z":
             return None
         since_boot_s = int(fields[19]) / os.sysconf("SC_CLK_TCK")
@@ -58,8 +72,23 @@ def _linux_start(pid: int) -> float | None:
         return 0.0
 
 
+def _linux_stat(pid: int) -> list[bytes]:
+    """From its state on, which proc_pid_stat(5) has third; the start in clock ticks is 22nd."""
+    with open(f"/proc/{pid}/stat", "rb") as file:  # noqa: PTH123  (no pathlib in the loop)
+        return file.read().rpartition(b") ")[2].split()
+
+
 def _windows_start(pid: int) -> float | None:
-    """As `_posix_start`; os.kill(pid, 0) would end the process on Windows, asking does not."""
+    """As `_posix_start`."""
+    created = _windows_creation(pid)
+    return created / 1e7 - _WINDOWS_EPOCH_S if created else created
+
+
+def _windows_creation(pid: int) -> int | None:
+    """In 100 ns since 1601; 0 where it is not told, None where there is no process.
+
+    os.kill(pid, 0) would end the process on Windows, asking does not.
+    """
     import ctypes
 
     query_limited_information, still_active = 0x1000, 259
@@ -73,4 +102,4 @@ def _windows_start(pid: int) -> float | None:
     kernel.CloseHandle(handle)
     if code.value != still_active:
         return None
-    return times[0] / 1e7 - _WINDOWS_EPOCH_S if told else 0.0
+    return int(times[0]) if told else 0

@@ -8,11 +8,12 @@ importing anything but the standard library.
 from __future__ import annotations
 
 import sqlite3
+import time
 from pathlib import Path
 from typing import Final
 
 from webots_mcp.connection import transaction
-from webots_mcp.contract import APPLICATION_ID, SCHEMA_VERSION
+from webots_mcp.contract import APPLICATION_ID, SCHEMA_VERSION, new_uuid
 from webots_mcp.errors import ForeignDatabaseError, SchemaTooNewError, SchemaTooOldError
 
 SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
@@ -22,6 +23,7 @@ _STAMPS: Final = (
     "SELECT (SELECT application_id FROM pragma_application_id), "
     "(SELECT user_version FROM pragma_user_version), (SELECT count(*) FROM sqlite_master)"
 )
+_NEW_RECORDING: Final = "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)"
 
 
 def schema_version(connection: sqlite3.Connection) -> int:
@@ -65,12 +67,14 @@ def require_current(connection: sqlite3.Connection) -> None:
 def create_schema(connection: sqlite3.Connection) -> None:
     """Make the tables in an empty database; of several starters at once, one does it.
 
-    The check and the tables stand in one transaction that takes the write lock first.
+    The database gets its UUID, the one row of `recording`. The check, the tables and that row
+    stand in one transaction that takes the write lock first.
     """
     with transaction(connection):
         if schema_version(connection) == 0:
             for statement in _statements():
                 connection.execute(statement)
+            connection.execute(_NEW_RECORDING, (new_uuid(), time.time()))
 
 
 def _statements() -> list[str]:

@@ -1,5 +1,5 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 3;
+PRAGMA user_version = 4;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
@@ -41,7 +41,7 @@ CREATE TABLE session (
 	rows_dropped INTEGER DEFAULT 0 NOT NULL /* rows that could never be written */, 
 	last_error TEXT /* newest thing that could not be recorded, and why */, 
 	ended_wall_time_s FLOAT, 
-	end_reason TEXT /* finished, reload, crashed, replaced */, 
+	end_reason TEXT /* finished, reload, crashed, replaced */, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, process TEXT /* which process of that pid; null where the system does not tell */ NULL, last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */ NULL, extern INTEGER /* 1 where nobody starts the controller again */ NULL, hold_mode TEXT /* simulation mode to go back to when the hold ends */ NULL, adopted_rows INTEGER DEFAULT 0 /* rows of its spill file that were taken in */ NOT NULL, 
 	CONSTRAINT fk_session_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_session_robot_id_id ON session (robot_id, id);
@@ -84,7 +84,7 @@ CREATE TABLE run (
 	end_reason TEXT /* finished, reset, reload, crashed, replaced */, 
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows, as of last_wall_time_s */, 
 	label TEXT, 
-	note TEXT, keep INTEGER /* 1: retention deletes nothing of this run */ DEFAULT 0 NOT NULL, purged_rows INTEGER /* of the rows, those that retention has deleted */ DEFAULT 0 NOT NULL, 
+	note TEXT, keep INTEGER /* 1: retention deletes nothing of this run */ DEFAULT 0 NOT NULL, purged_rows INTEGER /* of the rows, those that retention has deleted */ DEFAULT 0 NOT NULL, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, 
 	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
 	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE
 );
@@ -122,7 +122,7 @@ CREATE TABLE log (
 	wall_time_s FLOAT NOT NULL, 
 	level TEXT NOT NULL /* debug, info, warning, error */, 
 	source TEXT NOT NULL /* controller or bridge */, 
-	message TEXT NOT NULL, 
+	message TEXT NOT NULL, logger TEXT /* name of the Python logger, where one logged it */ NULL, 
 	CONSTRAINT fk_log_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_log_run_id_sim_time_s ON log (run_id, sim_time_s);
@@ -331,4 +331,11 @@ FROM (
       WHERE b.run_id = e.run_id AND b.kind = 'change' AND b.name = e.name AND b.id < e.id))
   ) c
 ) p JOIN run u ON u.id = p.run_id;
-INSERT INTO alembic_version (version_num) VALUES ('0003');
+CREATE TABLE recording (
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	PRIMARY KEY (uuid)
+);
+CREATE UNIQUE INDEX ix_session_uuid ON session (uuid);
+CREATE UNIQUE INDEX ix_run_uuid ON run (uuid);
+INSERT INTO alembic_version (version_num) VALUES ('0004');

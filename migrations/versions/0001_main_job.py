@@ -14,8 +14,9 @@ TABLES = ("image", "event", "log", "state", "command", "run", "session", "robot"
 
 
 def upgrade() -> None:
-    op.execute("PRAGMA application_id = 1463962947")
-    op.execute("PRAGMA user_version = 1")
+    if op.get_context().dialect.name == "sqlite":
+        op.execute("PRAGMA application_id = 1463962947")
+        op.execute("PRAGMA user_version = 1")
     op.create_table(
         "lease",
         sa.Column("name", sa.Text(), nullable=False),
@@ -191,6 +192,7 @@ def upgrade() -> None:
         ["robot_id", "id"],
         unique=False,
         sqlite_where=sa.text("status = 'claimed'"),
+        postgresql_where=sa.text("status = 'claimed'"),
     )
     op.create_index(
         "ix_command_pending",
@@ -198,6 +200,7 @@ def upgrade() -> None:
         ["robot_id", "id"],
         unique=False,
         sqlite_where=sa.text("status = 'pending'"),
+        postgresql_where=sa.text("status = 'pending'"),
     )
     op.create_table(
         "run",
@@ -327,4 +330,5 @@ def upgrade() -> None:
 def downgrade() -> None:
     for table in TABLES:
         op.drop_table(table)
-    op.execute("PRAGMA user_version = 0")
+    if op.get_context().dialect.name == "sqlite":
+        op.execute("PRAGMA user_version = 0")

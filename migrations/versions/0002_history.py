@@ -122,10 +122,12 @@ def upgrade() -> None:
         sa.Column("state_id", sa.Integer(), nullable=False),
         sa.PrimaryKeyConstraint("name"),
     )
-    op.execute("PRAGMA user_version = 2")
+    if op.get_context().dialect.name == "sqlite":
+        op.execute("PRAGMA user_version = 2")
 
 
 def downgrade() -> None:
     for table in TABLES:
         op.drop_table(table)
-    op.execute("PRAGMA user_version = 1")
+    if op.get_context().dialect.name == "sqlite":
+        op.execute("PRAGMA user_version = 1")

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from webots_mcp.contract import host_name
+from webots_mcp.liveness import process_identity
 
 
 class Identity(NamedTuple):
@@ -21,8 +22,10 @@ class Identity(NamedTuple):
     world: str | None
     basic_time_step_ms: float | None
     pid: int
+    process: str | None
     host: str
     instance: str
+    extern: bool
     controller: str | None
     controller_sha256: str | None
     git_commit: str | None
@@ -40,8 +43,10 @@ def identify(robot: Any, supervisor: bool, version: str) -> Identity:
         world=_plain_text(robot.getWorldPath()) if hasattr(robot, "getWorldPath") else None,
         basic_time_step_ms=float(robot.getBasicTimeStep()),
         pid=os.getpid(),
+        process=process_identity(os.getpid()),
         host=host_name(),
         instance=_instance(),
+        extern=_is_extern(),
         controller=_plain_text(controller) if controller else None,
         controller_sha256=_sha256(controller) if controller else None,
         git_commit=_git_commit(controller.parent) if controller else None,
@@ -72,6 +77,11 @@ def _devices(robot: Any) -> dict[str, Any]:
 def _instance() -> str:
     """Which Webots this is: its own temporary folder, else the process that started this one."""
     return os.environ.get("WEBOTS_INSTANCE_PATH") or f"{host_name()}:{os.getppid()}"
+
+
+def _is_extern() -> bool:
+    """Whether somebody else than Webots started this process, and so nobody will start another."""
+    return "WEBOTS_CONTROLLER_URL" in os.environ and "WEBOTS_INSTANCE_PATH" not in os.environ
 
 
 def _sha256(file: Path) -> str | None:

@@ -13,13 +13,14 @@ END_RUN: Final = (
     "last_sim_time_s = :sim_time, rows = :rows WHERE id = :run"
 )
 END_SESSION: Final = (
-    "UPDATE session SET ended_wall_time_s = ?, last_seen_wall_time_s = ?, end_reason = ?, "
-    "hold = NULL, rows_waiting = 0, rows_dropped = ?, last_error = ? WHERE id = ?"
+    "UPDATE session SET ended_wall_time_s = ?, last_seen_wall_time_s = ?, "
+    "last_seen_monotonic_s = ?, end_reason = ?, hold = NULL, rows_waiting = 0, rows_dropped = ?, "
+    "last_error = ? WHERE id = ?"
 )
 _BEAT_SESSION: Final = (
-    "UPDATE session SET last_seen_wall_time_s = ?, last_poll_wall_time_s = ?, "
-    "moved_wall_time_s = ?, sim_time_s = ?, hold = ?, rows_waiting = ?, rows_dropped = ?, "
-    "last_error = ? WHERE id = ?"
+    "UPDATE session SET last_seen_wall_time_s = ?, last_seen_monotonic_s = ?, "
+    "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, hold = ?, "
+    "rows_waiting = ?, rows_dropped = ?, last_error = ? WHERE id = ?"
 )
 _BEAT_RUN: Final = "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, rows = ? WHERE id = ?"
 
@@ -46,6 +47,6 @@ def write_pulse(
 ) -> None:
     """Write session and run as they are now, inside a transaction of the caller."""
     now = time.time()
-    loop = (now, pulse.last_poll_wall_time_s, pulse.moved_wall_time_s, pulse.sim_time_s)
-    connection.execute(_BEAT_SESSION, (*loop, pulse.hold, *health, session_id))
+    seen = (now, time.monotonic(), pulse.last_poll_wall_time_s, pulse.moved_wall_time_s)
+    connection.execute(_BEAT_SESSION, (*seen, pulse.sim_time_s, pulse.hold, *health, session_id))
     connection.execute(_BEAT_RUN, (now, pulse.sim_time_s, run.rows, run.id))

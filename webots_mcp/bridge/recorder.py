@@ -269,7 +269,8 @@ class Recorder:
         self.end_run(reason, sim_time_s)
         if self.registration is not None:
             now, health = time.time(), (self.drops.rows, self.trouble.last_error)
-            values = (now, now, reason, *health, self.registration.session_id)
+            times = (now, now, time.monotonic())
+            values = (*times, reason, *health, self.registration.session_id)
             self.record(END_SESSION, None, values)
 
     def close(self, reason: str, sim_time_s: float) -> None:
@@ -333,7 +334,7 @@ class Recorder:
         waiting = tuple(self._backlog.rows)
         states = Counter(row.run for row in waiting if row.statement == INSERT_STATE)
         for run in {self.run, *(row.run for row in waiting if row.run is not None)}:
-            run.id, run.rows = None, states[run]
+            run.begin_anew(states[run])
         data = json.dumps({"why": why})
         event = (self._clock.newest_s(self.run), time.time(), "storage", None, data)
         self._backlog.add_first(Row(INSERT_EVENT, self.run, event))

@@ -5,12 +5,13 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
+import time
 from typing import Final, NamedTuple
 
 from webots_mcp import settlement
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.connection import transaction
-from webots_mcp.contract import REMOTE_SILENCE_S
+from webots_mcp.contract import REMOTE_SILENCE_S, new_uuid
 from webots_mcp.liveness import process_alive
 
 _KNOWN_ROBOT: Final = (
@@ -34,9 +35,10 @@ _RELOADED: Final = (
 )
 _LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
 _NEW_SESSION: Final = (
-    "INSERT INTO session (robot_id, pid, host, instance, controller, controller_sha256, "
-    "git_commit, versions, supervisor, actions, started_wall_time_s, last_seen_wall_time_s) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
+    "INSERT INTO session (uuid, robot_id, pid, process, host, instance, extern, controller, "
+    "controller_sha256, git_commit, versions, supervisor, actions, started_wall_time_s, "
+    "last_seen_wall_time_s, last_seen_monotonic_s) "
+    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 )
 
 # Sessions of this very process. A pid alone does not tell: in a container the same one comes back.
@@ -123,10 +125,12 @@ def _enter_robot(
 def _enter_session(
     connection: sqlite3.Connection, identity: Identity, robot_id: int, actions: str, now_s: float
 ) -> int:
-    who = (robot_id, identity.pid, identity.host, identity.instance)
+    process = (identity.pid, identity.process, identity.host, identity.instance)
+    who = (new_uuid(), robot_id, *process, int(identity.extern))
     code = (identity.controller, identity.controller_sha256, identity.git_commit)
     versions = json.dumps(identity.versions)
-    values = (*who, *code, versions, int(identity.supervisor), actions, now_s, now_s)
+    times = (now_s, now_s, time.monotonic())
+    values = (*who, *code, versions, int(identity.supervisor), actions, *times)
     session_id = connection.execute(_NEW_SESSION, values).lastrowid
     assert session_id is not None
     return session_id

@@ -8,6 +8,7 @@ from typing import Final
 
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.registration import Registration
+from webots_mcp.contract import new_uuid
 
 INSERT_STATE: Final = (
     "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, odd) VALUES (?, ?, ?, ?, ?)"
@@ -17,23 +18,28 @@ INSERT_EVENT: Final = (
     "VALUES (?, ?, ?, ?, ?, ?)"
 )
 _INSERT_RUN: Final = (
-    "INSERT INTO run (session_id, robot_id, world, basic_time_step_ms, start_reason, "
+    "INSERT INTO run (uuid, session_id, robot_id, world, basic_time_step_ms, start_reason, "
     "started_wall_time_s, started_sim_time_s, last_wall_time_s, last_sim_time_s) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
+    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
 )
 
 
 class Run:
     """A stretch of rising simulation time; its id is None until its row is written."""
 
-    __slots__ = ("id", "rows", "start_reason", "started_sim_time_s", "started_wall_time_s")
+    __slots__ = ("id", "rows", "start_reason", "started_sim_time_s", "started_wall_time_s", "uuid")
 
     def __init__(self, start_reason: str, sim_time_s: float) -> None:
-        self.id: int | None = None
-        self.rows = 0
+        self.begin_anew(0)
         self.start_reason = start_reason
         self.started_sim_time_s = sim_time_s
         self.started_wall_time_s = time.time()
+
+    def begin_anew(self, rows: int) -> None:
+        """It has no row yet, or none in the database that is written to from now on."""
+        self.id: int | None = None
+        self.uuid = new_uuid()
+        self.rows = rows
 
 
 def insert_run(
@@ -42,5 +48,5 @@ def insert_run(
     """Write the run's row, from which on its id is known."""
     begun = (run.started_wall_time_s, run.started_sim_time_s)
     where = (identity.world, identity.basic_time_step_ms, run.start_reason)
-    values = (owner.session_id, owner.robot_id, *where, *begun, *begun)
+    values = (run.uuid, owner.session_id, owner.robot_id, *where, *begun, *begun)
     run.id = connection.execute(_INSERT_RUN, values).lastrowid

@@ -18,6 +18,7 @@ SQLModel.metadata.naming_convention = {
     "uq": "uq_%(table_name)s_%(column_0_name)s",
 }
 _KEEP_IDS = {"sqlite_autoincrement": True}
+_UUID = "random (version 4); names the row among those of all machines"
 
 
 def _id() -> Any:
@@ -55,6 +56,19 @@ def _count(comment: str | None = None) -> Any:
     return _column(Integer, comment, nullable=False, server_default=text("0"))
 
 
+def _partial(name: str, where: str) -> Index:
+    """Of commands: an index that holds only the few rows that are asked for all the time."""
+    condition = text(where)
+    return Index(name, "robot_id", "id", sqlite_where=condition, postgresql_where=condition)
+
+
+class Recording(SQLModel, table=True):
+    """This database: its one row is made with the tables."""
+
+    uuid: str = Field(sa_column=Column(Text, primary_key=True, comment=_UUID))
+    created_wall_time_s: float = _number(nullable=False)
+
+
 class Robot(SQLModel, table=True):
     """A robot name that was ever seen."""
 
@@ -72,7 +86,7 @@ class Robot(SQLModel, table=True):
 class Session(SQLModel, table=True):
     """One controller process, or one bridge in it."""
 
-    __table_args__ = (Index(None, "robot_id", "id"), _KEEP_IDS)
+    __table_args__ = (Index(None, "robot_id", "id"), Index(None, "uuid", unique=True), _KEEP_IDS)
     id: int | None = _id()
     robot_id: int = _to("robot")
     pid: int = _column(Integer, nullable=False)
@@ -95,12 +109,25 @@ class Session(SQLModel, table=True):
     last_error: str | None = _text("newest thing that could not be recorded, and why")
     ended_wall_time_s: float | None = _number()
     end_reason: str | None = _text("finished, reload, crashed, replaced")
+    uuid: str | None = _text(_UUID)
+    process: str | None = _text("which process of that pid; null where the system does not tell")
+    last_seen_monotonic_s: float | None = _number(
+        "the host's monotonic clock at last_seen_wall_time_s"
+    )
+    extern: bool | None = _column(Integer, "1 where nobody starts the controller again")
+    hold_mode: str | None = _text("simulation mode to go back to when the hold ends")
+    adopted_rows: int = _count("rows of its spill file that were taken in")
 
 
 class Run(SQLModel, table=True):
     """A stretch of rising simulation time in a session; a reset or a reload begins the next."""
 
-    __table_args__ = (Index(None, "robot_id", "id"), Index(None, "session_id"), _KEEP_IDS)
+    __table_args__ = (
+        Index(None, "robot_id", "id"),
+        Index(None, "session_id"),
+        Index(None, "uuid", unique=True),
+        _KEEP_IDS,
+    )
     id: int | None = _id()
     session_id: int = _to("session")
     robot_id: int = _to("robot")
@@ -118,6 +145,7 @@ class Run(SQLModel, table=True):
     note: str | None = _text()
     keep: bool = _count("1: retention deletes nothing of this run")
     purged_rows: int = _count("of the rows, those that retention has deleted")
+    uuid: str | None = _text(_UUID)
 
 
 class State(SQLModel, table=True):
@@ -205,6 +233,7 @@ class Log(SQLModel, table=True):
     level: str = _text("debug, info, warning, error", nullable=False)
     source: str = _text("controller or bridge", nullable=False)
     message: str = _text(nullable=False)
+    logger: str | None = _text("name of the Python logger, where one logged it")
 
 
 class Event(SQLModel, table=True):
@@ -226,8 +255,8 @@ class Command(SQLModel, table=True):
     """A request to a robot and its fate: claimed by one session, at most once."""
 
     __table_args__ = (
-        Index("ix_command_pending", "robot_id", "id", sqlite_where=text("status = 'pending'")),
-        Index("ix_command_claimed", "robot_id", "id", sqlite_where=text("status = 'claimed'")),
+        _partial("ix_command_pending", "status = 'pending'"),
+        _partial("ix_command_claimed", "status = 'claimed'"),
         _KEEP_IDS,
     )
     id: int | None = _id()

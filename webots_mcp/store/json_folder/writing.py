@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.connection import transaction
-from webots_mcp.contract import CAMERA_FOLDER, SCREENSHOT_FOLDER
+from webots_mcp.contract import CAMERA_FOLDER, SCREENSHOT_FOLDER, new_uuid
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.json_folder.reading import (
     COMMANDS,
@@ -187,10 +187,16 @@ class _Writer:
         ended = {"ended_wall_time_s": self._last_s, "end_reason": "finished"}
         where = {"pid": 0, "host": socket.gethostname(), "instance": instance, "supervisor": 0}
         session_id = self._insert(
-            "session", **started, **ended, **where, last_seen_wall_time_s=self._last_s
+            "session",
+            uuid=new_uuid(),
+            **started,
+            **ended,
+            **where,
+            last_seen_wall_time_s=self._last_s,
         )
         self.run_id = self._insert(
             "run",
+            uuid=new_uuid(),
             **started,
             **ended,
             session_id=session_id,

@@ -1,0 +1,219 @@
+"""Every recording, session and run has a UUID, so that those of many machines can be pooled."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import subprocess
+import sys
+import time
+import uuid
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.bridge.conftest import heartbeat_now
+from webots_mcp import MCPBridge
+from webots_mcp.connection import connect
+from webots_mcp.contract import new_uuid
+from webots_mcp.liveness import process_identity
+from webots_mcp.schema import create_schema
+from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.json_folder.writing import import_folder
+from webots_mcp.store.migrate import downgrade, upgrade
+
+OLD_ROWS = (
+    "INSERT INTO robot (name, kind, first_seen_wall_time_s, last_seen_wall_time_s) "
+    "VALUES ('rover', 'Robot', 1.0, 2.0)",
+    *(
+        "INSERT INTO session (robot_id, pid, host, instance, supervisor, started_wall_time_s, "
+        f"last_seen_wall_time_s) VALUES (1, 7, 'here', 'i', 0, {started_s}, 2.0)"
+        for started_s in (1.5, 1.25, 1.75)
+    ),
+    *(
+        "INSERT INTO run (session_id, robot_id, start_reason, started_wall_time_s, "
+        f"started_sim_time_s, last_wall_time_s, last_sim_time_s, note) "
+        f"VALUES ({session_id}, 1, 'start', 1, 0, 2, 1, 'n{session_id}')"
+        for session_id in (1, 2, 3)
+    ),
+    *(
+        "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) "
+        f"VALUES ({run_id}, 0.5, 1.5, '{{}}')"
+        for run_id in (1, 2, 3)
+    ),
+    "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
+    "VALUES (2, 0.5, 1.5, 'info', 'bridge', 'm')",
+)
+
+
+def is_random_uuid(text: str) -> bool:
+    return str(uuid.UUID(text)) == text and uuid.UUID(text).version == 4
+
+
+def uuids(connection: sqlite3.Connection, table: str) -> list[str]:
+    found = [text for (text,) in connection.execute(f"SELECT uuid FROM {table}")]
+    assert all(map(is_random_uuid, found)), found
+    return found
+
+
+def test_new_uuids_are_random_ones_of_version_4() -> None:
+    made = [new_uuid() for _ in range(1000)]
+    assert all(map(is_random_uuid, made))
+    assert len(set(made)) == len(made)
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """A database of schema 3 with three sessions and what belongs to them."""
+    file = tmp_path / "webots.db"
+    upgrade(file, "0003")
+    with closing(connect(file, "writer")) as connection:
+        for statement in OLD_ROWS:
+            connection.execute(statement)
+    return file
+
+
+def everything(connection: sqlite3.Connection) -> list[object]:
+    tables = ("robot", "session", "run", "state", "log")
+    return [connection.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
+
+
+def test_rows_of_an_older_database_are_named_once_and_for_all(old: Path) -> None:
+    upgrade(old)
+    with closing(connect(old, "reader")) as connection:
+        before = [uuids(connection, table) for table in ("recording", "session", "run")]
+    upgrade(old)
+    with closing(connect(old, "reader")) as connection:
+        assert before == [uuids(connection, table) for table in ("recording", "session", "run")]
+        created_s = connection.execute("SELECT created_wall_time_s FROM recording").fetchall()
+    assert [len(set(named)) for named in before] == [1, 3, 3]
+    assert created_s == [(1.25,)]  # when its first session started
+
+
+def test_no_row_is_lost_on_the_way_forward_and_back(old: Path) -> None:
+    with closing(connect(old, "reader")) as connection:
+        before = everything(connection)
+    upgrade(old)
+    with closing(connect(old, "reader")) as connection:
+        assert connection.execute("SELECT note FROM robot_run ORDER BY run_id").fetchall() == [
+            ("n1",),
+            ("n2",),
+            ("n3",),
+        ]
+    downgrade(old, "0003")
+    with closing(connect(old, "reader")) as connection:
+        assert everything(connection) == before
+
+
+@pytest.mark.parametrize("table", ["session", "run"])
+def test_two_rows_cannot_have_the_same_uuid(old: Path, table: str) -> None:
+    upgrade(old)
+    with (
+        closing(connect(old, "writer")) as connection,
+        pytest.raises(sqlite3.IntegrityError, match=f"{table}.uuid"),
+    ):
+        connection.execute(f"UPDATE {table} SET uuid = (SELECT uuid FROM {table} WHERE id = 1)")
+
+
+def test_starters_at_once_make_one_recording(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    with (
+        closing(connect(file, "writer", create=True)) as first,
+        closing(connect(file, "writer", create=True)) as second,
+    ):
+        create_schema(first)
+        create_schema(second)
+        assert len(uuids(second, "recording")) == 1
+
+
+def test_a_bridge_names_its_session_and_each_of_its_runs(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    robot = InProcessSupervisor()
+    bridge = MCPBridge(robot, database=file, throttle_interval=1)
+    robot.step(160)
+    bridge.publish({"x": 1})
+    robot.simulationReset()
+    robot.step(16)
+    bridge.publish({"x": 2})
+    bridge.close()
+    with closing(connect(file, "reader")) as connection:
+        assert len(uuids(connection, "recording")) == 1
+        assert len(uuids(connection, "session")) == 1
+        assert len(set(uuids(connection, "run"))) == 2
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be moved there")
+def test_a_run_that_goes_on_in_a_new_database_is_another_one_there(tmp_path: Path) -> None:
+    file, moved = tmp_path / "webots.db", tmp_path / "moved.db"
+    bridge = MCPBridge(InProcessSupervisor(), database=file)
+    bridge.publish({"x": 1})
+    for suffix in ("", "-wal", "-shm"):
+        file.with_name(f"{file.name}{suffix}").rename(f"{moved}{suffix}")
+    heartbeat_now(bridge)
+    bridge.close()
+    runs: list[str] = []
+    for database in (file, moved):
+        with closing(connect(database, "reader")) as connection:
+            runs += uuids(connection, "run")
+    assert len(set(runs)) == 2
+
+
+def test_a_bridge_says_when_it_was_last_seen_by_a_clock_that_nobody_sets(tmp_path: Path) -> None:
+    before_s = time.monotonic()
+    bridge = MCPBridge(InProcessSupervisor(), database=tmp_path / "webots.db")
+    bridge.get_command()
+    bridge.close()
+    with closing(connect(tmp_path / "webots.db", "reader")) as connection:
+        (seen_s,) = connection.execute("SELECT last_seen_monotonic_s FROM session").fetchone()
+    assert before_s < seen_s < time.monotonic()
+
+
+@pytest.mark.parametrize(
+    ("variables", "extern"),
+    [
+        ({}, 0),
+        ({"WEBOTS_CONTROLLER_URL": "tcp://here:1234/rover"}, 1),
+        ({"WEBOTS_CONTROLLER_URL": "ipc://1234/rover", "WEBOTS_INSTANCE_PATH": "/tmp/webots"}, 0),
+    ],
+)
+def test_a_session_says_whether_anybody_starts_its_controller_again(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    variables: dict[str, str],
+    extern: int,
+) -> None:
+    for name in ("WEBOTS_CONTROLLER_URL", "WEBOTS_INSTANCE_PATH"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    MCPBridge(InProcessSupervisor(), database=tmp_path / "webots.db").close()
+    with closing(connect(tmp_path / "webots.db", "reader")) as connection:
+        assert connection.execute("SELECT extern FROM session").fetchall() == [(extern,)]
+
+
+def test_a_session_says_which_process_of_its_pid_it_is(tmp_path: Path) -> None:
+    MCPBridge(InProcessSupervisor(), database=tmp_path / "webots.db").close()
+    with closing(connect(tmp_path / "webots.db", "reader")) as connection:
+        (process,) = connection.execute("SELECT process FROM session").fetchone()
+    assert process == process_identity(os.getpid())
+
+
+@pytest.mark.skipif(not sys.platform.startswith(("linux", "win")), reason="not told there")
+def test_two_processes_are_told_apart_and_one_that_ended_is_none() -> None:
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as other:
+        told = process_identity(other.pid)
+        assert told == process_identity(other.pid)
+        assert None is not told != process_identity(os.getpid())
+        other.communicate(b"\n")
+    assert process_identity(other.pid) is None
+
+
+def test_an_imported_folder_is_named_as_well(tmp_path: Path) -> None:
+    folder = tmp_path / "old"
+    folder.mkdir()
+    (folder / "status.json").write_text('{"x": 1, "timestamp": 1700000000.0}')
+    with closing(connect(tmp_path / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+        import_folder(connection, folder, tmp_path)
+        assert len(uuids(connection, "session")) == len(uuids(connection, "run")) == 1

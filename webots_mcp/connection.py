@@ -7,17 +7,20 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Generator
+import time
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
-from typing import Final, Literal
+from typing import Final, Literal, TypeVar
 
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import DatabaseError, NoDatabaseError
 
 Role = Literal["loop", "writer", "reader"]
+T = TypeVar("T")
 
 OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
 OPENING_TIMEOUT_MS: Final = 5000
+LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write waits so long
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
 
@@ -96,6 +99,49 @@ def transaction(connection: sqlite3.Connection) -> Generator[None]:
         if connection.in_transaction:  # a full disk has ended it already
             connection.execute("ROLLBACK")
         raise
+
+
+class ShortWrites:
+    """Work in transactions that hold the write lock for about a millisecond, commit included.
+
+    What an item costs differs a hundredfold from one recording to another, so it is measured: a
+    transaction ends when the next item and the commit of all of them would go beyond the time.
+
+    Attributes:
+        held_s: How long the last transaction held the lock.
+        longest_held_s: How long the longest one did.
+    """
+
+    def __init__(self, connection: sqlite3.Connection, limit_s: float = LONGEST_WRITE_S) -> None:
+        self._connection = connection
+        self._limit_s = limit_s
+        self._commit_s = 0.0  # of an item, about
+        self.held_s = 0.0
+        self.longest_held_s = 0.0
+
+    def write(self, items: Iterable[T], store: Callable[[T], object]) -> int:
+        """Store the first items in one transaction; returns how many: one at least, if any.
+
+        Raises:
+            sqlite3.Error: Also where the lock is not to be had (`is_busy`); nothing was stored.
+        """
+        stored, started_s, working_s = 0, 0.0, 0.0
+        with transaction(self._connection):
+            started_s = time.perf_counter()
+            for item in items:
+                store(item)
+                stored += 1
+                working_s = time.perf_counter() - started_s
+                if (stored + 1) * (working_s / stored + self._commit_s) > self._limit_s:
+                    break
+        self._measure(time.perf_counter() - started_s, working_s, stored)
+        return stored
+
+    def _measure(self, held_s: float, working_s: float, stored: int) -> None:
+        self.held_s = held_s
+        self.longest_held_s = max(self.longest_held_s, held_s)
+        if stored:
+            self._commit_s = (self._commit_s + (held_s - working_s) / stored) / 2
 
 
 def is_busy(error: Exception) -> bool:

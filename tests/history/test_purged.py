@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.history.recording import WALL_START_S, record_rover
+from webots_mcp.store.history.compare import compare_code, compare_runs
 from webots_mcp.store.history.events import find_events
 from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.history.rollup import roll
@@ -100,3 +101,15 @@ def test_where_rows_were_purged_events_do_not_claim_to_have_looked_at_them(
     keep_rows(rover, tmp_path, 1500)
     notes = find_events(rover, resolve_range(rover, run_id=1)).notes
     assert any("searched from 55 s on only" in note for note in notes)
+
+
+@pytest.mark.parametrize("rows", [900, 1500])
+def test_the_distance_of_a_run_that_lost_rows_is_not_known(
+    rover: sqlite3.Connection, tmp_path: Path, rows: int
+) -> None:
+    keep_rows(rover, tmp_path, rows)
+    comparison = compare_runs(rover, [1, 3])
+    first, third = comparison.groups
+    assert first.distance_m is None and third.distance_m is not None
+    assert any("run 1 were purged" in note and "distance" in note for note in comparison.notes)
+    assert compare_code(rover).groups[0].distance_m is None  # a part is not known, so the sum

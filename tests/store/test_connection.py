@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.memory import memory_connection
-from webots_mcp.connection import connect, is_busy, is_damage, transaction
+from webots_mcp.connection import ShortWrites, connect, is_busy, is_damage, transaction
 
 LEASE = "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (?, 'somebody', 0)"
 COUNT = "SELECT count(*) FROM lease"
@@ -46,6 +46,31 @@ def test_a_transaction_beside_another_is_busy_and_runs_nothing(tmp_path: Path) -
         pytest.fail("two transactions wrote at once")
     assert is_busy(refused.value)
     assert not is_damage(refused.value)
+
+
+def test_a_short_write_ends_when_its_time_is_over_and_goes_on_where_it_ended() -> None:
+    with memory_connection() as connection:
+        names = [(f"{number}",) for number in range(100)]
+
+        def store(name: tuple[str]) -> None:
+            connection.execute(LEASE, name)
+
+        one_each = ShortWrites(connection, limit_s=0.0)
+        assert [one_each.write(names[number:], store) for number in range(3)] == [1, 1, 1]
+        assert ShortWrites(connection, limit_s=60.0).write(names[3:], store) == 97
+        assert connection.execute(COUNT).fetchone() == (100,)
+        assert one_each.longest_held_s >= one_each.held_s > 0
+        assert one_each.write([], store) == 0
+
+
+def test_of_a_short_write_that_fails_nothing_is_stored() -> None:
+    with memory_connection() as connection:
+        connection.execute(LEASE, ("b",))
+        with pytest.raises(sqlite3.IntegrityError):
+            ShortWrites(connection, limit_s=60.0).write(
+                [("a",), ("b",)], lambda name: connection.execute(LEASE, name)
+            )
+        assert connection.execute(COUNT).fetchone() == (1,)
 
 
 def test_a_file_that_is_no_database_is_damage_and_not_busy(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ class Album:
         except ValueError as error:
             raise CommandRefusedError(f"camera {device!r} has no image yet") from error
         name = f"{_file_name(self._robot_name)}.{_file_name(device)}"
-        kept = self._kept.setdefault(name, self._kept_before(name))
+        kept = self._kept_of(name)
         path = f"{CAMERA_FOLDER}/{name}.{_next_number(kept):06d}.png"
         size = self._write(path, encode_png(image, width, height))
         row = (self._clock.sim_time_s, time.time(), "camera", device, path, width, height, size)
@@ -77,8 +77,14 @@ class Album:
         registration = self._recorder.registration
         return registration.robot_name if registration else "robot"
 
-    def _kept_before(self, name: str) -> deque[str]:
-        """What an earlier session of the robot left in the folder."""
+    def _kept_of(self, name: str) -> deque[str]:
+        """The frames of a device that are there, oldest first; the folder is listed once."""
+        if name not in self._kept:
+            self._kept[name] = self._left_before(name)
+        return self._kept[name]
+
+    def _left_before(self, name: str) -> deque[str]:
+        """What an earlier session of the robot left: listing costs 1 us a file of any camera."""
         folder = self._data_dir / CAMERA_FOLDER
         files = sorted(file.name for file in folder.glob(f"{name}.[0-9]*.png"))
         return deque(f"{CAMERA_FOLDER}/{file}" for file in files)

@@ -38,7 +38,8 @@ COUNTED: Final[tuple[Kind, ...]] = (
 
 _CODE_OF_RUNS: Final = (
     "SELECT r.id, s.controller_sha256 FROM run r JOIN session s ON s.id = r.session_id "
-    "WHERE r.robot_id = ? AND EXISTS (SELECT 1 FROM state WHERE run_id = r.id) ORDER BY r.id DESC"
+    "WHERE r.robot_id = ? AND (r.rows > 0 OR EXISTS (SELECT 1 FROM state WHERE run_id = r.id)) "
+    "ORDER BY r.id DESC"
 )
 
 
@@ -48,7 +49,8 @@ class Group:
 
     Attributes:
         duration_s: Simulated seconds, of all its runs together like the next three.
-        distance_m: Travelled; None if no position is published.
+        distance_m: Travelled; None if one of its runs publishes no position, or lost rows to a
+            purge: summaries of 10 s do not tell the way in between.
         time_by_mode_s: Simulated seconds in each mode; empty if no mode is published.
         events: How many of each kind.
     """
@@ -221,7 +223,10 @@ def _notes(runs: Sequence[RunInfo]) -> list[str]:
         notes.append(f"these are runs of different robots: {', '.join(robots)}")
     purged = [str(run.run_id) for run in runs if run.purged_rows]
     if purged:
-        notes.append(f"rows of run {', '.join(purged)} were purged: events and distance lack them")
+        notes.append(
+            f"rows of run {', '.join(purged)} were purged: events lack them, and the distance is "
+            "not known (null)"
+        )
     return notes
 
 
@@ -329,8 +334,12 @@ def _group(
     deadline: Deadline,
 ) -> Group:
     runs = tuple(run_info(connection, part.segment.run_id) for part in parts)
-    distances = [_distance(connection, part, deadline) for part in parts]
+    distances = [
+        None if run.purged_rows else _distance(connection, part, deadline)
+        for run, part in zip(runs, parts, strict=True)
+    ]
     known = [distance for distance in distances if distance is not None]
+    distance_m = sum(known) if len(known) == len(distances) else None
     modes: dict[str, float] = {}
     for part in parts:
         for mode, seconds in _mode_times(connection, part, deadline).items():
@@ -340,7 +349,7 @@ def _group(
         events.update(event.kind for event in _events(connection, part, options, deadline))
     duration_s = sum(run.duration_s for run in runs)
     by_mode = dict(sorted(modes.items(), key=lambda item: -item[1]))
-    return Group(name, runs, duration_s, sum(known) if known else None, by_mode, dict(events))
+    return Group(name, runs, duration_s, distance_m, by_mode, dict(events))
 
 
 def _distance(connection: sqlite3.Connection, part: _Part, deadline: Deadline) -> float | None:

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated, Final
+from collections.abc import AsyncGenerator
+from contextlib import asynccontextmanager
+from typing import Annotated, Any, Final
 
+import anyio
+from anyio import to_thread
 from pydantic import Field
 
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.fitting import LONGEST_NAME, header_of_only
 from webots_mcp.server.history_results import SqlAnswer
 from webots_mcp.server.parameters import ShownLimit
 from webots_mcp.server.results import Table
 from webots_mcp.server.shortening import cut_text
-from webots_mcp.store.history.sql import Cell, query_sql
+from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S
+from webots_mcp.store.history.sql import Cell, Result, require_select
+from webots_mcp.store.history.sql_process import FOLDER, LINE, Statement, as_file, decode
 from webots_mcp.store.recording import Recording
 
 DEFAULT_ROWS: Final = 100
 _BUDGET_BYTES: Final = 4_400  # of values: quotes and brackets come to it
 _LARGE_BUDGET_BYTES: Final = 20_000
 _MOST_COLUMNS: Final = 60
+_AT_ONCE: Final = 2
+_LONGEST_WAIT_S: Final = 30.0
+_PROCESS_TIMEOUT_S: Final = 20.0  # its own deadline counts from when it has started
 
 
 class SqlTools:
@@ -27,9 +37,10 @@ class SqlTools:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
+        self._turns = anyio.Semaphore(_AT_ONCE)
 
     @tool("Query by SQL", READS)
-    def webots_query_sql(
+    async def webots_query_sql(
         self,
         sql: Annotated[str, Field(min_length=1, max_length=10_000, description="One SELECT.")],
         limit: ShownLimit = None,
@@ -43,19 +54,52 @@ class SqlTools:
         robot_log, robot_command. Ask by run_id and sim_time_s: they are indexed. Values of a state:
         json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.
         """
+        budget = _BUDGET_BYTES if limit is None else _LARGE_BUDGET_BYTES
+        require_select(sql)
+        header = await to_thread.run_sync(self._header)
+        found = await self._run(sql, limit or DEFAULT_ROWS, budget)
+        columns = [cut_text(name, LONGEST_NAME) for name in found.columns[:_MOST_COLUMNS]]
+        rows = [[_cell(cell) for cell in row[:_MOST_COLUMNS]] for row in found.rows]
+        more = len(found.columns) > _MOST_COLUMNS
+        return SqlAnswer(
+            **header,
+            result=Table(columns=columns, rows=rows),
+            truncated=found.truncated,
+            shortened=found.shortened or None,
+            hint=f"only the first {_MOST_COLUMNS} columns are shown" if more else _none(rows),
+        )
+
+    def _header(self) -> dict[str, Any]:
         with self._recording.reader() as connection:
-            budget = _BUDGET_BYTES if limit is None else _LARGE_BUDGET_BYTES
-            found = query_sql(connection, sql, max_rows=limit or DEFAULT_ROWS, max_bytes=budget)
-            columns = [cut_text(name, LONGEST_NAME) for name in found.columns[:_MOST_COLUMNS]]
-            rows = [[_cell(cell) for cell in row[:_MOST_COLUMNS]] for row in found.rows]
-            more = len(found.columns) > _MOST_COLUMNS
-            return SqlAnswer(
-                **header_of_only(connection),
-                result=Table(columns=columns, rows=rows),
-                truncated=found.truncated,
-                shortened=found.shortened or None,
-                hint=f"only the first {_MOST_COLUMNS} columns are shown" if more else _none(rows),
+            return header_of_only(connection)
+
+    async def _run(self, sql: str, max_rows: int, max_bytes: int) -> Result:
+        """Run it in a process of its own, which ends with its deadline or with the asker."""
+        async with self._turn():
+            with as_file(self._recording.database) as file:
+                asked = Statement(str(file), sql, max_rows, max_bytes, QUESTION_DEADLINE_S)
+                with anyio.move_on_after(_PROCESS_TIMEOUT_S):
+                    ended = await anyio.run_process(
+                        LINE, input=asked.encoded(), check=False, stderr=None, cwd=FOLDER
+                    )
+                    return decode(ended.stdout, asked)
+        raise InvalidInputError(
+            f"no process answered within {_PROCESS_TIMEOUT_S:g} s: this machine is overloaded"
+        )
+
+    @asynccontextmanager
+    async def _turn(self) -> AsyncGenerator[None]:
+        """Wait until few enough statements run; they take memory and a processor each."""
+        with anyio.move_on_after(_LONGEST_WAIT_S) as waiting:
+            await self._turns.acquire()
+        if waiting.cancelled_caught:
+            raise InvalidInputError(
+                f"other statements were running for {_LONGEST_WAIT_S:g} s: ask again, one at a time"
             )
+        try:
+            yield
+        finally:
+            self._turns.release()
 
 
 def _cell(cell: Cell) -> Cell:

@@ -2,7 +2,9 @@
 
 What keeps it harmless: an authorizer that lets a statement read and call functions and nothing
 else, one statement, a deadline by a progress handler, and limits on rows, bytes and the length of
-a value. The connection may be any; one in the role "reader" cannot write anyway.
+a value. The deadline is looked at between the steps of SQLite's virtual machine; where one step
+must not outlast it either, `sql_process` runs the statement. The connection may be any; one in the
+role "reader" cannot write anyway.
 """
 
 from __future__ import annotations
@@ -24,14 +26,19 @@ MOST_ROWS: Final = 1000
 MAX_BYTES: Final = 20_000  # about 5,000 tokens
 MAX_TEXT: Final = 200  # characters of one value
 MAX_VALUE_BYTES: Final = 10_000_000  # SQLite may build values of 1 GB otherwise
+MAX_COLUMNS: Final = 100  # a row of so many such values still fits into memory
 
 _READING: Final = frozenset(
     {sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE}
 )
-_REFUSED_FUNCTIONS: Final = frozenset({"load_extension", "zeroblob", "randomblob"})
+_REFUSED_FUNCTIONS: Final = frozenset(
+    {"load_extension", "fts3_tokenizer", "zeroblob", "randomblob"}
+)
 # Their first use on a connection defines them, which an authorizer would see as writing.
 _LOAD_JSON_TABLES: Final = "SELECT 1 FROM json_each('[]'), json_tree('[]')"
 _BEGINS: Final = re.compile(r"(?:\s|--[^\n]*\n|/\*.*?\*/)*(\w*)", re.DOTALL)
+_TOO_LARGE: Final = "it needs too much memory: read shorter values, or fewer at a time"
+_LONGEST_ERROR: Final = 300
 _MISSING: Final = re.compile(r"no such (column|table): (\S+)")
 
 Cell = int | float | str | None
@@ -75,28 +82,39 @@ def query_sql(
     """
     if not 1 <= max_rows <= MOST_ROWS:
         raise InvalidInputError(f"max_rows={max_rows} must be from 1 to {MOST_ROWS}")
-    _require_select(statement)
+    require_select(statement)
     deadline = Deadline(deadline_s)
     rows: list[tuple[Cell, ...]] = []
     budget = _Budget(max_bytes)
     columns: tuple[str, ...] = ()
     why: str | None = None
     try:
-        with _only_reading(connection), deadline.interrupting(connection):
+        with (
+            _only_reading(connection),
+            budget.shortening(connection),
+            deadline.interrupting(connection),
+        ):
             cursor = connection.execute(statement)
             columns = tuple(str(column[0]) for column in cursor.description or ())
             why = _fetch(cursor, rows, max_rows, budget)
             cursor.close()
+    except MemoryError as error:
+        raise InvalidInputError(_TOO_LARGE) from error
     except (sqlite3.Error, sqlite3.Warning, ValueError) as error:  # ValueError: a NUL, on 3.10
         if not (deadline.passed and "interrupted" in str(error)):
             raise InvalidInputError(_explain(connection, statement, error)) from error
         if not rows:
-            raise InvalidInputError(_too_slow(deadline_s)) from error
+            raise InvalidInputError(too_slow(deadline_s)) from error
         why = f"stopped after {deadline_s:g} s; further rows may exist"
     return Result(columns, tuple(rows), why, budget.shortened)
 
 
-def _require_select(statement: str) -> None:
+def require_select(statement: str) -> None:
+    """Refuse what does not even begin as a reading statement.
+
+    Raises:
+        InvalidInputError: The text says with what it begins.
+    """
     begin = _BEGINS.match(statement)
     word = begin.group(1).upper() if begin else ""
     if word not in ("SELECT", "WITH", "VALUES", "EXPLAIN"):
@@ -110,7 +128,7 @@ def _require_select(statement: str) -> None:
 def _only_reading(connection: sqlite3.Connection) -> Generator[None]:
     """Refuse all but reading, and values beyond 10 MB, until the end of the block."""
     connection.execute(_LOAD_JSON_TABLES).fetchall()
-    before = _limit_values(connection, MAX_VALUE_BYTES)
+    before = _limit_values(connection, (MAX_VALUE_BYTES, MAX_COLUMNS))
     connection.set_authorizer(_authorize)
     try:
         yield
@@ -119,11 +137,15 @@ def _only_reading(connection: sqlite3.Connection) -> Generator[None]:
         _limit_values(connection, before)
 
 
-def _limit_values(connection: sqlite3.Connection, limit_bytes: int) -> int:
-    """Set the longest value that SQLite may build, and return what it was before."""
-    if sys.version_info >= (3, 11):
-        return connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limit_bytes)
-    return 0
+def _limit_values(connection: sqlite3.Connection, limits: tuple[int, int]) -> tuple[int, int]:
+    """Set the longest value and the longest row that SQLite may build; what they were before."""
+    if sys.version_info < (3, 11):
+        return limits
+    max_bytes, max_columns = limits
+    return (
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max_bytes),
+        connection.setlimit(sqlite3.SQLITE_LIMIT_COLUMN, max_columns),
+    )
 
 
 def _authorize(action: int, _first: str | None, function: str | None, *_: str | None) -> int:
@@ -144,6 +166,16 @@ class _Budget:
         self.left = max_bytes
         self.shortened = 0
 
+    @contextlib.contextmanager
+    def shortening(self, connection: sqlite3.Connection) -> Generator[None]:
+        """Cut texts as they are read: the whole row is never in memory; bad UTF-8 is shown."""
+        before = connection.text_factory
+        connection.text_factory = self._text
+        try:
+            yield
+        finally:
+            connection.text_factory = before
+
     def take(self, row: Iterable[object]) -> tuple[Cell, ...]:
         cells = tuple(self._shown(value) for value in row)
         self.left -= sum(len(str(cell).encode("utf-8", "replace")) + 1 for cell in cells)
@@ -152,12 +184,14 @@ class _Budget:
     def _shown(self, value: object) -> Cell:
         if isinstance(value, bytes):
             return f"<blob of {len(value)} bytes>"
-        if not isinstance(value, str):
-            return value if isinstance(value, (int, float)) else None
-        if len(value) <= MAX_TEXT:
-            return value
+        return value if isinstance(value, (int, float, str)) else None
+
+    def _text(self, stored: bytes) -> str:
+        text = stored.decode("utf-8", "replace")
+        if len(text) <= MAX_TEXT:
+            return text
         self.shortened += 1
-        return f"{value[:MAX_TEXT]}... ({len(value)} characters)"
+        return f"{text[:MAX_TEXT]}... ({len(text)} characters)"
 
 
 def _fetch(
@@ -173,7 +207,8 @@ def _fetch(
     return None
 
 
-def _too_slow(deadline_s: float) -> str:
+def too_slow(deadline_s: float) -> str:
+    """What to do about a statement that gave no row in time."""
     return (
         f"no row within {deadline_s:g} s; narrow it by run_id and sim_time_s (there is an index), "
         "use the rollup table for long ranges, and give a recursion an end"
@@ -181,7 +216,7 @@ def _too_slow(deadline_s: float) -> str:
 
 
 def _explain(connection: sqlite3.Connection, statement: str, error: Exception) -> str:
-    text = str(error)
+    text = str(error)[:_LONGEST_ERROR]
     if "one statement" in text:
         return "only one statement is allowed"
     if "not authorized" in text or "prohibited" in text or "readonly" in text:

@@ -143,7 +143,8 @@ class Actions:
         return self._album.add_screenshot(path, *size)
 
     def _reset_state(self, command: Command) -> Progress:
-        outcomes = self._call_back()
+        with self._hold.users_code():
+            outcomes = self._call_back()
         if not outcomes:
             raise CommandRefusedError(
                 "nothing to reset: this controller registered no callback with bridge.on_reload()"

@@ -40,6 +40,7 @@ class Control:
         call_back: CallBack,
         heart: Heart,
         throttle: Throttle,
+        look: Callable[[], object],
     ) -> None:
         self._simulation = simulation
         self._recorder = recorder
@@ -47,7 +48,7 @@ class Control:
         self._heart = heart
         self._journal = journal
         self._queue = CommandQueue(recorder)
-        self._hold = Hold(simulation, journal, heart)
+        self._hold = Hold(simulation, journal, heart, self._stay, look)
         self.actions = Actions(
             simulation, self._queue, self._hold, clock, album, call_back, throttle
         )
@@ -87,6 +88,11 @@ class Control:
         self._next_poll_s = now + POLL_INTERVAL_S
         self._advance_all()
         handled = self._serve_one()
+        return self._stay() or handled
+
+    def _stay(self) -> Command | None:
+        """Serve commands for as long as the loop is held."""
+        handled = None
         while self._hold.held:
             self._heart.poll()
             self._hold.pump()
@@ -123,7 +129,8 @@ class Control:
     def _run_handler(self, command: Command) -> object:
         handler = self._handlers.get(command.action)
         if handler is not None:
-            return handler(command.as_dict())
+            with self._hold.users_code():
+                return handler(command.as_dict())
         if self._handlers:
             known = ", ".join((*self._handlers, *BUILT_IN_ACTIONS))
             raise CommandRefusedError(f"no action {command.action!r}; this robot knows {known}")

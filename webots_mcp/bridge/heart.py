@@ -19,6 +19,7 @@ class Heart:
         self._next_s = 0.0
         self._last_poll_wall_time_s: float | None = None
         self.hold: str | None = None
+        self.hold_mode: str | None = None
 
     def poll(self) -> None:
         """The loop asked for commands; beat if it is time to."""
@@ -37,9 +38,14 @@ class Heart:
         pulse = Pulse(clock.sim_time_s, polled_s, clock.moved_wall_time_s, self.hold)
         self._recorder.beat(pulse)
 
-    def change_hold(self, hold: str | None) -> None:
-        """Tell at once: whoever reads the command's answer must not see the old status."""
-        self.hold = hold
+    def change_hold(self, hold: str | None, mode_before: str | None = None) -> None:
+        """Tell at once: whoever reads the command's answer must not see the old status.
+
+        Args:
+            hold: How the loop is held now; None where it is not.
+            mode_before: The simulation mode to go back to, where it is paused.
+        """
+        self.hold, self.hold_mode = hold, mode_before
         if hold != PAUSED:
             self._clock.let_go()
         self.beat()

@@ -304,6 +304,7 @@ class MCPBridge:
             self._reloads.call_back,
             self._heart,
             self._throttle,
+            self._look,
         )
         self._maintainer = self._start_maintainer()
 
@@ -332,6 +333,12 @@ class MCPBridge:
             times = {"now": time.time(), "sim_time": self._clock.sim_time_s}
             values = {**times, "robot": registration.robot_id}
             self._recorder.record(CONFIRM_RELOAD, run, values)
+
+    def _look(self) -> None:
+        """Time has passed, or gone back, outside of the loop: in a step of a handler's."""
+        if self._clock.look():
+            self._begin_run()
+        self._heart.beat_if_due()
 
     def _begin_run(self) -> None:
         """Simulation time went back: the old run ends with what was last known of it."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, Final
 
+from webots_mcp.bridge.gate import QUIT, Guard, StepGate
 from webots_mcp.errors import CommandRefusedError
 
 _ROBOT_METHODS: Final = ("step", "getTime", "getName", "getBasicTimeStep")
 _INSIDE: Final = ("robot", "supervisor", "inner", "env", "unwrapped", "_robot")  # of wrappers
-QUIT: Final = -1
 
 
 class Simulation:
@@ -27,7 +26,7 @@ class Simulation:
         self.robot = robot
         self.over = False
         self.supervisor: bool = _may_supervise(robot)
-        self._base_step = _base_step(robot)
+        self._gate = StepGate(robot)
 
     @property
     def time_s(self) -> float:
@@ -60,14 +59,20 @@ class Simulation:
         return names.get(self.mode, "real_time")
 
     def pump(self) -> bool:
-        """Exchange news with Webots without letting time pass; False if Webots says quit.
-
-        Always Robot's own `step`: a subclass may have given its `step` another meaning.
-        """
-        if self._base_step(self.robot, 0) != QUIT:
+        """Exchange news with Webots without letting time pass; False if Webots says quit."""
+        if self._gate.exchange() != QUIT:
             return True
         self.end()
         return False
+
+    def guard_steps(self, guard: Guard | None) -> None:
+        """Let `guard` answer the controller's steps, or (None) Webots itself again."""
+        if self.over:
+            return
+        if guard is None:
+            self._gate.open()
+        else:
+            self._gate.close(guard)
 
     def end(self) -> None:
         """Webots wants the controller to end: the API must not be called any more.
@@ -75,10 +80,8 @@ class Simulation:
         The next `step` of the user's loop would end the process in the middle, without any
         cleanup, so it is answered here: -1, which ends the loop as Webots itself would.
         """
+        self._gate.close(lambda _: QUIT)
         self.over = True
-        owner: Any = self.robot.__class__
-        if owner.step is self._base_step:
-            self.robot.step = _answer_quit
 
     def require_supervisor(self, action: str) -> None:
         """Refuse what only a Supervisor can do.
@@ -94,10 +97,6 @@ class Simulation:
             else "create it with Supervisor() instead of Robot(), and set 'supervisor' to TRUE"
         )
         raise CommandRefusedError(f"{action} needs a Supervisor and this robot is none: {missing}")
-
-
-def _answer_quit(*_: object, **__: object) -> int:
-    return QUIT
 
 
 def _require_robot(robot: Any) -> None:
@@ -124,13 +123,3 @@ def _has_method(robot: object, name: str) -> bool:
 def _may_supervise(robot: Any) -> bool:
     """Both are needed: the class that has the methods, and the world's permission."""
     return hasattr(robot, "simulationSetMode") and bool(robot.getSupervisor())
-
-
-def _base_step(robot: Any) -> Callable[..., int]:
-    """Robot's own `step`: of the last class that defines both `step` and `getTime`.
-
-    A subclass that overrides `step` (an environment, say) hardly ever redefines `getTime` too.
-    """
-    owners = [cls for cls in type(robot).__mro__ if {"step", "getTime"} <= vars(cls).keys()]
-    owner: Any = owners[-1] if owners else type(robot)
-    return owner.step

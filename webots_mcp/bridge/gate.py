@@ -1,0 +1,90 @@
+"""Robot's own `step`, however the controller comes to it.
+
+A loop calls the robot's method, or that of a subclass whose own `step` goes on by `super()`: so it
+is the method of Webots' class that asks the bridge first. It does so for robots that have a bridge
+with something to say; for any other call nothing changes.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple
+
+QUIT: Final = -1
+
+Method = Callable[..., int]
+
+_STEPPING: Final = ("step", "stepBegin", "stepEnd")
+_GUARD: Final = "_webots_mcp_guard"  # of a robot
+_MARK: Final = "_webots_mcp_asks"  # of a method
+
+
+class Step(NamedTuple):
+    """A step that a controller asks for.
+
+    Attributes:
+        begins: It asks Webots for time to pass: `step(n)` and `stepBegin`, not `step(0)`.
+        ends: It waits until that has passed: `step(n)` and `stepEnd`.
+        make: Ask Webots, as it was meant.
+    """
+
+    begins: bool
+    ends: bool
+    make: Callable[[], int]
+
+
+Guard = Callable[[Step], int]
+
+
+class StepGate:
+    """The way of one robot's steps to Webots.
+
+    Args:
+        robot: A Webots `Robot`, or an instance of a subclass.
+    """
+
+    def __init__(self, robot: Any) -> None:
+        self._robot = robot
+        owner = _owner_of_step(robot)
+        for name in _STEPPING:
+            method = vars(owner).get(name)
+            if callable(method) and not hasattr(method, _MARK):
+                setattr(owner, name, _guarded(name, method))
+        self._own_step: Method = owner.step.__wrapped__
+
+    def exchange(self) -> int:
+        """Robot's own `step(0)`, which no guard is asked about: 0, or -1 if Webots says quit."""
+        return self._own_step(self._robot, 0)
+
+    def close(self, guard: Guard) -> None:
+        """From now on the guard answers each step of the controller's."""
+        vars(self._robot)[_GUARD] = guard
+
+    def open(self) -> None:
+        """Steps go to Webots again."""
+        vars(self._robot).pop(_GUARD, None)
+
+
+def _guarded(name: str, method: Method) -> Method:
+    @functools.wraps(method)
+    def ask_first(robot: Any, *args: Any, **kwargs: Any) -> int:
+        guard: Guard | None = robot.__dict__.get(_GUARD)
+        if guard is None:
+            return method(robot, *args, **kwargs)
+        make = functools.partial(method, robot, *args, **kwargs)
+        if name == "step" and 0 in (*args, *kwargs.values()):
+            return guard(Step(begins=False, ends=False, make=make))
+        return guard(Step(name != "stepEnd", name != "stepBegin", make))
+
+    setattr(ask_first, _MARK, True)
+    return ask_first
+
+
+def _owner_of_step(robot: Any) -> Any:
+    """The last class that defines both `step` and `getTime`.
+
+    A subclass that overrides `step` (an environment, say) hardly ever redefines `getTime` too.
+    """
+    owners = [cls for cls in type(robot).__mro__ if {"step", "getTime"} <= vars(cls).keys()]
+    return owners[-1] if owners else type(robot)

@@ -43,7 +43,8 @@ def test_a_controller_runs_where_and_as_webots_would_run_it(
         print("argv", sys.argv)
         print("cwd", os.getcwd())
         print("name", os.environ["WEBOTS_ROBOT_NAME"], os.environ["PYTHONIOENCODING"])
-        print("instance", os.path.isdir(os.environ["WEBOTS_INSTANCE_PATH"]))
+        folder = os.environ["WEBOTS_INSTANCE_PATH"]
+        print("instance", os.path.isdir(folder), folder.rstrip("/").rpartition("/")[2].isdigit())
         print("own", os.environ["MY_SETTING"])
         print("module", Supervisor.__module__, robot.getDevice("gps").__class__.__module__)
         print("paths", robot.getWorldPath(), robot.getProjectPath())
@@ -56,7 +57,7 @@ def test_a_controller_runs_where_and_as_webots_would_run_it(
     assert "argv ['rover.py', 'a b', 'c']" in console
     assert f"cwd {file.parent}" in console
     assert "name rover UTF-8" in console
-    assert "instance True" in console
+    assert "instance True True" in console
     assert "own yes" in console
     assert "module controller.supervisor controller.sensors" in console
     assert f"paths {world} {world.parent.parent}" in console
@@ -195,18 +196,21 @@ def test_a_program_of_ones_own_can_be_an_extern_controller(
     with fast(world) as simulation:
         environment = simulation.environment_of("rover")
         assert simulation.time_s == 0.0  # the world waits for it
+        assert environment["WEBOTS_CONTROLLER_URL"].startswith("tcp://127.0.0.1:")
+        assert "WEBOTS_INSTANCE_PATH" not in environment
         done = subprocess.run(
             [sys.executable, str(file)], env=environment, capture_output=True, text=True, check=True
         )
         assert done.stdout == "0.16\n"
         refused = subprocess.run(
             [sys.executable, str(file)],
-            env=environment | {"WEBOTS_ROBOT_NAME": "nobody"},
+            env=environment
+            | {"WEBOTS_CONTROLLER_URL": environment["WEBOTS_CONTROLLER_URL"] + "-not"},
             capture_output=True,
             text=True,
             check=False,
         )
-        assert "there is no robot 'nobody'" in refused.stderr
+        assert "there is no robot 'rover-not'" in refused.stderr
 
 
 def test_a_controller_that_no_simulation_started_says_what_to_do(

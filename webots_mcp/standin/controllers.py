@@ -9,25 +9,44 @@ from pathlib import Path
 from typing import Final
 
 from webots_mcp.standin.connection import Connection
+from webots_mcp.standin.errors import StandInError
 from webots_mcp.standin.process import ControllerProcess
 from webots_mcp.standin.simulator import Robot, Simulator
 
 _NOBODY: Final = ("", "<none>", "void", "<generic>")
 _EXTERN: Final = "<extern>"
+_INTERN_VARIABLES: Final = ("WEBOTS_ROBOT_NAME", "WEBOTS_INSTANCE_PATH")
+_EXTERN_VARIABLES: Final = ("WEBOTS_CONTROLLER_URL", "WEBOTS_STANDIN_TOKEN")
 
 
 @dataclass(frozen=True)
+class Address:
+    """Where controllers find the simulator.
+
+    Attributes:
+        port: On this machine.
+        token: What they show to be let in.
+        folder: The simulator's own folder, named after the port as Webots names its own.
+    """
+
+    port: int
+    token: str
+    folder: Path
+
+
+@dataclass
 class Launch:
     """How controllers are started, the same for all robots of a simulation."""
 
     library: Path
-    instance: Path
     python: str
     environment: Mapping[str, str]
     overrides: Mapping[str, Path]
     """Controller files by robot name, instead of what the world says."""
     print_line: Callable[[str], None]
     on_exit: Callable[[], None]
+    address: Address | None = None
+    """None before the simulator has started."""
 
     def file_of(self, robot: Robot, simulator: Simulator) -> Path | None:
         """The controller's file; None if the robot has none or it is started by somebody else."""
@@ -41,14 +60,22 @@ class Launch:
     def environment_of(self, robot: Robot) -> dict[str, str]:
         """The environment of the robot's controller, as Webots would set it."""
         merged = {**os.environ, **self.environment}
-        merged.pop("WEBOTS_CONTROLLER_URL", None)
         path = [str(self.library), merged.get("PYTHONPATH", "")]
-        return merged | {
-            "WEBOTS_ROBOT_NAME": robot.name,
-            "WEBOTS_INSTANCE_PATH": str(self.instance),
-            "PYTHONPATH": os.pathsep.join(part for part in path if part),
-            "PYTHONIOENCODING": "UTF-8",
-        }
+        merged["PYTHONPATH"] = os.pathsep.join(part for part in path if part)
+        for name in (*_INTERN_VARIABLES, *_EXTERN_VARIABLES):
+            merged.pop(name, None)
+        return merged | self._way_to(robot)
+
+    def _way_to(self, robot: Robot) -> dict[str, str]:
+        """As Webots tells a controller that it starts, or a person one that Webots does not."""
+        if self.address is None:
+            raise StandInError("start the simulation before you ask how to reach it")
+        if robot.node.fields["controller"] == _EXTERN and robot.name not in self.overrides:
+            url = f"tcp://127.0.0.1:{self.address.port}/{robot.name}"
+            return dict(zip(_EXTERN_VARIABLES, (url, self.address.token), strict=True))
+        folder = f"{self.address.folder}{os.sep}"  # Webots writes it so
+        told = dict(zip(_INTERN_VARIABLES, (robot.name, folder), strict=True))
+        return told | {"PYTHONIOENCODING": "UTF-8"}
 
 
 @dataclass

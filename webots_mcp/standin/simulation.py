@@ -18,7 +18,7 @@ from typing import Final, TypeVar
 from controller.wire import ADDRESS_FILE
 
 from webots_mcp.standin.controller_path import LIBRARY
-from webots_mcp.standin.controllers import Controller, Launch, controllers_of
+from webots_mcp.standin.controllers import Address, Controller, Launch, controllers_of
 from webots_mcp.standin.errors import StandInError
 from webots_mcp.standin.runner import Runner
 from webots_mcp.standin.simulator import Mode, Robot, Simulator
@@ -71,21 +71,15 @@ class Simulation:
         self._printing = threading.Lock()
         self._changed = threading.Condition()
         self._noticed_s = 0.0
-        self._instance = Path(tempfile.mkdtemp(prefix="webots-standin-"))
-        self._clean_up = weakref.finalize(self, shutil.rmtree, self._instance, True)
+        self._folder = Path(tempfile.mkdtemp(prefix="webots-standin-"))
+        self._clean_up = weakref.finalize(self, shutil.rmtree, self._folder, True)
         overrides = {name: Path(file) for name, file in (controllers or {}).items()}
-        launch = Launch(
-            LIBRARY,
-            self._instance,
-            python,
-            environment or {},
-            overrides,
-            self._print,
-            self._exited,
+        self._launch = Launch(
+            LIBRARY, python, environment or {}, overrides, self._print, self._exited
         )
         self._runner = Runner(
             Simulator(load_world(world), _MODES[mode], self._print),
-            lambda simulator, before: controllers_of(simulator, launch, before),
+            lambda simulator, before: controllers_of(simulator, self._launch, before),
             self._notice,
         )
         self._thread = threading.Thread(target=self._runner.run, name="simulation", daemon=True)
@@ -94,8 +88,11 @@ class Simulation:
 
     def start(self) -> Simulation:
         """Start the controllers and, unless it is to be paused, time."""
-        address = self._instance / ADDRESS_FILE  # the folder is this user's alone
-        address.write_text(f"{self._runner.open()} {self._runner.token}", encoding="utf-8")
+        port, token = self._runner.open(), self._runner.token
+        folder = self._folder / str(port)  # it is this user's alone
+        folder.mkdir()
+        (folder / ADDRESS_FILE).write_text(f"{port} {token}", encoding="utf-8")
+        self._launch.address = Address(port, token, folder)
         self._thread.start()
         return self
 
@@ -172,7 +169,11 @@ class Simulation:
         raise StandInError(f"no robot {name!r} in {self._runner.simulator.world.path.name}")
 
     def environment_of(self, name: str) -> dict[str, str]:
-        """The environment that makes a program of yours the controller of an <extern> robot."""
+        """The environment that makes a program of yours the controller of an <extern> robot.
+
+        Raises:
+            StandInError: There is no such robot, or the simulation has not started.
+        """
         controller = self.controller(name)
         return controller.launch.environment_of(controller.robot)
 

@@ -14,10 +14,10 @@ class SocketLink:
     """Talks to the simulator that the `WEBOTS_...` environment variables name."""
 
     def __init__(self) -> None:
-        port, token = _address().split()
-        self._socket = connect(int(port))
+        port, token, robot_name = _address()
+        self._socket = connect(port)
         self._inbox = Inbox()
-        self.send(("hello", token, os.environ["WEBOTS_ROBOT_NAME"]))
+        self.send(("hello", token, robot_name))
         kind, answer = self.receive()
         if kind != "welcome":
             raise ConnectionRefusedError(f"the simulation refused this controller: {answer}")
@@ -51,11 +51,16 @@ class SocketLink:
         self._socket.close()
 
 
-def _address() -> str:
-    folder = os.environ.get("WEBOTS_INSTANCE_PATH")
-    if not folder or "WEBOTS_ROBOT_NAME" not in os.environ:
-        raise ConnectionError(
-            "no simulation has started this process. Run the controller from a world: "
-            "python -m webots_mcp.standin WORLD; in a test use webots_mcp.standin.InProcessRobot"
-        )
-    return (Path(folder) / ADDRESS_FILE).read_text(encoding="utf-8")
+def _address() -> tuple[int, str, str]:
+    """Port, token and robot name; as in the real library, what Webots itself started comes first."""
+    name, folder = os.environ.get("WEBOTS_ROBOT_NAME"), os.environ.get("WEBOTS_INSTANCE_PATH")
+    if name and folder:
+        port, token = (Path(folder) / ADDRESS_FILE).read_text(encoding="utf-8").split()
+        return int(port), token, name
+    if url := os.environ.get("WEBOTS_CONTROLLER_URL"):
+        place, _, name = url.partition("://")[2].partition("/")
+        return int(place.rpartition(":")[2]), os.environ.get("WEBOTS_STANDIN_TOKEN", ""), name
+    raise ConnectionError(
+        "no simulation has started this process. Run the controller from a world: "
+        "python -m webots_mcp.standin WORLD; in a test use webots_mcp.standin.InProcessRobot"
+    )

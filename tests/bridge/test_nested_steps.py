@@ -15,7 +15,7 @@ from webots_mcp.standin import InProcessSupervisor
 
 def stepping(robot: InProcessSupervisor, times: int) -> Callable[[dict[str, Any]], float]:
     def handler(_: dict[str, Any]) -> float:
-        for _ in range(times):
+        for _number in range(times):
             assert robot.step(STEP_MS) == 0
         return robot.getTime()
 
@@ -141,7 +141,8 @@ def test_steps_of_a_handler_go_on_where_a_person_pressed_play_meanwhile(
 def test_an_error_of_a_step_in_a_handler_leaves_the_simulation_paused(
     robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
 ) -> None:
-    bridge.register_command("typo", lambda _: robot.step(16.0))  # type: ignore[arg-type]  # pyright: ignore
+    steps: Any = 16.0
+    bridge.register_command("typo", lambda _: robot.step(steps))
     bridge.register_command("mode", lambda _: robot.simulationGetMode())
     recording.send("pause")
     typo, mode, resume = (recording.send(action) for action in ("typo", "mode", "resume"))
@@ -172,9 +173,7 @@ def test_a_quit_reaches_the_handlers_step_and_the_loops(
     assert answers == [-1, -1, -1]
 
 
-def test_a_robot_without_a_bridge_steps_as_ever(
-    bridge: MCPBridge, recording: Recording
-) -> None:
+def test_a_robot_without_a_bridge_steps_as_ever(bridge: MCPBridge, recording: Recording) -> None:
     other = InProcessSupervisor("rover")
 
     def step_other(_: object) -> int:

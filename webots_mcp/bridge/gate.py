@@ -8,7 +8,7 @@ with something to say; for any other call nothing changes.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
 QUIT: Final = -1
@@ -46,10 +46,11 @@ class StepGate:
 
     def __init__(self, robot: Any) -> None:
         self._robot = robot
+        self._of_robot: dict[str, Any] = vars(robot)
         owner = _owner_of_step(robot)
+        own: Mapping[str, Method] = vars(owner)
         for name in _STEPPING:
-            method = vars(owner).get(name)
-            if callable(method) and not hasattr(method, _MARK):
+            if (method := own.get(name)) is not None and not hasattr(method, _MARK):
                 setattr(owner, name, _guarded(name, method))
         self._own_step: Method = owner.step.__wrapped__
 
@@ -59,11 +60,11 @@ class StepGate:
 
     def close(self, guard: Guard) -> None:
         """From now on the guard answers each step of the controller's."""
-        vars(self._robot)[_GUARD] = guard
+        self._of_robot[_GUARD] = guard
 
     def open(self) -> None:
         """Steps go to Webots again."""
-        vars(self._robot).pop(_GUARD, None)
+        self._of_robot.pop(_GUARD, None)
 
 
 def _guarded(name: str, method: Method) -> Method:

@@ -52,7 +52,7 @@ class SocketLink:
 
 
 def _address() -> tuple[int, str, str]:
-    """Port, token and robot name; as in the real library, what Webots itself started comes first."""
+    """Port, token and robot name; the real library looks in this order, too."""
     name, folder = os.environ.get("WEBOTS_ROBOT_NAME"), os.environ.get("WEBOTS_INSTANCE_PATH")
     if name and folder:
         port, token = (Path(folder) / ADDRESS_FILE).read_text(encoding="utf-8").split()

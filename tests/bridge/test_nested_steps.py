@@ -50,7 +50,7 @@ def test_a_handler_that_steps_during_a_hold_makes_its_steps_and_it_is_paused_aga
 class Environment(InProcessSupervisor):
     """As reinforcement learning does it: another signature, and more than one step."""
 
-    def step(self, action: object = None) -> int:  # type: ignore[override]  # pyright: ignore
+    def step(self, action: object = None) -> int:  # pyright: ignore[reportIncompatibleMethodOverride]
         if action is None:
             return 0
         return super().step(STEP_MS)

@@ -8,7 +8,7 @@ with something to say; for any other call nothing changes.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple
 
 QUIT: Final = -1
@@ -47,10 +47,10 @@ class StepGate:
     def __init__(self, robot: Any) -> None:
         self._robot = robot
         self._of_robot: dict[str, Any] = vars(robot)
-        owner = _owner_of_step(robot)
-        own: Mapping[str, Method] = vars(owner)
+        owner: Any = _owner_of_step(robot)
         for name in _STEPPING:
-            if (method := own.get(name)) is not None and not hasattr(method, _MARK):
+            method: Any = getattr(owner, name, None)
+            if callable(method) and not hasattr(method, _MARK):
                 setattr(owner, name, _guarded(name, method))
         self._own_step: Method = owner.step.__wrapped__
 

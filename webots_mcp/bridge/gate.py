@@ -50,7 +50,7 @@ class StepGate:
         owner: Any = _owner_of_step(robot)
         for name in _STEPPING:
             method: Any = getattr(owner, name, None)
-            if callable(method) and not hasattr(method, _MARK):
+            if method is not None and not hasattr(method, _MARK):
                 setattr(owner, name, _guarded(name, method))
         self._own_step: Method = owner.step.__wrapped__
 

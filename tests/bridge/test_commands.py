@@ -12,6 +12,7 @@ from PIL import Image
 
 from tests.bridge.conftest import STEP_MS, Recording, eager
 from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 
@@ -99,6 +100,44 @@ def test_an_exception_that_cannot_be_written_as_it_is_still_fails_its_command(
     assert text is not None and text.startswith(said)
 
 
+@pytest.mark.parametrize("error", [SystemExit(3), KeyboardInterrupt(), GeneratorExit()])
+def test_a_handler_that_ends_the_controller_fails_its_command_and_ends_it(
+    bridge: MCPBridge, recording: Recording, error: BaseException
+) -> None:
+    def leave(command: dict[str, Any]) -> None:
+        raise error
+
+    bridge.register_command("leave", leave)
+    bridge.on_reload(lambda: leave({}))
+    for action in ("leave", "reset_state"):
+        sent = recording.send(action)
+        with pytest.raises(type(error)):
+            eager(bridge)
+        status, _, reason = recording.fate(sent)
+        assert (status, (reason or "").split(":")[0]) == ("failed", type(error).__name__)
+
+
+def test_a_long_reason_is_cut_and_says_so(bridge: MCPBridge, recording: Recording) -> None:
+    def fail(command: dict[str, Any]) -> None:
+        raise ValueError("x" * 1_000_000)
+
+    bridge.register_command("grip", fail)
+    sent = recording.send("grip")
+    eager(bridge)
+    error = recording.fate(sent)[2]
+    assert error is not None and len(error) < 3000
+    assert "... (cut: it had 1000000 characters) (test_commands.py, line " in error
+
+
+def test_a_large_result_is_cut_and_says_what(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.register_command("map", lambda _: {"n": 1, "grid": [[0] * 1000 for _ in range(1000)]})
+    sent = recording.send("map")
+    eager(bridge)
+    status, result, replaced = recording.fate(sent)
+    assert (status, result) == ("done", {"n": 1, "grid": None})
+    assert replaced is not None and "grid (array[1000000])" in replaced
+
+
 def test_an_unknown_action_is_refused_with_the_known_ones(
     bridge: MCPBridge, recording: Recording
 ) -> None:
@@ -131,13 +170,84 @@ def test_parameters_that_are_no_object_fail_the_command(
     bridge: MCPBridge, recording: Recording, database: MemoryDatabase
 ) -> None:
     sent = recording.send("move")
-    from webots_mcp.connection import connect
-
     connection = connect(database, "writer")
     connection.execute("UPDATE command SET params = '[1, 2'")
     connection.close()
     assert eager(bridge) is None
     assert recording.fate(sent)[::2] == ("failed", "params must be a JSON object, got '[1, 2'")
+
+
+NO_PARAMS = {
+    "nested too deep": b'{"a":' + b"[" * 100_000 + b"]" * 100_000 + b"}",
+    "no UTF-8": b'{"a": "\xff"}',
+    "only bytes": b"\xff\xfe\xfd",
+    "empty": b"",
+}
+
+
+@pytest.mark.parametrize("params", NO_PARAMS.values(), ids=NO_PARAMS)
+@pytest.mark.parametrize("kind", ["TEXT", "BLOB"])
+def test_whatever_stands_in_a_command_it_gets_a_final_status(
+    bridge: MCPBridge, recording: Recording, database: MemoryDatabase, params: bytes, kind: str
+) -> None:
+    bridge.register_command("move", lambda _: pytest.fail("a malformed command ran"))
+    sent = recording.send("move")
+    connection = connect(database, "writer")
+    connection.execute(f"UPDATE command SET params = CAST(? AS {kind})", (params,))
+    connection.close()
+    assert eager(bridge) is None
+    status, _, error = recording.fate(sent)
+    assert status == "failed"
+    assert error is not None and error.startswith("params must be a JSON object, got ")
+
+
+def test_an_action_that_is_no_text_is_refused_like_an_unknown_one(
+    bridge: MCPBridge, recording: Recording, database: MemoryDatabase
+) -> None:
+    bridge.register_command("move", lambda _: pytest.fail("another command ran"))
+    sent = recording.send("move")
+    connection = connect(database, "writer")
+    connection.execute("UPDATE command SET action = CAST(? AS TEXT)", (b"mo\xffve",))
+    connection.close()
+    eager(bridge)
+    status, _, error = recording.fate(sent)
+    assert status == "failed"
+    assert error is not None and "no action 'mo\ufffdve'; this robot knows move" in error
+
+
+@pytest.mark.parametrize("name", [b"x", 5, None, ("a", "b")])
+def test_a_name_that_is_no_text_is_refused(
+    bridge: MCPBridge, recording: Recording, name: Any
+) -> None:
+    with pytest.raises(TypeError, match="the name of an action is a text, not"):
+        bridge.register_command(name, lambda _: None)
+    bridge.register_command("wave", lambda _: None)
+    assert recording.rows("SELECT actions FROM session") == ['{"wave": ""}']
+
+
+@pytest.mark.parametrize("name", ["lone \udcff", "null \0", "two\nlines", "x" * 101])
+def test_a_name_that_cannot_be_sent_is_refused(
+    bridge: MCPBridge, recording: Recording, name: str
+) -> None:
+    with pytest.raises(ValueError, match="choose a name of printable characters, at most 100"):
+        bridge.register_command(name, lambda _: None)
+    bridge.register_command("größe", lambda _: None)
+    assert recording.rows("SELECT actions FROM session") == ['{"größe": ""}']
+
+
+@pytest.mark.parametrize(
+    ("doc", "told"),
+    [("lone \udcff", "lone ?"), (5, ""), ("x" * 5000, "x" * 4000 + "... (cut: it had 5000")],
+)
+def test_a_handlers_docstring_never_stops_the_registration(
+    bridge: MCPBridge, recording: Recording, doc: Any, told: str
+) -> None:
+    def wave(command: dict[str, Any]) -> None: ...
+
+    wave.__doc__ = doc
+    bridge.register_command("wave", wave)
+    (actions,) = recording.rows("SELECT actions FROM session")
+    assert json.loads(actions)["wave"].startswith(told)
 
 
 @pytest.mark.parametrize("name", ["", "pause", "reset_state"])

@@ -165,6 +165,39 @@ def test_a_subclass_with_another_step_can_be_paused_and_resumed(
     assert [recording.fate(c)[0] for c in (pause, resume)] == ["done", "done"]
 
 
+class Plain(InProcessSupervisor):
+    """Its step() calls that of a class by name, without a look at what the instance has."""
+
+    def step(self, action: str) -> tuple[float, bool]:  # type: ignore[override]
+        return 0.5, InProcessSupervisor.step(self, STEP_MS) == -1
+
+
+class Halves(InProcessSupervisor):
+    """Its step() asks for time to pass and computes meanwhile."""
+
+    def step(self, action: str) -> tuple[float, bool]:  # type: ignore[override]
+        self.stepBegin(STEP_MS)
+        return 0.5, self.stepEnd() == -1
+
+
+@pytest.mark.parametrize("kind", [Environment, Plain, Halves])
+def test_a_quit_during_a_held_pause_reaches_the_loop_of_a_subclass_and_of_no_other_robot(
+    database: MemoryDatabase, kind: type[Environment]
+) -> None:
+    simulation = InProcessSimulation()
+    environment = kind("rover", world=simulation)
+    with MCPBridge(environment, throttle_interval=1, database=database) as bridge:
+        assert environment.step("forward") == (0.5, False)
+        pause = Recording(database).send("pause")
+        bridge.register_command("quit", lambda _: simulation.quit())
+        Recording(database).send("quit")
+        bridge.get_command()
+        assert Recording(database).fate(pause)[0] == "done"
+        assert environment.step("forward") == (0.5, True)
+        assert environment.step("forward") == (0.5, True)
+    assert kind("rover").step("forward") == (0.5, False)
+
+
 def test_an_object_that_owns_the_robot_is_refused_with_the_way_to_its_robot(
     database: MemoryDatabase,
 ) -> None:

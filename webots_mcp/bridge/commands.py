@@ -15,12 +15,16 @@ from typing import Any, Final, cast
 
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.text import cut, storable
 from webots_mcp.errors import WebotsMCPError
 
 _MOST_NAMED: Final = 10
 
+_MOST_CHARACTERS: Final = 2000
+
 # An indexed read takes no lock. An UPDATE takes the write lock even where it matches nothing, so
-# it is made only after this said that there is something.
+# it is made only after this said that there is something. The texts come as bytes: one that is no
+# UTF-8 would fail the statement after it claimed the command.
 PEEK: Final = (
     "SELECT 1 FROM command WHERE robot_id = ? AND status = 'pending' "
     "AND expires_wall_time_s > ? LIMIT 1"
@@ -29,7 +33,7 @@ CLAIM: Final = (
     "UPDATE command SET status = 'claimed', session_id = :session, claimed_wall_time_s = :now, "
     "claimed_sim_time_s = :sim_time WHERE status = 'pending' AND id = (SELECT id FROM command "
     "WHERE robot_id = :robot AND status = 'pending' AND expires_wall_time_s > :now "
-    "ORDER BY id LIMIT 1) RETURNING id, action, params"
+    "ORDER BY id LIMIT 1) RETURNING id, CAST(action AS BLOB), CAST(params AS BLOB)"
 )
 ISSUE: Final = (
     "UPDATE command SET issued_wall_time_s = ? "
@@ -87,17 +91,19 @@ class CommandQueue:
         return self._read(rows[0], registration.session_id, sim_time_s) if rows else None
 
     def _read(
-        self, row: tuple[int, str, str], session_id: int, sim_time_s: float
+        self, row: tuple[int, bytes, bytes | None], session_id: int, sim_time_s: float
     ) -> Command | None:
         command_id, action, text = row
+        command = Command(command_id, action.decode("utf-8", "replace"), {}, session_id)
         try:
-            params = json.loads(text)
-        except ValueError:
+            params = json.loads(text or b"")
+        except (ValueError, RecursionError):  # no JSON, no UTF-8, or nested beyond all sense
             params = None
         if isinstance(params, dict):
-            return Command(command_id, action, cast("dict[str, Any]", params), session_id)
-        command = Command(command_id, action, {}, session_id)
-        self.fail(command, f"params must be a JSON object, got {text[:100]!r}", sim_time_s)
+            command.params = cast("dict[str, Any]", params)
+            return command
+        got = (text or b"")[:100].decode("utf-8", "replace")
+        self.fail(command, f"params must be a JSON object, got {got!r}", sim_time_s)
         return None
 
     def issue(self, command: Command) -> None:
@@ -116,9 +122,8 @@ class CommandQueue:
         return replaced
 
     def fail(self, command: Command, error: str, sim_time_s: float) -> None:
-        """Write `failed` with the reason; no encoding has the surrogates of a broken file name."""
-        text = error.encode("utf-8", "replace").decode()
-        self._finish(command, "failed", None, text, sim_time_s)
+        """Write `failed` with the reason."""
+        self._finish(command, "failed", None, storable(error), sim_time_s)
 
     def _finish(
         self, command: Command, status: str, result: str | None, error: str | None, at_s: float
@@ -131,7 +136,7 @@ class CommandQueue:
             )
 
 
-def describe(error: Exception) -> str:
+def describe(error: BaseException) -> str:
     """What was wrong; for an exception of the user's own code also its kind and place."""
     text = _text_of(error)
     if isinstance(error, WebotsMCPError):
@@ -145,9 +150,9 @@ def describe(error: Exception) -> str:
     return f"{type(error).__name__}: {text} ({place}, line {frame.tb_lineno})"
 
 
-def _text_of(error: Exception) -> str:
+def _text_of(error: BaseException) -> str:
     try:
-        return str(error)
+        return cut(str(error), _MOST_CHARACTERS)
     except Exception as failure:  # noqa: BLE001  (an exception of the user's own kind)
         return f"(without words: its str() raised {type(failure).__name__})"
 

@@ -16,6 +16,7 @@ from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.text import cut, storable
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.connection import is_busy
 from webots_mcp.contract import BUILT_IN_ACTIONS
@@ -24,6 +25,8 @@ from webots_mcp.errors import CommandRefusedError
 Handler = Callable[[dict[str, Any]], object]
 
 POLL_INTERVAL_S: Final = 0.005
+_MOST_NAME_CHARACTERS: Final = 100
+_MOST_DOC_CHARACTERS: Final = 4000
 _ENDS_STEPPING: Final = ("pause", "resume", "fast", "step", "reset", "reload")
 
 
@@ -60,20 +63,18 @@ class Control:
         """Make an action of the user's own known.
 
         Raises:
-            ValueError: The name is built in, or empty.
-            TypeError: The handler is not a plain function.
+            ValueError: The name is built in, empty, too long, or no text that can be sent.
+            TypeError: The name is no text, or the handler is not a plain function.
         """
-        if not action or action in BUILT_IN_ACTIONS:
-            raise ValueError(
-                f"action {action!r} cannot be registered: choose a name that is not empty and "
-                f"not built in ({', '.join(BUILT_IN_ACTIONS)})"
-            )
+        _require_name(action)
         import inspect  # only here: it would be a fifth of the bridge's import time
 
         if not callable(handler) or inspect.iscoroutinefunction(handler):
             raise TypeError(f"the handler of {action!r} must be a plain function, not {handler!r}")
+        written = getattr(handler, "__doc__", None)
+        doc = inspect.cleandoc(written) if isinstance(written, str) else ""
         self._handlers[action] = handler
-        self._recorder.actions[action] = inspect.cleandoc(getattr(handler, "__doc__", None) or "")
+        self._recorder.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
         self._recorder.update_actions()
 
     def serve(self) -> Command | None:
@@ -120,11 +121,13 @@ class Control:
         try:
             if command.action in BUILT_IN_ACTIONS:
                 self._under_way[command] = self.actions.begin(command)
-                self._advance(command)
             else:
                 self._succeed(command, self._run_handler(command))
-        except Exception as error:  # noqa: BLE001  (whatever a handler raises is the answer)
-            self._fail(command, error)
+        except BaseException as error:
+            self._fail(command, error)  # whatever a handler raises is the answer
+            if not isinstance(error, Exception):
+                raise
+        self._advance(command)
 
     def _run_handler(self, command: Command) -> object:
         handler = self._handlers.get(command.action)
@@ -139,7 +142,18 @@ class Control:
 
     def _advance_all(self) -> None:
         for command in tuple(self._under_way):
-            self._advance(command)
+            if self._simulation.over:
+                self._abandon(command)
+            else:
+                self._advance(command)
+
+    def _abandon(self, command: Command) -> None:
+        """Webots is not asked for anything any more; the successor confirms a reload."""
+        del self._under_way[command]
+        if command.action != "reload":
+            self._fail(
+                command, CommandRefusedError("Webots ended the controller before it was done")
+            )
 
     def _advance(self, command: Command) -> None:
         """Go on with a built-in action; a callback of the user's in it may come back to here."""
@@ -151,8 +165,10 @@ class Control:
             self._under_way[command] = progress
         except StopIteration as end:
             self._succeed(command, end.value)
-        except Exception as error:  # noqa: BLE001  (whatever went wrong is the answer)
-            self._fail(command, error)
+        except BaseException as error:
+            self._fail(command, error)  # whatever went wrong is the answer
+            if not isinstance(error, Exception):
+                raise
 
     def _interrupt_steps(self, by: Command) -> None:
         for command in [c for c in self._under_way if c.action == "step"]:
@@ -166,5 +182,20 @@ class Control:
             text = f"command {command.id} ({command.action}): {replaced}"
             self._journal.log("warning", "bridge", text)
 
-    def _fail(self, command: Command, error: Exception) -> None:
+    def _fail(self, command: Command, error: BaseException) -> None:
         self._queue.fail(command, describe(error), self._clock.sim_time_s)
+
+
+def _require_name(action: object) -> None:
+    if not isinstance(action, str):
+        raise TypeError(f"the name of an action is a text, not {type(action).__name__} {action!r}")
+    if not action or action in BUILT_IN_ACTIONS:
+        raise ValueError(
+            f"action {action!r} cannot be registered: choose a name that is not empty and "
+            f"not built in ({', '.join(BUILT_IN_ACTIONS)})"
+        )
+    if len(action) > _MOST_NAME_CHARACTERS or not action.isprintable():
+        raise ValueError(
+            f"action {action[:_MOST_NAME_CHARACTERS]!r} cannot be registered: choose a name of "
+            f"printable characters, at most {_MOST_NAME_CHARACTERS}"
+        )

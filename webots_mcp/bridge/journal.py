@@ -9,7 +9,9 @@ from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.encoding import Encoded, encode
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.run import INSERT_EVENT, INSERT_STATE
+from webots_mcp.bridge.text import cut, storable
 
+MOST_LOG_CHARACTERS: Final = 10_000
 _NOT_LOST: Final = ("nan", "inf", "-inf", "bytes", "surrogate")
 _MOST_LOST_PATHS: Final = 20
 _INSERT_LOG: Final = (
@@ -37,8 +39,8 @@ class Journal:
             self._count_replaced(encoded.odd)
 
     def log(self, level: str, source: str, message: str) -> None:
-        """Record a line; SQLite's shell would end it at a NUL, and no encoding has surrogates."""
-        text = message.encode("utf-8", "replace").decode().replace("\0", "\\0")
+        """Record a line, or its beginning."""
+        text = storable(cut(message, MOST_LOG_CHARACTERS))
         row = (self._clock.sim_time_s, time.time(), level, source, text)
         self._recorder.record(_INSERT_LOG, self._clock.run, row)
 

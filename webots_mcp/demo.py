@@ -25,6 +25,7 @@ from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.errors import NothingRecordedError, WebotsMCPError
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
+from webots_mcp.store.recording import Recording
 
 DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
 _ROBOT: Final = "rover"
@@ -61,13 +62,16 @@ def run(data_dir: Path = DEFAULT_DATA_DIR, *, keep: bool = False) -> None:
         keep: Leave the robot running until Ctrl-C, so that another client can connect.
 
     Raises:
+        DatabaseError: Nothing can be recorded there.
         NothingRecordedError: The controller did not come up.
         WebotsMCPError: The server answered with an error.
     """
+    Recording(data_dir / DATABASE_NAME, data_dir).create()  # a robot only waits for a bad folder
     _say(f"Starting {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
     with Simulation(DEFAULT_WORLD, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
         _wait_for_rows(simulation, data_dir)
-        anyio.run(_converse, data_dir)
+        if not anyio.run(_converse, data_dir):
+            raise WebotsMCPError("the demo's server answered with an error, see above")
         _tell_where(data_dir)
         if keep:
             _keep(simulation, data_dir)
@@ -92,7 +96,8 @@ def _newest_image(data_dir: Path) -> int:
         return int(connection.execute(sql).fetchone()[0]) if tables else 0
 
 
-async def _converse(data_dir: Path) -> None:
+async def _converse(data_dir: Path) -> bool:
+    """Ask everything; False at the first answer that is an error."""
     async with _client(data_dir) as client:
         for question, tool, arguments in CONVERSATION:
             _say(f"\n> {question}\n  {tool}({_compact(arguments) if arguments else ''})")
@@ -100,6 +105,9 @@ async def _converse(data_dir: Path) -> None:
             result = await client.call_tool(tool, arguments, progress_callback=_show_progress)
             _clear_progress()
             _show(result, time.monotonic() - started_s)
+            if result.is_error:
+                return False
+    return True
 
 
 @contextlib.asynccontextmanager
@@ -135,8 +143,6 @@ def _show(result: CallToolResult, duration_s: float) -> None:
             elif isinstance(block, ImageContent):
                 _say(f"  [{block.mime_type}, {len(block.data) * 3 // 4} bytes]")
     _say(f"  ({duration_s:.2f} s)")
-    if result.is_error:
-        raise WebotsMCPError("the demo's server answered with an error, see above")
 
 
 def _compact(value: object) -> str:
@@ -165,9 +171,8 @@ def _keep(simulation: Simulation, data_dir: Path) -> None:
     command = shlex.join([_server_command(), "serve", "--data-dir", str(data_dir)])
     _say("\nThe robot keeps running until Ctrl-C. Connect Claude Code from another terminal:")
     _say(f"  claude mcp add webots -- {command}")
-    with contextlib.suppress(KeyboardInterrupt):
-        while simulation.is_running:
-            time.sleep(0.2)
+    while simulation.is_running:
+        time.sleep(0.2)
 
 
 def _server_command() -> str:

@@ -169,9 +169,7 @@ def test_the_tail_of_one_robot_leaves_out_the_others(
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no SIGINT for a child there")
-def test_the_tail_follows_until_ctrl_c_and_ends_cleanly(
-    rover: RecordedRobot, tmp_path: Path
-) -> None:
+def test_the_tail_follows_until_ctrl_c_and_says_so(rover: RecordedRobot, tmp_path: Path) -> None:
     with run("tail", "--interval", "0.05", "--data-dir", str(tmp_path)) as process:
         assert process.stdout is not None
         assert "cruise" in process.stdout.readline()
@@ -179,7 +177,7 @@ def test_the_tail_follows_until_ctrl_c_and_ends_cleanly(
         assert "it goes on" in process.stdout.readline()
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=10)
-    assert (process.returncode, out, err) == (0, "", "")
+    assert (process.returncode, out, err) == (130, "", "webots-mcp: ended by Ctrl-C\n")
 
 
 def test_a_follower_sees_each_line_once(rover: RecordedRobot) -> None:

@@ -1,12 +1,14 @@
 """The console commands.
 
 A command is one function under `@command`; what it needs is imported inside it, so that
-`webots-mcp --help` answers at once. Our own errors end it with one line on stderr and exit code 2.
+`webots-mcp --help` answers at once. Our own errors end it with one line on stderr and exit code 2,
+what the system refuses (a full disk) with one line and 1, Ctrl-C and SIGTERM with one and 130, 143.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import inspect
 import os
 import sys
@@ -15,11 +17,13 @@ from typing import Final
 
 from webots_mcp.cli import data, history, looking, serving
 from webots_mcp.cli.command import COMMANDS
+from webots_mcp.cli.ending import ended_by, ending_by_signals
 from webots_mcp.errors import WebotsMCPError
 
 __all__ = ["COMMANDS", "main"]
 
 FAMILIES: Final = (serving, looking, history, data)  # each registered its commands at import
+EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _DESCRIPTION: Final = (
     "Flight recorder and remote control for Webots simulations: controllers record into one "
@@ -29,19 +33,36 @@ _EPILOG: Final = "'webots-mcp COMMAND --help' explains a command. Try 'webots-mc
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command; returns the exit code: 0, or 2 for bad input and our own errors."""
-    arguments = _parser().parse_args(argv)
+    """Run a command; returns the exit code."""
     try:
-        arguments.run(arguments)
-        sys.stdout.flush()
+        with ending_by_signals():
+            arguments = _parser().parse_args(argv)
+            arguments.run(arguments)
+            sys.stdout.flush()
     except WebotsMCPError as error:
-        print(f"webots-mcp: {error}", file=sys.stderr)
-        return EXIT_BAD_INPUT
-    except KeyboardInterrupt:
-        return 0
+        return _end(EXIT_BAD_INPUT, str(error))
+    except KeyboardInterrupt as interrupt:
+        return _end(*ended_by(interrupt))
     except BrokenPipeError:  # the reader of a pipe has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _discard_output()
+    except OSError as error:
+        return _end(EXIT_SYSTEM, str(error))
     return 0
+
+
+def _end(code: int, text: str) -> int:
+    """Say why in one line; what could not be printed before is not tried again at the exit."""
+    with contextlib.suppress(OSError):
+        print(f"webots-mcp: {text}", file=sys.stderr, flush=True)
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _discard_output()
+    return code
+
+
+def _discard_output() -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _parser() -> argparse.ArgumentParser:

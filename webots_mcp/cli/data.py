@@ -7,7 +7,7 @@ import sqlite3
 import sys
 import time
 from collections.abc import Generator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -125,15 +125,12 @@ def _writable(
     arguments: argparse.Namespace, *, create: bool = False
 ) -> Generator[tuple[Recording, sqlite3.Connection]]:
     """The recording, migrated where it has to be, and a connection that may write to it."""
-    from webots_mcp.connection import connect
     from webots_mcp.contract import resolve_database
-    from webots_mcp.schema import create_schema
     from webots_mcp.store.recording import Recording
 
     recording = Recording(*resolve_database(arguments.database, arguments.data_dir))
     if create:
-        with closing(connect(recording.database, "writer", create=True)) as connection:
-            create_schema(connection)
+        recording.create()
     with recording.writer() as connection:
         yield recording, connection
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command
+from webots_mcp.cli.ending import ending_in_time
 from webots_mcp.cli.limits import LIMITS, retention_of
 from webots_mcp.errors import InvalidInputError
 
@@ -46,7 +47,9 @@ def serve(arguments: argparse.Namespace) -> None:
         )
     from webots_mcp.server import create_server
 
-    create_server(database, data_dir, read_only=arguments.read_only, retention=retention).run()
+    server = create_server(database, data_dir, read_only=arguments.read_only, retention=retention)
+    with ending_in_time():
+        server.run()
 
 
 @command(

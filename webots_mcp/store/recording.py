@@ -21,7 +21,7 @@ from webots_mcp.errors import (
     NothingRecordedError,
     SchemaTooOldError,
 )
-from webots_mcp.schema import require_current, schema_version
+from webots_mcp.schema import create_schema, require_current, schema_version
 from webots_mcp.store.queue import any_unfinished
 from webots_mcp.store.robots import Robot, resolve_robot, robot_name
 from webots_mcp.store.runs import Run, current_run, fetch_run
@@ -144,11 +144,27 @@ class Recording:
             if any_unfinished(connection):
                 settlement.settle(connection, time.time())
 
+    def create(self) -> None:
+        """Make the database where there is none, with its folder; one that is there is kept.
+
+        Raises:
+            DatabaseError: It cannot be made or written, or is not ours.
+        """
+        with (
+            self._explained(),
+            closing(connect(self.database, "writer", create=True)) as connection,
+        ):
+            create_schema(connection)
+
     @contextmanager
     def _opened(self, role: Role) -> Generator[sqlite3.Connection]:
+        with self._explained(), closing(self._open(role)) as connection:
+            yield connection
+
+    @contextmanager
+    def _explained(self) -> Generator[None]:
         try:
-            with closing(self._open(role)) as connection:
-                yield connection
+            yield
         except sqlite3.Error as error:
             raise DatabaseError(_explain(error, self.database)) from error
 

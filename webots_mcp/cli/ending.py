@@ -1,0 +1,68 @@
+"""How a command ends before it is done: by Ctrl-C or by SIGTERM."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Generator
+from types import FrameType
+from typing import Final
+
+_GRACE_S: Final = 0.5  # for giving back the lease and for commands that nobody waits for any more
+_WORDS: Final = {signal.SIGINT: "ended by Ctrl-C", signal.SIGTERM: "ended by SIGTERM"}
+
+
+@contextlib.contextmanager
+def ending_by_signals() -> Generator[None]:
+    """Let SIGTERM clean up as Ctrl-C does: by a KeyboardInterrupt, which carries the signal."""
+    if threading.current_thread() is not threading.main_thread():  # only that one gets signals
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, _interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+@contextlib.contextmanager
+def ending_in_time() -> Generator[None]:
+    """End the process at a signal, after half a second at most, whatever its threads wait for.
+
+    One that reads from a terminal waits for the next line, which nobody will type.
+    """
+
+    def end(number: int, frame: FrameType | None) -> None:
+        late = threading.Timer(_GRACE_S, _exit, [number])
+        late.daemon = True
+        late.start()
+        _interrupt(number, frame)
+
+    before = [(number, signal.signal(number, end)) for number in _WORDS]
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        _exit(*interrupt.args)
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
+
+
+def ended_by(interrupt: KeyboardInterrupt) -> tuple[int, str]:
+    """The exit code of a process that a signal has ended, and a word about it."""
+    number = signal.Signals(interrupt.args[0] if interrupt.args else signal.SIGINT)
+    return 128 + number, _WORDS[number]
+
+
+def _interrupt(number: int, _: FrameType | None) -> None:
+    raise KeyboardInterrupt(number)
+
+
+def _exit(number: int) -> None:
+    code, word = ended_by(KeyboardInterrupt(number))
+    with contextlib.suppress(OSError):
+        print(f"webots-mcp: {word}", file=sys.stderr, flush=True)
+    os._exit(code)

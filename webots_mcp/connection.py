@@ -10,6 +10,7 @@ import sqlite3
 import time
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Final, Literal, TypeVar
 
 from webots_mcp.contract import Database, MemoryDatabase
@@ -22,6 +23,7 @@ OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
 OPENING_TIMEOUT_MS: Final = 5000
 LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write waits so long
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
+_UNWRITABLE: Final = ("readonly database", "unable to open database file")
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
 
 # Why: a control loop never waits for a lock; an automatic checkpoint would be its slowest step,
@@ -29,14 +31,24 @@ _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
 _PRAGMAS: Final[dict[Role, tuple[str, ...]]] = {
     "loop": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
     "writer": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
-    "reader": ("query_only=ON",),
+    "reader": ("query_only=ON", "user_version"),  # asked for, it makes SQLite open the file
 }
+
+
+class FrozenConnection(sqlite3.Connection):
+    """To a file in a place that cannot be written, read as it lies on the disk.
+
+    Reading a database in WAL mode needs two files beside it. Where they cannot be made and are
+    not there, nothing but the file itself counts, and SQLite reads it as one that never changes.
+    """
 
 
 def connect(
     database: Database, role: Role, *, create: bool = False, patient: bool = True
 ) -> sqlite3.Connection:
     """Open the database in autocommit mode: transactions begin only where the code says so.
+
+    For a "reader" a file that cannot be written is opened as well, see `FrozenConnection`.
 
     Args:
         database: A file or a database in memory.
@@ -46,7 +58,8 @@ def connect(
 
     Raises:
         NoDatabaseError: The file is missing and `create` is false.
-        DatabaseError: The folder cannot be made, the file cannot be opened, or SQLite is too old.
+        DatabaseError: The folder cannot be made, the file cannot be opened, its log cannot be
+            read where nothing can be written, or SQLite is too old.
         sqlite3.Error: The file is no database, or is locked for longer than 5 s.
     """
     if sqlite3.sqlite_version_info < OLDEST_SQLITE:
@@ -55,25 +68,45 @@ def connect(
             "use a Python that was built with a newer one"
         )
     address = database.uri if isinstance(database, MemoryDatabase) else _file_uri(database, create)
+    timeout_s = OPENING_TIMEOUT_MS / 1000 if patient else 0
     try:
-        connection = sqlite3.connect(
-            address,
-            uri=True,
-            timeout=OPENING_TIMEOUT_MS / 1000 if patient else 0,
-            isolation_level=None,
-            check_same_thread=False,
-        )
+        connection = _open(address, timeout_s, sqlite3.Connection)
     except sqlite3.OperationalError as error:
         raise DatabaseError(f"{database} cannot be opened: {error}; check the folder") from error
     try:
         if create:
             _make_wal(connection)
         for pragma in _PRAGMAS[role]:
-            connection.execute(f"PRAGMA {pragma}")
-    except sqlite3.Error:
+            connection.execute(f"PRAGMA {pragma}").fetchall()
+    except sqlite3.Error as error:
         connection.close()
+        if role == "reader" and isinstance(database, Path) and is_unwritable(error):
+            return _open_frozen(database)
         raise
     return connection
+
+
+def _open(address: str, timeout_s: float, kind: type[sqlite3.Connection]) -> sqlite3.Connection:
+    return sqlite3.connect(
+        address,
+        uri=True,
+        timeout=timeout_s,
+        isolation_level=None,
+        check_same_thread=False,
+        factory=kind,
+    )
+
+
+def _open_frozen(file: Path) -> sqlite3.Connection:
+    """Never beside a log: it may hold the newest rows, or somebody may be writing it."""
+    log = file.with_name(f"{file.name}-wal")
+    if log.exists():
+        raise DatabaseError(
+            f"{file} lies where nothing can be written, and rows that are still in {log.name} can "
+            "only be read where SQLite can make a file beside it: copy both to a folder of your "
+            "own and give --database that copy"
+        )
+    return _open(f"{file.absolute().as_uri()}?mode=ro&immutable=1", 0, FrozenConnection)
 
 
 def never_wait(connection: sqlite3.Connection) -> None:
@@ -154,6 +187,13 @@ def is_damage(error: Exception) -> bool:
     return isinstance(error, sqlite3.DatabaseError) and any(s in str(error) for s in _DAMAGE)
 
 
+def is_unwritable(error: Exception) -> bool:
+    """Whether the file, or the folder that it needs for its log, cannot be written."""
+    return isinstance(error, sqlite3.OperationalError) and any(
+        text in str(error) for text in _UNWRITABLE
+    )
+
+
 def identify_files(database: Database) -> tuple[int, ...]:
     """Which files a database consists of at this moment.
 
@@ -179,11 +219,18 @@ def _file_uri(file: Database, create: bool) -> str:
             file.parent.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise DatabaseError(f"the folder {file.parent} cannot be made: {error}") from error
-    elif not file.exists():
+    elif not _exists(file):
         raise NoDatabaseError(
             f"no database at {file}: no controller with an MCPBridge has recorded there yet"
         )
     return f"{file.absolute().as_uri()}?mode={'rwc' if create else 'rw'}"
+
+
+def _exists(file: Path) -> bool:
+    try:
+        return file.exists()
+    except OSError as error:
+        raise DatabaseError(f"{file} cannot be looked at: {error}") from error
 
 
 def _make_wal(connection: sqlite3.Connection) -> None:

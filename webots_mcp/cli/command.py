@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
+    import sqlite3
+
     from webots_mcp.store.recording import Recording
 
 
@@ -65,6 +69,17 @@ DATA_DIR: Final = argument(
 DATABASE: Final = argument("--database", metavar="FILE", help="the database file itself")
 ROBOT: Final = argument("--robot", metavar="NAME", help="only this robot")
 JSON: Final = argument("--json", action="store_true", help="print it as JSON")
+
+
+@contextmanager
+def reading(arguments: argparse.Namespace) -> Generator[sqlite3.Connection]:
+    """A connection to the recording; how it is read is said on stderr where that matters."""
+    from webots_mcp.store.recording import storage
+
+    with open_recording(arguments).reader() as connection:
+        for said in storage(connection).values():
+            print(f"webots-mcp: {said}", file=sys.stderr)
+        yield connection
 
 
 def open_recording(arguments: argparse.Namespace) -> Recording:

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command, open_recording
+from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command, open_recording, reading
 from webots_mcp.cli.history import RANGE, range_of
 from webots_mcp.cli.limits import LIMITS, retention_of
 from webots_mcp.cli.progress import shown_progress
@@ -49,7 +49,7 @@ def export(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"{file} is the recording itself: choose another file")
     if file is None and form == "parquet" and sys.stdout.isatty():
         raise InvalidInputError("Parquet is not for a terminal: give a file with -o")
-    with recording.reader() as connection, shown_progress("exporting") as progress:
+    with reading(arguments) as connection, shown_progress("exporting") as progress:
         wanted = range_of(connection, arguments)
         if file is None:
             write(connection, wanted, form, sys.stdout.buffer, progress)
@@ -100,7 +100,7 @@ def prune(arguments: argparse.Namespace) -> None:
 
     retention = retention_of(arguments)
     if arguments.dry_run:
-        with open_recording(arguments).reader() as connection:
+        with reading(arguments) as connection:
             return _print_plan(plan(connection, retention), "would go")
     with _writable(arguments) as (recording, connection):
         _print_plan(plan(connection, retention), "goes")

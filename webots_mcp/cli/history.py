@@ -20,7 +20,7 @@ from webots_mcp.cli.command import (
     argument,
     command,
     count,
-    open_recording,
+    reading,
 )
 from webots_mcp.cli.tables import print_notes, print_table
 from webots_mcp.errors import InvalidInputError
@@ -54,7 +54,7 @@ def runs(arguments: argparse.Namespace) -> None:
     """List the runs: when, with which code, how long, how fast, how they ended."""
     from webots_mcp.store.history.runs import list_runs
 
-    with open_recording(arguments).reader() as connection:
+    with reading(arguments) as connection:
         found = list_runs(connection, robot=arguments.robot, limit=arguments.n)
     if arguments.json:
         return _print_json(found)
@@ -84,7 +84,7 @@ def history(arguments: argparse.Namespace) -> None:
     """
     from webots_mcp.store.history.series import query_history
 
-    with open_recording(arguments).reader() as connection:
+    with reading(arguments) as connection:
         found = query_history(
             connection, range_of(connection, arguments), arguments.signals,
             max_points=arguments.points,
@@ -104,7 +104,7 @@ def trends(arguments: argparse.Namespace) -> None:
     """Say in one line each what the signals did; what changed most comes first."""
     from webots_mcp.store.history.trends import trends as find_trends
 
-    with open_recording(arguments).reader() as connection:
+    with reading(arguments) as connection:
         found = find_trends(
             connection, range_of(connection, arguments), arguments.signals or ["*"],
             limit=arguments.n,
@@ -130,7 +130,7 @@ def events(arguments: argparse.Namespace) -> None:
     """Find what happened: changes, stuck, gaps, jumps, silent sensors, commands, warnings."""
     from webots_mcp.store.history.events import find_events
 
-    with open_recording(arguments).reader() as connection:
+    with reading(arguments) as connection:
         found = find_events(
             connection, range_of(connection, arguments), _options(arguments), limit=arguments.n
         )
@@ -161,7 +161,7 @@ def plot(arguments: argparse.Namespace) -> None:
 
     file = Path(arguments.output)
     run_ids = [*([arguments.run_id] if arguments.run_id is not None else []), *arguments.run_ids]
-    with open_recording(arguments).reader() as connection:
+    with reading(arguments) as connection:
         picture = plotting.plot(
             connection,
             "trajectory" if arguments.trajectory else "signals",
@@ -195,7 +195,7 @@ def compare(arguments: argparse.Namespace) -> None:
     from webots_mcp.store.history.compare import compare_code, compare_runs
 
     names = arguments.signal or ["*"]
-    with open_recording(arguments).reader() as connection:
+    with reading(arguments) as connection:
         if arguments.run_ids:
             found = compare_runs(connection, arguments.run_ids, names=names, limit=arguments.n)
         else:

@@ -17,6 +17,7 @@ from webots_mcp.cli.command import (
     command,
     count,
     open_recording,
+    reading,
 )
 from webots_mcp.errors import InvalidInputError
 
@@ -38,7 +39,11 @@ def status(arguments: argparse.Namespace) -> None:
             recordings.view_of(connection, robot, None, now_s)
             for robot in list_robots(connection, now_s)
         ]
-        facts = {"database": str(recording.database), "robots": [_facts(view) for view in views]}
+        facts = {
+            "database": str(recording.database),
+            **recordings.storage(connection),
+            "robots": [_facts(view) for view in views],
+        }
     print(json.dumps(facts, indent=2) if arguments.json else _as_text(facts))
 
 
@@ -56,18 +61,21 @@ def status(arguments: argparse.Namespace) -> None:
 def tail(arguments: argparse.Namespace) -> None:
     """Follow what is being recorded: states, log lines, events, commands. Ctrl-C ends it.
 
-    Of the states that came since the last look the newest of each robot is shown.
+    Of the states that came since the last look the newest of each robot is shown. Where nothing
+    can be written, nothing can come, and it ends after the last lines.
     """
     from webots_mcp.store.follow import Follower
+    from webots_mcp.store.recording import storage
     from webots_mcp.store.robots import resolve_robot
 
     if arguments.interval <= 0:
         raise InvalidInputError("--interval must be greater than 0")
-    with open_recording(arguments).reader() as connection:
+    with reading(arguments) as connection:
         robot = arguments.robot and resolve_robot(connection, arguments.robot, time.time())
         follower = Follower(connection, robot.id if robot else None)
         _print_lines(follower.look(arguments.n))
-        while not arguments.no_follow:
+        following = not arguments.no_follow and not storage(connection)
+        while following:
             time.sleep(arguments.interval)
             _print_lines(_newest_states_only(follower.look()))
 
@@ -91,7 +99,8 @@ def _facts(view: View) -> dict[str, Any]:
 
 def _as_text(facts: dict[str, Any]) -> str:
     robots = "\n".join(_robot_as_text(robot) for robot in facts["robots"])
-    return f"{facts['database']}\n{robots or 'no robot was recorded yet'}"
+    where = "\n".join(facts[name] for name in ("database", "storage") if name in facts)
+    return f"{where}\n{robots or 'no robot was recorded yet'}"
 
 
 def _robot_as_text(robot: dict[str, Any]) -> str:

@@ -16,7 +16,7 @@ from webots_mcp.server.shortening import (
     round_number,
     shorten,
 )
-from webots_mcp.store.recording import View, look
+from webots_mcp.store.recording import View, look, storage
 
 BUDGET: Final = 6_600  # characters of JSON, of the 8,000 that are 2,000 tokens; the header has 600
 LARGE_BUDGET: Final = 40_000  # where the asker said how much: clients put longer answers aside
@@ -44,7 +44,7 @@ def header_of_only(connection: sqlite3.Connection) -> dict[str, Any]:
     try:
         return look(connection, None).header()
     except (AmbiguousRobotError, NothingRecordedError):
-        return {}
+        return {**storage(connection)}
 
 
 def figure(value: float | None) -> float | None:

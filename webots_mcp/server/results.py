@@ -27,6 +27,9 @@ class Answer(BaseModel):
         default=None, description="running, paused, starting, 'stopped N s ago', 'never seen'."
     )
     why: str | None = Field(default=None, description="What the status rests on.")
+    storage: str | None = Field(
+        default=None, description="Where the recording cannot be written: how it was read."
+    )
     hint: str | None = Field(default=None, description="What to do next.")
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp import settlement
-from webots_mcp.connection import Role, connect, is_busy, is_damage
+from webots_mcp.connection import FrozenConnection, Role, connect, is_busy, is_damage, is_unwritable
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import (
     DatabaseError,
@@ -35,6 +35,8 @@ GETTING_STARTED: Final = (
     "then start the simulation. 'webots-mcp demo' shows it without Webots. If controllers record "
     "elsewhere, start the server with --data-dir or --database."
 )
+
+_FROZEN: Final = "the file cannot be written from here: read as it lies on the disk"
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ class View:
             "age_s": None if wall_time_s is None else self.age_s(wall_time_s),
             "status": self.status.text,
             "why": self.status.why,
+            **storage(self.connection),
         }
 
     def _newest_times(self) -> tuple[float, float] | tuple[None, None]:
@@ -175,8 +178,12 @@ class Recording:
             raise NoDatabaseError(f"{error}. {GETTING_STARTED}") from error
         try:
             self._require_ours(connection)
-        except SchemaTooOldError:
+        except SchemaTooOldError as error:
             connection.close()
+            if isinstance(connection, FrozenConnection):
+                raise SchemaTooOldError(
+                    f"{error}, of a copy in a folder that can be written; {_FROZEN}"
+                ) from error
             self._migrate()
             return connect(self.database, role)
         except BaseException:
@@ -232,6 +239,11 @@ def view_of(connection: sqlite3.Connection, robot: Robot, run_id: int | None, no
     return View(connection, robot, run, run == current, now_s)
 
 
+def storage(connection: sqlite3.Connection) -> dict[str, Any]:
+    """What an answer says of the file that it was read from; nothing where robots may record."""
+    return {"storage": _FROZEN} if isinstance(connection, FrozenConnection) else {}
+
+
 def name_of(database: Database) -> str:
     """The database as a person knows it."""
     return "(in memory)" if isinstance(database, MemoryDatabase) else str(database)
@@ -249,5 +261,10 @@ def _explain(error: sqlite3.Error, database: Database) -> str:
         return (
             f"the database at {name} is damaged ({text}): the bridge moves such a file aside at "
             "its next start; 'sqlite3 FILE .recover' can save rows from it"
+        )
+    if is_unwritable(error):
+        return (
+            f"the database at {name} cannot be written from here ({text}): commands that read it, "
+            "and 'webots-mcp serve --read-only', work"
         )
     return f"the database at {name} cannot be used: {text}; check free space and permissions"

@@ -10,7 +10,7 @@ from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.parameters import RobotName, RunId
 from webots_mcp.server.results import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.server.shortening import cut_text, round_number
-from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, view_of
+from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.runs import Run, count_runs
 from webots_mcp.store.sessions import Session, companions, fetch_session
@@ -46,7 +46,7 @@ class WorldTools:
             live = [view for view in views if view.robot.live]
             hint = f"{len(robots)} robots in all, the latest {len(views)} are shown"
             return RobotsAnswer(
-                **(live[0].header() if len(live) == 1 else {}),
+                **(live[0].header() if len(live) == 1 else storage(connection)),
                 robots=Table(columns=list(_ROBOT_COLUMNS), rows=[_row(view) for view in views]),
                 hint=hint if len(robots) > len(views) else None,
             )

@@ -210,7 +210,7 @@ def test_a_program_of_ones_own_can_be_an_extern_controller(
             text=True,
             check=False,
         )
-        assert "there is no robot 'rover-not'" in refused.stderr
+        assert "no robot 'rover-not'" in refused.stderr
 
 
 def test_a_controller_that_no_simulation_started_says_what_to_do(

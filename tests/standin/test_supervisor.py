@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from controller import Field, Node
 
+from tests.standin.placing import place
 from webots_mcp.standin import InProcessSupervisor, Mode
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 
@@ -25,12 +26,14 @@ def test_the_scene_tree_can_be_walked(robot: InProcessSupervisor) -> None:
     nodes = [children.getMFNode(i) for i in range(children.getCount())]
     assert [node.getDef() for node in nodes if node and node.getType() == Node.ROBOT] == ["ROVER"]
     last = children.getMFNode(-1)
-    assert last == robot.getSelf()
-    assert last is not None and last.getTypeName() == last.getBaseTypeName() == "Robot"
-    assert last.getParentNode() == robot.getRoot()
-    assert robot.getFromId(last.getId()) == last
+    assert last is not None and last.getId() == robot.getSelf().getId()
+    assert last.getTypeName() == last.getBaseTypeName() == "Robot"
+    parent, again = last.getParentNode(), robot.getFromId(last.getId())
+    assert parent is not None and parent.getId() == robot.getRoot().getId()
+    assert again is not None and again.getDef() == "ROVER"
+    assert again != last  # as in Webots: each call gives another object
     assert robot.getFromDef("NOBODY") is None
-    lidar = robot.getFromDevice(robot.getDevice("lidar").tag)
+    lidar = robot.getFromDevice(robot.getDevice("lidar")._tag)
     assert lidar is not None and lidar.getType() == Node.LIDAR
 
 
@@ -56,8 +59,56 @@ def test_fields_refuse_values_of_the_wrong_type(
     place.setSFVec3f((0.0, 0.0, 0.0))  # type: ignore[arg-type]
     place.setSFVec3f([0.0, 0.0])
     place.setSFFloat(1.0)
+    place.value = 1.0
     assert place.getSFVec3f() == [-1.2, 0.0, 0.04]
-    assert capfd.readouterr().err.count("wrong type or length") == 2
+    printed = capfd.readouterr().err
+    assert printed.count("wrong type or length") == 3
+    assert printed.count("length of 'value' argument should be 3") == 1
+
+
+def test_assigning_a_field_sets_it_with_the_next_step(robot: InProcessSupervisor) -> None:
+    place = robot.getSelf().getField("translation")
+    assert place is not None
+    place.value = [1, 0, 0.04]
+    assert place.value == [1.0, 0.0, 0.04]
+    robot.step(0)
+    assert robot.getSelf().getPosition() == [1.0, 0.0, 0.04]
+
+
+def test_a_pose_can_be_seen_from_another_node(robot: InProcessSupervisor) -> None:
+    place(robot, 1.0, 0.5, 1.5707963)
+    wheel = robot.getFromDef("ROVER.LEFT_WHEEL")
+    assert wheel is not None
+    pose = wheel.getPose(robot.getSelf())
+    assert [pose[3], pose[7], pose[11]] == pytest.approx([0.0, 0.075, 0.0], abs=1e-6)
+    back = robot.getSelf().getPose(robot.getSelf())
+    assert back == pytest.approx([*(1, 0, 0, 0), *(0, 1, 0, 0), *(0, 0, 1, 0), *(0, 0, 0, 1)])
+
+
+def test_a_box_whose_velocity_is_set_slides_until_friction_stops_it(
+    robot: InProcessSupervisor,
+) -> None:
+    crate = robot.getFromDef("CRATE")
+    assert crate is not None
+    x, y, _ = crate.getPosition()
+    crate.setVelocity([0.0, -1.0, 0.0, 0.0, 0.0, 0.0])
+    robot.step(STEP_MS)
+    assert crate.getVelocity()[1] == pytest.approx(-1.0 + 9.81 * 0.016)
+    robot.step(100 * STEP_MS)
+    assert crate.getVelocity() == [0.0] * 6
+    # v²/2g, and half a step more: a step slides at the speed with which it begins
+    assert crate.getPosition()[1] == pytest.approx(y - 1.0 / 2.0 / 9.81 - 0.008, abs=0.002)
+    assert crate.getPosition()[0] == x
+
+
+def test_a_robot_whose_velocity_is_set_is_back_on_its_wheels_after_one_step(
+    robot: InProcessSupervisor,
+) -> None:
+    robot.getSelf().setVelocity([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
+    robot.step(STEP_MS)
+    assert robot.getSelf().getPosition()[0] == pytest.approx(-1.2 + 0.5 * 0.016)
+    robot.step(STEP_MS)
+    assert robot.getSelf().getVelocity() == [0.0] * 6
 
 
 def test_a_field_that_was_set_reads_new_before_the_world_follows(

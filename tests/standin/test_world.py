@@ -62,8 +62,6 @@ def test_nested_places_add_up(tmp_path: Path) -> None:
         ("WorldInfo {}\nSolid { translation 1 2 }", 3, "translation has to be SFVec3f"),
         ("WorldInfo {}\nSolid {\n", 3, "ends in the middle"),
         ("WorldInfo {}\nUSE NOBODY", 3, "before any DEF NOBODY"),
-        ("WorldInfo {}\nE-puck {}", 3, "does not know E-puck nodes"),
-        ('EXTERNPROTO "x.proto"\nWorldInfo {}', 2, "base nodes"),
         ("WorldInfo {}\nSolid { children ] }", 3, "children has no value"),
         ("Solid {}", 1, "no WorldInfo"),
         ("WorldInfo { basicTimeStep 0 }", 2, "positive"),

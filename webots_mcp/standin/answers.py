@@ -8,8 +8,8 @@ from typing import Any, Final
 from controller.wire import Message
 
 from webots_mcp.standin.arena import Body
-from webots_mcp.standin.nodes import NODE_TYPES
 from webots_mcp.standin.picture import Label
+from webots_mcp.standin.protos import shown_definitions
 from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
 from webots_mcp.standin.vrml import Node
 
@@ -36,6 +36,7 @@ def description(simulator: Simulator, robot: Robot) -> dict[str, Any]:
         "project_path": str(simulator.world.path.parent.parent),
         "time": simulator.time_s,
         "mode": int(simulator.mode),
+        "left_out": simulator.world.left_out_in(robot.node),
         "devices": [device.description() for device in robot.devices.values()],
     }
 
@@ -126,14 +127,15 @@ class SupervisorRequests:
     def _shown(self, node: Node | None) -> Any:
         if node is None:
             return None
-        return (self._world.id_of(node), node.type_name, node.def_name)
+        type_name = node.proto_name or node.type_name
+        return (self._world.id_of(node), type_name, node.type_name, node.def_name)
 
     # Fields --------------------------------------------------------------------------------------
 
     def on_node_get_field(self, node_id: int, name: str) -> Any:
         """Type and number of entries of a field; None if the node has no such field."""
         node = self._world.nodes[node_id]
-        definition = NODE_TYPES[node.type_name].get(name)
+        definition = shown_definitions(node).get(name)
         if definition is None:
             return None
         many = definition.type_name.startswith("MF")
@@ -141,7 +143,7 @@ class SupervisorRequests:
 
     def on_node_get_field_names(self, node_id: int) -> list[str]:
         """The names of all fields of a node."""
-        return [*NODE_TYPES[self._world.nodes[node_id].type_name]]
+        return [*shown_definitions(self._world.nodes[node_id])]
 
     def on_field_get(self, field: FieldReference, index: int | None) -> Any:
         """The value of a field or of one entry of it; None beyond its end."""
@@ -169,9 +171,15 @@ class SupervisorRequests:
 
     # Places --------------------------------------------------------------------------------------
 
-    def on_node_get_pose(self, node_id: int) -> Any:
-        """Orientation (9 numbers) and position (3) in the world; None for what has no place."""
+    def on_node_get_pose(self, node_id: int, seen_from_id: int | None = None) -> Any:
+        """Orientation (9 numbers) and position (3), seen from the world or another node.
+
+        None for what has no place.
+        """
         frame = self._world.frame_of(self._world.nodes[node_id])
+        if frame is not None and seen_from_id is not None:
+            seen_from = self._world.frame_of(self._world.nodes[seen_from_id])
+            frame = frame if seen_from is None else seen_from.inverse().then(frame)
         return None if frame is None else (frame.rotation, frame.translation)
 
     def on_node_get_velocity(self, node_id: int) -> Any:
@@ -182,8 +190,16 @@ class SupervisorRequests:
             return None
         return [*body.velocity_mps, 0.0, 0.0, 0.0, body.yaw_rate_radps]
 
+    def on_node_set_velocity(self, node_id: int, velocity: list[float]) -> None:
+        """Set a body in motion, on the plane."""
+        if body := self._body_around(self._world.nodes[node_id]):
+            body.velocity_mps, body.yaw_rate_radps = (velocity[0], velocity[1]), velocity[5]
+            body.is_pushed = True
+
     def on_node_reset_physics(self, node_id: int) -> None:
-        """Take a robot's speed away."""
+        """Take a body's speed away."""
+        if body := self._body_around(self._world.nodes[node_id]):
+            body.stop()
         for robot in self._simulator.robots:
             if robot.node is self._world.nodes[node_id]:
                 robot.vehicle.stop()
@@ -234,7 +250,9 @@ class SupervisorRequests:
         self, number: int, text: str, x: float, y: float, size: float, rgb: int
     ) -> None:
         """Show a text over the picture; an empty one takes it away."""
-        if text:
+        if not 0 <= number <= 99:
+            self._simulator.log(f"ERROR: setLabel: the id {number} is not between 0 and 99")
+        elif text:
             self._simulator.labels[number] = Label(text, x, y, size, rgb)
         else:
             self._simulator.labels.pop(number, None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from math import cos, hypot, sin
+from math import cos, hypot, pi, sin
 from typing import Final
 
 from webots_mcp.standin.camera import SceneColors
@@ -13,8 +13,11 @@ from webots_mcp.standin.shapes import Block, Color, Disc, Shape
 from webots_mcp.standin.vrml import Node
 from webots_mcp.standin.world import World, children_of, descendants_of, own_frame
 
-_GEOMETRIES: Final = ("Box", "Cylinder", "Sphere")
+_GEOMETRIES: Final = ("Box", "Capsule", "Cylinder", "Sphere")
 _DEFAULT_COLOR: Final[Color] = (0.5, 0.5, 0.5)
+_LIGHTS: Final = ("DirectionalLight", "PointLight", "SpotLight")
+_SLIDING_FRICTION: Final = 1.0
+"""Coulomb friction of everything on the floor, Webots' default."""
 
 
 @dataclass(frozen=True)
@@ -25,6 +28,8 @@ class Part:
     frame: Frame
     half_m: tuple[float, float, float]
     color: Color
+    is_solid: bool
+    """Whether it is (part of) a bounding object: something to drive into."""
 
     def standing(self, body: Frame) -> Shape:
         """This part as a shape in the world, for a body that stands upright."""
@@ -69,11 +74,15 @@ class Body:
     def __init__(self, node: Node, frame: Frame) -> None:
         self.node = node
         self.name: str = node.fields["name"]
-        self.is_obstacle = node.fields["boundingObject"] is not None
         self.is_movable = node.type_name == "Solid" and node.fields["physics"] is not None
         self.velocity_mps = (0.0, 0.0)
         self.yaw_rate_radps = 0.0
+        self.is_pushed = False
+        """Whether its speed was set from outside and has not been worn off yet."""
+        self.touched: list[tuple[float, float]] = []
+        """By how much it was pushed back by what it ran into in the last step, metres."""
         self.stand(frame)
+        self.is_obstacle = any(part.is_solid for part in self.parts)
 
     def stand(self, frame: Frame) -> None:
         """Put the body where `frame` says, tilted as it may be."""
@@ -84,6 +93,15 @@ class Body:
         self.parts = [*_parts_of(self.node, tilt, _color_of(self.node))]
         self.footprint = Footprint.around(self.parts)
         self._shapes: tuple[Shape, ...] | None = None
+
+    def stop(self) -> None:
+        """Take its speed away."""
+        self.velocity_mps, self.yaw_rate_radps, self.is_pushed = (0.0, 0.0), 0.0, False
+
+    def mass_kg(self) -> float:
+        """What the Physics nodes in it weigh; without one it weighs nothing."""
+        solids = (self.node, *descendants_of(self.node))
+        return sum(_mass_kg(node) for node in solids if node.fields.get("physics"))
 
     @property
     def frame(self) -> Frame:
@@ -108,6 +126,12 @@ class Body:
             self._shapes = tuple(part.standing(frame) for part in self.parts)
         return self._shapes
 
+    @property
+    def solid_shapes(self) -> list[Shape]:
+        """The parts that one can drive into, where they stand now."""
+        pairs = zip(self.parts, self.shapes, strict=True)
+        return [shape for part, shape in pairs if part.is_solid]
+
     def centre(self) -> tuple[float, float]:
         """Where the centre of the footprint is in the world."""
         disc, c, s = self.footprint, cos(self.yaw_rad), sin(self.yaw_rad)
@@ -126,7 +150,11 @@ class Arena:
 
     def __init__(self, world: World) -> None:
         self.bodies = [*_bodies_in(world.root, Frame())]
+        self.world = world
         self.colors = _scene_colors(world)
+        self.lights = [node for node in world.nodes if node.type_name in _LIGHTS]
+        self.gravity_mps2: float = world.info.fields["gravity"]
+        self.step_s = world.basic_time_step_ms / 1000.0
         self._obstacles = [body for body in self.bodies if body.is_obstacle]
         self._movable = [body for body in self._obstacles if body.is_movable]
 
@@ -140,19 +168,38 @@ class Arena:
             shape
             for body in self.bodies
             if body is not without and body.is_obstacle
-            for shape in body.shapes
+            for shape in body.solid_shapes
         ]
 
     def settle(self, body: Body) -> bool:
         """Move a body out of what it drove into; True if that did not give way."""
+        body.touched.clear()
         for movable in self._movable:
             self._push_away(movable, body)
         return self._clear(body)
 
+    def glide(self, seconds: float) -> None:
+        """Let movable bodies whose speed was set slide on, until friction has stopped them."""
+        for body in self._movable:
+            if body.is_pushed:
+                self.slide(body, seconds)
+                if self._clear(body):
+                    body.stop()
+
+    def slide(self, body: Body, seconds: float) -> None:
+        """Let a body slide for one time step, slower and slower."""
+        (vx, vy), turn = body.velocity_mps, body.yaw_rate_radps
+        body.move(body.x + vx * seconds, body.y + vy * seconds, body.yaw_rad + turn * seconds)
+        speed, lost = hypot(vx, vy), _SLIDING_FRICTION * self.gravity_mps2 * seconds
+        left = 1.0 - lost / speed if speed > lost else 0.0
+        body.velocity_mps, body.yaw_rate_radps = (vx * left, vy * left), turn * left
+        body.is_pushed = left > 0.0
+
     def _push_away(self, movable: Body, pusher: Body) -> None:
         x, y = pusher.centre()
-        for shape in movable.shapes:
+        for shape in movable.solid_shapes:
             if push := shape.push(x, y, pusher.footprint.radius_m):
+                pusher.touched.append(push)
                 movable.move(movable.x - push[0], movable.y - push[1], movable.yaw_rad)
                 self._clear(movable, pusher)
 
@@ -164,16 +211,17 @@ class Arena:
                 continue
             for shape in _solid_shapes(other):
                 if push := shape.push(x, y, body.footprint.radius_m):
+                    body.touched.append(push)
                     body.move(body.x + push[0], body.y + push[1], body.yaw_rad)
                     (x, y), touched = body.centre(), True
         return touched
 
 
-def _solid_shapes(body: Body) -> tuple[Shape, ...]:
+def _solid_shapes(body: Body) -> list[Shape]:
     if body.node.type_name != "Robot":
-        return body.shapes
+        return body.solid_shapes
     x, y = body.centre()  # two robots meet as discs
-    return (Disc(x, y, body.footprint.radius_m, 0.0, 1.0, _DEFAULT_COLOR),)
+    return [Disc(x, y, body.footprint.radius_m, 0.0, 1.0, _DEFAULT_COLOR)]
 
 
 def _scene_colors(world: World) -> SceneColors:
@@ -200,18 +248,39 @@ def _parts_of(node: Node, frame: Frame, color: Color) -> Iterator[Part]:
     bounding = node.fields["boundingObject"]
     shown = [bounding] if bounding else node.fields["children"]
     for child in shown:
-        yield from _geometries(child, frame, color)
+        for geometry, place in _geometries(child, frame):
+            yield _part(geometry, place, color, is_solid=bounding is not None)
     for child in node.fields["children"]:
         yield from _solids(child, frame)
 
 
-def _geometries(node: Node, frame: Frame, color: Color) -> Iterator[Part]:
+def bounding_parts(node: Node, frame: Frame) -> list[Part]:
+    """The bounding object of a node that stands at `frame`."""
+    bounding = node.fields["boundingObject"]
+    geometries = _geometries(bounding, frame) if bounding else ()
+    return [_part(geometry, place, _DEFAULT_COLOR, True) for geometry, place in geometries]
+
+
+def _mass_kg(node: Node) -> float:
+    physics = node.fields["physics"].fields
+    if physics["mass"] >= 0.0:
+        return physics["mass"]
+    return physics["density"] * sum(_volume_m3(part) for part in bounding_parts(node, Frame()))
+
+
+def _volume_m3(part: Part) -> float:
+    hx, hy, hz = part.half_m
+    share = {"Box": 1.0, "Sphere": pi / 6.0}.get(part.kind, pi / 4.0)
+    return share * 8.0 * hx * hy * hz
+
+
+def _geometries(node: Node, frame: Frame) -> Iterator[tuple[Node, Frame]]:
     frame = frame.then(own_frame(node))
     if node.type_name in _GEOMETRIES:
-        yield _part(node, frame, color)
+        yield node, frame
     elif node.type_name in ("Group", "Pose", "Transform", "Shape"):
         for child in children_of(node):
-            yield from _geometries(child, frame, color)
+            yield from _geometries(child, frame)
 
 
 def _solids(node: Node, frame: Frame) -> Iterator[Part]:
@@ -223,18 +292,19 @@ def _solids(node: Node, frame: Frame) -> Iterator[Part]:
             yield from _solids(child, frame)
 
 
-def _part(geometry: Node, frame: Frame, color: Color) -> Part:
+def _part(geometry: Node, frame: Frame, color: Color, is_solid: bool) -> Part:
     fields = geometry.fields
     if geometry.type_name == "Box":
         hx, hy, hz = (size / 2.0 for size in fields["size"])
     elif geometry.type_name == "Sphere":
-        return Part("Sphere", frame, (fields["radius"],) * 3, color)
+        return Part("Sphere", frame, (fields["radius"],) * 3, color, is_solid)
     else:
         hx, hy, hz = fields["radius"], fields["radius"], fields["height"] / 2.0
+        hz += fields["radius"] if geometry.type_name == "Capsule" else 0.0
     if frame.rotation[8] > 0.999:
-        return Part(geometry.type_name, frame, (hx, hy, hz), color)
+        return Part(geometry.type_name, frame, (hx, hy, hz), color, is_solid)
     lying = _turned_half(frame, (hx, hy, hz))  # a lying shape counts as the box around it
-    return Part("Box", Frame(translation=frame.translation), lying, color)
+    return Part("Box", Frame(translation=frame.translation), lying, color, is_solid)
 
 
 def _turned_half(frame: Frame, half_m: tuple[float, float, float]) -> tuple[float, float, float]:

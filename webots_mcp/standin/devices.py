@@ -3,96 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import cos, inf, nan, pi, sin
 from typing import Any, Final
 
 from webots_mcp.standin import camera
-from webots_mcp.standin.arena import Arena, Body
+from webots_mcp.standin.arena import Arena
+from webots_mcp.standin.device import Device, Site, looked_up, table_of
 from webots_mcp.standin.frame import Frame
+from webots_mcp.standin.light_sensor import LightSensor
+from webots_mcp.standin.motion_sensors import Accelerometer, Compass, Gyro
 from webots_mcp.standin.nodes import DEVICE_TYPES
-from webots_mcp.standin.physics import Joint, Vehicle
+from webots_mcp.standin.physics import Vehicle
 from webots_mcp.standin.shapes import Shape, nearest_m, targets_from
+from webots_mcp.standin.touch_sensor import TouchSensor
 from webots_mcp.standin.vrml import Node
 from webots_mcp.standin.world import children_of, own_frame
 
-
-@dataclass(frozen=True)
-class Site:
-    """What a device is built into."""
-
-    vehicle: Vehicle
-    arena: Arena
-    frame: Frame
-    """Where the device stands in the robot."""
-    joint: Joint | None
-
-    @property
-    def body(self) -> Body:
-        """The robot's body."""
-        return self.vehicle.body
-
-    def place(self) -> tuple[float, float, float, float]:
-        """The device in the world: x, y, z in metres and yaw in radians."""
-        body, (x, y, z) = self.body, self.frame.translation
-        c, s = cos(body.yaw_rad), sin(body.yaw_rad)
-        yaw = body.yaw_rad + self.frame.yaw_rad
-        return body.x + c * x - s * y, body.y + s * x + c * y, body.z + z, yaw
-
-
-class Device:
-    """One device; subclasses measure or set something."""
-
-    kind = "Device"
-    """The class of the `controller` package that stands for it."""
-    fetched = False
-    """Whether a sample stays here until the controller looks at it (pictures and scans)."""
-
-    def __init__(self, tag: int, node: Node, site: Site) -> None:
-        self.tag = tag
-        self.node = node
-        self.site = site
-        self.name: str = node.fields["name"]
-        self.period_ms = 0
-        self._wait_ms = 0.0
-
-    def description(self) -> dict[str, Any]:
-        """What the controller is told about the device when it connects."""
-        return {
-            "tag": self.tag,
-            "kind": self.kind,
-            "name": self.name,
-            "model": self.node.fields.get("model", ""),
-            "node_type": self.node.type_name,
-            "fetched": self.fetched,
-        }
-
-    def configure(self, setting: str, value: Any) -> None:
-        """Take a setting from the controller."""
-        if setting == "period":
-            self.period_ms, self._wait_ms = value, float(value)
-
-    def make_due(self) -> None:
-        """Let an enabled sensor measure at the end of the step under way."""
-        self._wait_ms = 0.0
-
-    def is_due(self, passed_ms: float) -> bool:
-        """Let time pass; True if it is time to measure."""
-        if not self.period_ms:
-            return False
-        self._wait_ms -= passed_ms
-        if self._wait_ms > 0.0:
-            return False
-        self._wait_ms += self.period_ms
-        return True
-
-    def measure(self, period_ms: float) -> Any:
-        """What the sensor shows now, as the wire carries it."""
-        raise AttributeError(f"{self.kind} {self.name!r} measures nothing")
-
-    def fetch(self) -> Any:
-        """What the last sample shows, for devices with `fetched`."""
-        raise AttributeError(f"{self.kind} {self.name!r} has no pictures")
+_DISTANCE_SENSOR_TYPES: Final = {"generic": 0, "infra-red": 1, "sonar": 2, "laser": 3}
 
 
 class Motor(Device):
@@ -111,6 +38,7 @@ class Motor(Device):
             "max_velocity": fields["maxVelocity"],
             "max_torque": fields["maxTorque"],
             "acceleration": fields["acceleration"],
+            "multiplier": fields["multiplier"],
             "position_sensor": names[0] if names else None,
         }
 
@@ -153,7 +81,8 @@ class DistanceSensor(Device):
             "min_value": min(values),
             "max_value": max(values),
             "aperture": self.node.fields["aperture"],
-            "lookup_table": [number for row in self.table for number in row],
+            "type": _DISTANCE_SENSOR_TYPES.get(self.node.fields["type"], 0),
+            **table_of(self.node),
         }
 
     def measure(self, period_ms: float) -> float:
@@ -161,15 +90,7 @@ class DistanceSensor(Device):
         x, y, z, yaw = self.site.place()
         obstacles = self.site.arena.obstacles(without=self.site.body)
         targets = targets_from(obstacles, x, y, z, reach_m=self.table[-1][0])
-        return self._looked_up(nearest_m(targets, cos(yaw), sin(yaw)))
-
-    def _looked_up(self, distance_m: float) -> float:
-        if distance_m <= self.table[0][0]:
-            return self.table[0][1]
-        for (x0, y0, _), (x1, y1, _) in zip(self.table, self.table[1:], strict=False):
-            if distance_m <= x1:
-                return y0 + (y1 - y0) * (distance_m - x0) / (x1 - x0)
-        return self.table[-1][1]
+        return looked_up(self.table, nearest_m(targets, cos(yaw), sin(yaw)))
 
 
 class Gps(Device):
@@ -199,6 +120,10 @@ class InertialUnit(Device):
     """Roll, pitch and yaw in radians; the floor is flat, so only yaw ever changes."""
 
     kind = "InertialUnit"
+
+    def description(self) -> dict[str, Any]:
+        """Add what the device's getters tell."""
+        return super().description() | {"noise": self.node.fields["noise"]}
 
     def measure(self, period_ms: float) -> list[float]:
         """Roll, pitch and yaw, yaw between -pi and pi."""
@@ -231,6 +156,8 @@ class Lidar(Device):
             "max_range": fields["maxRange"],
             "near": fields["near"],
             "frequency": fields["defaultFrequency"],
+            "min_frequency": fields["minFrequency"],
+            "max_frequency": fields["maxFrequency"],
         }
 
     def measure(self, period_ms: float) -> int:
@@ -270,11 +197,14 @@ class Camera(Device):
 
     def description(self) -> dict[str, Any]:
         """Add what the device's getters tell."""
-        fields = self.node.fields
+        fields, fov = self.node.fields, self.field_of_view_rad
+        zoom: dict[str, Any] = fields["zoom"].fields if fields["zoom"] else {}
         return super().description() | {
             "width": fields["width"],
             "height": fields["height"],
-            "fov": self.field_of_view_rad,
+            "fov": fov,
+            "min_fov": zoom.get("minFieldOfView", fov),
+            "max_fov": zoom.get("maxFieldOfView", fov),
             "near": fields["near"],
         }
 
@@ -302,6 +232,12 @@ class Camera(Device):
         return b"" if self._seen is None else camera.render(self._seen, self.site.arena.colors)
 
 
+class Led(Device):
+    """A lamp; what it shines is the controller's business."""
+
+    kind = "LED"
+
+
 _BY_NODE_TYPE: Final[dict[str, Callable[[int, Node, Site], Device]]] = {
     "RotationalMotor": Motor,
     "PositionSensor": PositionSensor,
@@ -310,6 +246,12 @@ _BY_NODE_TYPE: Final[dict[str, Callable[[int, Node, Site], Device]]] = {
     "InertialUnit": InertialUnit,
     "Lidar": Lidar,
     "Camera": Camera,
+    "LED": Led,
+    "Accelerometer": Accelerometer,
+    "Compass": Compass,
+    "Gyro": Gyro,
+    "LightSensor": LightSensor,
+    "TouchSensor": TouchSensor,
 }
 
 

@@ -34,6 +34,21 @@ class Frame(NamedTuple):
             r[6] * x + r[7] * y + r[8] * z + tz,
         )
 
+    def inverse(self) -> Frame:
+        """What this frame stands in, seen from this frame."""
+        r = self.rotation
+        turned = Frame((r[0], r[3], r[6], r[1], r[4], r[7], r[2], r[5], r[8]))
+        x, y, z = turned.point(self.translation)
+        return Frame(turned.rotation, (-x, -y, -z))
+
+    def direction(self, outside: Sequence[float]) -> Vector:
+        """A direction given outside, seen from this frame."""
+        return self.inverse().turned(outside)
+
+    def turned(self, local: Sequence[float]) -> Vector:
+        """A direction given in this frame, seen from outside."""
+        return Frame(self.rotation).point(local)
+
     def then(self, inner: Frame) -> Frame:
         """A frame given in this frame, seen from outside."""
         a, b = self.rotation, inner.rotation

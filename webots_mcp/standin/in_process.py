@@ -145,7 +145,7 @@ class InProcessSimulation:
     def _found(self, name: str | None) -> SimulatedRobot:
         robots = self._simulator.robots
         if not robots:
-            raise WorldError(f"{self._simulator.world.path.name} has no robot")
+            raise WorldError(self._simulator.no_robot())
         if name is not None and len(robots) == 1:
             robots[0].node.fields["name"] = name
         return robots[0] if name is None else self._simulator.robot(name)

@@ -13,7 +13,7 @@ from webots_mcp.standin.vrml import Value, tokens_of
 
 _DEFINITIONS: Final = """
 WorldInfo {
-  MFString info []  SFString title ""  SFString window ""  SFVec3f northDirection 1 0 0
+  MFString info []  SFString title ""  SFString window "<none>"
   SFFloat gravity 9.81  SFFloat basicTimeStep 32  SFFloat FPS 60
   SFInt32 optimalThreadCount 1  SFInt32 randomSeed 0
   SFString coordinateSystem "ENU"  SFString gpsCoordinateSystem "local"
@@ -29,9 +29,17 @@ Viewpoint {
 Background { MFColor skyColor 0 0 0  SFFloat luminosity 1 }
 DirectionalLight {
   SFFloat ambientIntensity 0  SFColor color 1 1 1  SFVec3f direction 0 0 -1  SFFloat intensity 1
+  SFBool on TRUE
 }
-PointLight { SFVec3f location 0 0 0  SFColor color 1 1 1  SFFloat intensity 1 }
-SpotLight { SFVec3f location 0 0 10  SFVec3f direction 0 0 -1  SFColor color 1 1 1 }
+PointLight {
+  SFFloat ambientIntensity 0  SFVec3f attenuation 1 0 0  SFColor color 1 1 1  SFFloat intensity 1
+  SFVec3f location 0 0 0  SFBool on TRUE
+}
+SpotLight {
+  SFFloat ambientIntensity 0  SFVec3f attenuation 1 0 0  SFColor color 1 1 1  SFFloat intensity 1
+  SFVec3f location 0 0 10  SFVec3f direction 0 0 -1  SFFloat cutOffAngle 0.785398
+  SFFloat beamWidth 1.570796  SFBool on TRUE
+}
 Group { MFNode children [] }
 Pose { SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children [] }
 Transform {
@@ -61,6 +69,7 @@ Material { SFColor diffuseColor 0.8 0.8 0.8 }
 Plane { SFVec2f size 1 1 }
 Box { SFVec3f size 0.1 0.1 0.1 }
 Cylinder { SFFloat height 0.2  SFFloat radius 0.1  SFInt32 subdivision 32 }
+Capsule { SFFloat height 0.2  SFFloat radius 0.1  SFInt32 subdivision 24 }
 Sphere { SFFloat radius 0.1  SFInt32 subdivision 1  SFBool ico TRUE }
 Physics { SFFloat density 1000  SFFloat mass -1  MFVec3f centerOfMass [] }
 HingeJoint { SFNode jointParameters NULL  MFNode device []  SFNode endPoint NULL }
@@ -68,6 +77,7 @@ HingeJointParameters { SFFloat position 0  SFVec3f axis 1 0 0  SFVec3f anchor 0 
 RotationalMotor {
   SFString name "rotational motor"  SFFloat acceleration -1  SFVec3f controlPID 10 0 0
   SFFloat minPosition 0  SFFloat maxPosition 0  SFFloat maxVelocity 10  SFFloat maxTorque 10
+  SFFloat multiplier 1
 }
 PositionSensor { SFString name "position sensor"  SFFloat noise 0  SFFloat resolution -1 }
 DistanceSensor {
@@ -80,6 +90,38 @@ Camera {
   SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
   SFString name "camera"  SFString model ""
   SFFloat fieldOfView 0.7854  SFInt32 width 64  SFInt32 height 64  SFFloat near 0.01
+  SFNode zoom NULL
+}
+Zoom { SFFloat maxFieldOfView 1.5  SFFloat minFieldOfView 0.5 }
+Accelerometer {
+  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
+  SFString name "accelerometer"  SFString model ""  MFVec3f lookupTable []
+  SFBool xAxis TRUE  SFBool yAxis TRUE  SFBool zAxis TRUE  SFFloat resolution -1
+}
+Compass {
+  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
+  SFString name "compass"  SFString model ""  MFVec3f lookupTable []
+  SFBool xAxis TRUE  SFBool yAxis TRUE  SFBool zAxis TRUE  SFFloat resolution -1
+}
+Gyro {
+  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
+  SFString name "gyro"  SFString model ""  MFVec3f lookupTable []
+  SFBool xAxis TRUE  SFBool yAxis TRUE  SFBool zAxis TRUE  SFFloat resolution -1
+}
+LED {
+  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
+  SFString name "led"  SFString model ""  MFColor color [1 0 0]  SFBool gradual FALSE
+}
+LightSensor {
+  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
+  SFString name "light sensor"  SFString model ""  MFVec3f lookupTable [0 0 0 1 1000 0]
+  SFColor colorFilter 1 1 1  SFBool occlusion FALSE  SFFloat resolution -1
+}
+TouchSensor {
+  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
+  SFString name "touch sensor"  SFString model ""  SFNode boundingObject NULL
+  SFNode physics NULL  SFString type "bumper"  MFVec3f lookupTable [0 0 0 5000 50000 0]
+  SFFloat resolution -1
 }
 GPS {
   SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  MFNode children []
@@ -95,6 +137,7 @@ Lidar {
   SFInt32 horizontalResolution 512  SFFloat fieldOfView 1.5708  SFFloat verticalFieldOfView 0.2
   SFInt32 numberOfLayers 4  SFFloat near 0.01  SFFloat minRange 0.01  SFFloat maxRange 1
   SFString type "fixed"  SFFloat defaultFrequency 10
+  SFFloat minFrequency 1  SFFloat maxFrequency 25
 }
 """
 
@@ -112,8 +155,9 @@ class FieldDefinition:
     """As the parser would have read it from a file."""
 
 
-def _definitions() -> dict[str, dict[str, FieldDefinition]]:
-    words = [token.text for token in tokens_of(_DEFINITIONS)]
+def definitions_in(text: str) -> dict[str, dict[str, FieldDefinition]]:
+    """Fields by node type, from a text as Webots writes its node files, without comments."""
+    words = [token.text for token in tokens_of(text)]
     known: dict[str, dict[str, FieldDefinition]] = {}
     start = 0
     while start < len(words):
@@ -141,15 +185,18 @@ def _default(words: list[str]) -> Value:
     return [float(word) for word in words if word not in "[]"]
 
 
-NODE_TYPES: Final = _definitions()
+NODE_TYPES: Final = definitions_in(_DEFINITIONS)
 """Fields by node type."""
 
 DEVICE_TYPES: Final = (
-    "RotationalMotor",
-    "PositionSensor",
-    "DistanceSensor",
-    "Camera",
-    "GPS",
-    "InertialUnit",
-    "Lidar",
+    *("RotationalMotor", "PositionSensor", "DistanceSensor", "Camera", "GPS", "InertialUnit"),
+    *("Lidar", "Accelerometer", "Compass", "Gyro", "LED", "LightSensor", "TouchSensor"),
 )
+
+DEFAULT_NAME_OF: Final = {
+    **{"Altimeter": "altimeter", "Brake": "brake", "Connector": "connector"},
+    **{"Display": "display", "Emitter": "emitter", "LinearMotor": "linear motor", "Pen": "pen"},
+    **{"Radar": "radar", "RangeFinder": "range-finder", "Receiver": "receiver", "Skin": "skin"},
+    **{"Speaker": "speaker", "VacuumGripper": "vacuum gripper"},
+}
+"""What devices that the stand-in does not have are called, unless the world gives them a name."""

@@ -113,7 +113,7 @@ class Vehicle:
         """Take all speed away."""
         for joint in self.joints:
             joint.velocity_radps = 0.0
-        self.body.velocity_mps, self.body.yaw_rate_radps = (0.0, 0.0), 0.0
+        self.body.stop()
 
     def drive(self, arena: Arena, seconds: float) -> None:
         """Move the robot for one time step.
@@ -123,6 +123,7 @@ class Vehicle:
         """
         rolled = {id(joint): joint.turn(seconds) for joint in self.joints}
         if self._sides is None:
+            self._slide(arena, seconds)
             return
         left, right = (
             sum(rolled[id(wheel.joint)] * wheel.radius_m for wheel in side) / len(side)
@@ -131,15 +132,32 @@ class Vehicle:
         track = self._sides[0][0].left_m - self._sides[1][0].left_m
         self._roll((left + right) / 2.0, (right - left) / track, arena, seconds)
 
+    def _slide(self, arena: Arena, seconds: float) -> None:
+        if self.body.is_pushed:
+            arena.slide(self.body, seconds)
+            self._notice(arena.settle(self.body))
+
     def _roll(self, ahead_m: float, turn_rad: float, arena: Arena, seconds: float) -> None:
         body = self.body
         x, y, yaw = body.x, body.y, body.yaw_rad
-        if ahead_m or turn_rad:
+        kick_x, kick_y, kick_rad = self._kick(seconds)
+        if ahead_m or turn_rad or body.is_pushed:
             middle = yaw + turn_rad / 2.0  # exact to second order: the arc's chord
-            body.move(x + ahead_m * cos(middle), y + ahead_m * sin(middle), yaw + turn_rad)
+            x_then, y_then = x + ahead_m * cos(middle), y + ahead_m * sin(middle)
+            body.move(x_then + kick_x, y_then + kick_y, yaw + turn_rad + kick_rad)
             self._notice(arena.settle(body))
+        else:
+            body.touched.clear()
         body.velocity_mps = ((body.x - x) / seconds, (body.y - y) / seconds)
         body.yaw_rate_radps = (body.yaw_rad - yaw) / seconds
+        body.is_pushed = False
+
+    def _kick(self, seconds: float) -> tuple[float, float, float]:
+        """The way of a speed that was set from outside: after one step the wheels have it again."""
+        if not self.body.is_pushed:
+            return 0.0, 0.0, 0.0
+        (vx, vy), turn = self.body.velocity_mps, self.body.yaw_rate_radps
+        return vx * seconds, vy * seconds, turn * seconds
 
     def _notice(self, touching: bool) -> None:
         self.collisions += touching and not self.touching
@@ -156,7 +174,14 @@ def _wheel_of(joint: Joint) -> Wheel | None:
     if parameters is None or end is None or joint.max_velocity_radps == 0.0:
         return None
     axis, anchor = parameters.fields["axis"], parameters.fields["anchor"]
-    radii = [node.fields["radius"] for node in descendants_of(end) if "radius" in node.fields]
-    if not radii or abs(axis[1]) < 0.9 or anchor[1] == 0.0:
+    middle = end.fields.get("translation", anchor)  # of the wheel, along the axis
+    left_m: float = middle[1] or anchor[1]
+    radius_m = _radius_m(end.fields.get("boundingObject")) or _radius_m(end)
+    if not radius_m or abs(axis[1]) < 0.9 or left_m == 0.0:
         return None
-    return Wheel(joint, radii[0] if axis[1] > 0.0 else -radii[0], anchor[1])
+    return Wheel(joint, radius_m if axis[1] > 0.0 else -radius_m, left_m)
+
+
+def _radius_m(shape: Node | None) -> float:
+    nodes = (shape, *descendants_of(shape)) if shape else ()
+    return next((node.fields["radius"] for node in nodes if "radius" in node.fields), 0.0)

@@ -119,10 +119,9 @@ class Runner:
         return self.exit_status is None and self._patience_s() == 0.0
 
     def _advance(self) -> None:
-        self._due_s = max(
-            self._due_s + self.simulator.world.basic_time_step_ms / 1000.0,
-            time.monotonic() - _MAX_LAG_S,
-        )
+        now_s, step_s = time.monotonic(), self.simulator.world.basic_time_step_ms / 1000.0
+        # A step that came early, as all do in fast mode, is no reason to wait longer for the next.
+        self._due_s = max(min(self._due_s, now_s) + step_s, now_s - _MAX_LAG_S)
         done = self.simulator.advance()
         for controller in self.controllers:
             if controller.robot in done and controller.connection:
@@ -171,8 +170,10 @@ class Runner:
     def _admit(self, connection: Connection, message: Message) -> None:
         _, token, name = message
         controller = next((c for c in self.controllers if c.name == name), None)
-        if not hmac.compare_digest(token, self.token) or controller is None:
-            connection.send(("refused", f"there is no robot {name!r} here, or the token is wrong"))
+        if not hmac.compare_digest(token, self.token):
+            connection.send(("refused", "the token is that of another simulation"))
+        elif controller is None:
+            connection.send(("refused", self.simulator.no_robot(name)))
         elif controller.connection is not None:
             connection.send(("refused", f"robot {name!r} has a controller already"))
         else:

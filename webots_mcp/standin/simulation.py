@@ -61,7 +61,7 @@ class Simulation:
             python: The interpreter of the controllers.
 
         Raises:
-            WorldError: The world cannot be used.
+            WorldError: The world cannot be used, or has no robot that `controllers` names.
             StandInError: There is no such mode.
         """
         if mode not in _MODES:
@@ -77,8 +77,11 @@ class Simulation:
         self._launch = Launch(
             LIBRARY, python, environment or {}, overrides, self._print, self._exited
         )
+        simulator = Simulator(load_world(world), _MODES[mode], self._print)
+        for name in overrides:
+            simulator.robot(name)  # refuses a name that the world does not have
         self._runner = Runner(
-            Simulator(load_world(world), _MODES[mode], self._print),
+            simulator,
             lambda simulator, before: controllers_of(simulator, self._launch, before),
             self._notice,
         )

@@ -112,6 +112,10 @@ class Simulator:
         names = [robot.name for robot in self.robots]
         if double := {name for name in names if names.count(name) > 1}:
             raise WorldError(f"two robots have the name {double.pop()!r}; give each its own")
+        for warning in world.warnings():
+            log(warning)
+        if not self.robots and world.left_out:
+            raise WorldError(self.no_robot())
         self.time_ms = 0.0
         self.wanted: Wanted | None = None
         self.labels: dict[int, Label] = {}
@@ -134,8 +138,27 @@ class Simulator:
         for robot in self.robots:
             if robot.name == name:
                 return robot
+        raise WorldError(self.no_robot(name))
+
+    def no_robot(self, name: str | None = None) -> str:
+        """Why there is no robot of this name, or none at all, in words."""
+        left_out = [node for node in self.world.left_out if self._may_be(node, name)]
+        if left_out:
+            node = next((node for node in left_out if _has_controller(node)), left_out[0])
+            return (
+                f"{self.world.path.name}, line {node.line}: the stand-in has no {node.type_name} "
+                "nodes. If that is the robot: in Webots, right-click it, choose 'Convert Root to "
+                "Base Node(s)' and save the world; docs/standin.md tells what the stand-in has"
+            )
         known = ", ".join(repr(robot.name) for robot in self.robots)
-        raise WorldError(f"no robot {name!r} in {self.world.path.name}; it has {known or 'none'}")
+        asked = "no robot" if name is None else f"no robot {name!r}"
+        return f"{asked} in {self.world.path.name}; it has {known or 'none'}"
+
+    def _may_be(self, node: Node, name: str | None) -> bool:
+        """Whether a node that was left out may be the robot that is asked for."""
+        if name is None:
+            return _has_controller(node) or self.world.parent_of(node) is self.world.root
+        return node.fields.get("name", name if _has_controller(node) else None) == name
 
     def robot_of(self, node: Node) -> Robot:
         """The robot that a Robot node describes."""
@@ -161,6 +184,7 @@ class Simulator:
         basic = self.world.basic_time_step_ms
         for robot in self.robots:
             robot.vehicle.drive(self.arena, basic / 1000.0)
+        self.arena.glide(basic / 1000.0)
         self.time_ms += basic
         if self._reset_asked:
             self.reset()
@@ -191,6 +215,7 @@ class Simulator:
             node.fields["translation"], node.fields["rotation"] = [*translation], [*rotation]
         for body in self.arena.bodies:
             self.stand_anew(body)
+            body.stop()
         for robot in self.robots:
             robot.vehicle.reset()
             robot.ahead_ms = 0.0
@@ -205,6 +230,8 @@ class Simulator:
 
     def stop_motion(self) -> None:
         """Take the speed of everything away."""
+        for body in self.arena.bodies:
+            body.stop()
         for robot in self.robots:
             robot.vehicle.stop()
 
@@ -232,3 +259,7 @@ class Simulator:
             save_picture(picture, self.arena, self.time_s, [*self.labels.values()])
         except (OSError, ValueError, ImportError) as error:
             self.log(f"ERROR: cannot export the image {picture.path}: {error}")
+
+
+def _has_controller(node: Node) -> bool:
+    return "controller" in node.fields or "controllerArgs" in node.fields

@@ -33,6 +33,8 @@ class Node:
     def_name: str
     line: int
     fields: dict[str, Any] = field(default_factory=lambda: {})
+    proto_name: str = ""
+    """Of a PROTO node that was built: its own name; its type is that of what it is made of."""
 
 
 def tokens_of(text: str) -> Iterator[Token]:
@@ -61,8 +63,18 @@ class Parser:
         """The nodes at the top of the file, in order."""
         nodes: list[Node] = []
         while self._next < len(self._tokens):
-            nodes.append(self._node())
+            if not self._takes_externproto():
+                nodes.append(self._node())
         return nodes
+
+    def _takes_externproto(self) -> bool:
+        """Read over `EXTERNPROTO "url"`: it only says where a PROTO comes from."""
+        if self._peek().text not in ("EXTERNPROTO", "IMPORTABLE"):
+            return False
+        while not self._peek().text.startswith('"'):
+            self._take()
+        self._take()
+        return True
 
     def _peek(self) -> Token:
         if self._next == len(self._tokens):
@@ -84,12 +96,6 @@ class Parser:
         token = self._name("a node")
         if token.text == "USE":
             return self._used()
-        if token.text in ("EXTERNPROTO", "IMPORTABLE", "PROTO"):
-            raise WorldError(
-                "the stand-in knows no PROTO nodes: write the world with base nodes "
-                "(Solid, Robot, HingeJoint, ...)",
-                token.line,
-            )
         if token.text != "DEF":
             return self._body(token, "")
         name = self._name("a DEF name").text
@@ -110,7 +116,10 @@ class Parser:
             )
         while self._peek().text != "}":
             token = self._name("a field name or }")
-            node.fields[token.text] = self._value(token)
+            if token.text == "hidden":  # what Webots keeps of a saved simulation
+                self._value(self._take())
+            else:
+                node.fields[token.text] = self._value(token)
         self._take()
         if def_name:
             self._defined[def_name] = node
@@ -171,6 +180,12 @@ def parse(text: str) -> list[Node]:
         WorldError: The text is not a world; the message names the line.
     """
     first_line = text.partition("\n")[0]
-    if not re.match(r"#VRML_SIM R20\d\d[ab]? utf8", first_line):
+    release = re.match(r"#VRML_SIM (R20\d\d)[ab]?\S* utf8", first_line)
+    if release is None:
         raise WorldError(f'a world begins with "#VRML_SIM R2023b utf8", not {first_line[:40]!r}', 1)
+    if release[1] < "R2022":
+        raise WorldError(
+            f"worlds of {release[1]} have other axes: open and save it with Webots R2022a or newer",
+            1,
+        )
     return Parser(text).nodes()

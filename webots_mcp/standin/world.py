@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from copy import deepcopy
 from pathlib import Path
 from typing import Any, cast
 
 from webots_mcp.standin.errors import WorldError
 from webots_mcp.standin.frame import Frame, frame_of
-from webots_mcp.standin.nodes import NODE_TYPES, NUMBERS_IN, FieldDefinition
-from webots_mcp.standin.vrml import Node, Value, parse
+from webots_mcp.standin.nodes import DEFAULT_NAME_OF, NODE_TYPES
+from webots_mcp.standin.protos import PROTOS, build
+from webots_mcp.standin.typed_fields import give_types
+from webots_mcp.standin.vrml import Node, parse
 
 
 class World:
@@ -26,6 +27,8 @@ class World:
         self.root = Node("Group", "", 1, {"children": [*top]})
         self.nodes: list[Node] = []
         """Every node once, in the order of the scene tree; a node's id is its index here."""
+        self.left_out: list[Node] = []
+        """What stands in the file and not in the world: nodes of types that are not known here."""
         self._ids: dict[Node, int] = {}
         self._parents: dict[Node, Node] = {}
         self._register(self.root, None)
@@ -40,13 +43,61 @@ class World:
     def _register(self, node: Node, parent: Node | None) -> None:
         if node in self._ids:  # a USE: stands where its DEF stands
             return
-        _give_types(node)
+        if node.type_name in PROTOS:
+            build(node)
+        else:
+            give_types(node, NODE_TYPES[node.type_name])
         self._ids[node] = len(self.nodes)
         self.nodes.append(node)
         if parent is not None:
             self._parents[node] = parent
+        self._leave_out_unknown(node)
         for child in children_of(node):
             self._register(child, node)
+
+    def _leave_out_unknown(self, node: Node) -> None:
+        for child in [*children_of(node)]:
+            if child.type_name not in NODE_TYPES and child.type_name not in PROTOS:
+                self._leave_out(child, node)
+
+    def _leave_out(self, child: Node, parent: Node) -> None:
+        if child not in self.left_out:
+            self.left_out.append(child)
+            self._parents[child] = parent
+        for name, value in parent.fields.items():
+            if value is child:
+                parent.fields[name] = None
+            elif isinstance(value, list):
+                parent.fields[name] = [
+                    item for item in cast("list[Any]", value) if item is not child
+                ]
+
+    def warnings(self) -> list[str]:
+        """One line for each type of node that was left out."""
+        by_type: dict[str, list[Node]] = {}
+        for node in self.left_out:
+            by_type.setdefault(node.type_name, []).append(node)
+        return [
+            f"WARNING: {self.path.name}, line {nodes[0].line}: the stand-in has no {type_name} "
+            f"nodes; {'this one is' if len(nodes) == 1 else f'these {len(nodes)} are'} left out."
+            for type_name, nodes in by_type.items()
+        ]
+
+    def left_out_in(self, robot: Node) -> dict[str, str]:
+        """Devices that the world gives a robot and the stand-in does not: names and node types."""
+        names: dict[str, str] = {}
+        for node in self.left_out:
+            if any(around is robot for around in self._around(node)):
+                for device in (node, *descendants_of(node)):
+                    name = device.fields.get("name", DEFAULT_NAME_OF.get(device.type_name))
+                    if isinstance(name, str):
+                        names.setdefault(name, node.type_name)
+        return names
+
+    def _around(self, node: Node) -> Iterator[Node]:
+        while (parent := self._parents.get(node)) is not None:
+            yield parent
+            node = parent
 
     @property
     def title(self) -> str:
@@ -76,12 +127,13 @@ class World:
 
     def frame_of(self, node: Node) -> Frame | None:
         """Where a node stands in the world; None for nodes that have no place of their own."""
-        if "rotation" not in node.fields:
-            return None
-        frame = own_frame(node)
-        while (parent := self._parents.get(node)) is not None:
+        return self.frame_around(node).then(own_frame(node)) if "rotation" in node.fields else None
+
+    def frame_around(self, node: Node) -> Frame:
+        """Where that stands which a node stands in."""
+        frame = Frame()
+        for parent in self._around(node):
             frame = own_frame(parent).then(frame)
-            node = parent
         return frame
 
 
@@ -122,67 +174,3 @@ def descendants_of(node: Node) -> Iterator[Node]:
     for child in children_of(node):
         yield child
         yield from descendants_of(child)
-
-
-def _give_types(node: Node) -> None:
-    definitions = NODE_TYPES.get(node.type_name)
-    if definitions is None:
-        raise WorldError(
-            f"the stand-in does not know {node.type_name} nodes; it knows {', '.join(NODE_TYPES)}",
-            node.line,
-        )
-    written = node.fields
-    node.fields = {}
-    for name, definition in definitions.items():
-        value = written[name] if name in written else deepcopy(definition.default)
-        node.fields[name] = _typed(value, name, definition, node)
-
-
-def _typed(value: Value, name: str, definition: FieldDefinition, node: Node) -> Value:
-    many, kind = definition.type_name[:2] == "MF", definition.type_name[2:]
-    try:
-        if not many:
-            return _single(value, kind)
-        if kind in ("String", "Node"):
-            values: list[Any] = value if isinstance(value, list) else [value]
-            return [_single(item, kind) for item in values]
-        return _several_numbers(value, kind)
-    except (TypeError, ValueError):
-        raise WorldError(
-            f"{node.type_name}.{name} has to be {definition.type_name}, not {_shown(value)}",
-            node.line,
-        ) from None
-
-
-def _single(value: Value, kind: str) -> Any:
-    if kind in ("Bool", "String", "Node"):
-        expected = {"Bool": bool, "String": str, "Node": (Node, type(None))}[kind]
-        if not isinstance(value, expected):
-            raise TypeError(kind)
-        return value
-    numbers = _numbers(value)
-    if len(numbers) != NUMBERS_IN.get(kind, 1):
-        raise ValueError(kind)
-    if kind in NUMBERS_IN:
-        return numbers
-    return int(numbers[0]) if kind == "Int32" else numbers[0]
-
-
-def _several_numbers(value: Value, kind: str) -> Value:
-    numbers = _numbers(value)
-    size = NUMBERS_IN.get(kind, 1)
-    if len(numbers) % size:
-        raise ValueError(kind)
-    if size == 1:
-        return numbers
-    return [numbers[i : i + size] for i in range(0, len(numbers), size)]
-
-
-def _numbers(value: Value) -> list[float]:
-    if not isinstance(value, list) or not all(isinstance(item, float) for item in value):
-        raise TypeError("numbers")
-    return [*cast("list[float]", value)]
-
-
-def _shown(value: Value) -> str:
-    return f"a {value.type_name} node" if isinstance(value, Node) else repr(value)

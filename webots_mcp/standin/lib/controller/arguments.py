@@ -6,11 +6,16 @@ import ctypes
 from typing import Any
 
 
-def integer(value: Any) -> int:
-    """An `int` argument; everything else is refused, `32.0` too."""
+def integer(value: Any, position: int = 1) -> int:
+    """An `int` argument; everything else is refused, `32.0` too.
+
+    Args:
+        value: What was given.
+        position: Which argument of the C function it is, for the message.
+    """
     if not isinstance(value, int):
         raise ctypes.ArgumentError(
-            f"argument 1: TypeError: an int is needed, not {type(value).__name__} {value!r}"
+            f"argument {position}: TypeError: Don't know how to convert parameter {position}"
         )
     return value
 
@@ -20,8 +25,12 @@ def number(value: Any) -> float:
     return ctypes.c_double(value).value
 
 
+def numbers(values: Any, count: int) -> list[float]:
+    """A `double` array argument: so many numbers at most, the rest are zeros."""
+    return [*(ctypes.c_double * count)(*values)]
+
+
 def text(value: Any) -> str:
     """A `char *` argument: `str` only, no path objects, no None."""
-    if not isinstance(value, str):
-        raise TypeError(f"a text has to be str, not {type(value).__name__}")
+    str.encode(value)
     return value

@@ -4,12 +4,24 @@
 
 from __future__ import annotations
 
+from math import tan
 from pathlib import Path
 
 from .arguments import integer, number, text
+from .console import say
 from .device import Sensor
+from .lacking import lacks
 
 
+@lacks(
+    "disableRecognitionSegmentation enableRecognitionSegmentation exposure focal_distance "
+    "getExposure getFocalDistance getMaxFocalDistance getMinFocalDistance "
+    "getRecognitionNumberOfObjects getRecognitionObjects getRecognitionSamplingPeriod "
+    "getRecognitionSegmentationImage getRecognitionSegmentationImageArray "
+    "hasRecognitionSegmentation isRecognitionSegmentationEnabled max_focal_distance "
+    "min_focal_distance recognitionDisable recognitionEnable saveRecognitionSegmentationImage "
+    "segmentation_image setExposure setFocalDistance"
+)
 class Camera(Sensor):
     """Takes pictures: four bytes a pixel in the order blue, green, red, alpha."""
 
@@ -86,13 +98,22 @@ class Camera(Sensor):
         """The `near` field, metres."""
         return self._description["near"]
 
+    @property
+    def near(self) -> float:
+        """The `near` field, metres."""
+        return self.getNear()
+
     def getFov(self) -> float:
         """Horizontal field of view in radians."""
         return self._fov
 
-    def setFov(self, fov: float) -> None:
-        """Zooms: sets the horizontal field of view, in radians."""
-        self._fov = number(fov)
+    def setFov(self, f: float) -> None:
+        """Zoom: set the horizontal field of view, in radians; needs a Zoom node."""
+        low, high = self.getMinFov(), self.getMaxFov()
+        if not low <= number(f) <= high:
+            self._complain("set_fov", f" out of zoom range [{low:f}, {high:f}].")
+            return
+        self._fov = number(f)
         self._session.change(self._tag, "fov", self._fov)
 
     @property
@@ -101,12 +122,43 @@ class Camera(Sensor):
         return self.getFov()
 
     @fov.setter
-    def fov(self, fov: float) -> None:
-        self.setFov(fov)
+    def fov(self, f: float) -> None:
+        self.setFov(f)
+
+    def getMinFov(self) -> float:
+        """The narrowest field of view, radians: that of the Zoom node, or the only one."""
+        return self._description["min_fov"]
+
+    @property
+    def min_fov(self) -> float:
+        """The narrowest field of view, radians: that of the Zoom node, or the only one."""
+        return self.getMinFov()
+
+    def getMaxFov(self) -> float:
+        """The widest field of view, radians: that of the Zoom node, or the only one."""
+        return self._description["max_fov"]
+
+    @property
+    def max_fov(self) -> float:
+        """The widest field of view, radians: that of the Zoom node, or the only one."""
+        return self.getMaxFov()
+
+    def getFocalLength(self) -> float:
+        """The focal length in pixels."""
+        return self.getWidth() / 2.0 / tan(self._fov / 2.0)
+
+    @property
+    def focal_length(self) -> float:
+        """The focal length in pixels."""
+        return self.getFocalLength()
+
+    def hasRecognition(self) -> bool:
+        """False: cameras of the stand-in recognize nothing."""
+        return False
 
     def saveImage(self, filename: str, quality: int) -> int:
         """Write the last picture to a .png or .jpg file: 0, or -1 if that fails."""
-        path, quality = Path(text(filename)), integer(quality)
+        path, quality = Path(text(filename)), integer(quality, position=3)
         if path.suffix.lower() not in (".png", ".jpg", ".jpeg"):
             return -1
         from PIL import Image
@@ -117,5 +169,6 @@ class Camera(Sensor):
                 path, quality=quality
             )
         except OSError:
+            say(f"Insufficient permissions to write file: {filename}")
             return -1
         return 0

@@ -1,6 +1,6 @@
 """What all devices have in common."""
 
-# ruff: noqa: N802, N803 - the names are those of Webots
+# ruff: noqa: N802 - the names are those of Webots
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ class Device:
     `GPS("gps")` finds the device by name; the robot itself makes its devices by tag.
     """
 
+    _c_name = "device"
+    """As in the names of the C functions, for messages."""
+
     def __init__(self, name: int | str) -> None:
         session = library.current
         if session is None:
@@ -33,6 +36,9 @@ class Device:
         say(f'Warning: "{name}" device not found.')
         return {}
 
+    def _complain(self, what: str, complaint: str) -> None:
+        say(f"Error: wb_{self._c_name}_{what}(){complaint}")
+
     def getName(self) -> str:
         """The `name` field."""
         return self._description.get("name", "")
@@ -44,11 +50,6 @@ class Device:
     def getNodeType(self) -> int:
         """The number of the node type, to compare with `Node.GPS` and the like."""
         return NUMBER_OF.get(self._description.get("node_type", ""), 0)
-
-    @property
-    def tag(self) -> int:
-        """The number that the library knows the device by."""
-        return self._tag
 
     @property
     def name(self) -> str:
@@ -69,18 +70,20 @@ class Device:
 class Sensor(Device):
     """A device that measures something every so often, once it is enabled."""
 
-    _c_name = "device"
-    """As in the names of the C functions, for messages."""
-
     def __init__(self, name: int | str, sampling_period: int | None = None) -> None:
         super().__init__(name)
         if isinstance(name, str):  # by name: enables, as the real package does
             basic_ms = int(self._session.robot["basic_time_step"])
             self.enable(basic_ms if sampling_period is None else sampling_period)
 
-    def enable(self, samplingPeriod: int) -> None:
+    def enable(self, p: int) -> None:
         """Measure every so many milliseconds, from the next step on; 0 disables."""
-        self._session.enable(self._tag, max(integer(samplingPeriod), 0))
+        if integer(p, position=2) < 0:
+            self._complain("enable", " called with negative sampling period.")
+        elif not self._tag:
+            self._complain("enable", ": invalid device tag.")
+        else:
+            self._session.enable(self._tag, p)
 
     def disable(self) -> None:
         """Measure no longer; the last value stays."""
@@ -97,13 +100,11 @@ class Sensor(Device):
         return self.getSamplingPeriod()
 
     @sampling_period.setter
-    def sampling_period(self, period_ms: int) -> None:
-        self.enable(period_ms)
+    def sampling_period(self, p: int | None) -> None:
+        self.enable(0 if p is None else p)
 
     def _value(self, default: Any, what: str = "get_value") -> Any:
         if not self.getSamplingPeriod():
-            say(
-                f"Error: wb_{self._c_name}_{what}() called for a disabled device! "
-                f"Please use: wb_{self._c_name}_enable()."
-            )
+            use = f"Please use: wb_{self._c_name}_enable()."
+            self._complain(what, f" called for a disabled device! {use}")
         return self._session.value(self._tag, default)

@@ -4,10 +4,12 @@
 
 from __future__ import annotations
 
+from math import nan
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from .arguments import integer, number
+from .arguments import integer, number, numbers, text
 from .console import say
+from .lacking import lacking, lacks
 from .node_types import FIELD_NUMBER_OF
 from .session import Session
 
@@ -15,27 +17,43 @@ if TYPE_CHECKING:
     from .node import Node
 
 _LENGTHS: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
-_TYPES: Final[dict[str, tuple[type, ...]]] = {
-    "Bool": (bool, int),
-    "Int32": (int,),
-    "Float": (float,),
-    "String": (str,),
+_TYPES: Final[dict[str, type]] = {"Bool": bool, "Int32": int, "Float": float, "String": str}
+_BEYOND_THE_END: Final[dict[str, Any]] = {
+    **{"Bool": False, "Int32": 0, "Float": nan, "String": "", "Node": None},
+    **{kind: [nan] * length for kind, length in _LENGTHS.items()},
 }
 
 
+@lacks(
+    "disableSFTracking enableSFTracking getActualField importMFNodeFromString "
+    "importSFNodeFromString insertMFBool insertMFColor insertMFFloat insertMFInt32 "
+    "insertMFRotation insertMFString insertMFVec2f insertMFVec3f removeMF removeSF"
+)
 class Field:
     """A field of a node. Reads are answered at once, writes go out with the next step."""
 
     SF_BOOL, SF_INT32, SF_FLOAT, SF_VEC2F, SF_VEC3F = range(1, 6)
     SF_ROTATION, SF_COLOR, SF_STRING, SF_NODE = range(6, 10)
-    MF = 16
     MF_BOOL, MF_INT32, MF_FLOAT, MF_VEC2F, MF_VEC3F = range(17, 22)
     MF_ROTATION, MF_COLOR, MF_STRING, MF_NODE = range(22, 26)
 
-    def __init__(self, session: Session, node_id: int, name: str, found: tuple[str, int]) -> None:
-        self._session = session
-        self._key = (node_id, name)
-        self._type_name, self._count = found
+    type: int | None
+    """The number of the type, as `Field.SF_VEC3F`."""
+    _session: Session
+    _key: tuple[int, str]
+    _type_name: str
+    _count: int
+
+    def __init__(self, ref: Any) -> None:
+        raise lacking("Field(...); ask a node for its fields")
+
+    @classmethod
+    def _of(cls, session: Session, node_id: int, name: str, found: tuple[str, int]) -> Field:
+        field = cls.__new__(cls)
+        field._session, field._key = session, (node_id, name)
+        field._type_name, field._count = found
+        field.type = FIELD_NUMBER_OF[field._type_name]
+        return field
 
     def getName(self) -> str:
         """The name of the field."""
@@ -46,14 +64,9 @@ class Field:
         """The name of the field."""
         return self.getName()
 
-    def getType(self) -> int:
+    def getType(self) -> int | None:
         """The number of the type, as `Field.SF_VEC3F`."""
-        return FIELD_NUMBER_OF[self._type_name]
-
-    @property
-    def type(self) -> int:
-        """The number of the type, as `Field.SF_VEC3F`."""
-        return self.getType()
+        return self.type
 
     def getTypeName(self) -> str:
         """The type as text, as `SFVec3f`."""
@@ -73,157 +86,210 @@ class Field:
         """The number of entries; -1 for a single field."""
         return self.getCount()
 
+    # Single fields -------------------------------------------------------------------------------
+
     @property
     def value(self) -> Any:
-        """The whole value: of an MF field a list."""
-        if self._count < 0:
-            return self._read(self._type_name, None)
-        return [self._read(self._type_name, index) for index in range(self._count)]
+        """The value of a single field; None for a field with entries."""
+        if self._count >= 0:
+            return None
+        return self._as_given(self._session.read_field(self._key, None))
 
-    def _read(self, type_name: str, index: int | None) -> Any:
-        if not self._is(type_name, "get"):
-            return None
-        if index is not None and not -self._count <= integer(index) < self._count:
-            say(f"Error: index {index} is out of the range of field '{self.name}'.")
-            return None
-        return self._as_given(self._session.read_field(self._key, index))
+    @value.setter
+    def value(self, value: Any) -> None:
+        if self._count >= 0 or not _fits(self._type_name[2:], value):
+            say("Error: new field value has wrong type or length.")
+            return
+        self._session.set_field(self._key, None, _as_sent(value))
 
     def _as_given(self, value: Any) -> Any:
-        from .node import Node
+        from .node import node_of
 
         if self._type_name.endswith("Node"):
-            return None if value is None else Node(self._session, value)
+            return None if value is None else node_of(self._session, value)
         if isinstance(value, bool):
             return int(value)
         return [*value] if isinstance(value, (list, tuple)) else value
 
-    def _write(self, type_name: str, index: int | None, value: Any) -> None:
-        if not self._is(type_name, "set"):
-            return
-        if not _fits(type_name[2:], value):
-            say("Error: new field value has wrong type or length.")
-            return
-        value = bool(value) if type_name.endswith("Bool") else value
-        self._session.set_field(self._key, index, _as_sent(value))
-
-    def _is(self, type_name: str, what: str) -> bool:
-        if type_name != self._type_name:
-            function = f"wb_supervisor_field_{what}_{type_name[:2].lower()}_{type_name[2:].lower()}"
-            say(f"Error: {function}() called with a field of type {self._type_name}.")
-        return type_name == self._type_name
+    def _set_numbers(self, setter: str, length: int, value: list[float]) -> None:
+        if len(value) == length:
+            self.value = value
+        else:
+            say(f"Error: {setter}(): length of 'value' argument should be {length}.")
 
     def getSFBool(self) -> int:
-        """0 or 1."""
-        return self._read("SFBool", None)
+        """0 or 1. As in Webots, each `getSF...` gives the value, of whatever type it is."""
+        return self.value
 
     def getSFInt32(self) -> int:
         """The value."""
-        return self._read("SFInt32", None)
+        return self.value
 
     def getSFFloat(self) -> float:
         """The value."""
-        return self._read("SFFloat", None)
+        return self.value
 
     def getSFVec2f(self) -> list[float]:
         """Two numbers."""
-        return self._read("SFVec2f", None)
+        return self.value
 
     def getSFVec3f(self) -> list[float]:
         """Three numbers."""
-        return self._read("SFVec3f", None)
+        return self.value
 
     def getSFRotation(self) -> list[float]:
         """Axis and angle in radians: four numbers."""
-        return self._read("SFRotation", None)
+        return self.value
 
     def getSFColor(self) -> list[float]:
         """Red, green and blue, each 0 to 1."""
-        return self._read("SFColor", None)
+        return self.value
 
     def getSFString(self) -> str:
         """The value."""
-        return self._read("SFString", None)
+        return self.value
 
     def getSFNode(self) -> Node | None:
         """The node; None for NULL."""
-        return self._read("SFNode", None)
-
-    def getMFFloat(self, index: int) -> float:
-        """One entry."""
-        return self._read("MFFloat", index)
-
-    def getMFVec3f(self, index: int) -> list[float]:
-        """One entry: three numbers."""
-        return self._read("MFVec3f", index)
-
-    def getMFColor(self, index: int) -> list[float]:
-        """One entry: red, green and blue, each 0 to 1."""
-        return self._read("MFColor", index)
-
-    def getMFString(self, index: int) -> str:
-        """One entry."""
-        return self._read("MFString", index)
-
-    def getMFNode(self, index: int) -> Node | None:
-        """One entry; -1 is the last."""
-        return self._read("MFNode", index)
+        return self.value
 
     def setSFBool(self, value: bool) -> None:
-        """Set the value with the next step."""
-        self._write("SFBool", None, value)
+        """Set the value with the next step; an int is refused with a line on stderr."""
+        self.value = value
 
     def setSFInt32(self, value: int) -> None:
         """Set the value with the next step."""
-        self._write("SFInt32", None, value)
+        self.value = value
 
     def setSFFloat(self, value: float) -> None:
         """Set the value with the next step; an int is refused with a line on stderr."""
-        self._write("SFFloat", None, value)
+        self.value = value
 
-    def setSFVec2f(self, values: list[float]) -> None:
+    def setSFVec2f(self, value: list[float]) -> None:
         """Set two numbers with the next step; a tuple is refused with a line on stderr."""
-        self._write("SFVec2f", None, values)
+        self._set_numbers("setSFVec2f", 2, value)
 
-    def setSFVec3f(self, values: list[float]) -> None:
+    def setSFVec3f(self, value: list[float]) -> None:
         """Set three numbers with the next step; a tuple is refused with a line on stderr."""
-        self._write("SFVec3f", None, values)
+        self._set_numbers("setSFVec3f", 3, value)
 
-    def setSFRotation(self, values: list[float]) -> None:
+    def setSFRotation(self, value: list[float]) -> None:
         """Set axis and angle with the next step; a tuple is refused with a line on stderr."""
-        self._write("SFRotation", None, values)
+        self._set_numbers("setSFRotation", 4, value)
 
-    def setSFColor(self, values: list[float]) -> None:
+    def setSFColor(self, value: list[float]) -> None:
         """Set red, green and blue with the next step; a tuple is refused with a line on stderr."""
-        self._write("SFColor", None, values)
+        self._set_numbers("setSFColor", 3, value)
 
     def setSFString(self, value: str) -> None:
         """Set the value with the next step."""
-        self._write("SFString", None, value)
+        self.value = value
+
+    # Fields with entries -------------------------------------------------------------------------
+
+    def _entry(self, kind: str, index: int) -> Any:
+        if self._has_entry("get", kind, integer(index, position=2)):
+            return self._as_given(self._session.read_field(self._key, index))
+        return _BEYOND_THE_END[kind]
+
+    def _set_entry(self, kind: str, index: int, value: Any) -> None:
+        if self._has_entry("set", kind, integer(index, position=2)):
+            self._session.set_field(self._key, index, value)
+
+    def _has_entry(self, what: str, kind: str, index: int) -> bool:
+        function = f"Error: wb_supervisor_field_{what}_mf_{kind.lower()}()"
+        if self._type_name != f"MF{kind}":
+            say(f"{function} called with a field of type {self._type_name}.")
+        elif not self._count:
+            say(f"{function} called on an empty list.")
+        elif not -self._count <= index < self._count:
+            bounds = f"(should be between {-self._count} and {self._count - 1})"
+            say(f"{function} called with an out-of-bound index: {index} {bounds}.")
+        else:
+            return True
+        return False
+
+    def getMFBool(self, index: int) -> bool:
+        """One entry."""
+        return bool(self._entry("Bool", index))
+
+    def getMFInt32(self, index: int) -> int:
+        """One entry."""
+        return self._entry("Int32", index)
+
+    def getMFFloat(self, index: int) -> float:
+        """One entry."""
+        return self._entry("Float", index)
+
+    def getMFVec2f(self, index: int) -> list[float]:
+        """One entry: two numbers."""
+        return self._entry("Vec2f", index)
+
+    def getMFVec3f(self, index: int) -> list[float]:
+        """One entry: three numbers."""
+        return self._entry("Vec3f", index)
+
+    def getMFRotation(self, index: int) -> list[float]:
+        """One entry: axis and angle in radians."""
+        return self._entry("Rotation", index)
+
+    def getMFColor(self, index: int) -> list[float]:
+        """One entry: red, green and blue, each 0 to 1."""
+        return self._entry("Color", index)
+
+    def getMFString(self, index: int) -> str:
+        """One entry."""
+        return self._entry("String", index)
+
+    def getMFNode(self, index: int) -> Node | None:
+        """One entry; -1 is the last."""
+        return self._entry("Node", index)
+
+    def setMFBool(self, index: int, value: bool) -> None:
+        """Set one entry with the next step."""
+        self._set_entry("Bool", index, bool(value))
+
+    def setMFInt32(self, index: int, value: int) -> None:
+        """Set one entry with the next step."""
+        self._set_entry("Int32", index, integer(value, position=3))
 
     def setMFFloat(self, index: int, value: float) -> None:
         """Set one entry with the next step."""
-        self._write("MFFloat", index, value)
+        self._set_entry("Float", index, number(value))
 
-    def setMFVec3f(self, index: int, values: list[float]) -> None:
+    def setMFVec2f(self, index: int, value: list[float]) -> None:
         """Set one entry with the next step."""
-        self._write("MFVec3f", index, values)
+        self._set_entry("Vec2f", index, numbers(value, 2))
 
-    def setMFColor(self, index: int, values: list[float]) -> None:
+    def setMFVec3f(self, index: int, value: list[float]) -> None:
         """Set one entry with the next step."""
-        self._write("MFColor", index, values)
+        self._set_entry("Vec3f", index, numbers(value, 3))
+
+    def setMFRotation(self, index: int, value: list[float]) -> None:
+        """Set one entry with the next step."""
+        self._set_entry("Rotation", index, numbers(value, 4))
+
+    def setMFColor(self, index: int, value: list[float]) -> None:
+        """Set one entry with the next step."""
+        self._set_entry("Color", index, numbers(value, 3))
 
     def setMFString(self, index: int, value: str) -> None:
         """Set one entry with the next step."""
-        self._write("MFString", index, value)
+        self._set_entry("String", index, text(value))
 
 
 def _as_sent(value: Any) -> Any:
     if not isinstance(value, list):
         return value
-    return [number(part) for part in cast("list[Any]", value)]
+    values = cast("list[Any]", value)
+    return numbers(values, len(values))
 
 
 def _fits(kind: str, value: Any) -> bool:
     if kind in _LENGTHS:
         return isinstance(value, list) and len(cast("list[Any]", value)) == _LENGTHS[kind]
-    return isinstance(value, _TYPES.get(kind, ()))
+    return kind in _TYPES and isinstance(value, _TYPES[kind])
+
+
+field_of = Field._of  # pyright: ignore[reportPrivateUsage]
+"""Makes the object for a field that the simulator has told of."""

@@ -6,22 +6,14 @@ from __future__ import annotations
 
 import ctypes
 from math import cos, sin
-from typing import Any, NamedTuple
+from typing import Any
 
-from .console import say
 from .device import Sensor
+from .lacking import lacking, lacks
+from .lidar_point import LidarPoint, pack_point
 
 
-class LidarPoint(NamedTuple):
-    """A point of the point cloud: x, y and z in metres in the frame of the lidar."""
-
-    x: float
-    y: float
-    z: float
-    layer_id: int
-    time: float
-
-
+@lacks("setFrequency")
 class Lidar(Sensor):
     """Measures a fan of distances from left to right, layer after layer."""
 
@@ -71,19 +63,46 @@ class Lidar(Sensor):
         """Whether `getPointCloud` works."""
         return self._with_points
 
+    def getNumberOfPoints(self) -> int:
+        """Points in the point cloud; 0 and a line on stderr unless it is enabled."""
+        if self._has_points("get_number_of_points", "!"):
+            return self.getHorizontalResolution() * self.getNumberOfLayers()
+        return 0
+
+    @property
+    def number_of_points(self) -> int:
+        """Points in the point cloud; 0 and a line on stderr unless it is enabled."""
+        return self.getNumberOfPoints()
+
     def getPointCloud(self) -> list[LidarPoint]:
-        """The scan as points; empty and a line on stderr unless enabled."""
-        if not self._with_points:
-            say("Error: wb_lidar_get_point_cloud() called for a lidar with point cloud disabled!")
+        """The scan as points, layer after layer; empty and lines on stderr unless enabled."""
+        count = self.getNumberOfPoints()
+        if not self._has_points("get_point_cloud", "."):
             return []
+        data = self._packed_points()
+        return [LidarPoint(data, offset) for offset in range(count)]
+
+    def getLayerPointCloud(self, layer: int) -> list[LidarPoint]:
+        """The points of one layer; empty and lines on stderr unless enabled."""
+        size = self.getHorizontalResolution()
+        return self.getPointCloud()[layer * size : (layer + 1) * size]
+
+    def _has_points(self, what: str, mark: str) -> bool:
+        if not self._with_points:
+            use = "Please use: wb_lidar_enable_point_cloud()."
+            self._complain(what, f" called for a lidar with point cloud disabled{mark} {use}")
+        return self._with_points
+
+    def _packed_points(self) -> bytes:
         resolution, fov = self.getHorizontalResolution(), self.getFov()
-        step, ranges = fov / max(resolution - 1, 1), self.getRangeImage()[:resolution]
-        angles = (fov / 2.0 - i * step for i in range(resolution))
-        time_s = self._session.time_s
-        return [
-            LidarPoint(distance * cos(angle), distance * sin(angle), 0.0, 0, time_s)
-            for distance, angle in zip(ranges, angles, strict=True)
-        ]
+        step, time_s = fov / max(resolution - 1, 1), self._session.time_s
+        points: list[bytes] = []
+        for i, distance in enumerate(self.getRangeImage()):
+            layer, column = divmod(i, resolution)
+            angle = fov / 2.0 - column * step
+            x, y = distance * cos(angle), distance * sin(angle)
+            points.append(pack_point(x, y, 0.0, layer, time_s))
+        return b"".join(points)
 
     def getHorizontalResolution(self) -> int:
         """Distances in a layer."""
@@ -142,3 +161,30 @@ class Lidar(Sensor):
     def getFrequency(self) -> float:
         """The `defaultFrequency` field, hertz."""
         return self._description["frequency"]
+
+    @property
+    def frequency(self) -> float:
+        """The `defaultFrequency` field, hertz."""
+        return self.getFrequency()
+
+    @frequency.setter
+    def frequency(self, frequency: float) -> None:
+        raise lacking("Lidar.setFrequency")
+
+    def getMinFrequency(self) -> float:
+        """The `minFrequency` field, hertz."""
+        return self._description["min_frequency"]
+
+    @property
+    def min_frequency(self) -> float:
+        """The `minFrequency` field, hertz."""
+        return self.getMinFrequency()
+
+    def getMaxFrequency(self) -> float:
+        """The `maxFrequency` field, hertz."""
+        return self._description["max_frequency"]
+
+    @property
+    def max_frequency(self) -> float:
+        """The `maxFrequency` field, hertz."""
+        return self.getMaxFrequency()

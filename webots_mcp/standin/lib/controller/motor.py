@@ -7,14 +7,23 @@ from __future__ import annotations
 from math import isinf, isnan
 
 from .arguments import number
-from .console import say
 from .device import Device
+from .lacking import lacks
 from .sensors import PositionSensor
 
 
+@lacks(
+    "available_force disableForceFeedback disableTorqueFeedback enableForceFeedback "
+    "enableTorqueFeedback force force_feedback force_feedback_sampling_period "
+    "getAvailableForce getForceFeedback getForceFeedbackSamplingPeriod getMaxForce "
+    "getTorqueFeedback getTorqueFeedbackSamplingPeriod max_force setAvailableForce "
+    "available_torque setAvailableTorque getAvailableTorque setControlPID setForce setTorque "
+    "torque torque_feedback torque_feedback_sampling_period"
+)
 class Motor(Device):
     """Turns a joint. The getters give what was commanded, not what is measured."""
 
+    _c_name = "motor"
     ROTATIONAL, LINEAR = range(2)
 
     def __init__(self, name: int | str) -> None:
@@ -25,33 +34,33 @@ class Motor(Device):
 
     def setPosition(self, position: float) -> None:
         """Turn to an angle in radians; inf lets the motor run with `setVelocity`."""
-        if self._usable(position := number(position), "set_position"):
-            self._position = position
-            self._session.change(self._tag, "position", position)
+        if isnan(position := number(position)):
+            self._complain("set_position", " called with an invalid 'position' argument (NaN).")
+            return
+        self._position = position
+        self._session.change(self._tag, "position", position)
 
     def setVelocity(self, velocity: float) -> None:
         """Set the speed in radians a second; the motor keeps within its `maxVelocity`."""
-        if not self._usable(velocity := number(velocity), "set_velocity"):
-            return
-        if velocity < 0.0 and not isinf(self._position):
-            say(
-                "Error: wb_motor_set_velocity() called with a negative 'velocity' argument in "
-                "position control mode."
+        if isnan(velocity := number(velocity)):
+            self._complain("set_velocity", " called with an invalid 'velocity' argument.(NaN)")
+        elif velocity < 0.0 and not isinf(self._position):
+            self._complain(
+                "set_velocity",
+                " called with negative 'velocity' argument in position control mode "
+                f"({self._position:g}).",
             )
-            return
-        self._velocity = velocity
-        self._session.change(self._tag, "velocity", velocity)
+        else:
+            self._velocity = velocity
+            self._session.change(self._tag, "velocity", velocity)
 
     def setAcceleration(self, acceleration: float) -> None:
         """Limit how fast the speed changes, in radians a second squared; -1: no limit."""
-        if self._usable(acceleration := number(acceleration), "set_acceleration"):
-            self._acceleration = acceleration
-            self._session.change(self._tag, "acceleration", acceleration)
-
-    def _usable(self, value: float, what: str) -> bool:
-        if isnan(value):
-            say(f"Error: wb_motor_{what}() called with an invalid argument (NaN).")
-        return not isnan(value)
+        if isnan(acceleration := number(acceleration)):
+            self._complain("set_acceleration", " called with an invalid argument (NaN).")
+            return
+        self._acceleration = acceleration
+        self._session.change(self._tag, "acceleration", acceleration)
 
     def getTargetPosition(self) -> float:
         """The commanded position in radians."""
@@ -82,6 +91,15 @@ class Motor(Device):
     def getAcceleration(self) -> float:
         """The commanded limit of acceleration; -1: none."""
         return self._acceleration
+
+    @property
+    def target_acceleration(self) -> float:
+        """The commanded limit of acceleration; -1: none."""
+        return self.getAcceleration()
+
+    @target_acceleration.setter
+    def target_acceleration(self, acceleration: float) -> None:
+        self.setAcceleration(acceleration)
 
     def getMaxVelocity(self) -> float:
         """The `maxVelocity` field, radians a second."""
@@ -119,9 +137,30 @@ class Motor(Device):
         """The `maxTorque` field, newton metres."""
         return self.getMaxTorque()
 
+    def getMultiplier(self) -> float:
+        """The `multiplier` field; the stand-in couples no motors."""
+        return self._description["multiplier"]
+
+    @property
+    def multiplier(self) -> float:
+        """The `multiplier` field; the stand-in couples no motors."""
+        return self.getMultiplier()
+
     def getType(self) -> int:
         """`Motor.ROTATIONAL`."""
         return self.ROTATIONAL
+
+    @property
+    def type(self) -> int:
+        """`Motor.ROTATIONAL`."""
+        return self.getType()
+
+    def getBrake(self) -> None:
+        """None: the stand-in has no brakes."""
+
+    @property
+    def brake(self) -> None:
+        """None: the stand-in has no brakes."""
 
     def getPositionSensor(self) -> PositionSensor | None:
         """The sensor of the same joint; None if there is none."""
@@ -130,3 +169,8 @@ class Motor(Device):
             if name is not None and description["name"] == name:
                 return PositionSensor(description["tag"])
         return None
+
+    @property
+    def position_sensor(self) -> PositionSensor | None:
+        """The sensor of the same joint; None if there is none."""
+        return self.getPositionSensor()

@@ -7,36 +7,58 @@ from __future__ import annotations
 from math import nan
 from typing import TYPE_CHECKING, Any
 
-from .arguments import integer, text
-from .field import Field
+from .arguments import integer, numbers, text
+from .field import Field, field_of
+from .lacking import lacking, lacks
 from .node_types import CONSTANTS, NUMBER_OF
 from .session import Session
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    class _NodeTypes(type):
+        """Says that there is a constant for each node type, as `Node.GPS`."""
 
-class _NodeTypes(type):
-    """Gives `Node` a constant for each node type, as `Node.GPS`."""
-
-    def __getattr__(cls, name: str) -> int:
-        if name in CONSTANTS:
-            return CONSTANTS[name]
-        raise AttributeError(f"type object 'Node' has no attribute {name!r}")
+        def __getattr__(cls, name: str) -> int: ...
+else:
+    _NodeTypes = type
 
 
+@lacks(
+    "addForce addForceWithOffset addTorque disableContactPointsTracking disablePoseTracking "
+    "enableContactPointsTracking enablePoseTracking exportString getBaseNodeField "
+    "getBaseNodeFieldByIndex getCenterOfMass getContactPoints getFromProtoDef "
+    "getNumberOfBaseNodeFields getProto getProtoField getProtoFieldByIndex getStaticBalance "
+    "loadState moveViewpoint number_of_base_node_fields remove saveState setJointPosition "
+    "setVisibility"
+)
 class Node(metaclass=_NodeTypes):
-    """A node of the scene tree; a null node (no rights) answers with defaults."""
+    """A node of the scene tree; a null node (no rights) answers with defaults.
 
-    def __init__(self, session: Session, found: Sequence[Any]) -> None:
-        self._session = session
-        self._id, self._type_name, self._def_name = found
+    As in Webots, each call that gives a node makes another object, equal to no other: compare
+    `getId()`.
+    """
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Node) and (other._id, other._session) == (self._id, self._session)
+    _session: Session
+    _id: int
+    _found: tuple[str, str, str]
 
-    def __hash__(self) -> int:
-        return hash(self._id)
+    def __init__(
+        self,
+        DEF: str | None = None,
+        tag: int | None = None,
+        id: int | None = None,  # noqa: A002 - Webots' name
+        selected: bool | None = None,
+        ref: int | None = None,
+    ) -> None:
+        raise lacking("Node(...); ask the supervisor for nodes")
+
+    @classmethod
+    def _of(cls, session: Session, found: Sequence[Any]) -> Node:
+        node = cls.__new__(cls)
+        node._session, node._id = session, found[0]
+        node._found = (found[1], found[2], found[3])
+        return node
 
     def getId(self) -> int:
         """A number that no other node has."""
@@ -49,7 +71,7 @@ class Node(metaclass=_NodeTypes):
 
     def getType(self) -> int:
         """The number of the node type, to compare with `Node.ROBOT` and the like."""
-        return NUMBER_OF.get(self._type_name, 0)
+        return NUMBER_OF.get(self.getBaseTypeName(), 0)
 
     @property
     def type(self) -> int:
@@ -57,56 +79,61 @@ class Node(metaclass=_NodeTypes):
         return self.getType()
 
     def getTypeName(self) -> str:
-        """The node type, as `Robot`."""
-        return self._type_name
+        """The node type, as `Robot`; of a PROTO node its own name, as `WoodenBox`."""
+        return self._found[0]
 
     @property
     def type_name(self) -> str:
-        """The node type, as `Robot`."""
+        """The node type, as `Robot`; of a PROTO node its own name, as `WoodenBox`."""
         return self.getTypeName()
 
     def getBaseTypeName(self) -> str:
-        """The node type; the stand-in has no PROTO nodes."""
-        return self._type_name
+        """The node type; of a PROTO node what it is made of, as `Solid`."""
+        return self._found[1]
 
     @property
     def base_type_name(self) -> str:
-        """The node type; the stand-in has no PROTO nodes."""
+        """The node type; of a PROTO node what it is made of, as `Solid`."""
         return self.getBaseTypeName()
 
     def isProto(self) -> bool:
-        """False: the stand-in has no PROTO nodes."""
-        return False
+        """Whether it is a PROTO node."""
+        return self._found[0] != self._found[1]
 
     def getDef(self) -> str:
         """The DEF name, empty if there is none."""
-        return self._def_name
+        return self._found[2]
 
     @property
-    def def_name(self) -> str:
+    def DEF(self) -> str:
         """The DEF name, empty if there is none."""
         return self.getDef()
 
     def getParentNode(self) -> Node | None:
         """The node around this one; None for the root."""
         found = self._session.ask("node_get_parent_node", self._id)
-        return None if found is None else Node(self._session, found)
+        return None if found is None else node_of(self._session, found)
 
     # Fields --------------------------------------------------------------------------------------
 
     def getField(self, fieldName: str) -> Field | None:
         """A field by name; None if the node has no such field."""
         found = self._session.ask("node_get_field", self._id, text(fieldName))
-        return None if found is None else Field(self._session, self._id, fieldName, found)
+        return None if found is None else field_of(self._session, self._id, fieldName, found)
 
     def getNumberOfFields(self) -> int:
         """How many fields the node has."""
         return len(self._session.ask("node_get_field_names", self._id, default=[]))
 
+    @property
+    def number_of_fields(self) -> int:
+        """How many fields the node has."""
+        return self.getNumberOfFields()
+
     def getFieldByIndex(self, index: int) -> Field | None:
         """A field by its place; None beyond the last."""
         names: list[str] = self._session.ask("node_get_field_names", self._id, default=[])
-        return self.getField(names[index]) if 0 <= integer(index) < len(names) else None
+        return self.getField(names[index]) if 0 <= integer(index, 2) < len(names) else None
 
     # Places --------------------------------------------------------------------------------------
 
@@ -114,36 +141,26 @@ class Node(metaclass=_NodeTypes):
         """x, y and z in the world, metres; NaN for a node that has no place."""
         return [*self._pose()[1]]
 
-    @property
-    def position(self) -> list[float]:
-        """x, y and z in the world, metres."""
-        return self.getPosition()
-
     def getOrientation(self) -> list[float]:
         """The rotation matrix in the world by rows: nine numbers."""
         return [*self._pose()[0]]
 
-    @property
-    def orientation(self) -> list[float]:
-        """The rotation matrix in the world by rows: nine numbers."""
-        return self.getOrientation()
-
-    def getPose(self) -> list[float]:
-        """The 4 x 4 matrix in the world by rows: sixteen numbers."""
-        r, (x, y, z) = self._pose()
+    def getPose(self, fromNode: Node | None = None) -> list[float]:
+        """The 4 x 4 matrix by rows, in the world or in another node: sixteen numbers."""
+        r, (x, y, z) = self._pose(fromNode)
         return [*r[0:3], x, *r[3:6], y, *r[6:9], z, 0.0, 0.0, 0.0, 1.0]
 
-    def _pose(self) -> Any:
-        return self._session.ask("node_get_pose", self._id, default=([nan] * 9, [nan] * 3))
+    def _pose(self, seen_from: Node | None = None) -> Any:
+        node_ids = (self._id, seen_from._id if seen_from else None)
+        return self._session.ask("node_get_pose", *node_ids, default=([nan] * 9, [nan] * 3))
 
     def getVelocity(self) -> list[float]:
         """Linear (metres a second) and angular (radians a second) velocity: six numbers."""
         return [*self._session.ask("node_get_velocity", self._id, default=[nan] * 6)]
 
-    @property
-    def velocity(self) -> list[float]:
-        """Linear and angular velocity: six numbers."""
-        return self.getVelocity()
+    def setVelocity(self, velocity: list[float]) -> None:
+        """Set linear and angular velocity; on the plane, so x, y and the turn about z count."""
+        self._session.ask("node_set_velocity", self._id, numbers(velocity, 6))
 
     def restartController(self) -> None:
         """End the controller of this Robot node and start it again."""
@@ -152,3 +169,10 @@ class Node(metaclass=_NodeTypes):
     def resetPhysics(self) -> None:
         """Take the node's speed away."""
         self._session.ask("node_reset_physics", self._id)
+
+
+for _name, _number in CONSTANTS.items():
+    setattr(Node, _name, _number)
+
+node_of = Node._of  # pyright: ignore[reportPrivateUsage]
+"""Makes the object for a node that the simulator has told of."""

@@ -1,11 +1,13 @@
 """The robot: stepping, devices, and what the world says about it."""
 
-# ruff: noqa: N802 - the names are those of Webots
+# ruff: noqa: N802, N815 - the names are those of Webots
 
 from __future__ import annotations
 
+import ctypes
+import os
 import signal
-import threading
+from collections.abc import Callable
 from typing import Any, ClassVar, Final
 
 from . import session as library
@@ -13,26 +15,58 @@ from .arguments import integer, text
 from .camera import Camera
 from .console import say
 from .device import Device
+from .lacking import lacking, lacks
+from .led import LED
 from .lidar import Lidar
 from .motor import Motor
-from .sensors import GPS, DistanceSensor, InertialUnit, PositionSensor
+from .sensors import (
+    GPS,
+    Accelerometer,
+    Compass,
+    DistanceSensor,
+    Gyro,
+    InertialUnit,
+    LightSensor,
+    PositionSensor,
+    TouchSensor,
+)
 from .session import Link, Session
 from .socket_link import SocketLink
 
 _DEVICE_CLASSES: Final[dict[str, type[Device]]] = {
-    "Motor": Motor,
-    "PositionSensor": PositionSensor,
-    "DistanceSensor": DistanceSensor,
-    "GPS": GPS,
-    "InertialUnit": InertialUnit,
-    "Lidar": Lidar,
-    "Camera": Camera,
+    device_class.__name__: device_class
+    for device_class in (
+        *(Motor, PositionSensor, DistanceSensor, GPS, InertialUnit, Lidar, Camera, LED),
+        *(Accelerometer, Compass, Gyro, LightSensor, TouchSensor),
+    )
 }
 _DEADLY_SIGNALS: Final = ("SIGINT", "SIGTERM", "SIGHUP", "SIGQUIT")
 
 
+def _deprecated(getter: str) -> Callable[[Robot, str], Any]:
+    """The old way to a device, as `getGPS`."""
+
+    def get(self: Robot, name: str) -> Any:
+        use = "please use Robot.getDevice instead."
+        say(f"DEPRECATION: Robot.{getter} is deprecated, {use}")
+        return self.getDevice(name)
+
+    return get
+
+
+@lacks(
+    "EVENT_JOYSTICK_AXIS EVENT_JOYSTICK_BUTTON EVENT_JOYSTICK_POV EVENT_KEYBOARD "
+    "EVENT_MOUSE_CLICK EVENT_MOUSE_MOVE EVENT_NO_EVENT EVENT_QUIT "
+    "batterySensorDisable batterySensorEnable batterySensorGetSamplingPeriod "
+    "batterySensorGetValue battery_sensor_sampling_period getAltimeter getBrake getConnector "
+    "getDisplay getEmitter getJoystick getKeyboard getMouse getPen getRadar getRangeFinder "
+    "getReceiver getSkin getSpeaker getUrdf joystick keyboard mouse setMode "
+    "waitForUserInputEvent wwiReceiveText wwiSendText"
+)
 class Robot:
     """The robot that this process controls; a process has one."""
+
+    MODE_SIMULATION, MODE_CROSS_COMPILATION, MODE_REMOTE_CONTROL = range(3)
 
     created: ClassVar[Robot | None] = None
     """The first robot that was made."""
@@ -111,11 +145,32 @@ class Robot:
     # Devices -------------------------------------------------------------------------------------
 
     def getDevice(self, name: str) -> Any:
-        """The device with this name; None and a line on stderr if there is none."""
-        device = self.devices.get(text(name))
+        """The device with this name; None and a line on stderr if there is none.
+
+        Raises:
+            NotInStandInError: The world gives the robot such a device, the stand-in has none.
+        """
+        device = self.devices.get(name)
+        left_out: dict[str, str] = self._session.robot["left_out"]
+        if device is None and name in left_out:
+            raise lacking(f"{left_out[name]} nodes, so robot {self.getName()!r} has no {name!r}")
         if device is None:
-            say(f'Warning: "{name}" device was not found on robot "{self.getName()}".')
+            say(f'Device "{name}" was not found on robot "{self.getName()}"')
         return device
+
+    getAccelerometer = _deprecated("getAccelerometer")
+    getCamera = _deprecated("getCamera")
+    getCompass = _deprecated("getCompass")
+    getDistanceSensor = _deprecated("getDistanceSensor")
+    getGPS = _deprecated("getGPS")
+    getGyro = _deprecated("getGyro")
+    getInertialUnit = _deprecated("getInertialUnit")
+    getLED = _deprecated("getLED")
+    getLidar = _deprecated("getLidar")
+    getLightSensor = _deprecated("getLightSensor")
+    getMotor = _deprecated("getMotor")
+    getPositionSensor = _deprecated("getPositionSensor")
+    getTouchSensor = _deprecated("getTouchSensor")
 
     def getNumberOfDevices(self) -> int:
         """How many devices the robot has."""
@@ -134,7 +189,7 @@ class Robot:
         """
         tags = [*self._by_tag]
         if not 0 <= integer(index) < len(tags):
-            say("Error: wb_robot_get_device_by_index() called with an out of range index.")
+            say("Error: The index of wb_robot_get_device_by_index() is out of the bounds.")
             raise KeyError(self.getName())
         return self._by_tag[tags[index]]
 
@@ -222,9 +277,13 @@ class Robot:
 
 
 def _restore_signals() -> None:
-    """Signals end the process at once, without KeyboardInterrupt, `finally` or atexit."""
-    if threading.current_thread() is not threading.main_thread():
-        return  # Python lets only the main thread do this
+    """Signals end the process at once, without KeyboardInterrupt, `finally` or atexit.
+
+    As in Webots it is C that is told, so that `signal.getsignal` knows nothing of it.
+    """
+    if os.name != "posix":
+        return
+    c_signal = ctypes.CDLL(None).signal
+    c_signal.argtypes, c_signal.restype = (ctypes.c_int, ctypes.c_void_p), ctypes.c_void_p
     for name in _DEADLY_SIGNALS:
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_DFL)
+        c_signal(getattr(signal, name), None)  # SIG_DFL

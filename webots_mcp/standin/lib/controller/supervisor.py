@@ -8,12 +8,18 @@ from typing import Any, Final
 
 from .arguments import integer, number, text
 from .console import say
-from .node import Node
+from .lacking import lacks
+from .node import Node, node_of
 from .robot import Robot
 
-_NULL_NODE: Final = (0, "", "")
+_NULL_NODE: Final = (0, "", "", "")
 
 
+@lacks(
+    "animationStartRecording animationStopRecording movieFailed movieIsReady movieStartRecording "
+    "movieStopRecording virtualRealityHeadsetGetOrientation virtualRealityHeadsetGetPosition "
+    "virtualRealityHeadsetIsUsed worldSave"
+)
 class Supervisor(Robot):
     """A robot with more methods; the world decides whether it may use them."""
 
@@ -21,26 +27,37 @@ class Supervisor(Robot):
     SIMULATION_MODE_REAL_TIME = 1
     SIMULATION_MODE_FAST = 2
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._nodes: dict[str, Any] = {}
+
     # Nodes ---------------------------------------------------------------------------------------
 
     def getRoot(self) -> Node:
         """The node around everything; its `children` are the top of the scene tree."""
-        return Node(self._session, self._session.ask("node_get_root") or _NULL_NODE)
+        return self._known("node_get_root")
 
     def getSelf(self) -> Node:
         """The robot's own node."""
-        return Node(self._session, self._session.ask("node_get_self") or _NULL_NODE)
+        return self._known("node_get_self")
 
-    def getFromDef(self, name: str) -> Node | None:
+    def _known(self, operation: str) -> Node:
+        """A node that is asked for once; after that it can be had between requests too."""
+        found = self._nodes.get(operation) or self._session.ask(operation)
+        if found is not None:
+            self._nodes[operation] = found
+        return node_of(self._session, found or _NULL_NODE)
+
+    def getFromDef(self, d: str) -> Node | None:
         """The node with this DEF name (`A.B`: B inside A); None if there is none."""
-        return self._node(self._session.ask("node_get_from_def", text(name)))
+        return self._node(self._session.ask("node_get_from_def", text(d)))
 
     def getFromId(self, id: int) -> Node | None:  # noqa: A002 - Webots' name
         """The node with this number; None if there is none."""
         return self._node(self._session.ask("node_get_from_id", integer(id)))
 
     def getFromDevice(self, tag: int) -> Node | None:
-        """The node of a device: wants `device.tag`, not the device."""
+        """The node of a device: wants the number `device._tag`, not the device."""
         return self._node(self._session.ask("node_get_from_device", integer(tag)))
 
     def getSelected(self) -> Node | None:
@@ -48,7 +65,7 @@ class Supervisor(Robot):
         return None
 
     def _node(self, found: Any) -> Node | None:
-        return None if found is None else Node(self._session, found)
+        return None if found is None else node_of(self._session, found)
 
     # The simulation ------------------------------------------------------------------------------
 
@@ -85,14 +102,9 @@ class Supervisor(Robot):
         """Read the world from its file again; the next step returns -1."""
         self._session.ask("world_reload")
 
-    def worldLoad(self, file: str) -> None:
+    def worldLoad(self, filename: str) -> None:
         """Load another world after the next physics step."""
-        self._session.ask("world_load", text(file))
-
-    def worldSave(self, file: str | None = None) -> int:
-        """0 and a line on stderr: the stand-in writes no worlds."""
-        say("Error: wb_supervisor_world_save(): the stand-in writes no world files.")
-        return 0
+        self._session.ask("world_load", text(filename))
 
     # Pictures ------------------------------------------------------------------------------------
 
@@ -115,11 +127,8 @@ class Supervisor(Robot):
         transparency: float = 0.0,
         font: str = "Arial",
     ) -> None:
-        """Write a text over the picture: number 0 to 99; x, y and size from 0 to 1."""
-        if not 0 <= integer(id) <= 99:
-            say(f"Error: wb_supervisor_set_label(): id {id} is not between 0 and 99.")
-            return
+        """Write a text over the picture; ids are 0 to 99; x, y and size from 0 to 1."""
         number(transparency)
         text(font)
         place = (number(x), number(y), number(size))
-        self._session.ask("set_label", id, text(label), *place, integer(color))
+        self._session.ask("set_label", integer(id), text(label), *place, integer(color))

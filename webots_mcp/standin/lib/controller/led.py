@@ -1,0 +1,33 @@
+"""Lamps."""
+
+from __future__ import annotations
+
+from .arguments import integer
+from .device import Device
+
+
+class LED(Device):
+    """A lamp; nobody sees it shine, but it remembers what it was told."""
+
+    _c_name = "led"
+
+    def __init__(self, name: int | str) -> None:
+        super().__init__(name)
+        self._value = 0
+
+    def set(self, v: int) -> None:
+        """Switch on, with 1 or the number or RGB value of a color, or off with 0."""
+        self._value = integer(v, position=2)
+
+    def get(self) -> int:
+        """What it was told last."""
+        return self._value
+
+    @property
+    def value(self) -> int:
+        """What it was told last."""
+        return self.get()
+
+    @value.setter
+    def value(self, v: int) -> None:
+        self.set(v)

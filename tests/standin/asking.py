@@ -49,7 +49,7 @@ def answer(expression: str, names: dict[str, Any]) -> str:
             exec(expression, names)
             return "ok"
         return shape(eval(code, names))
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - that is an answer too
         return f"EXC {type(error).__name__}: {error}"
 
 

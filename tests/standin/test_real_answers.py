@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
+
+import pytest
 
 from webots_mcp.standin import Simulation
 
@@ -51,6 +54,7 @@ def answers_of_the_stand_in(expressions: list[str], tmp_path: Path) -> list[tupl
     return [(answer, printed) for answer, printed in json.loads(answers.read_text("utf-8"))]
 
 
+@pytest.mark.skipif(os.name != "posix", reason="the table was made on Linux")
 def test_each_expression_is_answered_as_in_webots_or_refused_with_the_page(
     tmp_path: Path,
 ) -> None:
@@ -59,11 +63,8 @@ def test_each_expression_is_answered_as_in_webots_or_refused_with_the_page(
     found = answers_of_the_stand_in([entry.expression for entry in table], tmp_path)
     other: list[str] = []
     for entry, (answer, printed) in zip(table, found, strict=True):
-        if (
-            entry.expression in AFTER_LACKING
-            or answer.startswith(LACKING)
-            and answer.endswith(PAGE)
-        ):
+        is_refused = answer.startswith(LACKING) and answer.endswith(PAGE)
+        if is_refused or entry.expression in AFTER_LACKING:
             continue
         if answer not in entry.answers or printed != entry.printed:
             wanted = f"{' or '.join(entry.answers)} {entry.printed}"

@@ -23,11 +23,18 @@ ALLOWED = {
     "liveness": set[str](),
     "notice": set[str](),
     "settlement": {"contract", "liveness"},
-    "maintenance": {"connection", "errors", "notice", "schema"},
+    "entries": set[str](),
+    "adoption": {"connection", "entries", "notice"},
+    "maintenance": {"adoption", "connection", "errors", "notice", "schema"},
     "standin": {"standin", "bundled"},
 }
 ENTRIES = {"bundled", "maintenance", "settlement"}
-STDLIB = {*ENTRIES, *ALLOWED["maintenance"], *ALLOWED["settlement"]}
+STDLIB = {
+    *ENTRIES,
+    *ALLOWED["maintenance"],
+    *ALLOWED["settlement"],
+    *ALLOWED["adoption"],
+}
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["store"] = STDLIB | {"store"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}

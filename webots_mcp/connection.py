@@ -17,7 +17,7 @@ from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import DatabaseError, NoDatabaseError
 
 Role = Literal["loop", "writer", "reader"]
-T = TypeVar("T")
+Result = TypeVar("Result")
 
 OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
 OPENING_TIMEOUT_MS: Final = 5000
@@ -25,6 +25,9 @@ LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write wa
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
 _UNWRITABLE: Final = ("readonly database", "unable to open database file")
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
+
+# All that a statement may raise because of the database.
+FAILURES: Final = (sqlite3.Error, sqlite3.Warning, UnicodeDecodeError, SystemError)
 
 # Why: a control loop never waits for a lock; an automatic checkpoint would be its slowest step,
 # so only the maintainer checkpoints; NORMAL costs the last commits at a power cut, never the file.
@@ -124,14 +127,34 @@ def transaction(connection: sqlite3.Connection) -> Generator[None]:
     Raises:
         sqlite3.Error: Also where the lock is not to be had (`is_busy`); then nothing ran inside.
     """
-    connection.execute("BEGIN IMMEDIATE")
     try:
+        connection.execute("BEGIN IMMEDIATE")
         yield
         connection.execute("COMMIT")
     except BaseException:
-        if connection.in_transaction:  # a full disk has ended it already
-            connection.execute("ROLLBACK")
+        roll_back(connection)
         raise
+
+
+def together(connection: sqlite3.Connection, act: Callable[[], Result]) -> Result:
+    """As `transaction`, also where a KeyboardInterrupt comes between any two lines.
+
+    A `with` statement has a moment after BEGIN and one before COMMIT that are outside of it.
+    """
+    try:
+        connection.execute("BEGIN IMMEDIATE")
+        result = act()
+        connection.execute("COMMIT")
+    except BaseException:
+        roll_back(connection)
+        raise
+    return result
+
+
+def roll_back(connection: sqlite3.Connection) -> None:
+    """End the transaction, if one is open: a full disk ends it by itself."""
+    if connection.in_transaction:
+        connection.execute("ROLLBACK")
 
 
 class ShortWrites:
@@ -152,7 +175,7 @@ class ShortWrites:
         self.held_s = 0.0
         self.longest_held_s = 0.0
 
-    def write(self, items: Iterable[T], store: Callable[[T], object]) -> int:
+    def write(self, items: Iterable[Result], store: Callable[[Result], object]) -> int:
         """Store the first items in one transaction; returns how many: one at least, if any.
 
         Raises:
@@ -178,13 +201,25 @@ class ShortWrites:
 
 
 def is_busy(error: Exception) -> bool:
-    """Whether another connection held the lock at that instant: trying again helps."""
+    """Whether another connection held the lock at that instant: trying again helps.
+
+    `sqlite3` raises more than its own errors: a damaged file makes it quote bytes in a message,
+    which are no UTF-8. So who writes catches any Exception, and asks here what it means.
+    """
     return isinstance(error, sqlite3.OperationalError) and "locked" in str(error)
 
 
 def is_damage(error: Exception) -> bool:
     """Whether SQLite says that the file itself is broken, or never was a database."""
-    return isinstance(error, sqlite3.DatabaseError) and any(s in str(error) for s in _DAMAGE)
+    text = text_of(error)
+    return isinstance(error, FAILURES) and any(words in text for words in _DAMAGE)
+
+
+def text_of(error: Exception) -> str:
+    """What went wrong, also where SQLite's own message is no text."""
+    if isinstance(error, UnicodeDecodeError):
+        return error.object.decode("utf-8", "replace")
+    return str(error)
 
 
 def is_unwritable(error: Exception) -> bool:

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal
 
+from webots_mcp.adoption import adopt
 from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect, identify_files, is_busy
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.notice import say
@@ -115,6 +116,7 @@ class Maintainer(threading.Thread):
         # A lease that was just taken from another: give a checkpoint of theirs time to end.
         if held and self._held_before:
             self._checkpoint(self._connection)
+            adopt(self._connection, self._database)
             if self._work is not None:
                 self._work(self._connection)
         self._held_before = held

@@ -15,6 +15,7 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import recorder
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, Database
+from webots_mcp.entries import waiting_path
 from webots_mcp.standin import InProcessSupervisor
 
 STEP_MS = 16
@@ -125,6 +126,25 @@ def drive(robot: InProcessSupervisor, bridge: MCPBridge) -> Callable[[int], None
 def numbers(recording: Recording) -> list[int]:
     """The `n` of all states, in order."""
     return [state["n"] for state in recording.states()]
+
+
+def waiting_file(bridge: MCPBridge) -> Path:
+    """Where the rows of the bridge wait while its database takes none."""
+    assert isinstance(bridge.database, Path)
+    return waiting_path(bridge.database, bridge._recorder._uuid)  # pyright: ignore[reportPrivateUsage]
+
+
+def keep_in_memory(bridge: MCPBridge) -> None:
+    """From now on no row can wait in the file either, as on a full disk."""
+    waiting_file(bridge).mkdir()
+
+
+def catch_up(bridge: MCPBridge) -> None:
+    """Write all that waits, whatever the maintainer is doing at this moment."""
+    deadline_s = time.monotonic() + 10
+    while not bridge._recorder.flush():  # pyright: ignore[reportPrivateUsage]
+        assert time.monotonic() < deadline_s
+    assert bridge.stats().rows_waiting == 0
 
 
 def heartbeat_now(bridge: MCPBridge) -> None:

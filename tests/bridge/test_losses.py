@@ -8,13 +8,19 @@ import os
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.bridge.conftest import STEP_MS, Recording, heartbeat_now, numbers
+from tests.bridge.conftest import (
+    STEP_MS,
+    Recording,
+    catch_up,
+    heartbeat_now,
+    keep_in_memory,
+    numbers,
+)
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import backlog
 from webots_mcp.connection import connect
@@ -54,6 +60,7 @@ def test_the_last_error_stays_short_however_many_rows_are_dropped(
     bridge: MCPBridge, file: Path, filed: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 1)
+    keep_in_memory(bridge)
     other = connect(file, "writer")
     other.execute("BEGIN IMMEDIATE")
     for n in range(50):
@@ -70,6 +77,7 @@ def test_a_run_counts_the_rows_that_are_in_the_database(
     bridge: MCPBridge, file: Path, filed: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 3)
+    keep_in_memory(bridge)
     other = connect(file, "writer")
     other.execute("BEGIN IMMEDIATE")
     for n in range(9):
@@ -89,6 +97,7 @@ def test_what_is_told_of_dropped_rows_is_stamped_with_the_time_of_now(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 1)
+    keep_in_memory(bridge)
     other = connect(file, "writer")
     other.execute("BEGIN IMMEDIATE")
     for n in range(5):
@@ -136,7 +145,7 @@ def test_recording_goes_on_after_the_write_ahead_log_was_deleted(
     bridge.publish({"n": 1})
     heartbeat_now(bridge)
     assert bridge.stats().rows_dropped == 1  # at the most: the maintainer may save it
-    flush(bridge)
+    catch_up(bridge)
     bridge.publish({"n": 2})
     assert numbers(filed)[-1] == 2
 
@@ -191,7 +200,7 @@ def test_rows_of_several_threads_are_all_written(bridge: MCPBridge, filed: Recor
     while any(thread.is_alive() for thread in threads):
         heartbeat_now(bridge)
         threads[0].join(0.001)  # a loop that never waits would take the threads their turns
-    flush(bridge)
+    catch_up(bridge)
     assert filed.rows("SELECT count(*) FROM log WHERE source = 'controller'") == [800]
     assert bridge.stats().rows_dropped == 0
 
@@ -226,10 +235,3 @@ def test_a_database_in_memory_has_no_files_that_could_vanish(
         bridge.publish({"n": 0})
         heartbeat_now(bridge)
         assert bridge.stats().rows_dropped == 0
-
-
-def flush(bridge: MCPBridge) -> None:
-    """Write all that waits, whatever the maintainer is doing at this moment."""
-    deadline_s = time.monotonic() + 10
-    while not bridge._recorder.flush():  # pyright: ignore[reportPrivateUsage]
-        assert time.monotonic() < deadline_s

@@ -1,71 +1,162 @@
-"""Rows that could not be written yet."""
+"""Writes that the database could not take yet: in a file beside it, else in memory."""
 
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable
+from typing import Any, Final
 
 from webots_mcp.bridge.run import Run
+from webots_mcp.entries import ENTRIES_AT_ONCE, Entry, Kind, Values, WaitingFile
 
 MAX_WAITING_ROWS: Final = 10_000
 MAX_WAITING_BYTES: Final = 16_000_000
 
-Values = tuple[Any, ...] | dict[str, Any]
 
+class Row:
+    """A write of the session, the run that it belongs to, and its number once it has one."""
 
-class Row(NamedTuple):
-    """A statement that writes one row, and the run that the row belongs to."""
+    __slots__ = ("kind", "number", "run", "values")
 
-    statement: str
-    run: Run | None
-    values: Values
+    def __init__(self, kind: Kind, run: Run | None, values: Values) -> None:
+        self.kind: Kind = kind
+        self.run = run
+        self.values = values
+        self.number: int | None = None
 
 
 class Backlog:
-    """The rows that wait, oldest first.
+    """What waits, oldest first: the entries of the file, then the rows in memory.
 
-    Any thread may add at the end; the rest belongs to the thread that holds the recorder's lock.
+    A row stays in memory only where the file does not take it (a full disk, a database in memory),
+    or until the next call where another thread was writing. Any thread may `put`; the rest belongs
+    to whose turn it is. An interrupt at any place leaves too much here, never too little; what the
+    database has already is known by its number.
+
+    Args:
+        file: Where rows survive the process; None for memory alone.
+        describe_run: The values of a run's own entry.
     """
 
-    def __init__(self) -> None:
-        self.rows: deque[Row] = deque()
+    def __init__(
+        self, file: WaitingFile | None, describe_run: Callable[[Run], dict[str, Any]]
+    ) -> None:
+        self._file = file
+        self._describe_run = describe_run
+        self._rows: deque[Row] = deque()
         self._bytes = 0
+        self._last_number = 0
+        self._in_file = 0
+        self._offset = 0
+        self._read: list[tuple[int, Entry]] = []
+        self._described: set[str] = set()
+        self.obstacle: str | None = None  # why the file did not take the last row
 
-    def add(self, row: Row) -> None:
+    @property
+    def waits(self) -> bool:
+        """Whether there may be anything."""
+        return bool(self._rows or self._in_file)
+
+    @property
+    def rows_in_memory(self) -> int:
+        """Those that a killed process would lose."""
+        return len(self._rows)
+
+    @property
+    def rows(self) -> int:
+        """How many wait."""
+        return len(self._rows) + self._in_file
+
+    def put(self, row: Row) -> None:
         """Keep the newest row."""
-        self.rows.append(row)
+        self._rows.append(row)
         self._bytes += _weight(row)
 
-    def add_first(self, row: Row) -> None:
-        """Keep a row that is to be written before all others."""
-        self.rows.appendleft(row)
-        self._bytes += _weight(row)
+    def save(self) -> None:
+        """Move the rows in memory to the file, as far as it takes them."""
+        while self._rows and self._file is not None:
+            row = self._rows[0]
+            self._in_file += 1
+            try:
+                self._file.append(self._entries(row, self._described))
+            except OSError as error:
+                self._in_file -= 1
+                self.obstacle = str(error)
+                return
+            self.obstacle = None
+            if row.run is not None:
+                self._described.add(row.run.uuid)
+            self.remove_oldest()
 
-    def oldest(self, most: int) -> list[Row]:
-        """The rows to be written next; they stay until they are removed."""
-        return [self.rows[i] for i in range(min(len(self.rows), most))]
+    def next_entries(self) -> list[Entry]:
+        """The oldest entries; they stay until they are forgotten. None are left where empty."""
+        if self._in_file and self._file is not None:
+            self._read = self._read or self._file.read(self._offset)
+            if self._read:
+                return [entry for _, entry in self._read]
+            self._empty_file()
+        entries: list[Entry] = []
+        described: set[str] = set()
+        for index in range(min(len(self._rows), ENTRIES_AT_ONCE)):
+            row = self._rows[index]
+            entries += self._entries(row, described)
+            if row.run is not None:
+                described.add(row.run.uuid)
+        return entries
+
+    def forget(self, number: int) -> None:
+        """The database has the entries up to that number."""
+        done = [item for item in self._read if item[1].number <= number]
+        if done:
+            self._offset = done[-1][0]
+            self._read = self._read[len(done) :]
+            rows = sum(entry.kind != "run" for _, entry in done)
+            self._in_file = max(1, self._in_file - rows)  # 0 once the end was seen
+        while self._rows and (self._rows[0].number or number + 1) <= number:
+            self.remove_oldest()
 
     def remove_oldest(self) -> Row:
-        """Take the oldest row out."""
-        row = self.rows.popleft()
+        """Take the oldest row out of memory."""
+        row = self._rows.popleft()
         self._bytes -= _weight(row)
         return row
 
     def is_over_limit(self) -> bool:
-        """Whether more waits than may."""
-        return len(self.rows) > MAX_WAITING_ROWS or self._bytes > MAX_WAITING_BYTES
+        """Whether more waits in memory than may."""
+        return len(self._rows) > MAX_WAITING_ROWS or self._bytes > MAX_WAITING_BYTES
 
+    def close(self) -> str | None:
+        """Close the file; where it holds entries, it stays, and is named."""
+        if self._file is None:
+            return None
+        waits, path = bool(self._in_file), self._file.path
+        self._file.close(remove=not waits)
+        self._file = None
+        return str(path) if waits else None
 
-def bind(run: Run | None, values: Values) -> Values:
-    """The parameters of a row's statement, with what is known of its run by now.
+    def leave_file(self) -> None:
+        """In a forked child: the file belongs to the parent."""
+        if self._file is not None:
+            self._file.close(remove=False)
+            self._file = None
 
-    Positional ones begin with the run's id; named ones may use `run` and `rows`.
-    """
-    if run is None:
-        return values
-    if isinstance(values, tuple):
-        return (run.id, *values)
-    return {"run": run.id, "rows": run.rows, **values}
+    def _empty_file(self) -> None:
+        assert self._file is not None
+        self._described.clear()  # first: described twice does no harm
+        self._offset, self._read = 0, []
+        self._file.empty()
+        self._in_file = 0
+
+    def _entries(self, row: Row, described: set[str]) -> list[Entry]:
+        """The row's entry, after that of its run if it is not among those described."""
+        if row.number is None:
+            self._last_number += 2  # one is for the run
+            row.number = self._last_number
+        entry = Entry(row.number, row.kind, row.run.uuid if row.run else None, row.values)
+        if row.run is None or row.run.uuid in described:
+            return [entry]
+        run = Entry(row.number - 1, "run", None, self._describe_run(row.run))
+        return [run, entry]
 
 
 def _weight(row: Row) -> int:

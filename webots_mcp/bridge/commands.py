@@ -35,21 +35,6 @@ CLAIM: Final = (
     "WHERE robot_id = :robot AND status = 'pending' AND expires_wall_time_s > :now "
     "ORDER BY id LIMIT 1) RETURNING id, CAST(action AS BLOB), CAST(params AS BLOB)"
 )
-ISSUE: Final = (
-    "UPDATE command SET issued_wall_time_s = ? "
-    "WHERE id = ? AND status = 'claimed' AND session_id = ?"
-)
-FINISH: Final = (
-    "UPDATE command SET status = ?, finished_wall_time_s = ?, finished_sim_time_s = ?, "
-    "result = ?, error = ? WHERE id = ? AND status = 'claimed' AND session_id = ?"
-)
-# The process that asked for the reload is gone; that this one runs is the proof that it worked.
-CONFIRM_RELOAD: Final = (
-    "UPDATE command SET status = 'done', finished_wall_time_s = :now, "
-    "finished_sim_time_s = :sim_time, result = json_object('run_id', :run) "
-    "WHERE robot_id = :robot AND action = 'reload' AND status = 'claimed' "
-    "AND issued_wall_time_s IS NOT NULL"
-)
 
 
 class Command:
@@ -108,8 +93,8 @@ class CommandQueue:
 
     def issue(self, command: Command) -> None:
         """Note that Webots is about to be asked for what may end this process."""
-        values = (time.time(), command.id, command.session_id)
-        self._recorder.record(ISSUE, None, values)
+        values = {"now": time.time(), "command": command.id}
+        self._recorder.record("command issued", None, values)
         deadline_s = time.monotonic() + 1  # the world stands still for a reload anyway
         while not self._recorder.flush() and time.monotonic() < deadline_s:
             time.sleep(0.002)
@@ -128,8 +113,9 @@ class CommandQueue:
     def _finish(
         self, command: Command, status: str, result: str | None, error: str | None, at_s: float
     ) -> None:
-        values = (status, time.time(), at_s, result, error, command.id, command.session_id)
-        if self._recorder.record(FINISH, None, values) == 0:
+        times = {"now": time.time(), "sim_time": at_s}
+        fate = {"command": command.id, "status": status, "result": result, "error": error}
+        if self._recorder.record("command finished", None, {**fate, **times}) == 0:
             self._recorder.complain(
                 f"command {command.id}",
                 f"command {command.id} ({command.action}) was judged lost before it was {status}",

@@ -3,13 +3,8 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-from typing import Final
 
 from webots_mcp.bridge.trouble import Trouble
-
-# What refuses a row whatever state the database is in: its own content.
-UNFIT: Final = (sqlite3.IntegrityError, sqlite3.DataError, UnicodeError, OverflowError)
 
 
 class Drops:
@@ -31,8 +26,3 @@ class Drops:
     def describe(self) -> str:
         """What an event tells of those that were not told yet."""
         return json.dumps({"rows": self.untold, "why": self._because})
-
-
-def is_unfit(error: Exception) -> bool:
-    """Whether the row itself is refused; a session that is gone is the database's fault."""
-    return isinstance(error, UNFIT) and "FOREIGN KEY" not in str(error)

@@ -8,16 +8,11 @@ from typing import Final
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.encoding import Encoded, encode
 from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.bridge.run import INSERT_EVENT, INSERT_STATE
 from webots_mcp.bridge.text import cut, storable
 
 MOST_LOG_CHARACTERS: Final = 10_000
 _NOT_LOST: Final = ("nan", "inf", "-inf", "bytes", "surrogate")
 _MOST_LOST_PATHS: Final = 20
-_INSERT_LOG: Final = (
-    "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
-    "VALUES (?, ?, ?, ?, ?, ?)"
-)
 
 
 class Journal:
@@ -32,9 +27,8 @@ class Journal:
     def state(self, encoded: Encoded) -> None:
         """Record a published state."""
         clock = self._clock
-        clock.run.rows += 1
         row = (clock.sim_time_s, time.time(), encoded.text, encoded.odd_text)
-        self._recorder.record(INSERT_STATE, clock.run, row)
+        self._recorder.record("state", clock.run, row)
         if encoded.odd:
             self._count_replaced(encoded.odd)
 
@@ -42,7 +36,7 @@ class Journal:
         """Record a line, or its beginning."""
         text = storable(cut(message, MOST_LOG_CHARACTERS))
         row = (self._clock.sim_time_s, time.time(), level, source, text)
-        self._recorder.record(_INSERT_LOG, self._clock.run, row)
+        self._recorder.record("log", self._clock.run, row)
 
     def event(
         self, kind: str, data: dict[str, object] | None = None, name: str | None = None
@@ -50,7 +44,7 @@ class Journal:
         """Record something that was noticed now."""
         text = encode(data).text if data is not None else None
         row = (self._clock.sim_time_s, time.time(), kind, name, text)
-        self._recorder.record(INSERT_EVENT, self._clock.run, row)
+        self._recorder.record("event", self._clock.run, row)
 
     def _count_replaced(self, odd: dict[str, str]) -> None:
         """Named in `odd` all the same; a value that is not in the row is said once a path."""

@@ -14,7 +14,7 @@ from typing import Any, Final
 from webots_mcp.bridge import open_bridges
 from webots_mcp.bridge.changes import Changes
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.commands import CONFIRM_RELOAD, describe
+from webots_mcp.bridge.commands import describe
 from webots_mcp.bridge.control import Control, Handler
 from webots_mcp.bridge.devices import read_devices
 from webots_mcp.bridge.encoding import encode
@@ -331,8 +331,7 @@ class MCPBridge:
             self._reloads.happened()
         if registration is not None:
             times = {"now": time.time(), "sim_time": self._clock.sim_time_s}
-            values = {**times, "robot": registration.robot_id}
-            self._recorder.record(CONFIRM_RELOAD, run, values)
+            self._recorder.record("reload confirmed", run, times)
 
     def _look(self) -> None:
         """Time has passed, or gone back, outside of the loop: in a step of a handler's."""

@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 from typing import Final
 
+from webots_mcp.adoption import adopt
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.registration import Registration, register
 from webots_mcp.connection import connect, journal_mode, never_wait
@@ -18,13 +19,14 @@ _SQLITE_HEADER: Final = b"SQLite format 3\0"
 
 
 def open_session(
-    database: Database, identity: Identity, actions: str, *, patient: bool
+    database: Database, identity: Identity, session_uuid: str, actions: str, *, patient: bool
 ) -> tuple[sqlite3.Connection, Registration]:
     """Open or make the database, and enter a session of this process.
 
     Args:
         database: Where to record.
         identity: Who records.
+        session_uuid: The session's own; one that the database knows goes on.
         actions: The registered custom actions as JSON text.
         patient: Wait for locks and migrate an older schema: at the start, not in the loop.
 
@@ -37,7 +39,9 @@ def open_session(
     connection = connect(database, "loop", create=True, patient=patient)
     try:
         _prepare(connection, database, patient)
-        registration = register(connection, identity, actions, time.time())
+        if isinstance(database, Path):
+            adopt(connection, database)
+        registration = register(connection, identity, session_uuid, actions)
         never_wait(connection)
     except BaseException:
         connection.close()

@@ -15,11 +15,6 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.contract import CAMERA_FOLDER
 from webots_mcp.errors import CommandRefusedError
 
-INSERT_IMAGE: Final = (
-    "INSERT INTO image (run_id, sim_time_s, wall_time_s, kind, device, path, width, height, bytes) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)"
-)
-_FORGET_IMAGE: Final = "DELETE FROM image WHERE path = ?"
 _PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n"
 _PNG_TAIL: Final = b"IEND\xaeB`\x82"
 
@@ -52,7 +47,7 @@ class Album:
         path = f"{CAMERA_FOLDER}/{name}.{_next_number(kept):06d}.png"
         size = self._write(path, encode_png(image, width, height))
         row = (self._clock.sim_time_s, time.time(), "camera", device, path, width, height, size)
-        self._recorder.record(INSERT_IMAGE, self._clock.run, row)
+        self._recorder.record("image", self._clock.run, row)
         kept.append(path)
         while len(kept) > max(1, max_frames):
             self._forget(kept.popleft())
@@ -69,7 +64,7 @@ class Album:
         """Enter a picture that the simulator wrote; returns what its command answers."""
         clock = self._clock
         row = (clock.sim_time_s, time.time(), "screenshot", None, path, width, height, size)
-        self._recorder.record(INSERT_IMAGE, clock.run, row)
+        self._recorder.record("image", clock.run, row)
         return {"path": path, "width": width, "height": height, "bytes": size}
 
     @property
@@ -99,7 +94,7 @@ class Album:
 
     def _forget(self, path: str) -> None:
         (self._data_dir / path).unlink(missing_ok=True)
-        self._recorder.record(_FORGET_IMAGE, None, (path,))
+        self._recorder.record("image forgotten", None, (path,))
 
 
 def encode_png(bgra: bytes, width: int, height: int) -> bytes:

@@ -8,15 +8,6 @@ from typing import Final, NamedTuple
 
 from webots_mcp.bridge.run import Run
 
-END_RUN: Final = (
-    "UPDATE run SET end_reason = :reason, ended_wall_time_s = :now, last_wall_time_s = :now, "
-    "last_sim_time_s = :sim_time, rows = :rows WHERE id = :run"
-)
-END_SESSION: Final = (
-    "UPDATE session SET ended_wall_time_s = ?, last_seen_wall_time_s = ?, "
-    "last_seen_monotonic_s = ?, end_reason = ?, hold = NULL, rows_waiting = 0, rows_dropped = ?, "
-    "last_error = ? WHERE id = ?"
-)
 _BEAT_SESSION: Final = (
     "UPDATE session SET last_seen_wall_time_s = ?, last_seen_monotonic_s = ?, "
     "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, hold = ?, "

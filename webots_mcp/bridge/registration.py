@@ -6,19 +6,15 @@ import json
 import os
 import sqlite3
 import time
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from webots_mcp import settlement
+from webots_mcp.adoption import enter_robot, enter_session
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.connection import transaction
-from webots_mcp.contract import REMOTE_SILENCE_S, new_uuid
+from webots_mcp.contract import REMOTE_SILENCE_S
 from webots_mcp.liveness import process_alive
 
-_KNOWN_ROBOT: Final = (
-    "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
-    "VALUES (:name, :kind, :devices, :now, :now) ON CONFLICT (name) DO UPDATE SET "
-    "kind = excluded.kind, devices = excluded.devices, last_seen_wall_time_s = :now"
-)
 _OPEN_SESSIONS: Final = (
     "SELECT s.id, s.pid, s.host, s.last_seen_wall_time_s FROM session s "
     "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
@@ -34,12 +30,6 @@ _RELOADED: Final = (
     "AND status = 'claimed' AND action = 'reload' AND issued_wall_time_s IS NOT NULL"
 )
 _LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
-_NEW_SESSION: Final = (
-    "INSERT INTO session (uuid, robot_id, pid, process, host, instance, extern, controller, "
-    "controller_sha256, git_commit, versions, supervisor, actions, started_wall_time_s, "
-    "last_seen_wall_time_s, last_seen_monotonic_s) "
-    "VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)"
-)
 
 # Sessions of this very process. A pid alone does not tell: in a container the same one comes back.
 _own_sessions: set[int] = set()
@@ -55,7 +45,7 @@ class Registration(NamedTuple):
 
 
 def register(
-    connection: sqlite3.Connection, identity: Identity, actions: str, now_s: float
+    connection: sqlite3.Connection, identity: Identity, session_uuid: str, actions: str
 ) -> Registration:
     """Enter a session; several starters at once each get their own, with names of their own.
 
@@ -63,12 +53,14 @@ def register(
     is settled, an unfinished session of the same robot is ended as `replaced`, and where a live
     process already has the name, `#2` (and so on) is appended.
     """
+    now_s = time.time()
     with transaction(connection):
         settlement.settle(connection, now_s)
         name = _free_name(connection, identity, now_s)
-        robot_id = _enter_robot(connection, identity, name, now_s)
+        robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         reloaded = _is_reload(connection, identity, robot_id, now_s)
-        session_id = _enter_session(connection, identity, robot_id, actions, now_s)
+        session = describe_session(identity, session_uuid, actions)
+        session_id = enter_session(connection, robot_id, session)
     _own_sessions.add(session_id)
     return Registration(robot_id, name, session_id, reloaded)
 
@@ -113,24 +105,29 @@ def _is_living(session: tuple[int, int, str, float], identity: Identity, now_s: 
     return process_alive(pid, last_seen_s)
 
 
-def _enter_robot(
-    connection: sqlite3.Connection, identity: Identity, name: str, now_s: float
-) -> int:
+def describe_robot(identity: Identity, name: str) -> dict[str, Any]:
+    """What the robot's row holds."""
     devices = json.dumps(identity.devices, ensure_ascii=False)
-    values = {"name": name, "kind": identity.kind, "devices": devices, "now": now_s}
-    connection.execute(_KNOWN_ROBOT, values)
-    return int(connection.execute("SELECT id FROM robot WHERE name = ?", (name,)).fetchone()[0])
+    return {"name": name, "kind": identity.kind, "devices": devices}
 
 
-def _enter_session(
-    connection: sqlite3.Connection, identity: Identity, robot_id: int, actions: str, now_s: float
-) -> int:
-    process = (identity.pid, identity.process, identity.host, identity.instance)
-    who = (new_uuid(), robot_id, *process, int(identity.extern))
-    code = (identity.controller, identity.controller_sha256, identity.git_commit)
-    versions = json.dumps(identity.versions)
-    times = (now_s, now_s, time.monotonic())
-    values = (*who, *code, versions, int(identity.supervisor), actions, *times)
-    session_id = connection.execute(_NEW_SESSION, values).lastrowid
-    assert session_id is not None
-    return session_id
+def describe_session(identity: Identity, uuid: str, actions: str) -> dict[str, Any]:
+    """What the session's row holds at its start."""
+    now_s = time.time()
+    return {
+        "uuid": uuid,
+        "pid": identity.pid,
+        "process": identity.process,
+        "host": identity.host,
+        "instance": identity.instance,
+        "extern": int(identity.extern),
+        "controller": identity.controller,
+        "controller_sha256": identity.controller_sha256,
+        "git_commit": identity.git_commit,
+        "versions": json.dumps(identity.versions),
+        "supervisor": int(identity.supervisor),
+        "actions": actions,
+        "started_wall_time_s": now_s,
+        "last_seen_wall_time_s": now_s,
+        "last_seen_monotonic_s": time.monotonic(),
+    }

@@ -13,7 +13,17 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp import settlement
-from webots_mcp.connection import FrozenConnection, Role, connect, is_busy, is_damage, is_unwritable
+from webots_mcp.adoption import adopt
+from webots_mcp.connection import (
+    FAILURES,
+    FrozenConnection,
+    Role,
+    connect,
+    is_busy,
+    is_damage,
+    is_unwritable,
+    text_of,
+)
 from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.errors import (
     DatabaseError,
@@ -145,6 +155,8 @@ class Recording:
             return
         with self.writer() as connection:
             if any_unfinished(connection):
+                if isinstance(self.database, Path):
+                    adopt(connection, self.database)  # a command's result may wait there
                 settlement.settle(connection, time.time())
 
     def create(self) -> None:
@@ -168,7 +180,7 @@ class Recording:
     def _explained(self) -> Generator[None]:
         try:
             yield
-        except sqlite3.Error as error:
+        except FAILURES as error:
             raise DatabaseError(_explain(error, self.database)) from error
 
     def _open(self, role: Role) -> sqlite3.Connection:
@@ -249,9 +261,9 @@ def name_of(database: Database) -> str:
     return "(in memory)" if isinstance(database, MemoryDatabase) else str(database)
 
 
-def _explain(error: sqlite3.Error, database: Database) -> str:
+def _explain(error: Exception, database: Database) -> str:
     """What a person can do about it."""
-    text, name = str(error), name_of(database)
+    text, name = text_of(error), name_of(database)
     if is_busy(error):
         return (
             f"the database at {name} stayed locked by another process: ask again; if it lasts, "

@@ -69,6 +69,7 @@ def test_the_last_error_stays_short_however_many_rows_are_dropped(
     other.execute("COMMIT")
     other.close()
     bridge.publish({"n": 50})
+    catch_up(bridge)
     (told,) = filed.rows("SELECT data FROM event WHERE kind = 'dropped'")
     assert json.loads(told)["why"] == "database is locked"
 
@@ -84,6 +85,7 @@ def test_a_run_counts_the_rows_that_are_in_the_database(
         bridge.publish({"n": n})
     other.execute("COMMIT")
     other.close()
+    catch_up(bridge)
     heartbeat_now(bridge)
     assert numbers(filed) == [6, 7, 8]
     assert filed.rows("SELECT rows FROM run") == [3]
@@ -106,6 +108,7 @@ def test_what_is_told_of_dropped_rows_is_stamped_with_the_time_of_now(
     other.execute("COMMIT")
     other.close()
     bridge.publish({"n": 5})
+    catch_up(bridge)
     told = filed.rows("SELECT sim_time_s FROM event WHERE kind = 'dropped'")
     assert told == [pytest.approx(5 * STEP_MS / 1000)]
 
@@ -125,6 +128,7 @@ def test_rows_that_went_into_a_deleted_file_are_counted_as_dropped(
         bridge.publish({"n": n})
     heartbeat_now(bridge)
     bridge.publish({"n": 7})
+    catch_up(bridge)
     heartbeat_now(bridge)
     assert numbers(filed) == [7]
     assert bridge.stats().rows_dropped == 4
@@ -159,6 +163,7 @@ def test_a_row_that_the_database_refuses_is_dropped_and_stops_no_other(
         patch.setattr(robot, "getTime", lambda: math.nan)
         bridge.publish({"n": 1})
     bridge.publish({"n": 2})
+    catch_up(bridge)
     assert numbers(filed) == [0, 2]
     assert bridge.stats().rows_waiting == 0
     assert bridge.stats().rows_dropped > 0
@@ -174,6 +179,7 @@ def test_a_row_that_waits_with_a_lone_surrogate_is_dropped_and_stops_no_other(
     other.execute("COMMIT")
     other.close()
     bridge.publish({"n": 2, "\ud800": "c"})
+    catch_up(bridge)
     assert numbers(filed) == [0, 1, 2]
     assert bridge.stats().rows_waiting == 0
 

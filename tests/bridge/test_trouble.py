@@ -77,6 +77,7 @@ def test_beyond_the_limit_the_oldest_rows_are_dropped_counted_and_told(
     other.execute("COMMIT")
     other.close()
     bridge.publish({"n": 25})
+    catch_up(bridge)
     assert numbers(filed) == list(range(15, 26))
     assert bridge.stats().rows_dropped == 15
     (told,) = filed.rows("SELECT data FROM event WHERE kind = 'dropped'")
@@ -115,6 +116,7 @@ def test_a_deleted_database_is_made_again_and_told(
         part.unlink()
     heartbeat_now(bridge)
     bridge.publish({"n": 1})
+    catch_up(bridge)
     assert numbers(filed) == [1]
     assert filed.rows("SELECT count(*) FROM event WHERE kind = 'storage'") == [1]
     assert "deleted or replaced" in capfd.readouterr().err
@@ -129,6 +131,7 @@ def test_a_database_that_is_damaged_in_mid_run_is_moved_aside_and_a_new_one_begu
     damage_schema(file)
     bridge.publish({"n": 1})
     bridge.publish({"n": 2})
+    catch_up(bridge)
     assert numbers(filed) == [1, 2]
     assert len(list(file.parent.glob(f"{DATABASE_NAME}.damaged-*"))) >= 1
     assert filed.rows("SELECT count(*) FROM event WHERE kind = 'storage'") == [1]
@@ -282,6 +285,7 @@ def test_a_database_that_turns_read_only_costs_rows_only(
     assert capfd.readouterr().err.count("readonly") == 1
     connection.execute("PRAGMA query_only=OFF")
     bridge.publish({"n": 2})
+    catch_up(bridge)
     assert numbers(filed) == [0, 1, 2]
 
 
@@ -315,6 +319,7 @@ def test_an_answer_that_meets_a_lock_is_written_later(
     other.execute("COMMIT")
     other.close()
     bridge.publish({"n": 1})
+    catch_up(bridge)
     assert filed.fate(sent)[:2] == ("done", "locked")
 
 

@@ -50,6 +50,7 @@ class Backlog:
         self._offset = 0
         self._read: list[tuple[int, Entry]] = []
         self._described: set[str] = set()
+        self._names: dict[str, str] = {}
         self.obstacle: str | None = None  # why the file did not take the last row
 
     @property
@@ -93,7 +94,7 @@ class Backlog:
         if self._in_file and self._file is not None:
             self._read = self._read or self._file.read(self._offset)
             if self._read:
-                return [entry for _, entry in self._read]
+                return [self._renamed(entry) for _, entry in self._read]
             self._empty_file()
         entries: list[Entry] = []
         described: set[str] = set()
@@ -114,6 +115,11 @@ class Backlog:
             self._in_file = max(1, self._in_file - rows)  # 0 once the end was seen
         while self._rows and (self._rows[0].number or number + 1) <= number:
             self.remove_oldest()
+
+    def rename_run(self, before: str, now: str) -> None:
+        """What waits in the file for a run belongs to its continuation in another database."""
+        self._names = {old: now if name == before else name for old, name in self._names.items()}
+        self._names[before] = now
 
     def remove_oldest(self) -> Row:
         """Take the oldest row out of memory."""
@@ -139,6 +145,13 @@ class Backlog:
         if self._file is not None:
             self._file.close(remove=False)
             self._file = None
+
+    def _renamed(self, entry: Entry) -> Entry:
+        if isinstance(entry.values, dict) and (
+            name := self._names.get(entry.values.get("uuid", ""))
+        ):
+            return entry._replace(values={**entry.values, "uuid": name})
+        return entry._replace(run=self._names.get(entry.run or "", entry.run))
 
     def _empty_file(self) -> None:
         assert self._file is not None

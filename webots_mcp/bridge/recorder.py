@@ -426,7 +426,9 @@ class Recorder:
         """Record into a database that knows nothing of this session yet."""
         self._disconnect()
         self._retry_at_s = 0.0
+        before = self.run.uuid
         self.run.begin_anew()
+        self._backlog.rename_run(before, self.run.uuid)
         data = json.dumps({"why": why})
         event = (self._clock.newest_s(self.run), time.time(), "storage", None, data)
         self._keep(Row("event", self.run, event))

@@ -37,8 +37,9 @@ class Run:
         self.started_wall_time_s = time.time()
 
     def begin_anew(self) -> None:
-        """It has no row in the database that is written to from now on."""
+        """It goes on as a run of its own in the database that is written to from now on."""
         self.id = None
+        self.uuid = new_uuid()
         self.rows = 0
 
     def describe(self, identity: Identity) -> dict[str, Any]:

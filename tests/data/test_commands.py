@@ -145,7 +145,7 @@ def test_a_bad_folder_is_one_line_and_exit_code_2(
 
 def test_a_dry_run_tells_what_would_go_and_deletes_nothing(say: Say, database: Path) -> None:
     before = query(database, "SELECT count(*) FROM state")
-    text = say("prune", "--dry-run", "--state", "400rows")
+    text = say("prune", "--dry-run", "--keep-states", "400rows")
     assert [line.split()[:2] for line in text.splitlines()] == [
         ["would", "go"],
         ["state", "458"],
@@ -154,30 +154,30 @@ def test_a_dry_run_tells_what_would_go_and_deletes_nothing(say: Say, database: P
 
 
 def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
-    text = say("prune", "--state", "400rows", "--image", "none")
+    text = say("prune", "--keep-states", "400rows", "--keep-images", "all")
     assert text.splitlines()[1].split()[:2] == ["state", "458"]
     assert query(database, "SELECT run_id, rows, purged_rows FROM robot_run") == [
         (1, 530, 458),
         (2, 328, 0),
     ]
     assert query(database, "PRAGMA integrity_check") == [("ok",)]
-    assert say("prune", "--state", "400rows") == "nothing is beyond the limits\n"
+    assert say("prune", "--keep-states", "400rows") == "nothing is beyond the limits\n"
 
 
 def test_a_run_that_is_kept_is_named_and_stays(say: Say, database: Path) -> None:
     assert say("keep", "1") == ""
-    text = say("prune", "--state", "400rows")
+    text = say("prune", "--keep-states", "400rows")
     assert text == (
         "nothing is beyond the limits\nnote: kept because of a label, a note or a mark: run 1\n"
     )
     say("keep", "1", "--release")
-    say("prune", "--state", "400rows")
+    say("prune", "--keep-states", "400rows")
     assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(458,)]
 
 
 def test_prune_shrinks_the_file(say: Say, database: Path) -> None:
     before = database.stat().st_size
-    assert "of the database file freed" in say("prune", "--state", "100rows")
+    assert "of the database file freed" in say("prune", "--keep-states", "100rows")
     assert database.stat().st_size < 0.7 * before
 
 
@@ -187,12 +187,12 @@ def test_a_run_that_does_not_exist_cannot_be_kept(
     assert "no run 9" in complaint(capsys, "keep", "9", "--database", str(database))
 
 
-@pytest.mark.parametrize("limit", ["", "500", "5 parsecs", "1GB,2GB", "-3d", "1GB;2d"])
+@pytest.mark.parametrize("limit", ["", "none", "500", "5 parsecs", "1GB,2GB", "-3d", "1GB;2d"])
 def test_a_limit_that_is_none_is_told_how_to_write_one(
     limit: str, database: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for command in ("prune", "serve"):
-        said = complaint(capsys, command, f"--state={limit}", "--database", str(database))
+        said = complaint(capsys, command, f"--keep-states={limit}", "--database", str(database))
         assert "500MB" in said or "twice" in said
 
 
@@ -228,7 +228,7 @@ def test_progress_is_shown_on_a_terminal_and_vanishes(database: Path) -> None:
         ("500MB", Limit(size_bytes=500_000_000)),
         ("1.5 gb, 30d", Limit(size_bytes=1_500_000_000, age_s=30 * 86_400)),
         ("2h,100000rows", Limit(age_s=7200, rows=100_000)),
-        ("none", Limit()),
+        ("all", Limit()),
         ("0rows", Limit(rows=0)),
     ],
 )
@@ -242,7 +242,7 @@ def test_what_a_current_run_is_spared_does_not_depend_on_the_limit() -> None:
         parse_limit("many", DEFAULT.state)
 
 
-@pytest.mark.parametrize("text", ["500.0 MB", "7200s", "100000rows", "2.50 GB,60s,3rows", "none"])
+@pytest.mark.parametrize("text", ["500.0 MB", "7200s", "100000rows", "2.50 GB,60s,3rows", "all"])
 def test_a_limit_is_written_as_it_is_read(text: str) -> None:
     assert limit_text(parse_limit(text, Limit())) == text
 
@@ -254,9 +254,28 @@ def test_the_help_tells_the_limits_that_are_in_force(
     with pytest.raises(SystemExit):
         main([command, "--help"])
     text = " ".join(capsys.readouterr().out.split())
+    options = text.partition("options:")[2]
     for kind in ("state", "rollup", "log", "event", "image"):
-        assert f"({limit_text(getattr(DEFAULT, kind))})" in text.partition(f"--{kind} LIMIT")[2]
-    assert f"({DEFAULT.outlive:g}; 0: for ever)" in text
+        limit, told = getattr(DEFAULT, kind), options.partition(f"--keep-{kind}s LIMIT")[2]
+        spared = f"; spares the newest {limit.spared_rows:,}" if limit.limits else ""
+        assert f"({limit_text(limit)}{spared})" in told.partition("--keep")[0]
+    assert f"({DEFAULT.outlive:g}), or for ever: all" in text
+    assert "current runs are spared" in text or command == "serve"
+
+
+@pytest.mark.parametrize("times", ["0", "none", "nan", "-1"])
+def test_how_long_runs_are_kept_cannot_be_written_the_wrong_way_round(
+    times: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["prune", "--keep-runs", times])
+    assert "must be a number, 1 or more, or all" in capsys.readouterr().err
+
+
+def test_all_keeps_everything(say: Say, database: Path) -> None:
+    before = query(database, "SELECT count(*) FROM state")
+    say("prune", "--keep-states", "all", "--keep-runs", "all")
+    assert query(database, "SELECT count(*) FROM state") == before
 
 
 @pytest.mark.parametrize(

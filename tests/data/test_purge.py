@@ -136,7 +136,7 @@ def test_a_robot_that_records_meanwhile_loses_no_row(filed: tuple[Path, Recorded
     recorded.end_run("finished")
     recorded.run(1, recorded.robot_id)  # a robot's newest run would be spared
     robot, steps = InProcessSupervisor("other"), 0
-    line = [sys.executable, "-m", "webots_mcp", "prune", "--state", "0rows"]
+    line = [sys.executable, "-m", "webots_mcp", "prune", "--keep-states", "0rows"]
     with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
         command = subprocess.Popen([*line, "--database", str(file)], stdout=subprocess.PIPE)
         while is_running(command):

@@ -92,8 +92,9 @@ def prune(arguments: argparse.Namespace) -> None:
     """Delete what is beyond the limits, oldest first, and give the space back to the disk.
 
     A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
-    commas between, or none. Runs with a label or a note, and those marked by 'webots-mcp keep',
-    lose nothing. Robots may record meanwhile. The MCP server does the same once a minute, with the
+    commas between, or all, which keeps everything. Runs with a label or a note, and those marked
+    by 'webots-mcp keep', lose nothing; the newest rows of current runs are spared, as many as the
+    options tell. Robots may record meanwhile. The MCP server does the same once a minute, with the
     limits that 'webots-mcp serve' was given.
     """
     from webots_mcp.store.retention import plan

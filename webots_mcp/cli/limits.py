@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.cli.command import argument
@@ -30,26 +31,46 @@ class _Default:
         from webots_mcp.store.retention.notation import limit_text
 
         value = getattr(DEFAULT, self._name)
-        return limit_text(value) if isinstance(value, Limit) else f"{value:g}"
+        if not isinstance(value, Limit):
+            return f"{value:g}"
+        spared = f"; spares the newest {value.spared_rows:,}" if value.limits else ""
+        return f"{limit_text(value)}{spared}"
+
+
+def _times(text: str) -> float:
+    """How many times; 0 for ever, which a person might take for the opposite, and writes as all."""
+    from webots_mcp.store.retention.notation import NO_LIMIT
+
+    if text == NO_LIMIT:
+        return 0.0
+    try:
+        times = float(text)
+    except ValueError:
+        times = math.nan
+    if not 1 <= times < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a number, 1 or more, or {NO_LIMIT}")
+    return times
 
 
 LIMITS: Final = (
     *(
         argument(
-            f"--{kind}",
+            f"--keep-{kind}s",
             metavar="LIMIT",
+            dest=kind,
             default=_Default(kind),
             help=f"how much to keep of {what} (%(default)s)",
         )
         for kind, what in _KINDS.items()
     ),
     argument(
-        "--outlive",
-        type=float,
+        "--keep-runs",
+        type=_times,
         metavar="TIMES",
+        dest="outlive",
         default=_Default("outlive"),
-        help="keep what is left of a run so many times longer than its states (%(default)s; "
-        "0: for ever)",
+        help="keep what is left of a run so many times longer than its states (%(default)s), or "
+        "for ever: all",
     ),
 )
 

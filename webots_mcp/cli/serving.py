@@ -30,7 +30,8 @@ def serve(arguments: argparse.Namespace) -> None:
 
     While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
     A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
-    commas between, or none. 'webots-mcp prune --dry-run' with the same limits tells what would go.
+    commas between, or all, which keeps everything. 'webots-mcp prune --dry-run' with the same
+    limits tells what would go.
     """
     import logging
 

@@ -1,4 +1,4 @@
-"""Limits as a person writes them: `500MB,30d`, `100000rows`, `none`."""
+"""Limits as a person writes them: `500MB,30d`, `100000rows`, `all`."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from webots_mcp.store.retention.policy import Limit
 _PART: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
 _BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
+NO_LIMIT: Final = "all"  # is kept
 _ROWS: Final = {"row": 1, "rows": 1}
 
 
@@ -19,14 +20,14 @@ def parse_limit(text: str, default: Limit) -> Limit:
     """A limit from its parts, separated by commas; what is not named has no limit.
 
     Args:
-        text: Sizes (kB, MB, GB), ages (min, h, d, w) and rows; or `none`.
+        text: Sizes (kB, MB, GB), ages (min, h, d, w) and rows; or `all`, without any limit.
         default: What a current run is spared comes from here.
 
     Raises:
         InvalidInputError: A part is none of these, or named twice.
     """
     limit: dict[str, Any] = {"size_bytes": None, "rows": None, "age_s": None}
-    for part in [] if text.strip().lower() == "none" else text.split(","):
+    for part in [] if text.strip().lower() == NO_LIMIT else text.split(","):
         name, value = _parse_part(part.strip(), text)
         if limit[name] is not None:
             raise InvalidInputError(f"{text!r} limits the same thing twice")
@@ -46,7 +47,7 @@ def _parse_part(part: str, text: str) -> tuple[str, float]:
             return "rows", round(number)
     raise InvalidInputError(
         f"{part!r} in {text!r} is no limit: write a size (500MB), an age (30d), a number of rows "
-        "(100000rows), several of them with commas between, or none"
+        f"(100000rows), several of them with commas between, or {NO_LIMIT} to keep everything"
     )
 
 
@@ -55,7 +56,7 @@ def limit_text(limit: Limit) -> str:
     parts = [size_text(limit.size_bytes)] if limit.size_bytes is not None else []
     parts += [f"{limit.age_s:g}s"] if limit.age_s is not None else []
     parts += [f"{limit.rows}rows"] if limit.rows is not None else []
-    return ",".join(parts) or "none"
+    return ",".join(parts) or NO_LIMIT
 
 
 def size_text(size_bytes: float) -> str:

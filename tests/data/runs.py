@@ -86,7 +86,9 @@ class Recorded(Recorder):
         return found
 
     def prune(self, retention: Retention, now_s: float | None = None):
-        return prune(self.connection, self.folder, retention, now_s=now_s or self.wall_s, pause_s=0)
+        return prune(
+            self.connection, self.folder, retention, now_s=now_s or self.wall_s, rest=False
+        )
 
 
 def states(**limits: Any) -> Retention:

@@ -166,13 +166,18 @@ def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
 
 def test_a_run_that_is_kept_is_named_and_stays(say: Say, database: Path) -> None:
     assert say("keep", "1") == ""
-    text = say("prune", "--keep-states", "400rows")
-    assert text == (
-        "nothing is beyond the limits\nnote: kept because of a label, a note or a mark: run 1\n"
-    )
+    nothing, note = say("prune", "--keep-states", "400rows").splitlines()
+    assert nothing == "nothing is beyond the limits"
+    assert "kept because of a label, a note or a mark, and not counted: run 1, about " in note
     say("keep", "1", "--release")
     say("prune", "--keep-states", "400rows")
     assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(458,)]
+
+
+def test_what_is_too_old_but_among_the_newest_is_told(say: Say, database: Path) -> None:
+    text = say("prune", "--dry-run", "--keep-states", "0s")
+    assert "beyond the limit, but spared: 858 rows of state, about " in text
+    assert "too old, but among the newest 50000" in text
 
 
 def test_prune_shrinks_the_file(say: Say, database: Path) -> None:

@@ -23,7 +23,7 @@ def overview(connection: sqlite3.Connection, start_s: float | None = None) -> Ru
 
 def keep_rows(connection: sqlite3.Connection, folder: Path, rows: int) -> None:
     limits = Retention(state=Limit(rows=rows), outlive=0)
-    prune(connection, folder, limits, pause_s=0)
+    prune(connection, folder, limits, rest=False)
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import time
 from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command, open_recording, reading
 from webots_mcp.cli.history import RANGE, range_of
@@ -21,8 +21,6 @@ from webots_mcp.errors import InvalidInputError
 if TYPE_CHECKING:
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.retention import Plan, Purged, Retention
-
-_HURRIED_PAUSE_S: Final = 0.01  # where no robot records
 
 
 @command(
@@ -89,13 +87,14 @@ def import_(arguments: argparse.Namespace) -> None:
     argument("--dry-run", action="store_true", help="only tell what would go"), *LIMITS,
 )  # fmt: skip
 def prune(arguments: argparse.Namespace) -> None:
-    """Delete what is beyond the limits, oldest first, and give the space back to the disk.
+    """Delete what is beyond the limits, and give the space back to the disk.
 
-    A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
-    commas between, or all, which keeps everything. Runs with a label or a note, and those marked
-    by 'webots-mcp keep', lose nothing; the newest rows of current runs are spared, as many as the
-    options tell. Robots may record meanwhile. The MCP server does the same once a minute, with the
-    limits that 'webots-mcp serve' was given.
+    Rows go in the order in which they were recorded, whatever their run. Runs with a label or a
+    note, and those marked by 'webots-mcp keep', lose nothing and do not count. A LIMIT is a size
+    (500MB), an age (30d), a number of rows (100000rows), several of them with commas between, or
+    all, which keeps everything. A size or a number of rows always holds; an age spares the newest
+    rows, as many as the options tell. Robots may record meanwhile. The MCP server does the same
+    every few seconds.
     """
     from webots_mcp.store.retention import plan
 
@@ -141,7 +140,6 @@ def _prune(recording: Recording, connection: sqlite3.Connection, retention: Rete
     from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS
     from webots_mcp.maintenance import Maintainer
     from webots_mcp.store.retention import prune as purge
-    from webots_mcp.store.retention.purge import PAUSE_S
     from webots_mcp.store.robots import list_robots
 
     assert isinstance(recording.database, Path)
@@ -151,10 +149,7 @@ def _prune(recording: Recording, connection: sqlite3.Connection, retention: Rete
     maintainer.start()
     try:
         with shown_progress("pruning") as progress:
-            pause_s = PAUSE_S if live else _HURRIED_PAUSE_S
-            return purge(
-                connection, recording.data_dir, retention, pause_s=pause_s, progress=progress
-            )
+            return purge(connection, recording.data_dir, retention, rest=live, progress=progress)
     finally:
         maintainer.stop()
 
@@ -171,9 +166,17 @@ def _print_plan(wanted: Plan, going: str) -> None:
         print_table((going, "rows", "about", "runs"), table)
     else:
         print("nothing is beyond the limits")
+    print_notes(
+        [
+            f"beyond the limit, but spared: {each.rows} rows of {each.table}, about "
+            f"{size_text(each.size_bytes)}, {each.why}"
+            for each in wanted.spared
+        ]
+    )
     if wanted.kept_run_ids:
-        ids = _ranges(wanted.kept_run_ids)
-        print_notes([f"kept because of a label, a note or a mark: run {ids}"])
+        ids, size = _ranges(wanted.kept_run_ids), size_text(wanted.kept_bytes)
+        why = "kept because of a label, a note or a mark, and not counted"
+        print_notes([f"{why}: run {ids}, about {size}"])
 
 
 def _ranges(numbers: Sequence[int]) -> str | None:

@@ -33,7 +33,7 @@ class _Default:
         value = getattr(DEFAULT, self._name)
         if not isinstance(value, Limit):
             return f"{value:g}"
-        spared = f"; spares the newest {value.spared_rows:,}" if value.limits else ""
+        spared = f"; an age spares the newest {value.spared_rows:,}" if value.limits else ""
         return f"{limit_text(value)}{spared}"
 
 

@@ -6,7 +6,7 @@ import math
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Final
@@ -16,11 +16,15 @@ from webots_mcp.store.retention.policy import DEFAULT, KEPT, Limit, Retention
 from webots_mcp.store.retention.stock import (
     TABLES,
     Holding,
+    Oldest,
     count_rows,
     holdings,
     nth_id,
+    nth_newest_id,
+    oldest,
     read_runs,
     rows_before,
+    rows_below,
 )
 
 # Those that were created during a kept run stay with it.
@@ -33,6 +37,7 @@ OLD_COMMANDS: Final = (
 ROLLED: Final = ("rollup", "change")
 _ROLLED_BYTES: Final = 150  # a row of those two, about
 _COMMAND_BYTES: Final = 400
+_GUESSES: Final = 12
 
 
 @dataclass(frozen=True)
@@ -56,16 +61,33 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Spared:
+    """What is beyond a limit, and stays."""
+
+    table: str
+    rows: int
+    size_bytes: int
+    why: str
+
+
+@dataclass(frozen=True)
 class Plan:
     """What would go now.
 
     Attributes:
-        steps: In the order in which they are carried out.
-        kept_run_ids: Runs that a person named, described or marked: nothing of them goes.
+        steps: What goes.
+        held_bytes: About what each kind takes now, of all runs.
+        spared: What would have to go as well, and why it does not.
+        kept_run_ids: Runs that a person named, described or marked: nothing of them goes, and
+            they do not count.
+        kept_bytes: About what they take.
     """
 
     steps: tuple[Step, ...]
+    held_bytes: dict[str, int]
+    spared: tuple[Spared, ...]
     kept_run_ids: tuple[int, ...]
+    kept_bytes: int
 
     @property
     def rows(self) -> int:
@@ -100,7 +122,7 @@ def plan(
 ) -> Plan:
     """Find what is beyond the limits; nothing is changed.
 
-    Costs a pass over the time indexes: about 0.1 s per million state rows.
+    Costs a pass over the time indexes, about 0.1 s per million state rows, and one over what goes.
 
     Args:
         connection: Any.
@@ -119,26 +141,40 @@ class _Planner:
         self._now_s = now_s
         self._runs = read_runs(connection)
         self._free = [run for run in self._runs if not run.is_kept]
-        self._held = {table: holdings(connection, table, self._free) for table in TABLES}
+        self._held = {table: holdings(connection, table, self._runs) for table in TABLES}
+        self._spared: list[Spared] = []
         self._forgotten = self._find_forgotten() if retention.outlive else set[int]()
 
     def plan(self) -> Plan:
         steps: list[Step] = []
         for table in TABLES:
-            steps += self._excess(self._held[table], getattr(self._retention, table))
+            steps += self._beyond(self._of_free_runs(table), getattr(self._retention, table))
         steps += self._rolled_up(
             {step.owner_id: step.rows for step in steps if step.table == "state"}
         )
         steps += (Step("run", run.id, 1) for run in self._free if run.id in self._forgotten)
         for robot_id in {run.robot_id: None for run in self._runs}:
             steps += self._commands(robot_id)
-        return Plan(tuple(steps), tuple(run.id for run in self._runs if run.is_kept))
+        held_bytes = {table: round(_size_of(held)) for table, held in self._held.items()}
+        free_bytes = sum(_size_of(self._of_free_runs(table)) for table in TABLES)
+        return Plan(
+            tuple(steps),
+            held_bytes,
+            tuple(self._spared),
+            tuple(run.id for run in self._runs if run.is_kept),
+            max(sum(held_bytes.values()) - round(free_bytes), 0),
+        )
+
+    def _of_free_runs(self, table: str) -> list[Holding]:
+        return [holding for holding in self._held[table] if not holding.run.is_kept]
 
     def _find_forgotten(self) -> set[int]:
-        """Finished runs after which `outlive` times the limits of state was recorded."""
-        states, limit = self._held["state"], self._retention.state
-        rows = sum(holding.rows for holding in states)
-        row_bytes = sum(holding.size_bytes for holding in states) / max(rows, 1)
+        """Finished runs after which `outlive` times the limits of state was recorded.
+
+        As of states, age alone does not do it where few were recorded since.
+        """
+        states, limit = self._of_free_runs("state"), self._retention.state
+        row_bytes = _size_of(states) / max(sum(holding.rows for holding in states), 1)
         newest_first = sorted(self._free, key=lambda run: (-run.started_wall_time_s, -run.id))
         rows_after = accumulate((run.recorded_rows for run in newest_first), initial=0)
         return {
@@ -148,55 +184,118 @@ class _Planner:
             and limit.is_exceeded(
                 size_bytes=after * row_bytes,
                 rows=after,
-                age_s=self._now_s - run.last_wall_time_s,
+                age_s=self._now_s - run.last_wall_time_s if after >= limit.spared_rows else 0,
                 times=self._retention.outlive,
             )
         }
 
-    def _excess(self, held: list[Holding], limit: Limit) -> Iterator[Step]:
+    def _beyond(self, held: Sequence[Holding], limit: Limit) -> Iterator[Step]:
         """Of each run as many rows as have to go; all of those that are forgotten."""
-        rows = sum(holding.rows for holding in held)
-        size_bytes = sum(holding.size_bytes for holding in held)
+        staying = [holding for holding in held if holding.run.id not in self._forgotten]
+        going = {
+            holding.run.id: Oldest(holding.rows, math.inf)
+            for holding in held
+            if holding.run.id in self._forgotten
+        }
+        going |= self._oldest_beyond(staying, limit)
+        for run_id, aged in self._aged(staying, limit).items():
+            if run_id not in going or going[run_id].rows < aged.rows:
+                going[run_id] = aged
         for holding in held:
-            going = self._going(holding, limit, rows, size_bytes)
-            if going > 0:
-                rows -= going
-                size_bytes -= going * holding.row_bytes
-                bound = nth_id(self._connection, holding, going)
-                size = round(going * holding.row_bytes)
-                yield Step(holding.table, holding.run.id, going, size, bound)
+            if (gone := going.get(holding.run.id)) and gone.rows:
+                size = round(gone.rows * holding.row_bytes)
+                yield Step(holding.table, holding.run.id, gone.rows, size, gone.bound)
 
-    def _going(self, holding: Holding, limit: Limit, rows: int, size_bytes: float) -> int:
-        """How many rows of a run have to go, where so much of the kind is left."""
-        run = holding.run
-        if run.id in self._forgotten:
-            return holding.rows
-        going = [0]
-        if limit.rows is not None:
-            going.append(rows - limit.rows)
-        if limit.size_bytes is not None and holding.row_bytes:
-            going.append(math.ceil((size_bytes - limit.size_bytes) / holding.row_bytes))
-        if limit.age_s is not None and run.started_wall_time_s < self._now_s - limit.age_s:
-            going.append(rows_before(self._connection, holding, self._now_s - limit.age_s))
-        return min(max(going), holding.rows - (limit.spared_rows if run.is_current else 0))
+    def _oldest_beyond(self, held: Sequence[Holding], limit: Limit) -> dict[int, Oldest]:
+        """The oldest rows of all runs, as many as are beyond a size or a number of rows."""
+        rows, size_bytes = sum(holding.rows for holding in held), _size_of(held)
+        least_rows = 0 if limit.rows is None else max(rows - limit.rows, 0)
+        excess_bytes = 0.0 if limit.size_bytes is None else size_bytes - limit.size_bytes
+        going = oldest(self._connection, held, least_rows) if least_rows else {}
+        freed_bytes = _size_of_oldest(held, going)
+        if freed_bytes >= excess_bytes:
+            return going
+        return self._oldest_of_size(held, (least_rows, freed_bytes), (rows, size_bytes))
+
+    def _oldest_of_size(
+        self, held: Sequence[Holding], low: tuple[int, float], high: tuple[int, float]
+    ) -> dict[int, Oldest]:
+        """As many as free what the limit asks for, between two (rows, bytes), within a row."""
+        excess_bytes = high[1] - (self._limit_of(held).size_bytes or 0)
+        largest_bytes = max(holding.row_bytes for holding in held)
+        going = {holding.run.id: Oldest(holding.rows, math.inf) for holding in held}
+        for guess in range(_GUESSES):
+            if high[1] - excess_bytes < largest_bytes or high[0] - low[0] <= 1:
+                break
+            share = (excess_bytes - low[1]) / (high[1] - low[1]) if guess % 2 == 0 else 0.5
+            rows = min(low[0] + max(math.ceil((high[0] - low[0]) * share), 1), high[0] - 1)
+            found = oldest(self._connection, held, rows)
+            freed_bytes = _size_of_oldest(held, found)
+            if freed_bytes >= excess_bytes:
+                going, high = found, (rows, freed_bytes)
+            else:
+                low = (rows, freed_bytes)
+        return going
+
+    def _limit_of(self, held: Sequence[Holding]) -> Limit:
+        return getattr(self._retention, held[0].table)
+
+    def _aged(self, held: Sequence[Holding], limit: Limit) -> dict[int, Oldest]:
+        """Rows that are too old, but for the newest of all runs."""
+        if limit.age_s is None:
+            return {}
+        before_s = self._now_s - limit.age_s
+        older = {
+            holding: rows_before(self._connection, holding, before_s)
+            for holding in held
+            if holding.run.started_wall_time_s < before_s
+        }
+        older = {holding: rows for holding, rows in older.items() if rows}
+        if not older:
+            return {}
+        spared_from = nth_newest_id(self._connection, held, limit.spared_rows)
+        going = {
+            holding: min(rows, rows_below(self._connection, holding, spared_from))
+            for holding, rows in older.items()
+        }
+        self._spare_newest(limit, {each: rows - going[each] for each, rows in older.items()})
+        return {
+            holding.run.id: Oldest(rows, nth_id(self._connection, holding, rows))
+            for holding, rows in going.items()
+            if rows
+        }
+
+    def _spare_newest(self, limit: Limit, spared: dict[Holding, int]) -> None:
+        if rows := sum(spared.values()):
+            (table,) = {holding.table for holding in spared}
+            size_bytes = sum(holding.row_bytes * count for holding, count in spared.items())
+            why = f"too old, but among the newest {limit.spared_rows}"
+            self._spared.append(Spared(table, rows, round(size_bytes), why))
 
     def _rolled_up(self, going_states: dict[int, int]) -> Iterator[Step]:
         """Rollups and change points go by whole runs, after the state rows that they stand for."""
         limit = self._retention.rollup
-        finished = [run for run in self._free if not run.is_current]
-        asked = finished if limit.limits else [r for r in finished if r.id in self._forgotten]
+        asked = [run for run in self._free if limit.limits or run.id in self._forgotten]
         counts = {run.id: {table: self._count(table, run.id) for table in ROLLED} for run in asked}
         rows = sum(sum(count.values()) for count in counts.values())
+        spared_rows = 0
         for run in asked:
             age_s = self._now_s - run.last_wall_time_s
             exceeded = limit.is_exceeded(size_bytes=rows * _ROLLED_BYTES, rows=rows, age_s=age_s)
-            stays = self._count("state", run.id) > going_states.get(run.id, 0)
-            if run.id not in self._forgotten and (stays or not exceeded):
+            if not exceeded and run.id not in self._forgotten:
                 continue
-            rows -= sum(counts[run.id].values())
+            rows_of_run = sum(counts[run.id].values())
+            stays = self._count("state", run.id) > going_states.get(run.id, 0)
+            if run.id not in self._forgotten and (stays or run.is_current):
+                spared_rows += rows_of_run
+                continue
+            rows -= rows_of_run
             for table, count in counts[run.id].items():
                 if count:
                     yield Step(table, run.id, count, count * _ROLLED_BYTES)
+        if spared_rows:
+            why = "of runs that go on or have states left"
+            self._spared.append(Spared("rollup", spared_rows, spared_rows * _ROLLED_BYTES, why))
 
     def _commands(self, robot_id: int) -> Iterator[Step]:
         """Finished commands from before all runs of the robot that stay, or older than events."""
@@ -212,3 +311,11 @@ class _Planner:
 
     def _count(self, table: str, run_id: int) -> int:
         return count_rows(self._connection, table, run_id)
+
+
+def _size_of(held: Sequence[Holding]) -> float:
+    return sum(holding.size_bytes for holding in held)
+
+
+def _size_of_oldest(held: Sequence[Holding], going: dict[int, Oldest]) -> float:
+    return sum(going[each.run.id].rows * each.row_bytes for each in held if each.run.id in going)

@@ -22,10 +22,12 @@ class Limit:
     """How much of one kind is kept; None is no limit. What is oldest goes first.
 
     Attributes:
-        size_bytes: About so much on the disk.
+        size_bytes: So much on the disk, with the free room on the pages and the time index; within
+            a twentieth, because it is estimated from samples. Of pictures their files.
         rows: So many rows.
         age_s: So long after they were written, in wall time.
-        spared_rows: Of a current run so many of its newest rows stay, whatever the others say.
+        spared_rows: So many of the newest rows, of all runs together, do not go because of their
+            age: what nobody went on with does not vanish altogether. Size and rows always hold.
     """
 
     size_bytes: int | None = None
@@ -56,19 +58,19 @@ class Limit:
 class Retention:
     """The limits of each kind of row.
 
-    They hold for the whole database, over all robots. Finished runs lose their oldest rows first,
-    in the order in which the runs began; then current ones (a robot's newest, or one that has not
-    ended). Runs with a label, a note or `keep` lose nothing and do not count.
+    They hold for the whole database, over all robots: rows go in the order in which they were
+    recorded, whatever their run. Runs with a label, a note or `keep` lose nothing and do not count.
 
     Attributes:
         state: The full rows. They go only after they were rolled up.
-        rollup: Rollups and change points; of whole runs, after the last of their state rows.
+        rollup: Rollups and change points; of whole finished runs, after the last of their states.
         log: Log lines.
         event: Events; its age also holds for finished commands.
         image: Pictures, with their files.
         outlive: When this many times the limits of `state` was recorded after a run, or it ended
-            that many times their age ago, all that is left of it goes, and with the last run of
-            that time the commands. 0 keeps runs for ever.
+            that many times their age ago (and as many states as an age spares were recorded since),
+            all that is left of it goes, and with the last run of that time the commands. 0 keeps
+            runs for ever.
     """
 
     state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)

@@ -1,8 +1,9 @@
 """Carrying out a plan, a little at a time, so that no writer has to wait for it.
 
-Each batch looks up the keys of at most 500 rows, then deletes them in one transaction of 1 to 2
-ms. Between batches the caller pauses. Where another writer holds the lock, the batch is tried
-again later. State rows go only after they were rolled up.
+Rows go one by one, in transactions of about a millisecond; between two of them the caller rests
+for longer than the lock was held. The tables take turns, and space that became free goes back to
+the disk in between. Where another writer holds the lock, it is tried again later. State rows go
+only after they were rolled up.
 """
 
 from __future__ import annotations
@@ -10,56 +11,44 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
-from webots_mcp.connection import is_busy, transaction
+from webots_mcp.connection import ShortWrites, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.history.rollup import roll, watermark
 from webots_mcp.store.images import inside
-from webots_mcp.store.retention.planning import OLD_COMMANDS, Plan, Step, plan
+from webots_mcp.store.retention.planning import OLD_COMMANDS, ROLLED, Plan, Step, plan
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
+from webots_mcp.store.retention.stock import TABLES
 
 BATCH_ROWS: Final = 500
-ROLLED_ROWS: Final = 100  # a batch of rolling up holds the lock longer than one of deleting
-BATCH_FILES: Final = 50
-BATCH_PAGES: Final = 200
-PAUSE_S: Final = 0.05
+ROLLED_ROWS: Final = 100
+REST_S: Final = 0.005  # at least, between two writes
+HURRIED_REST_S: Final = 0.001  # where no robot records: a checkpoint still gets its turn
+RESTS: Final = 9  # the lock is held for a tenth of the time at most
 
-
-class _Batch(NamedTuple):
-    """How the keys of the oldest rows are found, and one of them deleted."""
-
-    keys: str
-    delete: str
-
-
+_FREE_RUN: Final = f"NOT EXISTS (SELECT 1 FROM run WHERE id = :run_id AND {KEPT})"
 _IN_TIME: Final = (
-    "SELECT id FROM {table} WHERE run_id = :owner_id AND id <= :bound "
-    "ORDER BY sim_time_s, id LIMIT :limit"
+    "SELECT id, run_id FROM {table} NOT INDEXED WHERE id > :after AND id <= :bound "
+    "AND run_id IN (SELECT value FROM json_each(:runs)) ORDER BY id LIMIT :limit"
 )
-_IN_RUN: Final = (
-    "SELECT run_id, signal_id, {third} FROM {table} WHERE run_id = :owner_id LIMIT :limit"
-)
-_BATCHES: Final = {
-    table: _Batch(_IN_TIME.format(table=table), f"DELETE FROM {table} WHERE id = ?")
-    for table in ("state", "log", "event", "image")
+_FIRST: Final = "SELECT id FROM {table} WHERE run_id = ? ORDER BY sim_time_s, id LIMIT 1"
+_LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
+_IN_RUN: Final = "SELECT run_id, signal_id, {third} FROM {table} WHERE run_id = ? LIMIT ?"
+_OLD_COMMANDS: Final = f"SELECT id {OLD_COMMANDS} ORDER BY id LIMIT :limit"
+_THIRD_KEY: Final = {"rollup": "bucket", "change": "state_id"}
+_DELETE: Final = {
+    table: f"DELETE FROM {table} WHERE id = :id AND {_FREE_RUN}" for table in (*TABLES, "run")
 } | {
-    table: _Batch(
-        _IN_RUN.format(table=table, third=third),
-        f"DELETE FROM {table} WHERE run_id = ? AND signal_id = ? AND {third} = ?",
-    )
-    for table, third in (("rollup", "bucket"), ("change", "state_id"))
+    table: f"DELETE FROM {table} WHERE run_id = :run_id AND signal_id = :signal_id "
+    f"AND {_THIRD_KEY[table]} = :third AND {_FREE_RUN}"
+    for table in ROLLED
 }
-_BATCHES["run"] = _Batch("SELECT id FROM run WHERE id = :owner_id", "DELETE FROM run WHERE id = ?")
-_BATCHES["command"] = _Batch(
-    f"SELECT id {OLD_COMMANDS.replace(':robot_id', ':owner_id').replace(':before_s', ':bound')} "
-    "ORDER BY id LIMIT :limit",
-    "DELETE FROM command WHERE id = ?",
-)
-_COUNT_PURGED: Final = "UPDATE run SET purged_rows = purged_rows + ? WHERE id = ?"
+_DELETE["command"] = "DELETE FROM command WHERE id = :id"
+_COUNT_PURGED: Final = "UPDATE run SET purged_rows = purged_rows + 1 WHERE id = ?"
 _SESSION: Final = "SELECT session_id FROM run WHERE id = ?"
 _FORGET_SESSION: Final = (
     "DELETE FROM session WHERE id = ? AND ended_wall_time_s IS NOT NULL "
@@ -67,7 +56,6 @@ _FORGET_SESSION: Final = (
 )
 _PATH: Final = "SELECT path FROM image WHERE id = ?"
 _IN_USE: Final = "SELECT 1 FROM image WHERE path = ? LIMIT 1"
-_IS_KEPT: Final = f"SELECT 1 FROM run WHERE id = ? AND {KEPT}"
 _MOST_FAILURES: Final = 200
 
 
@@ -80,12 +68,21 @@ class Purged:
         files: Pictures.
         freed_bytes: Given back by the database file (it shrinks with the next checkpoint).
         problems: Files that could not be deleted, and why.
+        held_s: How long the last transaction held the write lock.
+        longest_held_s: How long the longest one did.
     """
 
     rows: Counter[str] = field(default_factory=Counter[str])
     files: int = 0
     freed_bytes: int = 0
     problems: list[str] = field(default_factory=list[str])
+    held_s: float = 0.0
+    longest_held_s: float = 0.0
+
+    @property
+    def rest_s(self) -> float:
+        """How long to leave the lock to others now."""
+        return max(REST_S, RESTS * self.held_s)
 
 
 def prune(
@@ -94,7 +91,7 @@ def prune(
     retention: Retention = DEFAULT,
     *,
     now_s: float | None = None,
-    pause_s: float = PAUSE_S,
+    rest: bool = True,
     progress: Callable[[int, int], object] | None = None,
 ) -> Purged:
     """Delete what is beyond the limits, and give the space back to the disk.
@@ -104,7 +101,7 @@ def prune(
         data_dir: The folder that the paths of pictures are relative to.
         retention: The limits.
         now_s: Unix time, from which ages are counted; None for now.
-        pause_s: Between batches; 0 where nobody else writes.
+        rest: Leave the lock to others for longer than it was held; false where no robot records.
         progress: Called after each batch with the rows deleted so far and in all.
 
     Raises:
@@ -116,14 +113,14 @@ def prune(
     for purged in purge(connection, wanted, data_dir):
         if progress is not None:
             progress(purged.rows.total(), wanted.rows)
-        time.sleep(pause_s)
+        time.sleep(purged.rest_s if rest else HURRIED_REST_S)
     return purged
 
 
 def purge(
     connection: sqlite3.Connection, wanted: Plan, data_dir: Path, spare_pages: int = 0
 ) -> Iterator[Purged]:
-    """Carry out a plan batch by batch; the caller pauses wherever this yields.
+    """Carry out a plan, write by write; the caller rests wherever this yields.
 
     Args:
         connection: As for `prune`.
@@ -134,77 +131,126 @@ def purge(
     Yields:
         What was deleted so far; always the same object, and once at least.
     """
-    work = _Purge(connection, data_dir)
+    work = _Purge(connection, data_dir, spare_pages)
     yield work.purged
-    for step in wanted.steps:
-        yield from work.carry_out(step)
-    yield from work.give_back(spare_pages)
+    # Summaries go after the states that they stand for, and a run after all that it holds.
+    for tables in ((*TABLES, "command"), ROLLED, ("run",)):
+        steps = {name: [step for step in wanted.steps if step.table == name] for name in tables}
+        yield from work.in_turn([work.carry_out(name, its) for name, its in steps.items() if its])
+    yield from work.give_back()
 
 
 class _Purge:
-    def __init__(self, connection: sqlite3.Connection, data_dir: Path) -> None:
+    def __init__(self, connection: sqlite3.Connection, data_dir: Path, spare_pages: int) -> None:
         self._connection = connection
         self._data_dir = data_dir
+        self._spare_pages = spare_pages
         self._failures = 0
+        self._writes = ShortWrites(connection)
+        self._vacuuming = ShortWrites(connection)
         self.purged = Purged()
 
-    def carry_out(self, step: Step) -> Iterator[Purged]:
-        left, most = step.rows, BATCH_FILES if step.table == "image" else BATCH_ROWS
-        while left > 0:
-            keys = self._oldest(step, min(left, most))
-            if not keys:
+    def in_turn(self, tables: Sequence[Iterator[Purged]]) -> Iterator[Purged]:
+        """A write of each table, then some of the space back, until nothing is left to delete."""
+        left = list(tables)
+        while left:
+            for table in tuple(left):
+                if next(table, None) is None:
+                    left.remove(table)
+                else:
+                    yield self.purged
+            if self._give_some_back():
+                yield self.purged
+
+    def give_back(self) -> Iterator[Purged]:
+        """Return what is free to the disk: many small transactions (SQLite, PRAGMA auto_vacuum)."""
+        while self._give_some_back():
+            yield self.purged
+
+    def carry_out(self, table: str, steps: Sequence[Step]) -> Iterator[Purged]:
+        """Delete what has to go of a table."""
+        find = self._in_time if table in TABLES else self._by_owner
+        for keys in find(table, steps):
+            while keys:
+                if table == "state" and keys[-1]["id"] > watermark(self._connection):
+                    roll(self._connection, ROLLED_ROWS)
+                else:
+                    keys = keys[self._delete_some(table, keys) :]
+                yield self.purged
+
+    def _in_time(self, table: str, steps: Sequence[Step]) -> Iterator[list[dict[str, Any]]]:
+        """Keys in the order in which the rows were recorded, so that whole pages become free."""
+        left: dict[int, int] = {step.owner_id: step.rows for step in steps}
+        bounds = {step.owner_id: step.bound for step in steps}
+        firsts = [self._first(_FIRST.format(table=table), run_id) for run_id in left]
+        after = min((first for first in firsts if first is not None), default=0) - 1
+        last = self._first(_LAST.format(table=table))  # what comes later was not planned
+        while left:
+            values = {
+                "after": after,
+                "bound": min(max(bounds.values()), last),
+                "runs": f"[{','.join(map(str, left))}]",
+                "limit": BATCH_ROWS,
+            }
+            found = self._connection.execute(_IN_TIME.format(table=table), values).fetchall()
+            if not found:
                 return  # another has deleted them
-            if step.table == "state" and keys[-1][0] > watermark(self._connection):
-                roll(self._connection, ROLLED_ROWS)
-            elif self._deleted(step, keys):
+            after = found[-1][0]
+            keys: list[dict[str, Any]] = []
+            for row_id, run_id in found:
+                if left.get(run_id) and row_id <= bounds[run_id]:
+                    left[run_id] -= 1
+                    keys.append({"id": row_id, "run_id": run_id})
+            left = {run_id: rows for run_id, rows in left.items() if rows}
+            yield keys
+
+    def _by_owner(self, table: str, steps: Sequence[Step]) -> Iterator[list[dict[str, Any]]]:
+        """Keys of summaries and runs of a run, of commands of a robot."""
+        for step in steps:
+            left = step.rows
+            while left > 0 and (keys := self._keys_of(table, step, min(left, BATCH_ROWS))):
+                yield keys
                 left -= len(keys)
-            yield self.purged
 
-    def give_back(self, spare_pages: int) -> Iterator[Purged]:
-        """Return free pages to the disk: many small transactions (SQLite, PRAGMA auto_vacuum)."""
-        page_bytes = self._pragma("page_size")
-        while self._pragma("auto_vacuum") == 2:
-            free = self._pragma("freelist_count")
-            if free <= spare_pages:
-                return
-            pages = min(BATCH_PAGES, free - spare_pages)
-            # execute() would stop after the first page.
-            script = f"PRAGMA incremental_vacuum({pages})"
-            if self._unless_locked(lambda script=script: self._connection.executescript(script)):
-                self.purged.freed_bytes += (free - self._pragma("freelist_count")) * page_bytes
-            yield self.purged
+    def _keys_of(self, table: str, step: Step, limit: int) -> list[dict[str, Any]]:
+        if table == "run":
+            return [{"id": step.owner_id, "run_id": step.owner_id}]
+        if table == "command":
+            before = {"robot_id": step.owner_id, "before_s": step.bound, "limit": limit}
+            found = self._connection.execute(_OLD_COMMANDS, before).fetchall()
+            return [{"id": row[0]} for row in found]
+        query = _IN_RUN.format(table=table, third=_THIRD_KEY[table])
+        names = ("run_id", "signal_id", "third")
+        found = self._connection.execute(query, (step.owner_id, limit)).fetchall()
+        return [dict(zip(names, row, strict=True)) for row in found]
 
-    def _oldest(self, step: Step, limit: int) -> list[tuple[Any, ...]]:
-        values = {"owner_id": step.owner_id, "bound": step.bound, "limit": limit}
-        return self._connection.execute(_BATCHES[step.table].keys, values).fetchall()
+    def _delete_some(self, table: str, keys: Sequence[dict[str, Any]]) -> int:
+        """One short transaction; returns how many of the keys are done, 0 where it was locked."""
+        deleted = 0
 
-    def _deleted(self, step: Step, keys: list[tuple[Any, ...]]) -> bool:
-        """One batch in one transaction; False where another holds the write lock."""
-        rows = 0
+        def delete(key: dict[str, Any]) -> None:
+            nonlocal deleted
+            deleted += self._delete(table, key)
 
-        def delete() -> None:
-            nonlocal rows
-            with transaction(self._connection):
-                rows = self._delete(step, keys)
+        done = self._unless_locked(lambda: self._writes.write(keys, delete))
+        if done:
+            self.purged.rows[table] += deleted
+            self._note(self._writes)
+        return done
 
-        if not self._unless_locked(delete):
-            return False
-        self.purged.rows[step.table] += rows
-        return True
-
-    def _delete(self, step: Step, keys: list[tuple[Any, ...]]) -> int:
-        """So many rows; nothing of a run that was marked since the plan."""
-        if step.table != "command" and self._first(_IS_KEPT, step.owner_id):
+    def _delete(self, table: str, key: dict[str, Any]) -> int:
+        """How many rows; none of a run that was marked since the plan."""
+        path = self._first(_PATH, key["id"]) if table == "image" else None
+        session = self._first(_SESSION, key["id"]) if table == "run" else None
+        deleted = self._connection.execute(_DELETE[table], key).rowcount
+        if not deleted:
             return 0
-        paths = [self._first(_PATH, *key) for key in keys] if step.table == "image" else []
-        session = self._first(_SESSION, step.owner_id) if step.table == "run" else None
-        deleted = self._connection.executemany(_BATCHES[step.table].delete, keys).rowcount
-        if step.table == "state":
-            self._connection.execute(_COUNT_PURGED, (deleted, step.owner_id))
-        self._connection.execute(_FORGET_SESSION, (session,))
-        for path in paths:
-            if path and not self._first(_IN_USE, path):
-                self._delete_file(path)
+        if table == "state":
+            self._connection.execute(_COUNT_PURGED, (key["run_id"],))
+        if session is not None:
+            self._connection.execute(_FORGET_SESSION, (session,))
+        if path and not self._first(_IN_USE, path):
+            self._delete_file(path)
         return deleted
 
     def _delete_file(self, path: str) -> None:
@@ -217,13 +263,32 @@ class _Purge:
         except (InvalidInputError, NothingRecordedError):
             pass  # a foreign path is not ours to delete, and a file that is gone need not be
 
+    def _give_some_back(self) -> bool:
+        """One short transaction of it; whether there may be more."""
+        pages = range(self._pragma("freelist_count") - self._spare_pages)
+        if self._pragma("auto_vacuum") != 2 or not pages:
+            return False
+        given = self._unless_locked(lambda: self._vacuuming.write(pages, self._give_page_back))
+        if given:
+            self.purged.freed_bytes += given * self._pragma("page_size")
+            self._note(self._vacuuming)
+        return True
+
+    def _give_page_back(self, _: int) -> None:
+        self._connection.execute("PRAGMA incremental_vacuum(1)").fetchall()
+
+    def _note(self, writes: ShortWrites) -> None:
+        self.purged.held_s = writes.held_s
+        self.purged.longest_held_s = max(self.purged.longest_held_s, writes.held_s)
+
     def _first(self, query: str, *values: object) -> Any:
         row = self._connection.execute(query, values).fetchone()
         return row[0] if row else None
 
-    def _unless_locked(self, work: Callable[[], object]) -> bool:
+    def _unless_locked(self, write: Callable[[], int]) -> int:
+        """How many were written; 0 where another holds the write lock."""
         try:
-            work()
+            written = write()
         except sqlite3.OperationalError as error:
             if not is_busy(error):
                 raise
@@ -233,9 +298,9 @@ class _Purge:
                     f"another process held the write lock in {_MOST_FAILURES} attempts: end it "
                     "and try again"
                 ) from error
-            return False
+            return 0
         self._failures = 0
-        return True
+        return written
 
     def _pragma(self, name: str) -> int:
         return int(self._connection.execute(f"PRAGMA {name}").fetchone()[0])

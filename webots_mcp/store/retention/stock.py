@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import sqlite3
-from typing import Final, NamedTuple
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple
 
+from webots_mcp.store.retention.pages import INDEX_BYTES, disk_shares
 from webots_mcp.store.retention.policy import KEPT
+
+TABLES: Final = ("state", "log", "event", "image")
 
 _RUNS: Final = (
     f"SELECT id, robot_id, rows, started_wall_time_s, last_wall_time_s, {KEPT}, "
     "ended_wall_time_s IS NULL OR id = (SELECT max(id) FROM run n WHERE n.robot_id = run.robot_id)"
-    " AS is_current FROM run ORDER BY is_current, started_wall_time_s, id"
+    " AS is_current FROM run ORDER BY started_wall_time_s, id"
 )
 _ROWS_BY_RUN: Final = "SELECT run_id, count(*) FROM {table} GROUP BY run_id"
 _ROWS: Final = "SELECT count(*) FROM {table} WHERE run_id = ?"
@@ -20,25 +25,30 @@ _NTH_ID: Final = (
 )
 _FIRST_TIME: Final = "SELECT min(sim_time_s) FROM {table} WHERE run_id = ?"
 _LAST_TIME: Final = "SELECT max(sim_time_s) FROM {table} WHERE run_id = ?"
-_SIZE_AT: Final = (
-    "SELECT {size} FROM {table} WHERE run_id = ? AND sim_time_s >= ? ORDER BY sim_time_s LIMIT 1"
-)
 _WALL_AT: Final = (
     "SELECT wall_time_s FROM {table} WHERE run_id = ? AND sim_time_s <= ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
 _ROWS_UP_TO: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s <= ?"
-
-# SQL for about what a row takes on the disk, page slack and index entries included (measured on
-# rows of 100 and 700 bytes of JSON); a picture takes its file.
-_ROW_BYTES: Final = {
-    "state": "length(CAST(data AS BLOB)) * 1.15 + coalesce(length(odd), 0) + 50",
-    "log": "length(CAST(message AS BLOB)) + 90",
-    "event": "coalesce(length(CAST(data AS BLOB)), 0) + 90",
-    "image": "bytes",
-}
-TABLES: Final = tuple(_ROW_BYTES)
-_SAMPLES: Final = 16
+_ROWS_BELOW: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND id < ?"
+_OF_RUNS: Final = "run_id IN (SELECT value FROM json_each(:runs))"
+# In the order of their ids: only what goes is looked at, and what lies in between.
+_OLDEST: Final = (
+    "SELECT run_id, count(*), max(id) FROM (SELECT run_id, id FROM {table} NOT INDEXED "
+    f"WHERE id >= :first AND {_OF_RUNS} ORDER BY id LIMIT :rows) GROUP BY run_id"
+)
+_NTH_NEWEST: Final = (
+    f"SELECT id FROM {{table}} NOT INDEXED WHERE {_OF_RUNS} "
+    "ORDER BY id DESC LIMIT 1 OFFSET :rows - 1"
+)
+_ID_RANGE: Final = "SELECT coalesce(min(id), 0), coalesce(max(id), -1) FROM {table}"
+_WINDOW: Final = (
+    "SELECT run_id, {payload} FROM {table} NOT INDEXED WHERE id >= ? ORDER BY id LIMIT ?"
+)
+_PICTURES: Final = "SELECT run_id, avg(bytes) FROM image GROUP BY run_id"
+_COLUMNS: Final = "SELECT name, type, pk FROM pragma_table_info(?)"
+_WINDOWS: Final = 32
+_WINDOW_ROWS: Final = 40
 _BISECTIONS: Final = 50
 
 
@@ -68,16 +78,24 @@ class Holding(NamedTuple):
         return self.rows * self.row_bytes
 
 
+class Oldest(NamedTuple):
+    """Of a run the oldest rows of a table: how many, and the last id of them."""
+
+    rows: int
+    bound: float
+
+
 def read_runs(connection: sqlite3.Connection) -> list[Run]:
-    """All runs in the order in which they lose rows: finished ones, then current ones."""
+    """All runs in the order in which they began."""
     return [Run(*row) for row in connection.execute(_RUNS).fetchall()]
 
 
-def holdings(connection: sqlite3.Connection, table: str, runs: list[Run]) -> list[Holding]:
+def holdings(connection: sqlite3.Connection, table: str, runs: Sequence[Run]) -> list[Holding]:
     """What these runs have in a table; those that have nothing are left out."""
     rows: dict[int, int] = dict(connection.execute(_ROWS_BY_RUN.format(table=table)).fetchall())
+    row_bytes, usual = _row_bytes(connection, table)
     return [
-        Holding(run, table, rows[run.id], _row_bytes(connection, table, run.id))
+        Holding(run, table, rows[run.id], row_bytes.get(run.id, usual))
         for run in runs
         if run.id in rows
     ]
@@ -88,10 +106,37 @@ def count_rows(connection: sqlite3.Connection, table: str, run_id: int) -> int:
     return int(connection.execute(_ROWS.format(table=table), (run_id,)).fetchone()[0])
 
 
+def rows_below(connection: sqlite3.Connection, holding: Holding, row_id: float) -> int:
+    """How many of the rows have smaller ids."""
+    query = _ROWS_BELOW.format(table=holding.table)
+    return int(connection.execute(query, (holding.run.id, row_id)).fetchone()[0])
+
+
 def nth_id(connection: sqlite3.Connection, holding: Holding, number: int) -> int:
     """The id of the row of that number, from 1, counted from the oldest."""
     query = _NTH_ID.format(table=holding.table)
     return int(connection.execute(query, (holding.run.id, number)).fetchone()[0])
+
+
+def oldest(connection: sqlite3.Connection, held: Sequence[Holding], rows: int) -> dict[int, Oldest]:
+    """The oldest rows of all of these together, by run; `held` is of one table."""
+    table = held[0].table
+    values = {
+        "runs": _as_json(held),
+        "first": min(nth_id(connection, holding, 1) for holding in held),
+        "rows": rows,
+    }
+    found = connection.execute(_OLDEST.format(table=table), values).fetchall()
+    return {run_id: Oldest(count, bound) for run_id, count, bound in found}
+
+
+def nth_newest_id(connection: sqlite3.Connection, held: Sequence[Holding], number: int) -> float:
+    """The id of the newest row but `number` - 1 of all of these; below all ids with fewer rows."""
+    if number == 0:
+        return float("inf")
+    values = {"runs": _as_json(held), "rows": number}
+    row = connection.execute(_NTH_NEWEST.format(table=held[0].table), values).fetchone()
+    return row[0] if row else 0
 
 
 def rows_before(connection: sqlite3.Connection, holding: Holding, wall_time_s: float) -> int:
@@ -114,15 +159,47 @@ def rows_before(connection: sqlite3.Connection, holding: Holding, wall_time_s: f
     return int(connection.execute(query, (run_id, older_s)).fetchone()[0])
 
 
-def _row_bytes(connection: sqlite3.Connection, table: str, run_id: int) -> float:
-    """The mean of a few rows, spread over the run's time."""
-    first_s, last_s = _bounds(connection, table, run_id)
-    query = _SIZE_AT.format(size=_ROW_BYTES[table], table=table)
-    total = 0.0
-    for i in range(_SAMPLES):
-        time_s = min(first_s + (last_s - first_s) * i / (_SAMPLES - 1), last_s)
-        total += connection.execute(query, (run_id, time_s)).fetchone()[0]
-    return total / _SAMPLES
+def _as_json(held: Sequence[Holding]) -> str:
+    return f"[{','.join(str(holding.run.id) for holding in held)}]"
+
+
+def _row_bytes(connection: sqlite3.Connection, table: str) -> tuple[dict[int, float], float]:
+    """About what a row of each run takes on the disk, and what it usually is."""
+    if table == "image":
+        means: dict[int, float] = dict(connection.execute(_PICTURES).fetchall())
+        return means, 0.0
+    page_bytes = int(connection.execute("PRAGMA page_size").fetchone()[0])
+    by_run = defaultdict[int, list[float]](list)
+    for rows in _windows(connection, table):
+        shares = disk_shares([payload for _, payload in rows], page_bytes)
+        for (run_id, _), share in zip(rows, shares, strict=True):
+            by_run[run_id].append(share + INDEX_BYTES)
+    every = [share for shares in by_run.values() for share in shares]
+    usual = sum(every) / max(len(every), 1)
+    return {run_id: sum(shares) / len(shares) for run_id, shares in by_run.items()}, usual
+
+
+def _windows(connection: sqlite3.Connection, table: str) -> Iterator[list[Any]]:
+    """(run, bytes of the record) of rows that follow each other, in windows over the table."""
+    query = _WINDOW.format(table=table, payload=_payload(connection, table))
+    first, last = connection.execute(_ID_RANGE.format(table=table)).fetchone()
+    if last - first < _WINDOWS * _WINDOW_ROWS:
+        yield connection.execute(query, (first, -1)).fetchall()
+        return
+    for number in range(_WINDOWS):
+        start = first + (last - first) * number // _WINDOWS
+        yield connection.execute(query, (start, _WINDOW_ROWS)).fetchall()
+
+
+def _payload(connection: sqlite3.Connection, table: str) -> str:
+    """SQL for the bytes of a record: each column takes a byte or two in its head, and its value."""
+    parts = ["2"]
+    for name, kind, is_key in connection.execute(_COLUMNS, (table,)).fetchall():
+        if kind == "TEXT":
+            parts.append(f"coalesce(length(CAST({name} AS BLOB)) + 1, 1)")
+        elif not is_key:
+            parts.append("9" if kind == "FLOAT" else "3")
+    return " + ".join(parts)
 
 
 def _bounds(connection: sqlite3.Connection, table: str, run_id: int) -> tuple[float, float]:

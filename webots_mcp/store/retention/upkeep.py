@@ -1,4 +1,4 @@
-"""Retention as a maintainer's work: a plan once a minute, carried out a little in each round."""
+"""Retention as a maintainer's work: a plan every few seconds, carried out a little at a time."""
 
 from __future__ import annotations
 
@@ -10,11 +10,14 @@ from typing import Final
 
 from webots_mcp.store.retention.planning import plan
 from webots_mcp.store.retention.policy import DEFAULT, Retention
-from webots_mcp.store.retention.purge import PAUSE_S, Purged, purge
+from webots_mcp.store.retention.purge import Purged, purge
 
-INTERVAL_S: Final = 60.0
-BUDGET_S: Final = 0.25  # of each round of the maintainer: about 2,500 rows a second
-SPARE_PAGES: Final = 2500  # 10 MB that stay in the file: what is recorded next needs them again
+INTERVAL_S: Final = 2.0
+PLANNING_SHARE: Final = 0.02  # of the time: looking at ten million rows takes a second
+BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
+# What stays free in the file, for the rows to come: so much of the file, but no more than 10 MB.
+SPARE_SHARE: Final = 20
+MOST_SPARE_PAGES: Final = 2500
 
 
 class Upkeep:
@@ -25,8 +28,8 @@ class Upkeep:
     Args:
         data_dir: The folder that the paths of pictures are relative to.
         retention: The limits.
-        interval_s: Between two plans.
-        budget_s: How long a call may last, pauses included; a batch more at most.
+        interval_s: Between two plans at least; more where planning takes long.
+        budget_s: How long a call may last, rests included; a write more at most.
     """
 
     def __init__(
@@ -52,7 +55,7 @@ class Upkeep:
             sqlite3.Error, DatabaseError: The next call begins with a new plan.
         """
         if connection is not self._connection:
-            self._connection, self._under_way = connection, None
+            self._connection, self._under_way, self._next_plan_s = connection, None, 0.0
         try:
             self._work(connection)
         except BaseException:
@@ -60,15 +63,22 @@ class Upkeep:
             raise
 
     def _work(self, connection: sqlite3.Connection) -> None:
-        now_s = time.monotonic()
+        started_s = time.monotonic()
         if self._under_way is None:
-            if now_s < self._next_plan_s:
+            if started_s < self._next_plan_s:
                 return
-            self._next_plan_s = now_s + self._interval_s
-            wanted = plan(connection, self._retention)
-            self._under_way = purge(connection, wanted, self._data_dir, SPARE_PAGES)
-        for _ in self._under_way:
-            if time.monotonic() - now_s > self._budget_s:
+            self._under_way = self._planned(connection)
+        for purged in self._under_way:
+            if time.monotonic() - started_s > self._budget_s:
                 return
-            time.sleep(PAUSE_S)
+            time.sleep(purged.rest_s)
         self._under_way = None
+
+    def _planned(self, connection: sqlite3.Connection) -> Iterator[Purged]:
+        started_s = time.monotonic()
+        wanted = plan(connection, self._retention)
+        took_s = time.monotonic() - started_s
+        self._next_plan_s = started_s + max(self._interval_s, took_s / PLANNING_SHARE)
+        pages = int(connection.execute("PRAGMA page_count").fetchone()[0])
+        spare_pages = min(pages // SPARE_SHARE, MOST_SPARE_PAGES)
+        return purge(connection, wanted, self._data_dir, spare_pages)

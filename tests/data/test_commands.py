@@ -241,7 +241,7 @@ def test_limits_are_read_as_they_are_written(text: str, limit: Limit) -> None:
     assert parse_limit(text, Limit()) == limit
 
 
-def test_what_a_current_run_is_spared_does_not_depend_on_the_limit() -> None:
+def test_what_an_age_spares_does_not_depend_on_the_limit() -> None:
     assert parse_limit("0rows", DEFAULT.state).spared_rows == DEFAULT.state.spared_rows
     with pytest.raises(InvalidInputError):
         parse_limit("many", DEFAULT.state)
@@ -262,10 +262,10 @@ def test_the_help_tells_the_limits_that_are_in_force(
     options = text.partition("options:")[2]
     for kind in ("state", "rollup", "log", "event", "image"):
         limit, told = getattr(DEFAULT, kind), options.partition(f"--keep-{kind}s LIMIT")[2]
-        spared = f"; spares the newest {limit.spared_rows:,}" if limit.limits else ""
+        spared = f"; an age spares the newest {limit.spared_rows:,}" if limit.limits else ""
         assert f"({limit_text(limit)}{spared})" in told.partition("--keep")[0]
     assert f"({DEFAULT.outlive:g}), or for ever: all" in text
-    assert "current runs are spared" in text or command == "serve"
+    assert "an age spares the newest rows" in text or command == "serve"
 
 
 @pytest.mark.parametrize("times", ["0", "none", "nan", "-1"])

@@ -15,9 +15,10 @@ class Rover:
     controller does that waits for Webots.
     """
 
-    def __init__(self, name: str = "rover") -> None:
+    def __init__(self, name: str = "rover", step_s: float = STEP_S) -> None:
         self.devices: dict[str, Any] = {}
         self._name = name
+        self._step_s = step_s
         self._time_s = 0.0
         self._due_s = time.perf_counter()
 
@@ -28,9 +29,9 @@ class Rover:
 
     def pace(self) -> None:
         """Let one step pass in real time."""
-        self._time_s += STEP_S
+        self._time_s += self._step_s
         now = time.perf_counter()
-        self._due_s = max(self._due_s + STEP_S, now)  # a late step is not caught up with
+        self._due_s = max(self._due_s + self._step_s, now)  # a late step is not caught up with
         time.sleep(self._due_s - now)
 
     def getTime(self) -> float:
@@ -40,7 +41,7 @@ class Rover:
         return self._name
 
     def getBasicTimeStep(self) -> float:
-        return STEP_S * 1000
+        return self._step_s * 1000
 
     def getWorldPath(self) -> str:
         return ""

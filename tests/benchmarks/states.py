@@ -16,6 +16,26 @@ def make_states(count: int = STATES) -> list[State]:
     return [_state(numbers) for _ in range(count)]
 
 
+def make_wide_states(count: int = STATES) -> list[State]:
+    """States of 88 leaves, about 1.5 kB: what all devices of a well equipped robot say."""
+    numbers = random.Random(8)
+    return [_wide_state(numbers) for _ in range(count)]
+
+
+def _wide_state(numbers: random.Random) -> State:
+    arms = {
+        f"arm_{side}": {
+            "angles_rad": [round(numbers.uniform(-3.1, 3.1), 8) for _ in range(6)],
+            "torques_nm": [round(numbers.uniform(-9.9, 9.9), 8) for _ in range(6)],
+            "touches": [numbers.random() < 0.01 for _ in range(4)],
+            "grasping": numbers.random() < 0.01,
+        }
+        for side in ("left", "right")
+    }
+    sonar = [round(numbers.uniform(0.1, 5), 8) for _ in range(15)]
+    return {**_state(numbers), **arms, "sonar_m": sonar}
+
+
 def _state(numbers: random.Random) -> State:
     def some(count: int, digits: int) -> list[float]:
         return [round(numbers.uniform(-9.99, 9.99), digits) for _ in range(count)]

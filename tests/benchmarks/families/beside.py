@@ -1,0 +1,113 @@
+"""Six robots with wide states in one database, beside a server: what its work costs them."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import anyio
+from mcp import Client
+
+from tests.benchmarks.measuring import Samples, alternate
+from tests.benchmarks.processes import Program
+from tests.benchmarks.programs.wide_robot import STEP_S
+from tests.benchmarks.registry import Bench, benchmark
+from tests.benchmarks.servers import our_server
+from tests.benchmarks.table import Line, Target, duration
+from webots_mcp.contract import DATABASE_NAME
+
+_ROBOTS: Final = 6
+_BLOCK_S: Final = 10
+_BLOCKS: Final = 3
+_LOOK_INTERVAL_S: Final = 1.0
+_LOOK: Final = {"robot": "rover 0", "lookback_s": 60}
+
+
+@dataclass
+class _Server:
+    """`webots-mcp serve` with a client, as long as its `with` block lasts.
+
+    Args:
+        database: Of the robots.
+        looking: Whether the client asks once a second what happened in the last minute.
+    """
+
+    database: Path
+    looking: bool
+    _over: threading.Event = field(default_factory=threading.Event)
+    _ready: threading.Event = field(default_factory=threading.Event)
+
+    def __enter__(self) -> None:
+        self._over.clear()
+        self._ready.clear()
+        self._thread = threading.Thread(target=lambda: anyio.run(self._be_client))
+        self._thread.start()
+        self._ready.wait()
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    async def _be_client(self) -> None:
+        try:
+            async with Client(our_server(self.database)) as client:
+                await client.list_tools()
+                self._ready.set()
+                while not await anyio.to_thread.run_sync(self._over.wait, _LOOK_INTERVAL_S):
+                    if self.looking:
+                        await client.call_tool("webots_monitor", _LOOK)
+        finally:
+            self._ready.set()
+
+
+@benchmark("beside", "publish() of 88 signals, 1.5 kB, by 6 robots at 62.5 Hz, beside a server")
+def measure_beside(bench: Bench) -> Iterable[Line]:
+    bench.say(f"starting {_ROBOTS} robots")
+    database = bench.folder / DATABASE_NAME
+    steps = bench.count(round(_BLOCK_S / STEP_S), least=20)
+    with ExitStack() as stack:
+        robots = [
+            stack.enter_context(Program("wide_robot", bench.folder, n)) for n in range(_ROBOTS)
+        ]
+        for robot in robots:
+            robot.hear()
+        contenders = {
+            "no server": _driving(robots, steps, nullcontext()),
+            "an idle server": _driving(robots, steps, _Server(database, looking=False)),
+            "a server that looks back each second": _driving(
+                robots, steps, _Server(database, looking=True)
+            ),
+        }
+        bench.say("16 ms steps")
+        taken = alternate(contenders, bench.count(_BLOCKS), warm_up=False)
+    for beside, blocks in taken.items():
+        yield from _lines(beside, blocks)
+
+
+def _driving(
+    robots: list[Program], steps: int, beside: AbstractContextManager[None]
+) -> Callable[[], list[Any]]:
+    def run_block() -> list[Any]:
+        with beside:
+            for robot in robots:
+                robot.send(str(steps))
+            return [robot.hear() for robot in robots]
+
+    return run_block
+
+
+def _lines(beside: str, blocks: list[list[Any]]) -> Iterable[Line]:
+    answers = [answer for block in blocks for answer in block]
+    waiting = [rows for answer in answers for rows in answer["waiting"]]
+    share = 100 * sum(rows > 0 for rows in waiting) / len(waiting)
+    ours, most = f"{share:.3g} %", f"{max(waiting)} rows at most, {len(waiting):,} calls"
+    yield Line(f"returned with rows waiting, {beside}", ours, most, share, "%", Target(2))
+    took = Samples([[s for answer in answers for s in answer["durations"]]])
+    beside_worst = f"p50 {duration(took.p50)}, p99.9 {duration(took.p999)}"
+    yield Line(
+        f"worst, {beside}", duration(took.worst), beside_worst, 1e3 * took.worst, "ms", Target(5)
+    )

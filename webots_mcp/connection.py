@@ -24,6 +24,7 @@ OPENING_TIMEOUT_MS: Final = 5000
 LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write waits so long
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
 _UNWRITABLE: Final = ("readonly database", "unable to open database file")
+_CALLED_OFF: Final = "called off"
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
 
 # All that a statement may raise because of the database.
@@ -198,6 +199,58 @@ class ShortWrites:
         self.longest_held_s = max(self.longest_held_s, held_s)
         if stored:
             self._commit_s = (self._commit_s + (held_s - working_s) / stored) / 2
+
+
+class Step:
+    """Statements that SQLite runs as one: one short transaction in one call.
+
+    Work that goes on beside control loops holds the write lock for a millisecond at most. In a
+    process with several threads a `transaction` cannot promise that: between any two of its
+    statements another thread may run for 5 ms and more, while every robot waits for the lock.
+    Statements in the body of a trigger run without Python in between.
+
+    What a step writes is prepared before it, in temporary tables, which lock nobody out.
+
+    Args:
+        name: Of the step, unlike that of any table.
+        parameters: Names of the values that it is run with: `NEW.name` in the statements.
+        statements: Tables without the name of a database, no LIMIT on a DELETE or an UPDATE (so
+            SQLite wants it in triggers).
+        unless: A condition in SQL under which nothing is done: what was prepared is out of date.
+    """
+
+    def __init__(
+        self, name: str, parameters: tuple[str, ...], *statements: str, unless: str = "0"
+    ) -> None:
+        call_off = f"SELECT RAISE(ABORT, '{_CALLED_OFF}') WHERE {unless}"
+        body = "".join(f"{statement}; " for statement in (call_off, *statements))
+        nulls, marks = (", ".join([one] * len(parameters)) for one in ("NULL", "?"))
+        self._prepare = (
+            f"CREATE TEMP VIEW IF NOT EXISTS {name} ({', '.join(parameters)}) AS SELECT {nulls}",
+            f"CREATE TEMP TRIGGER IF NOT EXISTS do_{name} INSTEAD OF INSERT ON {name} "
+            f"BEGIN {body}END",
+        )
+        self._run = f"INSERT INTO {name} VALUES ({marks})"
+
+    def run(self, connection: sqlite3.Connection, *values: object) -> bool:
+        """Do all of it and return True, or nothing.
+
+        Args:
+            connection: In autocommit mode; it has the temporary tables that the statements name.
+            values: One for each parameter.
+
+        Raises:
+            sqlite3.Error: Also where the write lock is not to be had (`is_busy`).
+        """
+        for statement in self._prepare:
+            connection.execute(statement)
+        try:
+            connection.execute(self._run, values)
+        except sqlite3.IntegrityError as error:
+            if str(error) != _CALLED_OFF:
+                raise
+            return False
+        return True
 
 
 def is_busy(error: Exception) -> bool:

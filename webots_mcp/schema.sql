@@ -84,7 +84,7 @@ CREATE TABLE run (
 	end_reason TEXT /* finished, reset, reload, crashed, replaced */, 
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows, as of last_wall_time_s */, 
 	label TEXT, 
-	note TEXT, keep INTEGER /* 1: retention deletes nothing of this run */ DEFAULT 0 NOT NULL, purged_rows INTEGER /* of the rows, those that retention has deleted */ DEFAULT 0 NOT NULL, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, 
+	note TEXT, keep INTEGER /* 1: retention deletes nothing of this run */ DEFAULT 0 NOT NULL, purged_rows INTEGER /* of the rows, those that retention has deleted */ DEFAULT 0 NOT NULL, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, rolled_state_id INTEGER DEFAULT 0 /* last state.id in the rollups, where beyond the watermark */ NOT NULL, 
 	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
 	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE
 );
@@ -338,4 +338,31 @@ CREATE TABLE recording (
 );
 CREATE UNIQUE INDEX ix_session_uuid ON session (uuid);
 CREATE UNIQUE INDEX ix_run_uuid ON run (uuid);
+CREATE TABLE recent_rollup (
+	run_id INTEGER NOT NULL, 
+	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
+	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
+	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
+	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
+	first_sim_time_s FLOAT, 
+	last FLOAT, 
+	last_sim_time_s FLOAT, 
+	min FLOAT, 
+	min_sim_time_s FLOAT /* of the first such extreme */, 
+	max FLOAT, 
+	max_sim_time_s FLOAT /* of the first such extreme */, 
+	sum FLOAT, 
+	squares FLOAT /* sum of squared deviations from sum / count */, 
+	sines FLOAT /* angles only: sum of sines */, 
+	cosines FLOAT /* angles only: sum of cosines */, 
+	PRIMARY KEY (run_id, bucket, signal_id), 
+	CONSTRAINT fk_recent_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+CREATE VIEW all_rollup AS
+/* Rollups, those of buckets that are over and the newest. */
+SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines FROM rollup
+UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines FROM recent_rollup;
 INSERT INTO alembic_version (version_num) VALUES ('0004');

@@ -1,4 +1,5 @@
 """Identity: UUIDs of recording, sessions and runs; what else tells one process from another.
+And the newest rollups in a table of their own, which is written in a millisecond.
 
 Revision ID: 0004
 Revises: 0003
@@ -38,12 +39,46 @@ COLUMNS = {
             comment="rows of its spill file that were taken in",
         ),
     ),
-    "run": (sa.Column("uuid", sa.Text(), comment=UUID),),
+    "run": (
+        sa.Column("uuid", sa.Text(), comment=UUID),
+        sa.Column(
+            "rolled_state_id",
+            sa.Integer(),
+            server_default=sa.text("0"),
+            nullable=False,
+            comment="last state.id in the rollups, where beyond the watermark",
+        ),
+    ),
     "log": (
         sa.Column("logger", sa.Text(), comment="name of the Python logger, where one logged it"),
     ),
 }
 NAMED = ("session", "run")
+COUNTS = {
+    "rows": "state rows that held the signal",
+    "present": "of them with a value",
+    "changes": "of the values, those unlike the one before in the bucket",
+}
+NUMBERS = {
+    "first": "of numbers and flags (0, 1); null for text, as all that follows",
+    "first_sim_time_s": None,
+    "last": None,
+    "last_sim_time_s": None,
+    "min": None,
+    "min_sim_time_s": "of the first such extreme",
+    "max": None,
+    "max_sim_time_s": "of the first such extreme",
+    "sum": None,
+    "squares": "sum of squared deviations from sum / count",
+    "sines": "angles only: sum of sines",
+    "cosines": "angles only: sum of cosines",
+}
+ROLLUP = ", ".join(["run_id", "signal_id", "bucket", *COUNTS, *NUMBERS])
+ALL_ROLLUP = f"""
+CREATE VIEW all_rollup AS
+/* Rollups, those of buckets that are over and the newest. */
+SELECT {ROLLUP} FROM rollup
+UNION ALL SELECT {ROLLUP} FROM recent_rollup"""
 NEW_UUID = {
     "sqlite": "lower(hex(randomblob(4)) || '-' || hex(randomblob(2)) || '-4' || "
     "substr(hex(randomblob(2)), 2) || '-' || substr('89ab', 1 + (random() & 3), 1) || "
@@ -74,11 +109,38 @@ def upgrade() -> None:
     for table in NAMED:
         op.execute(f"UPDATE {table} SET uuid = {NEW_UUID[dialect]}")
         op.create_index(op.f(f"ix_{table}_uuid"), table, ["uuid"], unique=True)
+    create_recent_rollup()
+    op.execute(ALL_ROLLUP)
     if dialect == "sqlite":
         op.execute("PRAGMA user_version = 4")
 
 
+def create_recent_rollup() -> None:
+    zero = sa.text("0")
+    op.create_table(
+        "recent_rollup",
+        sa.Column("run_id", sa.Integer(), nullable=False),
+        sa.Column("bucket", sa.Integer(), nullable=False, comment="floor(sim_time_s / 10)"),
+        sa.Column(
+            "signal_id", sa.Integer(), nullable=False, comment="signal.id, of the run's robot"
+        ),
+        *(
+            sa.Column(name, sa.Integer(), server_default=zero, nullable=False, comment=comment)
+            for name, comment in COUNTS.items()
+        ),
+        *(sa.Column(name, sa.Float(), comment=comment) for name, comment in NUMBERS.items()),
+        sa.ForeignKeyConstraint(
+            ["run_id"], ["run.id"], name=op.f("fk_recent_rollup_run_id"), ondelete="CASCADE"
+        ),
+        sa.PrimaryKeyConstraint("run_id", "bucket", "signal_id"),
+        sqlite_with_rowid=False,
+    )
+
+
 def downgrade() -> None:
+    op.execute("DROP VIEW all_rollup")
+    op.execute(f"INSERT INTO rollup ({ROLLUP}) SELECT {ROLLUP} FROM recent_rollup")
+    op.drop_table("recent_rollup")
     for table in NAMED:
         op.drop_index(op.f(f"ix_{table}_uuid"), table)
     for table, columns in COLUMNS.items():

@@ -16,12 +16,13 @@ from hypothesis import strategies as st
 
 from tests.history.recording import Recorder, record_rover
 from tests.memory import memory_connection
-from webots_mcp.connection import connect
+from webots_mcp.connection import connect, never_wait
 from webots_mcp.schema import create_schema
 from webots_mcp.store.history.leaves import flatten
 from webots_mcp.store.history.pages import query_rows
 from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.history.rollup import BUCKET_S, forget, roll, watermark
+from webots_mcp.store.history.rollup_tables import Addition, held, store
 from webots_mcp.store.history.series import query_history
 from webots_mcp.store.history.signals import list_signals
 from webots_mcp.store.history.summary import Summary, merge, summarise
@@ -83,7 +84,8 @@ def _record(
 def _stored_rollups(connection: sqlite3.Connection) -> dict[tuple[int, str, int], Summary]:
     columns = ", ".join(f"u.{name}" for name in Summary._fields)
     rows = connection.execute(
-        f"SELECT run_id, name, bucket, {columns} FROM rollup u JOIN signal s ON s.id = signal_id"
+        f"SELECT run_id, name, bucket, {columns} FROM all_rollup u "
+        "JOIN signal s ON s.id = signal_id"
     )
     return {(row[0], row[1], row[2]): Summary._make(row[3:]) for row in rows}
 
@@ -140,6 +142,80 @@ def _roll_all(file: Path) -> None:
             pass
 
 
+def test_what_was_summed_up_from_rollups_that_went_on_meanwhile_is_not_stored(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder.publish(0.0, {"x": 1})
+    before = held(empty, recorder.run_id, watermark(empty, recorder.run_id))
+    roll(empty)
+    whole = _everything(empty)
+    late = (False, recorder.run_id, 0, 1, *Summary(rows=7))
+    assert not store(empty, before, Addition([late], [], []), 1)
+    assert _everything(empty) == whole
+
+
+def test_a_batch_that_is_stored_in_part_is_finished_later_and_counted_once(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    with closing(connect(file, "writer", create=True)) as writer:
+        create_schema(writer)
+        recorder = Recorder(writer)
+        for name in ("a", "b", "c"):
+            robot_id = recorder.robot(name)
+            recorder.run(recorder.session(robot_id, "x"), robot_id)
+            for step in range(30):
+                recorder.publish(float(step), {"x": step, "mode": "ab"[step % 2]})
+        with closing(connect(file, "writer", patient=False)) as other:
+            _lock_at(writer, other, "INSERT INTO store_rollups VALUES (2,")
+            with pytest.raises(sqlite3.OperationalError, match="locked"):
+                never_wait(writer)
+                roll(writer)
+            writer.set_trace_callback(None)
+        runs = [watermark(writer, run_id) for run_id in (1, 2, 3)]
+        assert watermark(writer) == 0 and runs[0] == 30 and runs[2] == 0
+        for _ in range(2):
+            for run_id in (1, 2, 3):
+                (run,) = query_history(writer, resolve_range(writer, run_id=run_id), ["x"]).runs
+                assert run.numbers[0].whole.present == 30
+                assert len(list_signals(writer, run_id=run_id).signals) == 2
+            assert roll(writer).done
+        assert [row[0] for row in writer.execute("SELECT rows FROM signal")] == [30] * 6
+        assert writer.execute("SELECT sum(rows) FROM all_rollup").fetchone() == (180,)
+
+
+def _lock_at(writer: sqlite3.Connection, other: sqlite3.Connection, what: str) -> None:
+    """Let another connection have the write lock when such a statement begins."""
+
+    def look(statement: str) -> None:
+        if statement.startswith(what) and not other.in_transaction:
+            other.execute("BEGIN IMMEDIATE")
+
+    writer.set_trace_callback(look)
+
+
+def test_buckets_that_are_over_stand_by_signal_and_the_newest_side_by_side(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(35):
+        recorder.publish(float(step), {"x": step})
+        roll(empty)
+    buckets_in = "SELECT bucket, rows FROM {} ORDER BY bucket"
+    assert empty.execute(buckets_in.format("rollup")).fetchall() == [(0, 10), (1, 10), (2, 10)]
+    assert empty.execute(buckets_in.format("recent_rollup")).fetchall() == [(3, 5)]
+    recorder.end_run("crashed")
+    roll(empty)
+    assert len(empty.execute(buckets_in.format("rollup")).fetchall()) == 4
+    recorder.publish(36.0, {"x": 36})  # adopted later
+    recorder.publish(41.0, {"x": 41})
+    roll(empty)
+    assert empty.execute(buckets_in.format("rollup")).fetchall()[3:] == [(3, 6), (4, 1)]
+
+
 @pytest.mark.parametrize("lose", ["DELETE FROM rollup", "DELETE FROM watermark"])
 def test_lost_rollups_are_rebuilt_from_the_rows(empty: sqlite3.Connection, lose: str) -> None:
     record_rover(empty)
@@ -153,7 +229,7 @@ def test_lost_rollups_are_rebuilt_from_the_rows(empty: sqlite3.Connection, lose:
 
 
 def _everything(connection: sqlite3.Connection) -> list[list[Any]]:
-    tables = ("rollup", "change", "signal", "watermark")
+    tables = ("all_rollup", "change", "signal", "watermark")
     return [connection.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
 
 
@@ -255,7 +331,7 @@ def test_rows_that_are_rolled_up_during_an_answer_are_counted_once(
         record_rover(writer)
 
         def roll_in_between(statement: str) -> None:
-            if "FROM rollup" in statement:
+            if "FROM all_rollup" in statement:
                 roll(writer, 300)
 
         with closing(connect(file, "reader")) as reader:

@@ -24,7 +24,7 @@ async def test_a_server_that_may_write_maintains_the_database(
         robot.state(i * 1.0, {"x": float(i)})
     async with connect():
         with anyio.fail_after(10):
-            while not recorded.connection.execute("SELECT 1 FROM rollup").fetchone():
+            while not recorded.connection.execute("SELECT 1 FROM all_rollup").fetchone():
                 await anyio.sleep(0.02)
         holder = recorded.connection.execute("SELECT holder FROM lease").fetchone()[0]
         assert holder.startswith("server ")

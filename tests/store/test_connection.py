@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tests.memory import memory_connection
-from webots_mcp.connection import ShortWrites, connect, is_busy, is_damage, transaction
+from webots_mcp.connection import ShortWrites, Step, connect, is_busy, is_damage, transaction
 
 LEASE = "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (?, 'somebody', 0)"
 COUNT = "SELECT count(*) FROM lease"
@@ -71,6 +71,24 @@ def test_of_a_short_write_that_fails_nothing_is_stored() -> None:
                 [("a",), ("b",)], lambda name: connection.execute(LEASE, name)
             )
         assert connection.execute(COUNT).fetchone() == (1,)
+
+
+def test_a_step_stores_everything_or_is_called_off_or_fails_and_stores_nothing() -> None:
+    step = Step(
+        "take_two",
+        ("one", "other"),
+        LEASE.replace("?", "NEW.one"),
+        LEASE.replace("?", "NEW.other"),
+        unless="NEW.one = 'nobody'",
+    )
+    with memory_connection() as connection:
+        assert step.run(connection, "a", "b")
+        assert not step.run(connection, "nobody", "c")
+        with pytest.raises(sqlite3.IntegrityError, match="UNIQUE"):
+            step.run(connection, "d", "a")
+        assert step.run(connection, "e", "f")
+        assert connection.execute(COUNT).fetchone() == (4,)
+        assert not connection.in_transaction
 
 
 def test_a_file_that_is_no_database_is_damage_and_not_busy(tmp_path: Path) -> None:

@@ -146,6 +146,7 @@ class Run(SQLModel, table=True):
     keep: bool = _count("1: retention deletes nothing of this run")
     purged_rows: int = _count("of the rows, those that retention has deleted")
     uuid: str | None = _text(_UUID)
+    rolled_state_id: int = _count("last state.id in the rollups, where beyond the watermark")
 
 
 class State(SQLModel, table=True):
@@ -180,28 +181,60 @@ class Signal(SQLModel, table=True):
     max: float | None = _number()
 
 
-class Rollup(SQLModel, table=True):
-    """10 s of simulation time of one signal in one run: what its state rows come to."""
+def _figure(comment: str | None = None) -> Any:
+    """A number in a column that two tables have."""
+    return Field(default=None, sa_type=Float, sa_column_kwargs={"comment": comment})
+
+
+def _figure_count(comment: str) -> Any:
+    options = {"comment": comment, "nullable": False, "server_default": text("0")}
+    return Field(default=None, sa_type=Integer, sa_column_kwargs=options)
+
+
+class _Summary(SQLModel):
+    """What the state rows that held a signal come to."""
+
+    rows: int = _figure_count("state rows that held the signal")
+    present: int = _figure_count("of them with a value")
+    changes: int = _figure_count("of the values, those unlike the one before in the bucket")
+    first: float | None = _figure("of numbers and flags (0, 1); null for text, as all that follows")
+    first_sim_time_s: float | None = _figure()
+    last: float | None = _figure()
+    last_sim_time_s: float | None = _figure()
+    min: float | None = _figure()
+    min_sim_time_s: float | None = _figure("of the first such extreme")
+    max: float | None = _figure()
+    max_sim_time_s: float | None = _figure("of the first such extreme")
+    sum: float | None = _figure()
+    squares: float | None = _figure("sum of squared deviations from sum / count")
+    sines: float | None = _figure("angles only: sum of sines")
+    cosines: float | None = _figure("angles only: sum of cosines")
+
+
+class Rollup(_Summary, table=True):
+    """10 s of simulation time of one signal in one run: what its state rows come to.
+
+    Only buckets that are over; the others stand in `recent_rollup`, and in `all_rollup` both.
+    """
 
     __table_args__ = {"sqlite_with_rowid": False}
     run_id: int = _key("run")
     signal_id: int = _key(None, "signal.id, of the run's robot")
     bucket: int = _key(None, "floor(sim_time_s / 10)")
-    rows: int = _count("state rows that held the signal")
-    present: int = _count("of them with a value")
-    changes: int = _count("of the values, those unlike the one before in the bucket")
-    first: float | None = _number("of numbers and flags (0, 1); null for text, as all that follows")
-    first_sim_time_s: float | None = _number()
-    last: float | None = _number()
-    last_sim_time_s: float | None = _number()
-    min: float | None = _number()
-    min_sim_time_s: float | None = _number("of the first such extreme")
-    max: float | None = _number()
-    max_sim_time_s: float | None = _number("of the first such extreme")
-    sum: float | None = _number()
-    squares: float | None = _number("sum of squared deviations from sum / count")
-    sines: float | None = _number("angles only: sum of sines")
-    cosines: float | None = _number("angles only: sum of cosines")
+
+
+class RecentRollup(_Summary, table=True):
+    """The newest rollups of a run, all its signals side by side.
+
+    In `rollup` the buckets of a signal stand together, which makes a long history of it fast to
+    read; but to write a bucket of 100 signals there is to write 100 pages.
+    """
+
+    __tablename__ = "recent_rollup"  # pyright: ignore[reportAssignmentType]
+    __table_args__ = {"sqlite_with_rowid": False}
+    run_id: int = _key("run")
+    bucket: int = _key(None, "floor(sim_time_s / 10)")
+    signal_id: int = _key(None, "signal.id, of the run's robot")
 
 
 class Change(SQLModel, table=True):
@@ -216,7 +249,7 @@ class Change(SQLModel, table=True):
 
 
 class Watermark(SQLModel, table=True):
-    """Up to which state row a derived table is complete."""
+    """Up to which state row a derived table is complete, of all runs."""
 
     name: str = Field(sa_column=Column(Text, primary_key=True, comment="rollup"))
     state_id: int = _column(Integer, nullable=False)

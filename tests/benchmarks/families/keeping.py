@@ -32,7 +32,7 @@ _SIZES: Final = (
     "SELECT name, sum(pgsize) FROM dbstat WHERE name NOT IN ('log', 'ix_log_run_id_sim_time_s') "
     "GROUP BY name"
 )
-_ROLLED: Final = ("rollup", "change")
+_ROLLED: Final = ("rollup", "recent_rollup", "change")
 _TIME_INDEX: Final = "ix_state_run_id_sim_time_s"
 _READ: Final = "SELECT run_id, id, sim_time_s, wall_time_s, data FROM state"
 _INSERT_LINE: Final = (

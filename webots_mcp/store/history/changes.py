@@ -22,7 +22,7 @@ _CHANGES: Final = (
     "ORDER BY state_id"
 )
 _FIRST_VALUE: Final = (
-    "SELECT first_sim_time_s FROM rollup WHERE run_id = ? AND signal_id = ? "
+    "SELECT first_sim_time_s FROM all_rollup WHERE run_id = ? AND signal_id = ? "
     "AND first_sim_time_s IS NOT NULL ORDER BY bucket LIMIT 1"
 )
 
@@ -46,7 +46,7 @@ def change_points(
     come from the change table, and from the rows after the watermark until the deadline.
     """
     points = {signal.name: _stored(connection, segment, signal, deadline) for signal in signals}
-    mark = watermark(connection)
+    mark = watermark(connection, segment.run_id)
     before_end = Segment(segment.run_id, float("-inf"), segment.end_s)
     late = rows_after(connection, before_end, mark)
     if late is not None and signals:

@@ -27,8 +27,8 @@ DETECTED: Final[tuple[Kind, ...]] = (
 OF_NUMBERS: Final = frozenset[Kind]({"silent", "flat", "jump", "oscillation"})
 
 _OF_RUN: Final = (  # also the rows that do not hold the signal
-    "SELECT max(sum(rows), (SELECT rows FROM run WHERE id = rollup.run_id)), sum(present), "
-    "sum(changes) FROM rollup WHERE run_id = ? AND signal_id = ?"
+    "SELECT max(sum(rows), (SELECT rows FROM run WHERE id = all_rollup.run_id)), sum(present), "
+    "sum(changes) FROM all_rollup WHERE run_id = ? AND signal_id = ?"
 )
 # What a robot swings with; sensors swing by nature while it drives.
 _SWINGING: Final = re.compile(

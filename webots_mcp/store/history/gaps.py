@@ -28,10 +28,10 @@ _BEFORE: Final = (
 )
 # The signal that is in most rows tells how many a bucket has, and its first and last time.
 _BUCKETS: Final = (
-    "SELECT bucket, rows, first_sim_time_s, last_sim_time_s FROM rollup "
+    "SELECT bucket, rows, first_sim_time_s, last_sim_time_s FROM all_rollup "
     "WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = (SELECT id "
     "FROM signal s WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND EXISTS "
-    "(SELECT 1 FROM rollup WHERE run_id = :run AND signal_id = s.id) "
+    "(SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = s.id) "
     "ORDER BY s.rows - s.null_rows DESC LIMIT 1) ORDER BY bucket"
 )
 

@@ -25,7 +25,7 @@ from webots_mcp.store.history.wall_time import parse_wall_time, simulation_times
 
 _PURGED: Final = (
     "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0 "
-    "AND EXISTS (SELECT 1 FROM rollup WHERE run_id = run.id)"
+    "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = run.id)"
 )
 _FIRST: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
 _NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"

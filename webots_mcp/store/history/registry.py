@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import sqlite3
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, Final, cast
+from typing import Any, Final, NamedTuple
 
-from webots_mcp.store.history.batch import Batch, BatchColumn
+from webots_mcp.store.history.batch import BatchColumn
 from webots_mcp.store.history.leaves import (
     Kind,
     Place,
@@ -29,16 +28,10 @@ _OF_ROBOT: Final = (
     "SELECT id, robot_id, name, kind, unit, path, reduce FROM signal WHERE robot_id = ? ORDER BY id"
 )
 _ADD: Final = (
-    "INSERT INTO signal (robot_id, name, kind, unit, path, reduce, first_seen_wall_time_s, "
-    "last_seen_wall_time_s) VALUES (?, ?, ?, ?, ?, ?, ?, ?)"
+    "INSERT OR IGNORE INTO signal (robot_id, name, kind, unit, path, reduce, "
+    "first_seen_wall_time_s, last_seen_wall_time_s) VALUES "
 )
-_UPDATE: Final = (
-    "UPDATE signal SET kind = :kind, unit = :unit, rows = rows + :rows, "
-    "null_rows = null_rows + :null_rows, odd_rows = odd_rows + :odd_rows, "
-    "last_seen_wall_time_s = max(last_seen_wall_time_s, :seen), "
-    "min = min(coalesce(min, :min), coalesce(:min, min)), "
-    "max = max(coalesce(max, :max), coalesce(:max, max)) WHERE id = :id"
-)
+_ADDED_AT_ONCE: Final = 50  # in one statement, which holds the write lock for half a millisecond
 
 
 @dataclass(frozen=True)
@@ -106,35 +99,32 @@ def _telling(column: BatchColumn) -> list[Any]:
     return [*by_type.values(), *([min(numbers), max(numbers)] if numbers else [])]
 
 
-def enter_signals(connection: sqlite3.Connection, batch: Batch) -> dict[tuple[int, str], Signal]:
-    """Enter the names of a batch that are new, count its rows, and return what is registered.
+def enter_signals(
+    connection: sqlite3.Connection, robot_id: int, columns: Sequence[BatchColumn]
+) -> dict[str, Signal]:
+    """Enter the names of a robot that are new; return all that are registered, by name.
 
     Names beyond `MAX_SIGNALS` of a robot stay out.
     """
-    by_signal: defaultdict[tuple[int, str], list[BatchColumn]] = defaultdict(list)
-    for column in batch.columns():
-        by_signal[column.robot_id, column.name].append(column)
-    known = {robot_id: registered(connection, robot_id) for robot_id, _ in by_signal}
-    entered: dict[tuple[int, str], Signal] = {}
-    for (robot_id, name), columns in by_signal.items():
-        signal = known[robot_id].get(name) or _enter(connection, columns, known[robot_id])
-        if signal is not None:
-            entered[robot_id, name] = _update(connection, signal, columns)
-    return entered
+    known = registered(connection, robot_id)
+    fresh = [column for column in columns if column.name not in known]
+    if not fresh or len(known) >= MAX_SIGNALS:
+        return known
+    described = [row for column in fresh if (row := _description(column))]
+    rows = described[: MAX_SIGNALS - len(known)]
+    for start in range(0, len(rows), _ADDED_AT_ONCE):
+        some = rows[start : start + _ADDED_AT_ONCE]
+        marks = ", ".join(["(?, ?, ?, ?, ?, ?, ?, ?)"] * len(some))
+        connection.execute(_ADD + marks, [value for row in some for value in row])
+    return registered(connection, robot_id)
 
 
-def _enter(
-    connection: sqlite3.Connection, columns: list[BatchColumn], known: dict[str, Signal]
-) -> Signal | None:
-    first, last = columns[0], columns[-1]
-    signal = unregistered(first) if len(known) < MAX_SIGNALS else None
+def _description(column: BatchColumn) -> tuple[object, ...] | None:
+    signal = unregistered(column)
     if signal is None:
         return None
-    seen = (first.first_wall_time_s, last.last_wall_time_s)
     described = (signal.name, signal.kind, signal.unit, signal.path, signal.reduce)
-    added = connection.execute(_ADD, (first.robot_id, *described, *seen)).lastrowid
-    known[first.name] = replace(signal, id=added)
-    return known[first.name]
+    return (signal.robot_id, *described, column.first_wall_time_s, column.last_wall_time_s)
 
 
 def unregistered(column: BatchColumn) -> Signal | None:
@@ -162,24 +152,32 @@ def _places_of(data: str) -> dict[str, Place]:
     return places(parse(data))
 
 
-def _update(
-    connection: sqlite3.Connection, signal: Signal, columns: Sequence[BatchColumn]
-) -> Signal:
-    kind = signal.kind
-    for column in columns:
-        kind = seen_in(column, kind)
-    values = [point[2] for column in columns for point in column.points]
+class Count(NamedTuple):
+    """What the rows of a batch add to a registered signal."""
+
+    signal_id: int | None
+    kind: Kind
+    unit: str | None
+    rows: int
+    null_rows: int
+    odd_rows: int
+    seen_wall_time_s: float
+    min: float | None
+    max: float | None
+
+
+def count(signal: Signal, column: BatchColumn) -> Count:
+    """Count the values of a signal that is known as it is after them."""
+    values = [point[2] for point in column.points]
     _, numbers = usable_numbers(range(len(values)), values)
-    counted = {
-        "id": signal.id,
-        "kind": kind,
-        "unit": unit_of(signal.name, kind),
-        "rows": len(values),
-        "null_rows": sum(value is None for value in values),
-        "odd_rows": sum(column.odd_rows for column in columns),
-        "seen": max(column.last_wall_time_s for column in columns),
-        "min": min(numbers, default=None),
-        "max": max(numbers, default=None),
-    }
-    connection.execute(_UPDATE, counted)
-    return replace(signal, kind=kind, unit=cast("str | None", counted["unit"]))
+    return Count(
+        signal.id,
+        signal.kind,
+        signal.unit,
+        len(values),
+        values.count(None),
+        column.odd_rows,
+        column.last_wall_time_s,
+        min(numbers, default=None),
+        max(numbers, default=None),
+    )

@@ -1,64 +1,63 @@
 """Rollups: 10 s of simulation time of each signal of each run, kept beside the state rows.
 
 `roll` is the maintainer's work, never the control loop's. It also keeps the register of signals,
-and the change points of text and boolean signals. How far it came is the watermark, the id of the
-last state row that is in: ids are given under the write lock, so a row never comes late.
+and the change points of text and boolean signals. How far it came is told by two marks, the id of
+the last state row that is in: the watermark of all runs, and one of each run that is beyond it. Ids
+are given under the write lock, so a row never comes late.
 """
 
 from __future__ import annotations
 
-import contextlib
 import sqlite3
+import time
 from bisect import bisect_left
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.store.history.batch import Batch, BatchColumn
 from webots_mcp.store.history.columns import cleaned
 from webots_mcp.store.history.leaves import shown
-from webots_mcp.store.history.registry import Signal, enter_signals
+from webots_mcp.store.history.registry import Signal, count, enter_signals, seen_now
+from webots_mcp.store.history.rollup_tables import (
+    Addition,
+    Held,
+    forget,
+    held,
+    move,
+    run_mark,
+    store,
+)
 from webots_mcp.store.history.summary import Summary, merge, summarise
 
+__all__ = ["BUCKET_S", "Rolled", "bucket_of", "buckets", "forget", "roll", "watermark"]
+
 BUCKET_S: Final = 10.0
-BATCH_ROWS: Final = 200  # summing holds the write lock, about 0.1 ms a row: keep a batch short
+BATCH_ROWS: Final = 2000
 
 _WATERMARK: Final = "SELECT state_id FROM watermark WHERE name = 'rollup'"
-_SET_WATERMARK: Final = "INSERT OR REPLACE INTO watermark (name, state_id) VALUES ('rollup', ?)"
+_SET_WATERMARK: Final = (
+    "INSERT INTO watermark (name, state_id) VALUES ('rollup', ?) "
+    "ON CONFLICT (name) DO UPDATE SET state_id = max(state_id, excluded.state_id)"
+)
 _ROWS: Final = (
     "SELECT s.id, r.robot_id, s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd "
     "FROM state s JOIN run r ON r.id = s.run_id WHERE s.id > ? ORDER BY s.id LIMIT ?"
 )
-_COLUMNS: Final = ", ".join(Summary._fields)
-_BUCKET: Final = f"SELECT {_COLUMNS} FROM rollup WHERE run_id = ? AND signal_id = ? AND bucket = ?"
-_SET_BUCKET: Final = (
-    f"INSERT OR REPLACE INTO rollup (run_id, signal_id, bucket, {_COLUMNS}) "
-    f"VALUES (?, ?, ?{', ?' * len(Summary._fields)})"
-)
 _BUCKETS: Final = (
-    f"SELECT bucket, {_COLUMNS} FROM rollup "
+    f"SELECT bucket, {', '.join(Summary._fields)} FROM all_rollup "
     "WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ? ORDER BY bucket"
 )
 _LAST_CHANGE: Final = (
     "SELECT value FROM change WHERE run_id = ? AND signal_id = ? ORDER BY state_id DESC LIMIT 1"
 )
-_ADD_CHANGE: Final = (
-    "INSERT OR IGNORE INTO change (run_id, signal_id, state_id, sim_time_s, value) "
-    "VALUES (?, ?, ?, ?, ?)"
-)
 # The rollups were emptied by hand, although rows are there that they once held.
 _EMPTIED: Final = (
     "SELECT NOT EXISTS (SELECT 1 FROM rollup) "
-    "AND EXISTS (SELECT 1 FROM signal WHERE rows > 0) "
+    "AND (SELECT sum(rows) FROM signal) > (SELECT total(rows) FROM recent_rollup) "
     "AND EXISTS (SELECT 1 FROM state WHERE id <= (SELECT state_id FROM watermark))"
 )
 # What a row of foreign origin may hold: numbers, text and nesting that cannot be stored.
 _UNSTORABLE: Final = (OverflowError, ValueError, RecursionError, sqlite3.DataError)
-_FORGET: Final = (
-    "DELETE FROM watermark WHERE name = 'rollup'",
-    "DELETE FROM rollup",
-    "DELETE FROM change",
-    "UPDATE signal SET rows = 0, null_rows = 0, odd_rows = 0, min = NULL, max = NULL",
-)
 
 
 class Rolled(NamedTuple):
@@ -73,56 +72,37 @@ class Rolled(NamedTuple):
     done: bool
 
 
-def roll(connection: sqlite3.Connection, budget_rows: int = 2000) -> Rolled:
+def roll(connection: sqlite3.Connection, budget_rows: int = 2000, pause_s: float = 0.0) -> Rolled:
     """Take in the state rows after the watermark, at most `budget_rows` of them.
 
-    Each batch is read and parsed outside the write lock, summed and stored in one transaction that
-    first looks whether the watermark is still where it was: of two callers one stores, the other
-    finds nothing left to do. A missing watermark, or rollups emptied by hand, begin at the first
-    row again.
+    Rows are read, parsed and summed up outside the write lock. What they come to is stored run by
+    run, each in one step of less than a millisecond that first looks whether the run's mark is
+    still where it was: of two callers one stores, the other finds nothing left to do. Rollups
+    emptied by hand begin at the first row again.
 
     Args:
         connection: Of a maintainer (the role "writer"), in autocommit mode.
         budget_rows: Bounds the time of the call: about 50 us per row of 40 leaves.
+        pause_s: Between two steps, for others to write; 0 where nobody else does.
 
     Raises:
-        sqlite3.Error: The database is locked or damaged; nothing of the batch was stored.
+        sqlite3.Error: The database is locked or damaged; nothing of the step was stored.
     """
     if connection.execute(_EMPTIED).fetchone()[0]:
         forget(connection)
-    taken = 0
-    while taken < budget_rows:
-        rows = _roll_batch(connection, min(BATCH_ROWS, budget_rows - taken))
-        if rows is None:
-            return Rolled(taken, True)
-        taken += rows
-    return Rolled(taken, False)
+    taken, done = 0, False
+    while taken < budget_rows and not done:
+        rows = _roll_batch(connection, min(BATCH_ROWS, budget_rows - taken), pause_s)
+        done = rows is None
+        taken += rows or 0
+    move(connection, pause_s)
+    return Rolled(taken, done)
 
 
-def forget(connection: sqlite3.Connection) -> None:
-    """Empty the rollups, so that the next calls of `roll` rebuild them from the state rows.
-
-    What was rolled up from rows that have been deleted since is lost.
-    """
-    with _writing(connection):
-        for statement in _FORGET:
-            connection.execute(statement)
-
-
-@contextlib.contextmanager
-def _writing(connection: sqlite3.Connection) -> Generator[None]:
-    """A transaction that takes the write lock first; all of it is stored, or nothing."""
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        yield
-        connection.execute("COMMIT")
-    except BaseException:
-        connection.execute("ROLLBACK")
-        raise
-
-
-def watermark(connection: sqlite3.Connection) -> int:
-    """The id of the last state row that the rollups hold; 0 before the first."""
+def watermark(connection: sqlite3.Connection, run_id: int | None = None) -> int:
+    """The id of the last state row in the rollups, of a run or of all; 0 before the first."""
+    if run_id is not None:
+        return run_mark(connection, run_id) or 0
     row = connection.execute(_WATERMARK).fetchone()
     return int(row[0]) if row else 0
 
@@ -135,49 +115,68 @@ def buckets(
     return ((row[0], Summary._make(row[1:])) for row in rows)
 
 
-def _roll_batch(connection: sqlite3.Connection, limit: int) -> int | None:
+def _roll_batch(connection: sqlite3.Connection, limit: int, pause_s: float) -> int | None:
     """The rows taken in: None if there are no more, 0 if another caller was faster.
 
     A row that cannot be summed up costs only itself: it is looked for by halving, and left out.
     """
-    mark = watermark(connection)
-    rows = connection.execute(_ROWS, (mark, limit)).fetchall()
+    rows = connection.execute(_ROWS, (watermark(connection), limit)).fetchall()
     if not rows:
         return None
     try:
-        return _take_in(connection, mark, rows)
+        stored = _take_in(connection, rows, pause_s)
     except _UNSTORABLE:
         if len(rows) > 1:
-            return _roll_batch(connection, len(rows) // 2)
-        return _take_in(connection, mark, rows, leave_out=True)
+            return _roll_batch(connection, len(rows) // 2, pause_s)
+        stored = _take_in(connection, rows, pause_s, leave_out=True)
+    if stored:
+        connection.execute(_SET_WATERMARK, (rows[-1][0],))
+    return len(rows) if stored else 0
 
 
 def _take_in(
-    connection: sqlite3.Connection, mark: int, rows: Sequence[Any], *, leave_out: bool = False
-) -> int:
+    connection: sqlite3.Connection, rows: Sequence[Any], pause_s: float, *, leave_out: bool = False
+) -> bool:
+    """Whether all of them are in, run by run; the mark of a run tells which were before."""
+    robots = {row[2]: row[1] for row in rows}
+    for run_id, robot_id in robots.items():
+        mark = run_mark(connection, run_id)
+        if mark is None:
+            return False  # the run was deleted, and its rows with it
+        before = held(connection, run_id, mark)
+        fresh = [row for row in rows if row[2] == run_id and row[0] > mark]
+        addition = _sum_up(connection, before, robot_id, () if leave_out else fresh)
+        if fresh and not store(connection, before, addition, fresh[-1][0]):
+            return False
+        time.sleep(pause_s)
+    return True
+
+
+def _sum_up(
+    connection: sqlite3.Connection, before: Held, robot_id: int, rows: Sequence[Any]
+) -> Addition:
+    """What the rows of a run make of what is held of it; only names that are new are written."""
     batch = Batch()
-    for row in () if leave_out else rows:
+    for row in rows:
         batch.add(*row)
-    with _writing(connection):
-        current = watermark(connection) == mark
-        if current:
-            _store(connection, batch)
-            connection.execute(_SET_WATERMARK, (rows[-1][0],))
-    return len(rows) if current else 0
-
-
-def _store(connection: sqlite3.Connection, batch: Batch) -> None:
-    signals = enter_signals(connection, batch)
-    for column in batch.columns():
-        signal = signals.get((column.robot_id, column.name))
-        if signal is None:
+    columns = list(batch.columns())
+    known = enter_signals(connection, robot_id, columns)
+    addition = Addition([], [], [])
+    for column in columns:
+        signal = seen_now(known.get(column.name), column)
+        if signal is None or signal.id is None:
             continue  # beyond the number of signals that a robot may have
-        _store_buckets(connection, signal, column)
+        addition.counts.append(count(signal, column))
+        addition.rollups.extend(_rollups(connection, before, signal, column))
         if signal.kind not in ("num", "angle"):  # null may yet become text
-            _store_changes(connection, signal, column)
+            addition.changes.extend(_changes(connection, signal, column))
+    return addition
 
 
-def _store_buckets(connection: sqlite3.Connection, signal: Signal, column: BatchColumn) -> None:
+def _rollups(
+    connection: sqlite3.Connection, before: Held, signal: Signal, column: BatchColumn
+) -> Iterator[tuple[Any, ...]]:
+    assert signal.id is not None
     _, times, values = zip(*column.points, strict=True)
     if signal.kind == "text":
         values = cleaned(signal, list(values))
@@ -186,11 +185,10 @@ def _store_buckets(connection: sqlite3.Connection, signal: Signal, column: Batch
         bucket = bucket_of(times[start])
         end = bisect_left(times, (bucket + 1) * BUCKET_S, start)
         summary = summarise(times[start:end], values[start:end], angle=signal.kind == "angle")
-        key = (column.run_id, signal.id, bucket)
-        before = connection.execute(_BUCKET, key).fetchone()
-        if before is not None:
-            summary = merge([_of_kind(signal, Summary._make(before)), summary])
-        connection.execute(_SET_BUCKET, (*key, *summary))
+        known, is_over = before.find(connection, (bucket, signal.id))
+        if known is not None:
+            summary = merge([_of_kind(signal, known), summary])
+        yield (is_over, column.run_id, bucket, signal.id, *summary)
 
 
 def _of_kind(signal: Signal, before: Summary) -> Summary:
@@ -201,13 +199,15 @@ def _of_kind(signal: Signal, before: Summary) -> Summary:
     return Summary(**{name: getattr(before, name) for name in kept})
 
 
-def _store_changes(connection: sqlite3.Connection, signal: Signal, column: BatchColumn) -> None:
+def _changes(
+    connection: sqlite3.Connection, signal: Signal, column: BatchColumn
+) -> Iterator[tuple[Any, ...]]:
     key = (column.run_id, signal.id)
     last = connection.execute(_LAST_CHANGE, key).fetchone()
     before: str | tuple[()] | None = last[0] if last else ()
     for state_id, time_s, value in column.points:
         if (text := shown(value)) != before:
-            connection.execute(_ADD_CHANGE, (*key, state_id, time_s, text))
+            yield (*key, state_id, time_s, text)
             before = text
 
 

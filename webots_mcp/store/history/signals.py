@@ -33,7 +33,7 @@ _OLDEST_AFTER: Final = (  # by ids, from the watermark on: see `tiers`
 )
 _TOTALS: Final = (
     "SELECT signal_id, sum(rows), sum(present), min(first_sim_time_s), max(last_sim_time_s), "
-    "min(min), max(max) FROM rollup WHERE run_id = ? GROUP BY signal_id"
+    "min(min), max(max) FROM all_rollup WHERE run_id = ? GROUP BY signal_id"
 )
 
 
@@ -102,7 +102,7 @@ def _signals_in(
 
 def _unrolled_sample(connection: sqlite3.Connection, robot_id: int, run_id: int) -> Batch:
     """A run's rows after the watermark; of many the newest and the oldest."""
-    mark = watermark(connection)
+    mark = watermark(connection, run_id)
     batch = Batch()
     for state_id, *row in connection.execute(_NEWEST_ROWS, (run_id,)):
         if state_id <= mark:
@@ -238,7 +238,7 @@ def _late(
     connection: sqlite3.Connection, subject: Subject, deadline_s: float
 ) -> tuple[Batch, list[str]]:
     """The run's rows after the watermark, newest first, until the deadline."""
-    mark = watermark(connection)
+    mark = watermark(connection, subject.run_id)
     batch = Batch()
     limit = Deadline(deadline_s)
     notes: list[str] = []

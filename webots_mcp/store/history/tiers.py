@@ -109,7 +109,7 @@ def read_pieces(
     start_s, end_s = span.start * BUCKET_S, span.stop * BUCKET_S
     head, foot = replace(segment, end_s=start_s), replace(segment, start_s=end_s)
     middle = replace(segment, start_s=start_s, end_s=end_s)
-    mark = watermark(connection)
+    mark = watermark(connection, segment.run_id)
     pieces.add_rows(read_columns(connection, head, signals, deadline))
     pieces.add_rollups(connection, segment.run_id, span, deadline)
     if (late := rows_after(connection, middle, mark)) is not None:

@@ -30,9 +30,11 @@ SAMPLES_PER_STAY: Final = 5
 SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
 LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
 
-_OF_SIGNAL: Final = "FROM rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
+_OF_SIGNAL: Final = (
+    "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
+)
 _COUNTS: Final = (
-    "SELECT signal_id, sum(rows), sum(present), sum(changes) FROM rollup "
+    "SELECT signal_id, sum(rows), sum(present), sum(changes) FROM all_rollup "
     "WHERE run_id = ? AND bucket >= ? AND bucket < ? GROUP BY signal_id"
 )
 _USUAL_RANGE: Final = f"SELECT avg(max - min) {_OF_SIGNAL}"
@@ -147,7 +149,7 @@ class LongView:
         self._deadline = deadline
         self._signals = [signal for signal in signals if signal.is_number]
         self._span = (segment.run_id, bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
-        late = rows_after(connection, segment, watermark(connection))
+        late = rows_after(connection, segment, watermark(connection, segment.run_id))
         if late is not None and segment.end_s - late.start_s > LATE_S:
             since = f"rows from {late.start_s:g} s on are not rolled up yet"
             self.notes.append(f"{since}: not searched for silent, flat and jumps")

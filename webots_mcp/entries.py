@@ -73,7 +73,7 @@ STATEMENTS: Final[dict[Kind, str]] = {
     ),
     "session end": (
         "UPDATE session SET ended_wall_time_s = :now, last_seen_wall_time_s = :now, "
-        "last_seen_monotonic_s = :monotonic, end_reason = :reason, hold = NULL, rows_waiting = 0, "
+        "last_seen_monotonic_s = :monotonic, end_reason = :reason, rows_waiting = 0, "
         "rows_dropped = :dropped, last_error = :error WHERE id = :session"
     ),
     "actions": "UPDATE session SET actions = :actions WHERE id = :session",

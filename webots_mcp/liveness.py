@@ -17,11 +17,19 @@ _TOLERANCE_S: Final = 2.0
 _WINDOWS_EPOCH_S: Final = 11_644_473_600  # from 1601 to 1970
 
 
-def process_alive(pid: int, last_seen_wall_time_s: float) -> bool:
-    """Whether the process of this host that was last seen then still runs.
+def process_alive(pid: int, process: str | None, last_seen_wall_time_s: float) -> bool:
+    """Whether a process of this host still runs.
 
-    Where the system does not tell when a process started (macOS), any process of that pid counts.
+    Args:
+        pid: Its id, which another process may have by now.
+        process: Its `process_identity`, which no other has, whatever clocks are set to.
+        last_seen_wall_time_s: Its newest sign of life, Unix time: what there is to go by where the
+            identity is not known. Where the system does not tell either when a process started
+            (macOS), any process of that pid counts.
     """
+    now = process_identity(pid) if process is not None else None
+    if now is not None:
+        return now == process
     if sys.platform == "win32":
         started_s = _windows_start(pid)
     else:
@@ -35,16 +43,18 @@ def process_identity(pid: int) -> str | None:
     """Which process of this host that pid names now, whatever the wall clock is set to.
 
     A pid comes back; its boot and its start within that boot do not. On Windows the creation
-    time, which setting the clock does not change afterwards. None where there is no such process
-    or the system does not tell (macOS).
+    time, which setting the clock does not change afterwards. None where no such process runs, or
+    the system does not tell (macOS).
     """
     if sys.platform == "win32":
         created = _windows_creation(pid)
         return f"{created}" if created else None
     try:
-        ticks = _linux_stat(pid)[19]
+        fields = _linux_stat(pid)
+        if fields[0] == b"Z":
+            return None
         with open("/proc/sys/kernel/random/boot_id", "rb") as file:  # noqa: PTH123
-            return f"{file.read().decode().strip()} {int(ticks)}"
+            return f"{file.read().decode().strip()} {int(fields[19])}"
     except (OSError, IndexError, ValueError):
         return None
 

@@ -21,8 +21,8 @@ LOSE: Final = (
     "WHERE id = :id AND status = 'claimed'"
 )
 END_SESSION: Final = (
-    "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, hold = NULL, "
-    "end_reason = :reason WHERE id = :id AND ended_wall_time_s IS NULL"
+    "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, end_reason = :reason "
+    "WHERE id = :id AND ended_wall_time_s IS NULL"
 )
 # Judged from outside: the rows are counted, because the dead process could not say how many; and
 # its last row may be younger than its last heartbeat.
@@ -37,13 +37,15 @@ END_RUNS: Final = (
     "rows = purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
     "WHERE session_id = :id AND ended_wall_time_s IS NULL"
 )
+EXTERN: Final = "nobody starts an extern controller again: start it by hand"
 _OPEN_SESSIONS: Final = (
-    "SELECT id, pid, host, last_seen_wall_time_s, EXISTS (SELECT 1 FROM command "
+    "SELECT id, pid, process, last_seen_wall_time_s, EXISTS (SELECT 1 FROM command "
     "WHERE session_id = session.id AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
-    "FROM session WHERE ended_wall_time_s IS NULL"
+    "FROM session WHERE ended_wall_time_s IS NULL AND host = ?"
 )
 _CLAIMED_BY_ENDED: Final = (
-    "SELECT c.id, c.issued_wall_time_s FROM command c LEFT JOIN session s ON s.id = c.session_id "
+    "SELECT c.id, c.issued_wall_time_s, s.extern FROM command c "
+    "LEFT JOIN session s ON s.id = c.session_id "
     "WHERE c.status = 'claimed' AND (s.id IS NULL OR s.ended_wall_time_s IS NOT NULL)"
 )
 
@@ -54,22 +56,33 @@ def settle(connection: sqlite3.Connection, now_s: float) -> None:
     Pending commands past their time become `expired`. Open sessions whose process on this host is
     gone are ended (`reload` if they asked for one, else `crashed`). Commands claimed by an ended
     session become `lost`, and are never run again by themselves; only one that asked Webots for a
-    reload gets a minute for the next session to confirm it.
+    reload gets a minute for the next session to confirm it, where Webots starts one.
 
     The caller opens the transaction, or accepts that each statement is one of its own.
     """
     connection.execute(EXPIRE, {"now": now_s})
-    for session_id, pid, host, seen_s, reloading in connection.execute(_OPEN_SESSIONS).fetchall():
-        if host == host_name() and not process_alive(pid, seen_s):
-            end_session(connection, session_id, "reload" if reloading else "crashed")
-    for command_id, issued_s in connection.execute(_CLAIMED_BY_ENDED).fetchall():
+    for session_id, reason in gone_sessions(connection):
+        end_session(connection, session_id, reason)
+    for command_id, issued_s, extern in connection.execute(_CLAIMED_BY_ENDED).fetchall():
         if issued_s is None:
             why = "its controller ended before it finished; it may have run in part"
+        elif extern:
+            why = f"it was issued to Webots, and its controller's process ended; {EXTERN}"
         elif now_s - issued_s > ISSUED_TIME_TO_LIVE_S:
             why = "it was issued to Webots, but no new controller session confirmed it"
         else:
             continue
         connection.execute(LOSE, {"id": command_id, "now": now_s, "why": why})
+
+
+def gone_sessions(connection: sqlite3.Connection) -> list[tuple[int, str]]:
+    """Sessions that look open although their process on this host is gone, and how they ended."""
+    sessions = connection.execute(_OPEN_SESSIONS, (host_name(),)).fetchall()
+    return [
+        (session_id, "reload" if reloading else "crashed")
+        for session_id, pid, process, seen_s, reloading in sessions
+        if not process_alive(pid, process, seen_s)
+    ]
 
 
 def end_session(connection: sqlite3.Connection, session_id: int, reason: str) -> None:

@@ -13,7 +13,7 @@ from webots_mcp import MCPBridge
 
 def age(bridge: MCPBridge) -> None:
     """As if the simulation had stood still for a minute."""
-    bridge._clock.moved_wall_time_s = time.time() - 60  # pyright: ignore[reportPrivateUsage]
+    bridge._clock.moved_s = time.monotonic() - 60  # pyright: ignore[reportPrivateUsage]
 
 
 def standing_for_s(recording: Recording) -> float:

@@ -29,7 +29,7 @@ def leave_open(database: MemoryDatabase, recording: Recording, pid: int, seen_s:
     MCPBridge(InProcessSupervisor("rover"), database=database).close()
     change(
         recording,
-        "UPDATE session SET ended_wall_time_s = NULL, end_reason = NULL, pid = ?, "
+        "UPDATE session SET ended_wall_time_s = NULL, end_reason = NULL, pid = ?, process = NULL, "
         "started_wall_time_s = ?, last_seen_wall_time_s = ?",
         pid,
         seen_s - 60,
@@ -123,7 +123,7 @@ def test_a_run_that_ends_by_a_crash_lasts_until_its_last_row(
     now_s = time.time()
     change(
         recording,
-        "UPDATE session SET ended_wall_time_s = NULL, end_reason = NULL, pid = ?",
+        "UPDATE session SET ended_wall_time_s = NULL, end_reason = NULL, pid = ?, process = NULL",
         ended.pid,
     )
     change(

@@ -174,7 +174,7 @@ def test_a_bridge_says_when_it_was_last_seen_by_a_clock_that_nobody_sets(tmp_pat
     [
         ({}, 0),
         ({"WEBOTS_CONTROLLER_URL": "tcp://here:1234/rover"}, 1),
-        ({"WEBOTS_CONTROLLER_URL": "ipc://1234/rover", "WEBOTS_INSTANCE_PATH": "/tmp/webots"}, 0),
+        ({"WEBOTS_ROBOT_NAME": "rover", "WEBOTS_INSTANCE_PATH": "/tmp/webots/ada/1234/"}, 0),
     ],
 )
 def test_a_session_says_whether_anybody_starts_its_controller_again(
@@ -183,7 +183,7 @@ def test_a_session_says_whether_anybody_starts_its_controller_again(
     variables: dict[str, str],
     extern: int,
 ) -> None:
-    for name in ("WEBOTS_CONTROLLER_URL", "WEBOTS_INSTANCE_PATH"):
+    for name in ("WEBOTS_CONTROLLER_URL", "WEBOTS_INSTANCE_PATH", "WEBOTS_ROBOT_NAME"):
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)

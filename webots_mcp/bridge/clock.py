@@ -20,7 +20,7 @@ class Clock:
     def __init__(self, simulation: Simulation) -> None:
         self._simulation = simulation
         self.sim_time_s = simulation.time_s
-        self.moved_wall_time_s: float | None = None
+        self.moved_s: float | None = None  # by the monotonic clock
         self.steps_seen = 0  # looks at which time had gone forward
         self.run = Run("start", self.sim_time_s)
         self.ended_sim_time_s = self.sim_time_s  # of the run before this one
@@ -35,7 +35,7 @@ class Clock:
         before, now = self.sim_time_s, self._simulation.time_s
         self.sim_time_s = now
         if now > before + _EPSILON_S:
-            self.moved_wall_time_s = time.time()
+            self.moved_s = time.monotonic()
             self.steps_seen += 1
         if now >= before - _EPSILON_S and not self._is_awaited_reset(now, came_round):
             return False
@@ -47,7 +47,7 @@ class Clock:
 
     def let_go(self) -> None:
         """From this moment on time moves; it counts as standing only after a while without."""
-        self.moved_wall_time_s = time.time()
+        self.moved_s = time.monotonic()
 
     def newest_s(self, run: Run) -> float:
         """The newest simulation time of the current run, or of the one before it."""

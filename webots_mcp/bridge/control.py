@@ -77,6 +77,14 @@ class Control:
         self._recorder.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
         self._recorder.update_actions()
 
+    def take_over(self, mode_before: str) -> None:
+        """Hold the loop from its next step on, as the session before this one held it."""
+        self._hold.take_over(mode_before)
+
+    def let_go(self) -> None:
+        """No command will be served any more."""
+        self._hold.let_go()
+
     def serve(self) -> Command | None:
         """One round: what is under way, one new command, and the hold if there is one.
 

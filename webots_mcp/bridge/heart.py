@@ -10,6 +10,11 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S, PAUSED
 
 
+def wall_time_s(monotonic_s: float | None) -> float | None:
+    """When that was by the wall clock as it is set now."""
+    return None if monotonic_s is None else time.time() - (time.monotonic() - monotonic_s)
+
+
 class Heart:
     """Writes the session's heartbeat: a few times a second, and at once where the hold changes."""
 
@@ -17,13 +22,13 @@ class Heart:
         self._recorder = recorder
         self._clock = clock
         self._next_s = 0.0
-        self._last_poll_wall_time_s: float | None = None
+        self._last_poll_s: float | None = None
         self.hold: str | None = None
         self.hold_mode: str | None = None
 
     def poll(self) -> None:
         """The loop asked for commands; beat if it is time to."""
-        self._last_poll_wall_time_s = time.time()
+        self._last_poll_s = time.monotonic()
         self.beat_if_due()
 
     def beat_if_due(self) -> None:
@@ -34,9 +39,9 @@ class Heart:
     def beat(self) -> None:
         """Say now that the loop is alive, and what it can see of time."""
         self._next_s = time.monotonic() + HEARTBEAT_INTERVAL_S
-        clock, polled_s = self._clock, self._last_poll_wall_time_s
-        pulse = Pulse(clock.sim_time_s, polled_s, clock.moved_wall_time_s, self.hold)
-        self._recorder.beat(pulse)
+        polled_s, moved_s = wall_time_s(self._last_poll_s), wall_time_s(self._clock.moved_s)
+        hold = (self.hold, self.hold_mode)
+        self._recorder.beat(Pulse(self._clock.sim_time_s, polled_s, moved_s, *hold))
 
     def change_hold(self, hold: str | None, mode_before: str | None = None) -> None:
         """Tell at once: whoever reads the command's answer must not see the old status.

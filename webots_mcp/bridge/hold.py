@@ -66,6 +66,23 @@ class Hold:
             self._journal.event("resume", {"command_id": command.id})
         self._heart.change_hold(STEPPING if stepping else None)
 
+    def take_over(self, mode_before: str) -> None:
+        """Go on with the hold of a bridge whose process is gone, if the simulation still stands."""
+        if not self._simulation.supervisor or not self._simulation.pump():
+            return
+        if self._simulation.paused:
+            self._begin(mode_before)
+            self._journal.event("pause", {"by": "the controller's session before this one"})
+            self._heart.change_hold(PAUSED, mode_before)
+
+    def let_go(self) -> None:
+        """Nobody will serve commands any more: time goes on, if it was held."""
+        if self.held and not self._simulation.over:
+            self._simulation.set_mode(_running(self.mode_before))
+            self._end()
+            self._journal.event("resume", {"by": "the bridge, which was closed"})
+            self._heart.change_hold(None)
+
     def pump(self) -> None:
         """Hear from Webots: it may want to quit, or a person may have pressed play."""
         if not self._simulation.pump():

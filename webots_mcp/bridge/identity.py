@@ -6,10 +6,12 @@ import os
 import sqlite3
 import sys
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import host_name
 from webots_mcp.liveness import process_identity
+
+_THIS_HOST: Final = ("", "localhost", "127.0.0.1", "::1", host_name().lower())
 
 
 class Identity(NamedTuple):
@@ -75,13 +77,31 @@ def _devices(robot: Any) -> dict[str, Any]:
 
 
 def _instance() -> str:
-    """Which Webots this is: its own temporary folder, else the process that started this one."""
-    return os.environ.get("WEBOTS_INSTANCE_PATH") or f"{host_name()}:{os.getppid()}"
+    """Which Webots this is: host and port, as Webots tells them; else who started this process."""
+    folder = os.environ.get("WEBOTS_INSTANCE_PATH", "").rstrip("/\\")
+    url = os.environ.get("WEBOTS_CONTROLLER_URL", "")
+    if folder and not _is_extern():
+        port = folder[len(folder.rstrip("0123456789")) :]  # /tmp/webots/ada/1234, ...\webots-1234
+        return f"{host_name()}:{port}" if port else f"{host_name()}:{folder}"
+    if "://" in url:
+        return _simulator_of(url)
+    return f"{host_name()} process {os.getppid()}"
+
+
+def _simulator_of(url: str) -> str:
+    """Of `ipc://1234/robot` or `tcp://192.168.1.5:1234/robot`; the robot may be left out."""
+    place = url.partition("://")[2].partition("/")[0]
+    host, _, port = place.rpartition(":")
+    return f"{host_name() if host.strip('[]').lower() in _THIS_HOST else host}:{port}"
 
 
 def _is_extern() -> bool:
-    """Whether somebody else than Webots started this process, and so nobody will start another."""
-    return "WEBOTS_CONTROLLER_URL" in os.environ and "WEBOTS_INSTANCE_PATH" not in os.environ
+    """Whether somebody else than Webots started this process, and so nobody will start another.
+
+    Webots' library looks for these variables in this order.
+    """
+    intern = "WEBOTS_ROBOT_NAME" in os.environ and "WEBOTS_INSTANCE_PATH" in os.environ
+    return not intern and "WEBOTS_CONTROLLER_URL" in os.environ
 
 
 def _sha256(file: Path) -> str | None:

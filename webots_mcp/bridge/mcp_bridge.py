@@ -267,6 +267,7 @@ class MCPBridge:
         if self._closed:
             return
         self._closed = True
+        self._let_go()
         atexit.unregister(self._close_at_exit)
         open_bridges.leave(self.robot)
         if self._maintainer is not None:
@@ -332,6 +333,15 @@ class MCPBridge:
         if registration is not None:
             times = {"now": time.time(), "sim_time": self._clock.sim_time_s}
             self._recorder.record("reload confirmed", run, times)
+            if registration.held_mode is not None:
+                self._control.take_over(registration.held_mode)
+
+    def _let_go(self) -> None:
+        """A hold that nobody could end any more would stop the whole simulation."""
+        try:
+            self._control.let_go()
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._failed("close", error)
 
     def _look(self) -> None:
         """Time has passed, or gone back, outside of the loop: in a step of a handler's."""
@@ -355,7 +365,6 @@ class MCPBridge:
 
     def _end(self) -> None:
         """Webots may kill the process from here on, or let the loop say its last words."""
-        self._heart.hold = None
         self._recorder.end(self._end_reason, self._clock.sim_time_s)
 
     def _record_state(self, state: Mapping[Any, Any]) -> None:

@@ -8,12 +8,24 @@ from typing import Final, NamedTuple
 
 from webots_mcp.bridge.run import Run
 
+# A sign of life is proof against a judgement by others that the process was gone; but a session
+# that a later one has followed stays ended.
+_ALIVE: Final = (
+    "CASE WHEN end_reason = 'crashed' AND NOT EXISTS (SELECT 1 FROM session n "
+    "WHERE n.robot_id = {0}.robot_id AND n.id > {0}.{1}) THEN NULL ELSE {2} END"
+)
 _BEAT_SESSION: Final = (
     "UPDATE session SET last_seen_wall_time_s = ?, last_seen_monotonic_s = ?, "
-    "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, hold = ?, "
-    "rows_waiting = ?, rows_dropped = ?, last_error = ? WHERE id = ?"
+    "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, hold = ?, hold_mode = ?, "
+    "rows_waiting = ?, rows_dropped = ?, last_error = ?, "
+    f"ended_wall_time_s = {_ALIVE.format('session', 'id', 'ended_wall_time_s')}, "
+    f"end_reason = {_ALIVE.format('session', 'id', 'end_reason')} WHERE id = ?"
 )
-_BEAT_RUN: Final = "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, rows = ? WHERE id = ?"
+_BEAT_RUN: Final = (
+    "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, rows = ?, "
+    f"ended_wall_time_s = {_ALIVE.format('run', 'session_id', 'ended_wall_time_s')}, "
+    f"end_reason = {_ALIVE.format('run', 'session_id', 'end_reason')} WHERE id = ?"
+)
 
 
 class Pulse(NamedTuple):
@@ -23,6 +35,7 @@ class Pulse(NamedTuple):
     last_poll_wall_time_s: float | None
     moved_wall_time_s: float | None
     hold: str | None
+    hold_mode: str | None
 
 
 class Health(NamedTuple):
@@ -39,5 +52,6 @@ def write_pulse(
     """Write session and run as they are now, inside a transaction of the caller."""
     now = time.time()
     seen = (now, time.monotonic(), pulse.last_poll_wall_time_s, pulse.moved_wall_time_s)
-    connection.execute(_BEAT_SESSION, (*seen, pulse.sim_time_s, pulse.hold, *health, session_id))
+    loop = (pulse.sim_time_s, pulse.hold, pulse.hold_mode)
+    connection.execute(_BEAT_SESSION, (*seen, *loop, *health, session_id))
     connection.execute(_BEAT_RUN, (now, pulse.sim_time_s, run.rows, run.id))

@@ -12,11 +12,11 @@ from webots_mcp import settlement
 from webots_mcp.adoption import enter_robot, enter_session
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.connection import transaction
-from webots_mcp.contract import REMOTE_SILENCE_S
+from webots_mcp.contract import PAUSED, REMOTE_SILENCE_S
 from webots_mcp.liveness import process_alive
 
 _OPEN_SESSIONS: Final = (
-    "SELECT s.id, s.pid, s.host, s.last_seen_wall_time_s FROM session s "
+    "SELECT s.id, s.pid, s.process, s.host, s.last_seen_wall_time_s FROM session s "
     "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
 # A successor in the same Webots, soon after, means a reload; so does one after a reload that was
@@ -28,6 +28,10 @@ _RELOADED: Final = (
     "AND (:in_webots OR end_reason <> 'crashed') "
     "UNION SELECT 1 FROM command WHERE robot_id = :robot "
     "AND status = 'claimed' AND action = 'reload' AND issued_wall_time_s IS NOT NULL"
+)
+_HELD: Final = (
+    "SELECT coalesce(hold_mode, 'real_time') FROM session WHERE id = (SELECT max(id) FROM session "
+    "WHERE robot_id = ?) AND instance = ? AND hold = ?"
 )
 _LONGEST_RELOAD_S: Final = 10.0  # from the end of the old controller to the start of the new one
 
@@ -42,6 +46,8 @@ class Registration(NamedTuple):
     robot_name: str
     session_id: int
     reloaded: bool
+    held_mode: str | None
+    """The mode to go back to, where the session before this one held the simulation at its end."""
 
 
 def register(
@@ -59,10 +65,11 @@ def register(
         name = _free_name(connection, identity, now_s)
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         reloaded = _is_reload(connection, identity, robot_id, now_s)
+        held_mode = _held_mode(connection, identity, robot_id)
         session = describe_session(identity, session_uuid, actions)
         session_id = enter_session(connection, robot_id, session)
     _own_sessions.add(session_id)
-    return Registration(robot_id, name, session_id, reloaded)
+    return Registration(robot_id, name, session_id, reloaded, held_mode)
 
 
 def deregister(session_id: int) -> None:
@@ -90,19 +97,28 @@ def _is_reload(
         "robot": robot_id,
         "instance": identity.instance,
         "earliest": now_s - _LONGEST_RELOAD_S,
-        "in_webots": "WEBOTS_INSTANCE_PATH" in os.environ,
+        "in_webots": not identity.extern and "WEBOTS_INSTANCE_PATH" in os.environ,
     }
     return connection.execute(_RELOADED, values).fetchone() is not None
 
 
-def _is_living(session: tuple[int, int, str, float], identity: Identity, now_s: float) -> bool:
+def _held_mode(connection: sqlite3.Connection, identity: Identity, robot_id: int) -> str | None:
+    """What the robot's last session left behind in this same Webots."""
+    values = (robot_id, identity.instance, PAUSED)
+    row = connection.execute(_HELD, values).fetchone()
+    return row[0] if row else None
+
+
+def _is_living(
+    session: tuple[int, int, str | None, str, float], identity: Identity, now_s: float
+) -> bool:
     """On this host the process tells; on another only a recent heartbeat does."""
-    session_id, pid, host, last_seen_s = session
+    session_id, pid, process, host, last_seen_s = session
     if host != identity.host:
         return now_s - last_seen_s < REMOTE_SILENCE_S
     if pid == identity.pid:
         return session_id in _own_sessions
-    return process_alive(pid, last_seen_s)
+    return process_alive(pid, process, last_seen_s)
 
 
 def describe_robot(identity: Identity, name: str) -> dict[str, Any]:

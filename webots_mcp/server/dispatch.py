@@ -176,7 +176,7 @@ def _after_no_answer(view: View) -> str:
         )
     if session.last_poll_wall_time_s is None:
         return "the controller's loop never calls bridge.get_command(): add that line to its loop"
-    silent_s = view.now_s - session.last_poll_wall_time_s
+    silent_s = session.age_s(session.last_poll_wall_time_s, view.now_s)
     if silent_s > HEARTBEAT_LATE_S:
         return f"its loop runs, but last called bridge.get_command() {silent_s:.0f} s ago"
     return "its loop is alive but did not come to it in time: ask again with a longer timeout_s"

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import time
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 from webots_mcp.contract import HEARTBEAT_LATE_S, REMOTE_SILENCE_S, host_name
@@ -19,8 +21,10 @@ class Session:
     id: int
     robot_id: int
     pid: int
+    process: str | None
     host: str
     instance: str
+    extern: bool
     controller: str | None
     controller_sha256: str | None
     git_commit: str | None
@@ -29,6 +33,7 @@ class Session:
     actions: dict[str, Any]
     started_wall_time_s: float
     last_seen_wall_time_s: float
+    last_seen_monotonic_s: float | None
     last_poll_wall_time_s: float | None
     moved_wall_time_s: float | None
     sim_time_s: float | None
@@ -44,19 +49,38 @@ class Session:
         if self.ended_wall_time_s is not None:
             return False
         if self.host == host_name():
-            return process_alive(self.pid, self.last_seen_wall_time_s)
+            return self._process_is_alive
         return now_s - self.last_seen_wall_time_s < REMOTE_SILENCE_S
+
+    @cached_property
+    def _process_is_alive(self) -> bool:
+        return process_alive(self.pid, self.process, self.last_seen_wall_time_s)
+
+    def silent_s(self, now_s: float) -> float:
+        """Time since its newest sign of life; of a process here by a clock that nobody sets."""
+        beat_s = self.last_seen_monotonic_s
+        if beat_s is None or self.process is None or not self._is_of_this_boot():
+            return now_s - self.last_seen_wall_time_s
+        return time.monotonic() - beat_s
+
+    def age_s(self, wall_time_s: float, now_s: float) -> float:
+        """How long ago that was, which its bridge stamped for its newest sign of life."""
+        return self.silent_s(now_s) + self.last_seen_wall_time_s - wall_time_s
 
     def heartbeat_is_fresh(self, now_s: float) -> bool:
         """Whether its loop gave a sign of life lately."""
-        return now_s - self.last_seen_wall_time_s <= HEARTBEAT_LATE_S
+        return self.silent_s(now_s) <= HEARTBEAT_LATE_S
+
+    def _is_of_this_boot(self) -> bool:
+        """A clock that counts from the boot tells nothing of the time before it."""
+        return self.host == host_name() and self._process_is_alive
 
 
 _COLUMNS: Final = columns_of(Session)
 _NEWEST: Final = f"SELECT {_COLUMNS} FROM session WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
 _BY_ID: Final = f"SELECT {_COLUMNS} FROM session WHERE id = ?"
 _COMPANIONS: Final = (
-    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND host = :host "
+    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance "
     "AND id <> :id AND ended_wall_time_s IS NULL ORDER BY id"
 )
 
@@ -73,7 +97,7 @@ def fetch_session(connection: sqlite3.Connection, session_id: int) -> Session | 
 
 def companions(connection: sqlite3.Connection, session: Session, now_s: float) -> list[Session]:
     """The other living sessions in the same simulation."""
-    values = {"instance": session.instance, "host": session.host, "id": session.id}
+    values = {"instance": session.instance, "id": session.id}
     rows = connection.execute(_COMPANIONS, values).fetchall()
     return [found for row in rows if (found := _session(row)) and found.is_alive(now_s)]
 
@@ -85,4 +109,5 @@ def _session(row: tuple[Any, ...] | None) -> Session | None:
     values["versions"] = json.loads(values["versions"] or "{}")
     values["actions"] = json.loads(values["actions"] or "{}")
     values["supervisor"] = bool(values["supervisor"])
+    values["extern"] = bool(values["extern"])
     return Session(**values)

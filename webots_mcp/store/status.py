@@ -86,9 +86,9 @@ def judge(
     if fresh and _hold_since_beat(connection, session) == "resume":
         return Status(RUNNING)
     moved_s, still_moving_s = session.moved_wall_time_s, _still_moving_s(connection, run)
-    if moved_s is None and now_s - session.started_wall_time_s <= still_moving_s:
+    if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= still_moving_s:
         return Status(STARTING, _STARTED)
-    if moved_s is not None and now_s - moved_s <= still_moving_s:
+    if moved_s is not None and session.age_s(moved_s, now_s) <= still_moving_s:
         return Status(RUNNING)
     return _stopped(session, now_s, _why_standing(connection, session, now_s))
 
@@ -124,7 +124,7 @@ def stopped_for(seconds: float) -> str:
 
 def _stopped(session: Session, now_s: float, why: str | None) -> Status:
     moved_s = session.moved_wall_time_s or session.started_wall_time_s
-    return Status(stopped_for(now_s - moved_s), why)
+    return Status(stopped_for(session.age_s(moved_s, now_s)), why)
 
 
 def find_holder(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:

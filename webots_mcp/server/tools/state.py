@@ -188,7 +188,7 @@ def _recorder(view: View) -> dict[str, Any] | None:
         "rows_waiting": session.rows_waiting,
         "rows_dropped": session.rows_dropped,
         "last_error": error,
-        "heartbeat_age_s": view.age_s(session.last_seen_wall_time_s),
+        "heartbeat_age_s": round(session.silent_s(view.now_s), 2),
         "polls_commands": session.last_poll_wall_time_s is not None,
         "controller": session.controller,
         "controller_sha256": session.controller_sha256,

@@ -250,3 +250,23 @@ def test_waiting_in_vain_shows_the_console(world: Path, write_controller: WriteC
         simulation.wait_for(lambda: has_line(simulation, "here I am"))
         with pytest.raises(TimeoutError, match="here I am"):
             simulation.wait_for(lambda: False, timeout_s=0.1)
+
+
+def test_real_time_begins_anew_after_a_fast_stretch(
+    world: Path, write_controller: WriteController
+) -> None:
+    write_controller(
+        """
+        robot.simulationSetMode(robot.SIMULATION_MODE_FAST)
+        while robot.getTime() < 40.0:
+            robot.step(16)
+        robot.simulationSetMode(robot.SIMULATION_MODE_REAL_TIME)
+        for _ in range(5):
+            robot.step(16)
+        print("five steps in real time", flush=True)
+        """,
+        LOOP,
+    )
+    with Simulation(world, mode="realtime") as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 39.0, timeout_s=60)
+        simulation.wait_for(lambda: has_line(simulation, "five steps in real time"))

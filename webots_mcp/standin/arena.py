@@ -10,8 +10,8 @@ from typing import Final
 from webots_mcp.standin.camera import SceneColors
 from webots_mcp.standin.frame import Frame, frame_of
 from webots_mcp.standin.shapes import Block, Color, Disc, Shape
-from webots_mcp.standin.vrml import Node
-from webots_mcp.standin.world import World, children_of, descendants_of, own_frame
+from webots_mcp.standin.vrml import Node, children_of, descendants_of
+from webots_mcp.standin.world import World, own_frame
 
 _GEOMETRIES: Final = ("Box", "Capsule", "Cylinder", "Sphere")
 _DEFAULT_COLOR: Final[Color] = (0.5, 0.5, 0.5)
@@ -30,6 +30,15 @@ class Part:
     color: Color
     is_solid: bool
     """Whether it is (part of) a bounding object: something to drive into."""
+
+    def reach_m(self, x: float, y: float) -> float:
+        """The distance of its farthest point from a vertical line."""
+        hx, hy, _ = self.half_m
+        if self.kind == "Box":
+            corners = [self.frame.point((a * hx, b * hy, 0.0)) for a in (-1, 1) for b in (-1, 1)]
+            return max(hypot(corner_x - x, corner_y - y) for corner_x, corner_y, _ in corners)
+        part_x, part_y, _ = self.frame.translation
+        return hypot(part_x - x, part_y - y) + hx
 
     def standing(self, body: Frame) -> Shape:
         """This part as a shape in the world, for a body that stands upright."""
@@ -51,7 +60,7 @@ class Footprint:
 
     @staticmethod
     def around(parts: list[Part]) -> Footprint:
-        """The smallest disc around the rectangle that all parts fill."""
+        """A disc around all parts, in the middle of the rectangle that they fill."""
         at_and_half = [
             (part.frame.translation, _turned_half(part.frame, part.half_m)) for part in parts
         ]
@@ -65,7 +74,8 @@ class Footprint:
             min(at[1] - half[1] for at, half in at_and_half),
             max(at[1] + half[1] for at, half in at_and_half),
         )
-        return Footprint((x0 + x1) / 2.0, (y0 + y1) / 2.0, hypot(x1 - x0, y1 - y0) / 2.0)
+        x, y = (x0 + x1) / 2.0, (y0 + y1) / 2.0
+        return Footprint(x, y, max(part.reach_m(x, y) for part in parts))
 
 
 class Body:

@@ -16,8 +16,8 @@ from webots_mcp.standin.nodes import DEVICE_TYPES
 from webots_mcp.standin.physics import Vehicle
 from webots_mcp.standin.shapes import Shape, nearest_m, targets_from
 from webots_mcp.standin.touch_sensor import TouchSensor
-from webots_mcp.standin.vrml import Node
-from webots_mcp.standin.world import children_of, own_frame
+from webots_mcp.standin.vrml import Node, children_of
+from webots_mcp.standin.world import own_frame
 
 _DISTANCE_SENSOR_TYPES: Final = {"generic": 0, "infra-red": 1, "sonar": 2, "laser": 3}
 

@@ -146,7 +146,7 @@ class InProcessSimulation:
         robots = self._simulator.robots
         if not robots:
             raise WorldError(self._simulator.no_robot())
-        if name is not None and len(robots) == 1:
+        if name is not None and len(robots) == 1 and not self._simulator.left_out_robots(name):
             robots[0].node.fields["name"] = name
         return robots[0] if name is None else self._simulator.robot(name)
 

@@ -7,8 +7,7 @@ from math import cos, isinf, sin
 from typing import Any
 
 from webots_mcp.standin.arena import Arena, Body
-from webots_mcp.standin.vrml import Node
-from webots_mcp.standin.world import descendants_of
+from webots_mcp.standin.vrml import Node, descendants_of
 
 
 @dataclass

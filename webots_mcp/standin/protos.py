@@ -9,12 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from webots_mcp.standin.e_puck import E_PUCK, e_puck
 from webots_mcp.standin.nodes import NODE_TYPES, FieldDefinition, definitions_in
 from webots_mcp.standin.typed_fields import give_types
-from webots_mcp.standin.vrml import Node, Parser
+from webots_mcp.standin.vrml import Node, Parser, descendants_of
 
 _DEFINITIONS: Final = definitions_in(
-    """
+    E_PUCK
+    + """
 Floor {
   SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  SFString name "floor"
   SFString contactMaterial "default"  SFVec2f size 10 10  SFVec2f tileSize 0.5 0.5
@@ -60,11 +62,20 @@ def _rectangle_arena(fields: Mapping[str, Any]) -> str:
     east, north, z = (x + thickness) / 2.0, (y + thickness) / 2.0, height / 2.0
     along_x, along_y = f"{x + 2.0 * thickness} {thickness}", f"{thickness} {y}"
     walls = ((east, 0.0, along_y), (-east, 0.0, along_y), (0.0, north, along_x))
+    looks = f'{_look(fields["wallAppearance"])} name "wall"'
     boxes = " ".join(
-        f'SolidBox {{ translation {at_x} {at_y} {z} size {size} {height} name "wall" }}'
+        f"SolidBox {{ translation {at_x} {at_y} {z} size {size} {height} {looks} }}"
         for at_x, at_y, size in (*walls, (0.0, -north, along_x))
     )
-    return f"Solid {{ children [ Floor {{ size {x} {y} }} {boxes} ] }}"
+    floor = f"Floor {{ size {x} {y} {_look(fields['floorAppearance'])} }}"
+    return f"Solid {{ children [ {floor} {boxes} ] }}"
+
+
+def _look(appearance: Node | None) -> str:
+    """An appearance of the same color, if it says which."""
+    color: list[float] | None = appearance.fields.get("baseColor") if appearance else None
+    numbers = " ".join(map(str, color or ()))
+    return f"appearance PBRAppearance {{ baseColor {numbers} }}" if numbers else ""
 
 
 def _box(fields: Mapping[str, Any], color: str, middle_z_m: float = 0.0) -> str:
@@ -84,6 +95,7 @@ PROTOS: Final[dict[str, Callable[[Mapping[str, Any]], str]]] = {
     "SolidBox": lambda fields: _box(fields, "0.6 0.6 0.6"),
     "Wall": lambda fields: _box(fields, "0.8 0.8 0.75", middle_z_m=fields["size"][2] / 2.0),
     "WoodenBox": lambda fields: _box(fields, "0.6 0.45 0.3"),
+    "E-puck": e_puck,
     "CardboardBox": lambda fields: _box(fields, "0.7 0.55 0.4"),
 }
 """What a PROTO node is made of, written as in a world file, by its name and from its fields."""
@@ -98,6 +110,11 @@ def build(node: Node) -> None:
     give_types(node, _DEFINITIONS[node.type_name])
     (base,) = Parser(PROTOS[node.type_name](node.fields)).nodes()
     give_types(base, NODE_TYPES[base.type_name])
+    for part in [*descendants_of(base)]:
+        part.line = node.line
+        if part.def_name in node.fields:  # a slot: what the world puts in stands there
+            part.fields["children"], node.fields[part.def_name] = node.fields[part.def_name], []
+        part.def_name = ""  # what is inside a PROTO node cannot be found from outside
     node.fields = {**node.fields, **base.fields, **node.fields}  # its own colors come first
     node.proto_name, node.type_name = node.type_name, base.type_name
 

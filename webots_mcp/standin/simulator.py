@@ -142,8 +142,7 @@ class Simulator:
 
     def no_robot(self, name: str | None = None) -> str:
         """Why there is no robot of this name, or none at all, in words."""
-        left_out = [node for node in self.world.left_out if self._may_be(node, name)]
-        if left_out:
+        if left_out := self.left_out_robots(name):
             node = next((node for node in left_out if _has_controller(node)), left_out[0])
             return (
                 f"{self.world.path.name}, line {node.line}: the stand-in has no {node.type_name} "
@@ -154,11 +153,15 @@ class Simulator:
         asked = "no robot" if name is None else f"no robot {name!r}"
         return f"{asked} in {self.world.path.name}; it has {known or 'none'}"
 
+    def left_out_robots(self, name: str | None = None) -> list[Node]:
+        """What was left out of the world and may be this robot, or any."""
+        return [node for node in self.world.left_out if self._may_be(node, name)]
+
     def _may_be(self, node: Node, name: str | None) -> bool:
         """Whether a node that was left out may be the robot that is asked for."""
         if name is None:
             return _has_controller(node) or self.world.parent_of(node) is self.world.root
-        return node.fields.get("name", name if _has_controller(node) else None) == name
+        return _has_controller(node) and node.fields.get("name", name) == name
 
     def robot_of(self, node: Node) -> Robot:
         """The robot that a Robot node describes."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias, cast
 
 from webots_mcp.standin.errors import WorldError
 
@@ -35,6 +35,23 @@ class Node:
     fields: dict[str, Any] = field(default_factory=lambda: {})
     proto_name: str = ""
     """Of a PROTO node that was built: its own name; its type is that of what it is made of."""
+
+
+def children_of(node: Node) -> Iterator[Node]:
+    """The nodes in the fields of a node, in the order of the file."""
+    for value in node.fields.values():
+        if isinstance(value, Node):
+            yield value
+        elif isinstance(value, list):
+            items = cast("list[Any]", value)
+            yield from (item for item in items if isinstance(item, Node))
+
+
+def descendants_of(node: Node) -> Iterator[Node]:
+    """Everything inside a node, from the top of the file to the bottom."""
+    for child in children_of(node):
+        yield child
+        yield from descendants_of(child)
 
 
 def tokens_of(text: str) -> Iterator[Token]:

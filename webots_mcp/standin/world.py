@@ -11,7 +11,7 @@ from webots_mcp.standin.frame import Frame, frame_of
 from webots_mcp.standin.nodes import DEFAULT_NAME_OF, NODE_TYPES
 from webots_mcp.standin.protos import PROTOS, build
 from webots_mcp.standin.typed_fields import give_types
-from webots_mcp.standin.vrml import Node, parse
+from webots_mcp.standin.vrml import Node, children_of, descendants_of, parse
 
 
 class World:
@@ -157,20 +157,3 @@ def own_frame(node: Node) -> Frame:
     if "rotation" not in node.fields:
         return Frame()
     return frame_of(node.fields["translation"], node.fields["rotation"])
-
-
-def children_of(node: Node) -> Iterator[Node]:
-    """The nodes in the fields of a node, in the order of the file."""
-    for value in node.fields.values():
-        if isinstance(value, Node):
-            yield value
-        elif isinstance(value, list):
-            items = cast("list[Any]", value)
-            yield from (item for item in items if isinstance(item, Node))
-
-
-def descendants_of(node: Node) -> Iterator[Node]:
-    """Everything inside a node, from the top of the file to the bottom."""
-    for child in children_of(node):
-        yield child
-        yield from descendants_of(child)

@@ -73,6 +73,9 @@ def ask(expressions: list[str]) -> list[tuple[str, str]]:
 
 
 if __name__ == "__main__":
+    for name in ("SIGTERM", "SIGHUP", "SIGQUIT"):  # whoever started the tests may ignore them
+        signal.signal(getattr(signal, name), signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     asked = Path(os.environ["ASKED"]).read_text(encoding="utf-8").splitlines()
     answered = json.dumps(ask(asked))
     written = Path(os.environ["ANSWERS"])

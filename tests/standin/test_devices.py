@@ -215,3 +215,42 @@ def test_integers_have_to_be_integers_and_texts_texts(robot: InProcessSupervisor
         robot.exportImage(Path("x.png"), 90)  # type: ignore[arg-type]
     assert robot.step() == 0
     assert robot.getTime() == robot.time == 0.016
+
+
+def test_nobody_types_on_the_keyboard(
+    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    keyboard = robot.getKeyboard()
+    assert keyboard is robot.keyboard
+    assert keyboard.getKey() == -1
+    assert "disabled" in capfd.readouterr().err
+    keyboard.enable(STEP_MS)
+    assert keyboard.getKey() == -1 != keyboard.UP
+    assert capfd.readouterr().err == ""
+
+
+def test_the_points_of_a_lidar_have_layers_and_places(
+    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    lidar: Lidar = enabled(robot, "lidar")
+    steps(robot, 1)
+    assert lidar.getPointCloud() == []
+    assert lidar.getNumberOfPoints() == 0
+    assert "wb_lidar_enable_point_cloud" in capfd.readouterr().err
+    lidar.enablePointCloud()
+    points = lidar.getPointCloud()
+    assert lidar.number_of_points == len(points) == 180
+    middle = points[45]  # straight to the left, where the wall in the north is 2 m away
+    assert (middle.x, middle.y, middle.z) == pytest.approx((0.0, 2.0, 0.0), abs=0.02)
+    assert (middle.layer, middle.time) == (0, pytest.approx(0.016))
+    assert not isinstance(middle, tuple)
+
+
+def test_a_camera_without_zoom_keeps_its_field_of_view(
+    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    camera: Camera = enabled(robot, "camera")
+    fov = camera.getFov()
+    camera.setFov(fov / 2.0)
+    assert camera.fov == camera.min_fov == camera.max_fov == fov
+    assert "out of zoom range" in capfd.readouterr().err

@@ -1,12 +1,13 @@
 """A stand-in for Webots: a small, deterministic simulator for tests and first steps.
 
 It is not Webots and does not try to be: a flat arena with upright boxes, cylinders and balls,
-robots on two driven wheels, seven kinds of devices. What it does reproduce is how Webots treats
+robots on driven wheels, thirteen kinds of devices. What it does reproduce is how Webots treats
 controllers: processes, blocking, pause, reset, reload, and what each call returns or refuses.
 
 Simpler than in Webots: robots are discs where they touch something; what has Physics is pushed
-along without turning or rolling on; rays are level; there is no noise, no gravity and no torque;
-worlds are made of base nodes, without PROTOs.
+along without turning or rolling on; rays are level; there is no noise, no torque, nothing falls.
+Nodes of a world that are not known here are left out with a warning, functions of the package that
+are not there fail with a sentence; docs/standin.md lists what there is.
 
 Controllers run unchanged: `from controller import Robot` finds the stand-in's `controller` package
 in their processes. Importing this package makes it importable here as well.

@@ -8,6 +8,7 @@ from typing import Any
 
 from .camera import Camera
 from .field import Field
+from .keyboard import Keyboard
 from .lacking import CLASSES
 from .led import LED
 from .lidar import Lidar
@@ -38,6 +39,7 @@ __all__ = [  # noqa: PLE0604, RUF100 - as in Webots, where it makes `import *` f
     Field,
     Gyro,
     InertialUnit,
+    Keyboard,
     Lidar,
     LidarPoint,
     LightSensor,

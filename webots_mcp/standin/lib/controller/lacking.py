@@ -62,7 +62,7 @@ CLASSES: Final = {
     name: _LackingClass(name, (), {"__doc__": "In Webots, but not in the stand-in."})
     for name in (
         *("Altimeter", "AnsiCodes", "Brake", "CameraRecognitionObject", "Connector"),
-        *("ContactPoint", "Display", "Emitter", "Joystick", "Keyboard", "Motion", "Mouse"),
+        *("ContactPoint", "Display", "Emitter", "Joystick", "Motion", "Mouse"),
         *("MouseState", "Proto", "Radar", "RadarTarget", "RangeFinder", "Receiver"),
         *("Skin", "Speaker", "VacuumGripper"),
     )

@@ -15,6 +15,7 @@ from .arguments import integer, text
 from .camera import Camera
 from .console import say
 from .device import Device
+from .keyboard import Keyboard
 from .lacking import lacking, lacks
 from .led import LED
 from .lidar import Lidar
@@ -59,8 +60,8 @@ def _deprecated(getter: str) -> Callable[[Robot, str], Any]:
     "EVENT_MOUSE_CLICK EVENT_MOUSE_MOVE EVENT_NO_EVENT EVENT_QUIT "
     "batterySensorDisable batterySensorEnable batterySensorGetSamplingPeriod "
     "batterySensorGetValue battery_sensor_sampling_period getAltimeter getBrake getConnector "
-    "getDisplay getEmitter getJoystick getKeyboard getMouse getPen getRadar getRangeFinder "
-    "getReceiver getSkin getSpeaker getUrdf joystick keyboard mouse setMode "
+    "getDisplay getEmitter getJoystick getMouse getPen getRadar getRangeFinder "
+    "getReceiver getSkin getSpeaker getUrdf joystick mouse setMode "
     "waitForUserInputEvent wwiReceiveText wwiSendText"
 )
 class Robot:
@@ -83,6 +84,7 @@ class Robot:
         self._session = library.current = Session(link)
         described = self._session.robot["devices"]
         self._by_tag = {d["tag"]: _DEVICE_CLASSES[d["kind"]](d["tag"]) for d in described}
+        self.keyboard = Keyboard()
         self.devices = {device.name: device for device in self._by_tag.values()}
 
     def _connect(self) -> Link | None:
@@ -171,6 +173,10 @@ class Robot:
     getMotor = _deprecated("getMotor")
     getPositionSensor = _deprecated("getPositionSensor")
     getTouchSensor = _deprecated("getTouchSensor")
+
+    def getKeyboard(self) -> Keyboard:
+        """The keyboard, on which nobody types."""
+        return self.keyboard
 
     def getNumberOfDevices(self) -> int:
         """How many devices the robot has."""

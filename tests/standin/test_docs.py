@@ -1,0 +1,43 @@
+"""docs/standin.md lists what the stand-in has, and what it lacks."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import controller
+from controller.lacking import CLASSES, lacking
+
+from webots_mcp.standin.nodes import DEVICE_TYPES, NODE_TYPES
+from webots_mcp.standin.protos import PROTOS
+
+PAGE = (Path(__file__).parents[2] / "docs" / "standin.md").read_text(encoding="utf-8")
+HAD = {had.__name__ for had in controller.__all__}
+
+
+def names_between(start: str, end: str) -> set[str]:
+    return set(re.findall(r"`([^`]+)`", PAGE.partition(start)[2].partition(end)[0]))
+
+
+def test_it_lists_every_node() -> None:
+    assert names_between("### Nodes\n", "\n### ") == set(NODE_TYPES) - set(DEVICE_TYPES)
+    assert names_between("### PROTO nodes\n", "\n### ") == set(PROTOS)
+
+
+def test_it_lists_every_device() -> None:
+    assert set(re.findall(r"^\| `(\w+)` \|", PAGE, re.M)) == set(DEVICE_TYPES)
+
+
+def test_it_lists_every_class_and_what_each_lacks() -> None:
+    assert names_between("but for the names listed:\n", "\n- ") == HAD
+    assert names_between("and fail when used:\n", "\nThe package") == set(CLASSES)
+    listed = dict(re.findall(r"^- `(\w+)`: ((?:`\w+`,?\s+)+)", PAGE, re.M))
+    for name in HAD:
+        own: dict[str, Any] = dict(vars(getattr(controller, name)))
+        marks = {member for member, value in own.items() if type(value).__name__ == "_Lacking"}
+        assert set(re.findall(r"`(\w+)`", listed.get(name, ""))) == marks, name
+
+
+def test_it_shows_the_sentence_as_it_is() -> None:
+    assert str(lacking("Node.addForce")) in PAGE

@@ -122,6 +122,15 @@ def test_a_supervisor_sees_a_proto_node_with_its_own_fields() -> None:
     size = wall.getField("size")
     assert size is not None and size.getSFVec3f() == [0.2, 6.0, 2.4]
     assert wall.getField("boundingObject") is None
+    place, table = wall.getField("translation"), robot.getFromDef("TABLE")
+    assert place is not None and table is not None
+    place.setSFVec3f([1.0, 0.0, 0.0])
+    robot.step()
+    assert wall.getPosition() == [1.0, 0.0, 0.0]
+    assert not any("Wall" in line for line in robot.simulation.console)
+    size.setSFVec3f([9.0, 9.0, 9.0])
+    robot.step()
+    assert "WARNING: Wall.size was set" in robot.simulation.console[-1]
 
 
 def test_another_robot_of_a_world_is_an_error_only_where_it_is_asked_for(tmp_path: Path) -> None:

@@ -244,3 +244,21 @@ def test_without_rights_every_call_complains_and_gives_a_default(
     robot.simulationSetMode(robot.SIMULATION_MODE_PAUSE)
     assert robot.simulationGetMode() == robot.SIMULATION_MODE_FAST
     assert robot.step(STEP_MS) == 0
+
+
+def test_a_joint_can_be_turned_at_once(
+    robot: InProcessSupervisor, capfd: pytest.CaptureFixture[str]
+) -> None:
+    wheel, sensor = robot.getFromDef("ROVER.LEFT_WHEEL"), robot.getDevice("left wheel sensor")
+    joint = wheel.getParentNode() if wheel else None
+    assert joint is not None and joint.getType() == Node.HINGE_JOINT
+    sensor.enable(STEP_MS)
+    for motor in ("left wheel motor", "right wheel motor"):
+        robot.getDevice(motor).setPosition(inf)
+        robot.getDevice(motor).setVelocity(0.0)
+    joint.setJointPosition(1.5)
+    robot.step(STEP_MS)
+    assert sensor.getValue() == 1.5
+    assert robot.getSelf().getPosition()[0] == -1.2  # the wheel was turned, not rolled
+    joint.setJointPosition(1.0, 2)
+    assert "no axis 2" in capfd.readouterr().err

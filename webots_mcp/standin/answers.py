@@ -16,6 +16,8 @@ from webots_mcp.standin.vrml import Node
 CUSTOM_DATA_TAG: Final = 0
 """Stands for the robot itself where devices have their tags."""
 
+_FOLLOWED_OF_PROTOS: Final = ("translation", "rotation", "name", "customData")
+
 FieldReference = tuple[int, str]
 """Node id and field name."""
 FieldSet = tuple[FieldReference, int | None, Any]
@@ -166,6 +168,11 @@ class SupervisorRequests:
     def _follow(self, node: Node, name: str, value: Any) -> None:
         if node.type_name == "Robot" and name == "customData":
             self._simulator.robot_of(node).fresh[CUSTOM_DATA_TAG] = value
+        elif node.proto_name and name not in _FOLLOWED_OF_PROTOS:
+            self._simulator.log(
+                f"WARNING: {node.proto_name}.{name} was set, which changes nothing: "
+                "the stand-in builds PROTO nodes once"
+            )
         elif body := self._body_around(node):
             self._simulator.stand_anew(body)
 
@@ -203,6 +210,14 @@ class SupervisorRequests:
         for robot in self._simulator.robots:
             if robot.node is self._world.nodes[node_id]:
                 robot.vehicle.stop()
+
+    def on_node_set_joint_position(self, node_id: int, position_rad: float) -> None:
+        """Turn a hinge to an angle at once; its motor goes on with what it was told."""
+        node = self._world.nodes[node_id]
+        for robot in self._simulator.robots:
+            for joint in robot.vehicle.joints:
+                if joint.node is node:
+                    joint.position_rad = position_rad
 
     def on_node_restart_controller(self, node_id: int) -> None:
         """End a robot's controller and start it again."""

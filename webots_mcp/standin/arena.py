@@ -103,6 +103,8 @@ class Body:
         self.parts = [*_parts_of(self.node, tilt, _color_of(self.node))]
         self.footprint = Footprint.around(self.parts)
         self._shapes: tuple[Shape, ...] | None = None
+        self._solid_of: tuple[Shape, ...] | None = None
+        self._solid_shapes: tuple[Shape, ...] = ()
 
     def stop(self) -> None:
         """Take its speed away."""
@@ -137,10 +139,14 @@ class Body:
         return self._shapes
 
     @property
-    def solid_shapes(self) -> list[Shape]:
+    def solid_shapes(self) -> tuple[Shape, ...]:
         """The parts that one can drive into, where they stand now."""
-        pairs = zip(self.parts, self.shapes, strict=True)
-        return [shape for part, shape in pairs if part.is_solid]
+        shapes = self.shapes
+        if self._solid_of is not shapes:
+            pairs = zip(self.parts, shapes, strict=True)
+            self._solid_of = shapes
+            self._solid_shapes = tuple(shape for part, shape in pairs if part.is_solid)
+        return self._solid_shapes
 
     def centre(self) -> tuple[float, float]:
         """Where the centre of the footprint is in the world."""
@@ -227,11 +233,11 @@ class Arena:
         return touched
 
 
-def _solid_shapes(body: Body) -> list[Shape]:
+def _solid_shapes(body: Body) -> tuple[Shape, ...]:
     if body.node.type_name != "Robot":
         return body.solid_shapes
     x, y = body.centre()  # two robots meet as discs
-    return [Disc(x, y, body.footprint.radius_m, 0.0, 1.0, _DEFAULT_COLOR)]
+    return (Disc(x, y, body.footprint.radius_m, 0.0, 1.0, _DEFAULT_COLOR),)
 
 
 def _scene_colors(world: World) -> SceneColors:

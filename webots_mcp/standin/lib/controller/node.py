@@ -7,7 +7,8 @@ from __future__ import annotations
 from math import nan
 from typing import TYPE_CHECKING, Any
 
-from .arguments import integer, numbers, text
+from .arguments import integer, number, numbers, text
+from .console import say
 from .field import Field, field_of
 from .lacking import lacking, lacks
 from .node_types import CONSTANTS, NUMBER_OF
@@ -25,11 +26,11 @@ else:
 
 
 @lacks(
-    "addForce addForceWithOffset addTorque disableContactPointsTracking disablePoseTracking "
-    "enableContactPointsTracking enablePoseTracking exportString getBaseNodeField "
+    "addForce addForceWithOffset addTorque disableContactPointsTracking "
+    "enableContactPointsTracking exportString getBaseNodeField "
     "getBaseNodeFieldByIndex getCenterOfMass getContactPoints getFromProtoDef "
     "getNumberOfBaseNodeFields getProto getProtoField getProtoFieldByIndex getStaticBalance "
-    "loadState moveViewpoint number_of_base_node_fields remove saveState setJointPosition "
+    "loadState moveViewpoint number_of_base_node_fields remove saveState "
     "setVisibility"
 )
 class Node(metaclass=_NodeTypes):
@@ -161,6 +162,20 @@ class Node(metaclass=_NodeTypes):
     def setVelocity(self, velocity: list[float]) -> None:
         """Set linear and angular velocity; on the plane, so x, y and the turn about z count."""
         self._session.ask("node_set_velocity", self._id, numbers(velocity, 6))
+
+    def enablePoseTracking(self, samplingPeriod: int, fromNode: Node | None = None) -> None:
+        """Nothing changes: here a pose is asked for at once, tracked or not."""
+        integer(samplingPeriod, position=2)
+
+    def disablePoseTracking(self, fromNode: Node | None = None) -> None:
+        """Nothing changes: here a pose is asked for at once, tracked or not."""
+
+    def setJointPosition(self, position: float, index: int = 1) -> None:
+        """Turn a HingeJoint to an angle in radians at once."""
+        if integer(index, position=3) == 1:
+            self._session.ask("node_set_joint_position", self._id, number(position))
+        else:
+            say(f"Error: wb_supervisor_node_set_joint_position(): a hinge has no axis {index}.")
 
     def restartController(self) -> None:
         """End the controller of this Robot node and start it again."""

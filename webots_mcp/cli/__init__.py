@@ -2,7 +2,7 @@
 
 A command is one function under `@command`; what it needs is imported inside it, so that
 `webots-mcp --help` answers at once. Our own errors end it with one line on stderr and exit code 2,
-what the system refuses (a full disk) with one line and 1, Ctrl-C and SIGTERM with one and 130, 143.
+what the system refuses (a full disk) or lacks (a package) with 1, Ctrl-C and SIGTERM with 130, 143.
 """
 
 from __future__ import annotations
@@ -41,6 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
     except WebotsMCPError as error:
         return _end(EXIT_BAD_INPUT, str(error))
+    except ModuleNotFoundError as error:
+        return _end(EXIT_SYSTEM, _explain_missing(error))
     except KeyboardInterrupt as interrupt:
         return _end(*ended_by(interrupt))
     except BrokenPipeError:  # the reader of a pipe has seen enough
@@ -59,6 +61,15 @@ def _end(code: int, text: str) -> int:
     except OSError:
         _discard_output()
     return code
+
+
+def _explain_missing(error: ModuleNotFoundError) -> str:
+    """Raises the error again where it is a defect of ours."""
+    if (error.name or "").partition(".")[0] == "webots_mcp":
+        raise error
+    from webots_mcp.cli.missing import explain_missing
+
+    return explain_missing(error)
 
 
 def _discard_output() -> None:

@@ -1,0 +1,107 @@
+"""Installed by `pip install --no-deps`, as for a controller's Python: what works, what is said."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import webots_mcp
+from tests.store.recorded import Recorded
+
+# -I -S: nothing that is installed for this Python is found.
+PROGRAM = """
+import json, sys
+sys.path.insert(0, sys.argv[1])
+from webots_mcp.cli import main
+for arguments in json.loads(sys.argv[2]):
+    print(arguments[0], main(arguments))
+"""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The package and its metadata, without what it depends on."""
+    folder = tmp_path_factory.mktemp("site")
+    package = Path(webots_mcp.__file__).parent
+    without_bytecode = shutil.ignore_patterns("__pycache__")
+    shutil.copytree(package, folder / package.name, ignore=without_bytecode)
+    told = metadata.distribution("webots-mcp").read_text("METADATA")
+    assert told is not None
+    (folder / "webots_mcp-0.dist-info").mkdir()
+    (folder / "webots_mcp-0.dist-info" / "METADATA").write_text(told, "utf-8")
+    return folder
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Path:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot(now=1_700_000_000.0)
+    robot.state(0.5, {"x": 1})
+    robot.end_run("finished")
+    robot.begin_run("reset")
+    robot.state(0.5, {"x": 2})
+    recorded.close()
+    return tmp_path / "webots.db"
+
+
+def run(site: Path, commands: list[list[str]]) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-I", "-S", "-c", PROGRAM, str(site), json.dumps(commands)]
+    return subprocess.run(
+        line, capture_output=True, text=True, stdin=subprocess.DEVNULL, check=False, cwd=site
+    )
+
+
+def test_most_commands_work_without_a_package(site: Path, database: Path) -> None:
+    commands = [
+        ["status"], ["tail", "--no-follow"], ["runs"], ["history", "x"], ["trends"], ["events"],
+        ["compare", "1", "2"], ["export"], ["prune"], ["keep", "1"],
+    ]  # fmt: skip
+    lines = [[name, *rest, "--database", str(database)] for name, *rest in commands]
+    ended = run(site, lines)
+    assert [f"{name} 0\n" in ended.stdout for name, *_ in commands] == [True] * 10, ended.stderr
+
+
+@pytest.mark.parametrize("command", ["serve", "migrate", "plot", "demo"])
+def test_the_others_name_what_is_missing_and_the_line_that_installs_it(
+    site: Path, database: Path, command: str
+) -> None:
+    more: dict[str, Any] = {"plot": ["x", "-o", "x.png"], "demo": ["--data-dir", "demo"]}
+    where = [] if command == "demo" else ["--database", str(database)]
+    ended = run(site, [[command, *where, *more.get(command, [])]])
+    assert ended.stdout == f"{command} 1\n"
+    assert "Traceback" not in ended.stderr
+    (line,) = re.findall(r"-m pip install (.*)", ended.stderr)
+    wanted = [text for text in metadata.requires("webots-mcp") or () if "extra ==" not in text]
+    assert line == " ".join(f"'{requirement}'" for requirement in wanted)
+    assert "missing: alembic, anyio, matplotlib, mcp, " in ended.stderr
+    assert "orjson" not in ended.stderr
+
+
+def test_only_what_is_missing_is_named(site: Path, database: Path) -> None:
+    others = sorted({re.match(r"[\w-]+", r)[0] for r in metadata.requires("webots-mcp") or ()})  # type: ignore[index]
+    there = [name for name in others if name not in ("mcp", "matplotlib")]
+    made = [site / f"{name.replace('-', '_')}-1.dist-info" for name in there]
+    for folder in made:
+        folder.mkdir()
+        (folder / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {folder.name[:-12]}\n")
+    try:
+        ended = run(site, [["plot", "x", "-o", "x.png", "--database", str(database)]])
+    finally:
+        for folder in made:
+            shutil.rmtree(folder)
+    assert "they are missing: matplotlib, mcp. Install" in ended.stderr
+
+
+def test_without_being_installed_at_all_it_says_how_to(site: Path, tmp_path: Path) -> None:
+    shutil.copytree(site / "webots_mcp", tmp_path / "site" / "webots_mcp")
+    ended = run(tmp_path / "site", [["serve", "--data-dir", "x"]])
+    assert "'anyio' is missing" in ended.stderr
+    assert "pip install ." in ended.stderr

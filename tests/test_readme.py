@@ -43,3 +43,15 @@ def test_it_names_every_method_of_the_bridge() -> None:
 def test_the_files_it_links_to_exist() -> None:
     for target in re.findall(r"\]\(((?!http)[^)#]+)\)", README):
         assert any((folder / target).exists() for folder in (CHECKOUT, INSTALLED)), target
+
+
+def test_it_installs_from_what_exists() -> None:
+    lines = re.findall(r"(?:pip|uv tool) install ([^#`\n]*)|uvx --from (\S+)", README)
+    sources = [(installed or run).split()[-1] for installed, run in lines]
+    assert sources.count(".") >= 4
+    others = set(sources) - {".", "/path/to/checkout"}
+    assert others <= {"pyarrow"}, "not from a checkout, and no dependency"
+    published = re.findall(r"[^.]*\bpackage index\b[^.]*\.[^.]*\.", README)
+    assert len(published) == 1
+    assert "not on the package index yet" in published[0]
+    assert "Once it is published" in published[0]

@@ -55,7 +55,7 @@ def require_current(connection: sqlite3.Connection) -> None:
     if version > SCHEMA_VERSION:
         raise SchemaTooNewError(
             f"the database has schema {version}, this webots-mcp knows {SCHEMA_VERSION}: "
-            "upgrade it with 'pip install --upgrade webots-mcp'"
+            "upgrade it with 'pip install --upgrade', from where it was installed"
         )
     if version < SCHEMA_VERSION:
         raise SchemaTooOldError(

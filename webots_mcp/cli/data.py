@@ -35,7 +35,7 @@ def export(arguments: argparse.Namespace) -> None:
 
     The newest run is written, or a range; --since 0 writes all runs of a robot. Columns are run,
     row, times, and the dotted names of what the controller published; NaN and infinity are kept.
-    Parquet needs pyarrow: pip install 'webots-mcp[parquet]'.
+    Parquet needs pyarrow: pip install pyarrow.
     """
     from webots_mcp.store.export import export as write
     from webots_mcp.store.export import export_file, format_of

@@ -43,7 +43,7 @@ def _pyarrow() -> tuple[Any, Any]:
         return import_module("pyarrow"), import_module("pyarrow.parquet")
     except ImportError as error:
         raise InvalidInputError(
-            "Parquet needs pyarrow: pip install 'webots-mcp[parquet]', or export as csv or jsonl"
+            "Parquet needs pyarrow: pip install pyarrow, or export as csv or jsonl"
         ) from error
 
 

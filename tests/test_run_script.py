@@ -1,0 +1,61 @@
+"""`./run`, the way in from a checkout: what is chosen for it is used, or named."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).parent.parent
+pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="a shell script")
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    """A folder with the script, where nothing is set up."""
+    shutil.copy(CHECKOUT / "run", tmp_path)
+    return tmp_path
+
+
+def refused(checkout: Path, python: str) -> str:
+    """What it says to a Python that it cannot use; nothing was installed or made."""
+    line, environment = [checkout / "run", "shell"], {**os.environ, "PYTHON": python}
+    ended = subprocess.run(line, env=environment, capture_output=True, text=True, check=False)
+    assert ended.returncode == 1
+    assert ended.stdout == ""
+    assert ended.stderr.startswith(f"run: PYTHON={python}"), ended.stderr
+    assert ended.stderr.count("\n") == 1
+    return ended.stderr
+
+
+def write_python(file: Path, version: str) -> str:
+    """A program that says that it is that Python."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    too_old = int(version < "3.10")
+    file.write_text(f"#!/bin/sh\ncase $2 in *ensurepip*) exit {too_old};; esac\necho {version}\n")
+    file.chmod(0o755)
+    return str(file)
+
+
+def test_a_python_that_is_not_there_is_named(checkout: Path) -> None:
+    assert "no such program" in refused(checkout, "/typo")
+    assert list(checkout.iterdir()) == [checkout / "run"]
+
+
+def test_a_python_that_is_too_old_is_named(checkout: Path, tmp_path: Path) -> None:
+    old = write_python(tmp_path / "with space" / "python", "3.09")
+    assert "no Python 3.10 or newer" in refused(checkout, old)
+
+
+def test_a_python_that_did_not_make_the_environment_is_named(
+    checkout: Path, tmp_path: Path
+) -> None:
+    write_python(checkout / ".venv" / "bin" / "python", "3.11")
+    other = write_python(tmp_path / "python", "3.12")
+    said = refused(checkout, other)
+    assert "Python 3.12" in said
+    assert ".venv was made by 3.11" in said

@@ -47,7 +47,8 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "started_wall_time_s, started_sim_time_s, last_wall_time_s, last_sim_time_s) "
         "SELECT :uuid, id, robot_id, :world, :step_ms, :reason, :wall_time, :sim_time, "
         ":wall_time, :sim_time FROM session WHERE id = :session "
-        "ON CONFLICT (uuid) DO NOTHING"
+        # A conflict, instead of this question, would use up an id.
+        "AND NOT EXISTS (SELECT 1 FROM run WHERE uuid = :uuid)"
     ),
     "state": (
         "INSERT INTO state (run_id, sim_time_s, wall_time_s, data, odd) VALUES (?, ?, ?, ?, ?)"

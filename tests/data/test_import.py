@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sqlite3
+import sys
 from collections.abc import Iterator
 from contextlib import closing
 from datetime import datetime
@@ -239,10 +240,26 @@ BAD = [
     ("status.json", '{"timestamp": "yesterday"}', "timestamp 'yesterday' is no ISO 8601 time"),
     ("logs/controller.log", "no time\n", r"controller\.log, line 1: expected '\[HH:MM:SS\]"),
     ("logs/controller.log", "\n[12:00:00] a\n[12:61:00] b\n", r"line 3: \[12:61:00\] is no time"),
-    ("camera/frame_0000.png", b"\x89PNG\r\n\x1a\n but then not", r"frame_0000\.png is no complete"),
-    ("camera/frame_0000.png", b"", r"frame_0000\.png is no complete PNG"),
+    ("camera/frame_0000.png", b"\x89PNG\r\n\x1a\n but then not", r"frame_0000\.png is no usable"),
+    ("camera/frame_0000.png", b"", r"frame_0000\.png is no usable PNG"),
     ("commands.json", '[{"action": "a"}, 3]', r"commands\.json: a command is an object"),
     ("commands.json", "{", r"commands\.json, line 1, column 2"),
+    ("status.json", '{"x": ' + "9" * 100_000 + "}", r"status\.json: no JSON: Exceeds the limit"),
+    ("status.json", '{"x": ' + "[" * 900 + "]" * 900 + "}", "nested over 100 levels, at 'x'"),
+    ("status.json", '{"x": ' + "[" * 90_000, r"status\.json: no JSON"),
+    ("status.json", '{"x": "' + "y" * 16_000_000 + '"}', "16,000,000 is the limit"),
+    ("status.json", '{"timestamp": "' + "9" * 9000 + '"}', r"timestamp '9{50,99} is no ISO"),
+    ("commands.json", '{"action": {"a": ' + "[" * 900 + "]" * 900 + "}}", "nested over 100"),
+    (
+        "logs/controller.log",
+        b"[12:00:00] " + b"y" * 1_000_000,
+        "line 1: it has over 1,000,000 bytes",
+    ),
+    (
+        "logs/controller.log",
+        b"[00:00:01]\n[00:00:00]\n" * 800_000,
+        "its clock goes back 800,000 times",
+    ),
 ]
 
 
@@ -263,12 +280,69 @@ def test_a_bad_file_is_named_and_nothing_is_imported(
     assert not list(data_dir.rglob("*.png"))
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes and devices of POSIX")
+@pytest.mark.parametrize(
+    "name", ["status.json", "commands.json", "logs/controller.log", "camera/frame_0000.png"]
+)
+@pytest.mark.parametrize("kind", ["pipe", "device", "folder"])
+def test_what_may_never_end_is_not_read(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path, name: str, kind: str
+) -> None:
+    peer.everything()
+    file = peer.folder / name
+    file.unlink()
+    if kind == "pipe":
+        os.mkfifo(file)
+    elif kind == "device":
+        file.symlink_to("/dev/zero")
+    else:
+        file.mkdir()
+    with pytest.raises(InvalidInputError, match=f"{file.name} is no regular file"):
+        import_folder(database, peer.folder, data_dir)
+    assert set(counts(database).values()) == {0}
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links of POSIX")
+def test_a_folder_that_is_a_loop_of_links_is_refused(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    peer.folder.symlink_to(peer.folder)
+    with pytest.raises(InvalidInputError, match=r"nothing to import|cannot be read"):
+        import_folder(database, peer.folder, data_dir)
+
+
+def test_what_no_float_and_no_utf8_can_hold_is_replaced_and_named(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    huge = "9" * 400
+    peer.write("status.json", f'{{"a": [{huge}, 1e999, NaN], "t": "x\\ud800", "\\udfff": 1}}')
+    at = "2026-05-04T11:59:59"
+    peer.write("commands.json", f'{{"action": "gr\\ud800asp", "timestamp": "{at}", "x": {huge}}}')
+    import_folder(database, peer.folder, data_dir)
+    ((data, odd),) = rows(database, "SELECT data, odd FROM state")
+    assert json.loads(data) == {"a": [None, None, None], "t": "x?", "?": 1}
+    assert json.loads(odd) == {
+        "a.0": "int", "a.1": "inf", "a.2": "nan", "t": "surrogate", "?": "surrogate",
+    }  # fmt: skip
+    assert rows(database, "SELECT action, params FROM command") == [("gr?asp", '{"x":null}')]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names that are no text exist on Linux only")
+def test_a_picture_whose_name_is_no_text_is_refused(
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
+) -> None:
+    picture = peer.picture("camera/frame.png")
+    picture.rename(os.fsdecode(os.fsencode(picture.with_name("frame")) + b"\xff.png"))
+    with pytest.raises(InvalidInputError, match="is no text: rename the file"):
+        import_folder(database, peer.folder, data_dir)
+
+
 def test_a_picture_that_was_cut_off_is_refused(
     peer: Peer, database: sqlite3.Connection, data_dir: Path
 ) -> None:
     file = peer.picture("camera/frame_0000.png")
     file.write_bytes(file.read_bytes()[:-20])
-    with pytest.raises(InvalidInputError, match="no complete PNG"):
+    with pytest.raises(InvalidInputError, match="no usable PNG"):
         import_folder(database, peer.folder, data_dir)
 
 
@@ -309,7 +383,7 @@ def test_a_robots_own_recording_is_not_mixed_with_an_import(
         import_folder(database, peer.folder, data_dir, "rover")
 
 
-@pytest.mark.parametrize("name", ["", "  "])
+@pytest.mark.parametrize("name", ["", "  ", "rover\udcff"])
 def test_a_robot_needs_a_name(
     peer: Peer, database: sqlite3.Connection, data_dir: Path, name: str
 ) -> None:

@@ -172,14 +172,14 @@ async def test_a_robot_whose_simulation_another_one_holds_refuses_at_once(
     assert "robot 'referee' holds their simulation; resume or step it there first" in text
 
 
-async def test_a_failed_action_is_answered_with_its_docstring(
+async def test_a_failed_action_is_answered_with_where_its_docstring_stands_and_not_with_its_words(
     connect: Connect, controller: Callable[..., RecordedRobot]
 ) -> None:
     actions = json.dumps({"go": "Drive on: `speed` in rad/s."})
     controller(("failed", None, "KeyError: 'speed'"), actions=actions)
     async with connect() as client:
         answer = json.loads(await fail(client, "webots_send_command", action="go"))
-    assert answer["hint"] == "go: Drive on: `speed` in rad/s."
+    assert answer["hint"] == "webots_list_commands has the action's description"
 
 
 async def test_what_was_replaced_in_a_result_is_a_hint_and_no_error(

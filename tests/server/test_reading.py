@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import sqlite3
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -297,17 +299,69 @@ async def test_a_big_picture_is_scaled_and_the_original_named(
     ("path", "said"),
     [
         ("gone.png", "the file is gone"),
-        ("text.png", "cannot be shown"),
+        ("", "is no regular file"),
+        ("text.png", "is no usable PNG or JPEG"),
         ("../../etc/passwd", "outside the data folder"),
+        ("/etc/passwd", "outside the data folder"),
+        ("a\0.png", "is no usable path"),
+        ("x" * 256, "is no usable path"),
+        ("x/" * 3000, "is no usable path"),
+        ("text.png/eye.png", "is no usable path"),
+        ("sparse.png", "it has 2,000,000,000 bytes, 64,000,000 is the limit"),
+        ("wide.png", "it has 64,000,000 pixels, 50,000,000 is the limit"),
+        ("cut.png", "is no usable PNG or JPEG"),
+        ("frame.gif", "is no usable PNG or JPEG"),
     ],
 )
 async def test_a_picture_that_cannot_be_shown_says_why(
     connect: Connect, recorded: Recorded, file: Path, path: str, said: str
 ) -> None:
-    (file.parent / "text.png").write_text("no picture")
+    write_bad_pictures(file.parent)
     recorded.robot().image(1.0, path)
     async with connect() as client:
         assert said in text_of(await client.call_tool("webots_get_camera", {}))
+
+
+def write_bad_pictures(folder: Path) -> None:
+    (folder / "text.png").write_text("no picture")
+    Image.new("1", (8000, 8000)).save(folder / "wide.png")
+    Image.new("RGB", (40, 30)).save(folder / "frame.gif")
+    Image.effect_noise((400, 300), 50).save(folder / "whole.png")
+    (folder / "cut.png").write_bytes((folder / "whole.png").read_bytes()[:5000])
+    (folder / "sparse.png").write_bytes((folder / "whole.png").read_bytes())
+    os.truncate(folder / "sparse.png", 2_000_000_000)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links and pipes of POSIX")
+async def test_a_link_or_a_pipe_in_the_place_of_a_picture_is_not_opened(
+    connect: Connect, recorded: Recorded, file: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    elsewhere = tmp_path_factory.mktemp("elsewhere") / "secret.png"
+    Image.new("RGB", (40, 30)).save(elsewhere)
+    (file.parent / "out.png").symlink_to(elsewhere)
+    (file.parent / "loop.png").symlink_to("loop.png")
+    os.mkfifo(file.parent / "pipe.png")
+    robot = recorded.robot()
+    async with connect() as client:
+        for path, said in (
+            ("out.png", "outside the data folder"),
+            ("loop.png", "is no usable path"),
+            ("pipe.png", "is no regular file"),
+        ):
+            robot.image(1.0, path)
+            assert said in await fail(client, "webots_get_camera"), path
+
+
+async def test_a_small_picture_in_a_long_file_is_encoded_anew(
+    connect: Connect, recorded: Recorded, file: Path
+) -> None:
+    Image.new("RGB", (40, 30)).save(file.parent / "long.png")
+    with (file.parent / "long.png").open("ab") as end:
+        end.write(bytes(10_000_000))
+    recorded.robot().image(1.0, "long.png")
+    async with connect() as client:
+        result = await client.call_tool("webots_get_camera", {})
+    assert len(pictures_of(result)[0].data) < 10_000
 
 
 async def test_a_controller_that_saves_no_frames_is_told_how_to(

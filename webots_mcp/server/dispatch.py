@@ -29,7 +29,6 @@ _REPORT_INTERVAL_S: Final = 1.0
 # the command's own time to live end it, soon after anybody could still be waiting for it.
 _OUTLIVES_WAITING_S: Final = 1.0
 _ERROR_CHARACTERS: Final = 2_000
-_INSTRUCTION_CHARACTERS: Final = 500
 
 
 @dataclass(frozen=True)
@@ -158,9 +157,9 @@ def _hint(view: View, command: Command) -> str | None:
 
 
 def _instructions(view: View, action: str) -> str | None:
-    """The docstring of a custom action."""
-    text = view.session.actions.get(action) if view.session else None
-    return f"{action}: {cut_text(text, _INSTRUCTION_CHARACTERS)}" if text else None
+    """Where the description of a custom action stands: it is the controller's text, not ours."""
+    described = view.session is not None and action in view.session.actions
+    return "webots_list_commands has the action's description" if described else None
 
 
 def _after_no_answer(view: View) -> str:

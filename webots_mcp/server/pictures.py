@@ -8,35 +8,28 @@ from typing import Final
 
 from mcp.server.mcpserver import Image
 
-from webots_mcp.errors import NothingRecordedError
+from webots_mcp.store.images import opened
 
 LONGEST_SIDE_PX: Final = 1000
+MAX_SENT_BYTES: Final = 4_000_000  # more than such a picture has pixels: something else is in it
 _JPEG_QUALITY: Final = 85
 
 
 def load_picture(file: Path) -> tuple[Image, str]:
     """A picture within 1,000 pixels, and a note where it had to be scaled (else empty).
 
-    Pillow is imported here, at the first picture: it would add to the server's start.
-
     Raises:
-        NothingRecordedError: The file is gone or holds no complete picture.
+        InvalidInputError: The file holds no complete picture, or is too large.
     """
-    from PIL import Image as Pictures
-    from PIL import UnidentifiedImageError
-
-    try:
-        data = file.read_bytes()
-        picture = Pictures.open(io.BytesIO(data))
+    with opened(file) as picture:
         picture.load()
-    except (OSError, UnidentifiedImageError, Pictures.DecompressionBombError) as error:
-        raise NothingRecordedError(f"{file} cannot be shown as a picture: {error}") from error
-    if max(picture.size) <= LONGEST_SIDE_PX and picture.format in ("PNG", "JPEG"):
-        return Image(data=data, format=picture.format.lower()), ""
-    scaled = picture.convert("RGB")
-    scaled.thumbnail((LONGEST_SIDE_PX, LONGEST_SIDE_PX))
-    jpeg = io.BytesIO()
-    scaled.save(jpeg, "JPEG", quality=_JPEG_QUALITY)
+        short = max(picture.size) <= LONGEST_SIDE_PX
+        if short and picture.format and file.stat().st_size <= MAX_SENT_BYTES:
+            return Image(data=file.read_bytes(), format=picture.format.lower()), ""
+        scaled = picture.convert("RGB")
+        scaled.thumbnail((LONGEST_SIDE_PX, LONGEST_SIDE_PX))
+        jpeg = io.BytesIO()
+        scaled.save(jpeg, "JPEG", quality=_JPEG_QUALITY)
     (width, height), (true_width, true_height) = scaled.size, picture.size
     note = f"shown at {width} x {height} of {true_width} x {true_height} pixels"
     return Image(data=jpeg.getvalue(), format="jpeg"), note

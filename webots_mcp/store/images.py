@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import contextlib
 import sqlite3
+import stat
+from collections.abc import Generator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.store.rows import columns_of
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+MAX_FILE_BYTES: Final = 64_000_000
+MAX_PIXELS: Final = 50_000_000  # 200 MB in memory
 
 
 @dataclass(frozen=True)
@@ -31,6 +40,7 @@ class StoredImage:
         return inside(data_dir, self.path)
 
 
+_SHOWN_PATH: Final = 100
 _COLUMNS: Final = columns_of(StoredImage)
 _NEWEST: Final = (
     f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND kind = :kind "
@@ -45,18 +55,54 @@ def inside(data_dir: Path, path: str) -> Path:
     """The file at a recorded path.
 
     Raises:
-        InvalidInputError: The path leads out of the data folder.
+        InvalidInputError: The path leads out of the data folder, or to no regular file.
         NothingRecordedError: The file is gone.
     """
-    file = (data_dir / path).resolve()
-    if not file.is_relative_to(data_dir.resolve()):
-        raise InvalidInputError(f"{path!r} lies outside the data folder and is not opened")
-    if not file.is_file():
+    try:
+        file = (data_dir / path).resolve()
+        if not file.is_relative_to(data_dir.resolve()):
+            raise InvalidInputError(f"{path!r} lies outside the data folder and is not opened")
+        mode = file.stat().st_mode
+    except FileNotFoundError as error:
         raise NothingRecordedError(
-            f"{file} was recorded, but the file is gone: only the newest pictures are kept; or "
-            "this is not the data folder that the controller records into"
-        )
+            f"{data_dir / path} was recorded, but the file is gone: only the newest pictures are "
+            "kept; or this is not the data folder that the controller records into"
+        ) from error
+    except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL, a loop of links
+        raise InvalidInputError(f"{path[:_SHOWN_PATH]!r} is no usable path: {error}") from error
+    if not stat.S_ISREG(mode):
+        raise InvalidInputError(f"{file} is no regular file and is not opened")
     return file
+
+
+@contextlib.contextmanager
+def opened(file: Path, formats: tuple[str, ...] = ("PNG", "JPEG")) -> Generator[Image]:
+    """A picture, not decoded yet; what its user finds wrong inside the block is told alike.
+
+    Pillow is imported here, at the first picture: it would add to the server's start.
+
+    Args:
+        file: A regular file.
+        formats: Those that are allowed, as Pillow names them.
+
+    Raises:
+        InvalidInputError: It is no complete picture of these formats, or is too large.
+    """
+    from PIL import Image as Pictures
+
+    try:
+        _require_at_most(MAX_FILE_BYTES, "bytes", file.stat().st_size)
+        picture: Any = Pictures.open(file, formats=formats)
+        with picture:
+            _require_at_most(MAX_PIXELS, "pixels", picture.width * picture.height)
+            yield picture
+    except Exception as error:  # Pillow raises nearly anything about a file that is damaged
+        raise InvalidInputError(f"{file} is no usable {' or '.join(formats)}: {error}") from error
+
+
+def _require_at_most(limit: int, of: str, found: int) -> None:
+    if found > limit:
+        raise ValueError(f"it has {found:,} {of}, {limit:,} is the limit")
 
 
 def newest_camera_image(

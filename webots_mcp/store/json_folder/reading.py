@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import stat
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
@@ -13,12 +14,17 @@ from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.contract import CAMERA_FOLDER, SCREENSHOT_FOLDER
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.images import opened
 
 Clock = tuple[int, int, int]  # hour, minute, second
 
 STATUS: Final = "status.json"
 LOG: Final = "logs/controller.log"
 COMMANDS: Final = "commands.json"
+MAX_JSON_BYTES: Final = 16_000_000
+MAX_LINE_BYTES: Final = 1_000_000
+MAX_DEPTH: Final = 100
+_SHOWN: Final = 100  # characters of a value that is wrong
 _STAMP: Final = re.compile(r"\[(\d\d):(\d\d):(\d\d)\] ?(.*)", re.DOTALL)
 
 
@@ -121,32 +127,50 @@ def read_folder(folder: Path) -> Found:
     return found
 
 
+def is_there(file: Path) -> bool:
+    """Whether there is such a file.
+
+    Raises:
+        InvalidInputError: It is a pipe, a device or a folder, which may never end.
+    """
+    try:
+        mode = file.stat().st_mode
+    except FileNotFoundError:
+        return False
+    if not stat.S_ISREG(mode):
+        raise InvalidInputError(f"{file} is no regular file: move it away and import the rest")
+    return True
+
+
 def _read_state(file: Path) -> FoundState | None:
-    if not file.exists():
+    if not is_there(file):
         return None
     state = _read_json(file)
     if not isinstance(state, dict):
         raise InvalidInputError(f"{file}: a state is an object, this is a {type(state).__name__}")
     odd: dict[str, str] = {}
-    clean = _clean(cast("dict[str, Any]", state), "", odd)
+    clean = _clean(cast("dict[str, Any]", state), (), odd, file)
     wall_time_s = _moment(clean.get("timestamp"), file)
     return FoundState(wall_time_s, _encode(clean), _encode(odd) if odd else None)
 
 
 def _read_commands(file: Path) -> Iterator[FoundCommand]:
-    if not file.exists():
+    if not is_there(file):
         return
     content = _read_json(file)
     for command in cast("list[Any]", content if isinstance(content, list) else [content]):
         if not isinstance(command, dict) or "action" not in command:
-            raise InvalidInputError(f"{file}: a command is an object with an action: {command!r}")
-        params: dict[str, Any] = _clean(command, "", {})
+            shown = repr(cast("object", command))[:_SHOWN]
+            raise InvalidInputError(f"{file}: a command is an object with an action: {shown}")
+        params: dict[str, Any] = _clean(command, (), {}, file)
         action, moment = str(params.pop("action")), params.pop("timestamp", None)
         if action != "none":  # what a bridge leaves where it took a command
             yield FoundCommand(_moment(moment, file), action, _encode(params))
 
 
 def _read_json(file: Path) -> Any:
+    if (size := file.stat().st_size) > MAX_JSON_BYTES:
+        raise InvalidInputError(f"{file} has {size:,} bytes, {MAX_JSON_BYTES:,} is the limit")
     text = file.read_bytes()
     if not text.strip():
         raise InvalidInputError(
@@ -158,23 +182,56 @@ def _read_json(file: Path) -> Any:
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
         raise InvalidInputError(f"{file}, {where}: no JSON: {error.msg}") from error
-    except (UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # no UTF-8, a number of 5,000 digits
         raise InvalidInputError(f"{file}: no JSON: {error}") from error
 
 
-def _clean(value: Any, path: str, odd: dict[str, str]) -> Any:
+def _clean(value: Any, path: tuple[str, ...], odd: dict[str, str], file: Path) -> Any:
     """A copy without what JSON cannot hold; `odd` names where that stood, as the bridge does."""
-    prefix = f"{path}." if path else ""
+    if len(path) > MAX_DEPTH:
+        raise InvalidInputError(
+            f"{file} is nested over {MAX_DEPTH} levels, at {path[0]!r:.{_SHOWN}}"
+        )
     if isinstance(value, dict):
         items = cast("dict[str, Any]", value).items()
-        return {key: _clean(item, prefix + key, odd) for key, item in items}
+        return {
+            _text(key, (*path, key), odd): _clean(item, (*path, key), odd, file)
+            for key, item in items
+        }
     if isinstance(value, list):
         array = cast("list[Any]", value)
-        return [_clean(item, f"{prefix}{i}", odd) for i, item in enumerate(array)]
-    if isinstance(value, float) and not math.isfinite(value):
-        odd[path] = str(value)
+        return [_clean(item, (*path, str(i)), odd, file) for i, item in enumerate(array)]
+    if isinstance(value, str):
+        return _text(value, path, odd)
+    if isinstance(value, (int, float)) and (why := _no_number(value)):
+        odd[".".join(path)] = why
         return None
     return value
+
+
+def _text(text: str, path: tuple[str, ...], odd: dict[str, str]) -> str:
+    """Text that UTF-8 can hold."""
+    if is_text(text):
+        return text
+    odd[_readable(".".join(path))] = "surrogate"
+    return _readable(text)
+
+
+def _no_number(value: float) -> str | None:
+    """Why a number is none that a float can hold."""
+    try:
+        return None if math.isfinite(value) else str(value)
+    except OverflowError:
+        return "int"
+
+
+def is_text(text: str) -> bool:
+    """Whether UTF-8 can hold it, and with it the database: no lone half of a pair is in it."""
+    return not any("\ud800" <= character <= "\udfff" for character in text)
+
+
+def _readable(text: str) -> str:
+    return text.encode("utf-8", "replace").decode()
 
 
 def _encode(value: object) -> str:
@@ -193,12 +250,13 @@ def _moment(stamp: object, file: Path) -> float:
             return datetime.fromtimestamp(stamp).timestamp()
         return datetime.fromisoformat(str(stamp).replace("Z", "+00:00")).timestamp()
     except (ValueError, OverflowError, OSError) as error:
-        raise InvalidInputError(f"{file}: timestamp {stamp!r} is no ISO 8601 time") from error
+        shown = repr(stamp)[:_SHOWN]
+        raise InvalidInputError(f"{file}: timestamp {shown} is no ISO 8601 time") from error
 
 
 def _read_log(file: Path, newest_s: float | None) -> FoundLog | None:
     """Look through a log whose last line is about as old as the newest state, or as the file."""
-    if not file.exists():
+    if not is_there(file):
         return None
     lines, midnights, last, first = 0, 0, (0, 0, 0), (0, 0, 0)
     for clock, _ in _log_entries(file):
@@ -208,9 +266,14 @@ def _read_log(file: Path, newest_s: float | None) -> FoundLog | None:
         lines += 1
     if not lines:
         return None
-    last_day = _day_of(last, file.stat().st_mtime if newest_s is None else newest_s)
-    first_day = last_day - timedelta(days=midnights)
-    return FoundLog(file, first_day, lines, _at(first_day, first), _at(last_day, last))
+    try:
+        last_day = _day_of(last, file.stat().st_mtime if newest_s is None else newest_s)
+        first_day = last_day - timedelta(days=midnights)
+        return FoundLog(file, first_day, lines, _at(first_day, first), _at(last_day, last))
+    except (OverflowError, ValueError) as error:
+        raise InvalidInputError(
+            f"{file}: its clock goes back {midnights:,} times, to before all calendars: {error}"
+        ) from error
 
 
 def _day_of(clock: Clock, near_s: float) -> date:
@@ -227,8 +290,10 @@ def _at(day: date, clock: Clock) -> float:
 def _log_entries(file: Path) -> Iterator[tuple[Clock, str]]:
     """Clock time and message of each; lines without a time go on with the one before."""
     clock, message = None, list[str]()
-    with file.open("rb") as lines:
-        for number, line in enumerate(lines, 1):
+    with file.open("rb") as log:
+        for number, line in enumerate(iter(lambda: log.readline(MAX_LINE_BYTES), b""), 1):
+            if len(line) == MAX_LINE_BYTES:
+                raise InvalidInputError(f"{file}, line {number}: it has over {len(line):,} bytes")
             text = _decode(line)
             stamp = _STAMP.fullmatch(text)
             if stamp is None and clock is None:
@@ -271,20 +336,18 @@ def _read_pictures(folder: Path) -> Iterator[FoundPicture]:
 
 def _pictures_in(kind: str, files: Iterable[Path]) -> Iterator[FoundPicture]:
     for file in files:
+        if not is_text(file.name):
+            raise InvalidInputError(f"the name of {str(file)!r} is no text: rename the file")
+        is_there(file)
         status = file.stat()
         yield FoundPicture(status.st_mtime, kind, file, *_picture_size(file), status.st_size)
 
 
 def _picture_size(file: Path) -> tuple[int, int]:
     """Width and height in pixels of a PNG whose every part is whole."""
-    from PIL import Image
-
     try:
-        picture: Any = Image.open(file, formats=["PNG"])
-        with picture:
+        with opened(file, ("PNG",)) as picture:
             picture.verify()
             return picture.size
-    except (SyntaxError, ValueError, OSError, Image.DecompressionBombError) as error:
-        raise InvalidInputError(
-            f"{file} is no complete PNG ({error}): delete it and import the rest"
-        ) from error
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{error}: delete it and import the rest") from error

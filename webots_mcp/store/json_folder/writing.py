@@ -24,6 +24,8 @@ from webots_mcp.store.json_folder.reading import (
     Found,
     FoundLog,
     FoundPicture,
+    is_text,
+    is_there,
     read_folder,
 )
 
@@ -42,6 +44,7 @@ _INSERT_LINE: Final = (
 _NOTE: Final = "simulation times are wall time since the first entry: the folder has no others"
 _NOT_RUN: Final = "imported: it was waiting when its folder was imported, and will never run"
 _PROGRESS_LINES: Final = 1000
+_BLOCK_BYTES: Final = 1_000_000
 
 
 class Imported(NamedTuple):
@@ -76,7 +79,10 @@ def import_folder(
             the line), the name is taken, or the same folder was imported before. Nothing is
             written then.
     """
-    folder, data_dir = folder.resolve(), data_dir.resolve()
+    try:
+        folder, data_dir = folder.resolve(), data_dir.resolve()
+    except (OSError, RuntimeError) as error:  # a loop of links
+        raise InvalidInputError(f"{folder} cannot be read: {error}") from error
     found = read_folder(folder)
     instance = f"import {_fingerprint(folder, found)}"
     with _taken_back() as made, transaction(connection):
@@ -97,8 +103,11 @@ def import_folder(
 def _fingerprint(folder: Path, found: Found) -> str:
     digest = hashlib.sha256()
     for name in (STATUS, LOG, COMMANDS):
-        if (folder / name).exists():
-            digest.update(name.encode() + (folder / name).read_bytes())
+        if is_there(folder / name):
+            digest.update(name.encode())
+            with (folder / name).open("rb") as file:
+                for block in iter(lambda: file.read(_BLOCK_BYTES), b""):
+                    digest.update(block)
     for picture in found.pictures:
         digest.update(f"{picture.file.name} {picture.size_bytes}".encode())
     return digest.hexdigest()
@@ -109,8 +118,8 @@ def _require_new(connection: sqlite3.Connection, instance: str, folder: Path, ro
         raise InvalidInputError(
             f"{folder} was imported before, as run {before[0]} of robot {before[1]!r}"
         )
-    if not robot.strip():
-        raise InvalidInputError("the robot needs a name to be recorded under, not an empty one")
+    if not robot.strip() or not is_text(robot):
+        raise InvalidInputError(f"the robot needs a name to be recorded under, not {robot!r}")
     if connection.execute(_KNOWN_ROBOT, (robot,)).fetchone():
         raise InvalidInputError(
             f"there is a robot {robot!r} already, whose newest run this would seem to be: choose "

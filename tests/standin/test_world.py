@@ -63,6 +63,10 @@ def test_nested_places_add_up(tmp_path: Path) -> None:
         ("WorldInfo {}\nSolid {\n", 3, "ends in the middle"),
         ("WorldInfo {}\nUSE NOBODY", 3, "before any DEF NOBODY"),
         ("WorldInfo {}\nSolid { children ] }", 3, "children has no value"),
+        ("EXTERNPROTO\nWorldInfo {}", 2, "EXTERNPROTO has no URL"),
+        ("WorldInfo {}\nPROTO Foo [ ] { }", 3, "no PROTO definitions"),
+        ('WorldInfo { coordinateSystem "NUE" }', 2, "no coordinateSystem but ENU"),
+        ("WorldInfo {}\nRectangleArena { floorSize 1 }", 3, "floorSize has to be SFVec2f"),
         ("Solid {}", 1, "no WorldInfo"),
         ("WorldInfo { basicTimeStep 0 }", 2, "positive"),
     ],
@@ -83,3 +87,29 @@ def test_a_file_that_is_no_world_is_refused(tmp_path: Path) -> None:
         load_world(path)
     with pytest.raises(WorldError, match="cannot read the world"):
         load_world(tmp_path / "missing.wbt")
+
+
+def test_what_is_left_out_is_counted_by_type_and_scaling_is_said_to_be_ignored(
+    tmp_path: Path,
+) -> None:
+    world = loaded(
+        """WorldInfo { }
+        DEF A Foo { children [ Bar { } ] }
+        USE A
+        Floor { appearance Foo { } }
+        Transform { scale 1 1 2 children [ Shape { geometry Mesh { } } ] }""",
+        tmp_path,
+    )
+    assert world.warnings() == [
+        "WARNING: small.wbt, line 3: the stand-in has no Foo nodes; these 2 are left out.",
+        "WARNING: small.wbt, line 6: the stand-in has no Mesh nodes; this one is left out.",
+        "WARNING: small.wbt, line 6: the stand-in scales nothing: what is in this Transform keeps "
+        "its size.",
+    ]
+
+
+def test_worlds_with_the_axes_of_old_releases_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "old.wbt"
+    path.write_text("#VRML_SIM R2021b utf8\nWorldInfo { }", encoding="utf-8")
+    with pytest.raises(WorldError, match="have other axes: open and save it with Webots R2022a"):
+        load_world(path)

@@ -86,10 +86,13 @@ class Parser:
 
     def _takes_externproto(self) -> bool:
         """Read over `EXTERNPROTO "url"`: it only says where a PROTO comes from."""
-        if self._peek().text not in ("EXTERNPROTO", "IMPORTABLE"):
-            return False
-        while not self._peek().text.startswith('"'):
+        if self._peek().text == "IMPORTABLE":
             self._take()
+        if self._peek().text != "EXTERNPROTO":
+            return False
+        token = self._take()
+        if not self._peek().text.startswith('"'):
+            raise WorldError("EXTERNPROTO has no URL", token.line)
         self._take()
         return True
 
@@ -113,6 +116,8 @@ class Parser:
         token = self._name("a node")
         if token.text == "USE":
             return self._used()
+        if token.text == "PROTO":
+            raise WorldError("a world holds no PROTO definitions, they have own files", token.line)
         if token.text != "DEF":
             return self._body(token, "")
         name = self._name("a DEF name").text

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final, cast
 
 from webots_mcp.standin.errors import WorldError
 from webots_mcp.standin.frame import Frame, frame_of
@@ -12,6 +12,8 @@ from webots_mcp.standin.nodes import DEFAULT_NAME_OF, NODE_TYPES
 from webots_mcp.standin.protos import PROTOS, build
 from webots_mcp.standin.typed_fields import give_types
 from webots_mcp.standin.vrml import Node, children_of, descendants_of, parse
+
+_UNSCALED: Final = [1.0, 1.0, 1.0]
 
 
 class World:
@@ -39,6 +41,8 @@ class World:
         self.basic_time_step_ms: float = info.fields["basicTimeStep"]
         if self.basic_time_step_ms <= 0:
             raise WorldError("basicTimeStep has to be positive", info.line)
+        if info.fields["coordinateSystem"] != "ENU":
+            raise WorldError("the stand-in has no coordinateSystem but ENU", info.line)
 
     def _register(self, node: Node, parent: Node | None) -> None:
         if node in self._ids:  # a USE: stands where its DEF stands
@@ -73,15 +77,22 @@ class World:
                 ]
 
     def warnings(self) -> list[str]:
-        """One line for each type of node that was left out."""
+        """One line for each type of node that was left out, and for what is not followed."""
         by_type: dict[str, list[Node]] = {}
         for node in self.left_out:
             by_type.setdefault(node.type_name, []).append(node)
-        return [
-            f"WARNING: {self.path.name}, line {nodes[0].line}: the stand-in has no {type_name} "
-            f"nodes; {'this one is' if len(nodes) == 1 else f'these {len(nodes)} are'} left out."
+        lines = [
+            f"line {nodes[0].line}: the stand-in has no {type_name} nodes; "
+            f"{'this one is' if len(nodes) == 1 else f'these {len(nodes)} are'} left out."
             for type_name, nodes in by_type.items()
         ]
+        scaled = [node for node in self.nodes if node.fields.get("scale", _UNSCALED) != _UNSCALED]
+        if scaled:
+            lines.append(
+                f"line {scaled[0].line}: the stand-in scales nothing: what is in this "
+                "Transform keeps its size."
+            )
+        return [f"WARNING: {self.path.name}, {line}" for line in lines]
 
     def left_out_in(self, robot: Node) -> dict[str, str]:
         """Devices that the world gives a robot and the stand-in does not: names and node types."""

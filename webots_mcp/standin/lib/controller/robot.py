@@ -7,6 +7,7 @@ from __future__ import annotations
 import ctypes
 import os
 import signal
+import threading
 from collections.abc import Callable
 from typing import Any, ClassVar, Final
 
@@ -283,13 +284,13 @@ class Robot:
 
 
 def _restore_signals() -> None:
-    """Signals end the process at once, without KeyboardInterrupt, `finally` or atexit.
-
-    As in Webots it is C that is told, so that `signal.getsignal` knows nothing of it.
-    """
-    if os.name != "posix":
-        return
-    c_signal = ctypes.CDLL(None).signal
-    c_signal.argtypes, c_signal.restype = (ctypes.c_int, ctypes.c_void_p), ctypes.c_void_p
-    for name in _DEADLY_SIGNALS:
-        c_signal(getattr(signal, name), None)  # SIG_DFL
+    """Signals end the process at once, without KeyboardInterrupt, `finally` or atexit."""
+    numbers = [getattr(signal, name) for name in _DEADLY_SIGNALS if hasattr(signal, name)]
+    if os.name == "posix":  # as in Webots it is C that is told: `signal.getsignal` knows nothing
+        c_signal = ctypes.CDLL(None).signal
+        c_signal.argtypes, c_signal.restype = (ctypes.c_int, ctypes.c_void_p), ctypes.c_void_p
+        for number in numbers:
+            c_signal(number, None)  # SIG_DFL
+    elif threading.current_thread() is threading.main_thread():  # Python lets no other do this
+        for number in numbers:
+            signal.signal(number, signal.SIG_DFL)

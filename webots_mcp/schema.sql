@@ -336,6 +336,16 @@ CREATE TABLE recording (
 	created_wall_time_s FLOAT NOT NULL, 
 	PRIMARY KEY (uuid)
 );
+CREATE TABLE retention_limit (
+	kind TEXT NOT NULL /* state, rollup, log, event, image or run */, 
+	size_bytes BIGINT /* on the disk; of pictures their files */, 
+	rows BIGINT, 
+	age_s FLOAT /* since it was recorded, in wall time */, 
+	times FLOAT /* run only: what is left of one stays so many times longer than its states; 0 for ever */, 
+	set_by TEXT NOT NULL /* serve, prune or keep */, 
+	set_wall_time_s FLOAT NOT NULL, 
+	PRIMARY KEY (kind)
+);
 CREATE UNIQUE INDEX ix_session_uuid ON session (uuid);
 CREATE UNIQUE INDEX ix_run_uuid ON run (uuid);
 CREATE TABLE recent_rollup (

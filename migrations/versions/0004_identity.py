@@ -1,6 +1,8 @@
 """Identity: UUIDs of recording, sessions and runs; what else tells one process from another.
 And the newest rollups in a table of their own, which is written in a millisecond.
 
+And the limits of what is kept, which belong to the database.
+
 Revision ID: 0004
 Revises: 0003
 """
@@ -53,6 +55,8 @@ COLUMNS = {
         sa.Column("logger", sa.Text(), comment="name of the Python logger, where one logged it"),
     ),
 }
+KINDS = "state, rollup, log, event, image or run"
+TIMES = "run only: what is left of one stays so many times longer than its states; 0 for ever"
 NAMED = ("session", "run")
 COUNTS = {
     "rows": "state rows that held the signal",
@@ -103,6 +107,17 @@ def upgrade() -> None:
         f"INSERT INTO recording (uuid, created_wall_time_s) SELECT {NEW_UUID[dialect]}, "
         f"coalesce(min(started_wall_time_s), {NOW_S[dialect]}) FROM session"
     )
+    op.create_table(
+        "retention_limit",
+        sa.Column("kind", sa.Text(), nullable=False, comment=KINDS),
+        sa.Column("size_bytes", sa.BigInteger(), comment="on the disk; of pictures their files"),
+        sa.Column("rows", sa.BigInteger()),
+        sa.Column("age_s", sa.Float(), comment="since it was recorded, in wall time"),
+        sa.Column("times", sa.Float(), comment=TIMES),
+        sa.Column("set_by", sa.Text(), nullable=False, comment="serve, prune or keep"),
+        sa.Column("set_wall_time_s", sa.Float(), nullable=False),
+        sa.PrimaryKeyConstraint("kind"),
+    )
     for table, columns in COLUMNS.items():
         for column in columns:
             op.add_column(table, column)
@@ -146,6 +161,7 @@ def downgrade() -> None:
     for table, columns in COLUMNS.items():
         for column in columns:
             op.drop_column(table, column.name)
+    op.drop_table("retention_limit")
     op.drop_table("recording")
     if op.get_context().dialect.name == "sqlite":
         op.execute("PRAGMA user_version = 3")

@@ -104,7 +104,7 @@ def test_a_lock_that_another_holds_is_waited_for_without_waiting(
 def test_a_maintainer_purges_a_little_in_each_round(filed: tuple[Path, Recorded]) -> None:
     _, recorded = filed
     roll(recorded.connection, 10_000)
-    upkeep = Upkeep(recorded.folder, states(rows=1000, spared_rows=0), budget_s=0.0)
+    upkeep = Upkeep(recorded.folder, lambda _: states(rows=1000, spared_rows=0), budget_s=0.0)
     upkeep(recorded.connection)
     left = [recorded.rows()[2]]
     for _ in range(3):
@@ -121,7 +121,7 @@ def test_a_maintainer_does_not_look_for_what_is_beyond_again_at_once(
 ) -> None:
     _, recorded = filed
     roll(recorded.connection, 10_000)
-    upkeep = Upkeep(recorded.folder, states(rows=1000), interval_s=60, budget_s=60)
+    upkeep = Upkeep(recorded.folder, lambda _: states(rows=1000), interval_s=60, budget_s=60)
     upkeep(recorded.connection)
     assert recorded.rows() == {2: 1000}
     recorded.publish(2501.0, {})
@@ -133,7 +133,7 @@ def test_a_maintainer_that_reconnects_begins_with_a_new_plan(filed: tuple[Path, 
     file, recorded = filed
     roll(recorded.connection, 10_000)
     limits = states(rows=1000, spared_rows=0)
-    upkeep = Upkeep(recorded.folder, limits, interval_s=0, budget_s=0.0)
+    upkeep = Upkeep(recorded.folder, lambda _: limits, interval_s=0, budget_s=0.0)
     with closing(connect(file, "writer")) as first:
         upkeep(first)
         upkeep(first)

@@ -11,7 +11,7 @@ from mcp import Client
 from tests.server.conftest import Connect
 from tests.store.recorded import Recorded
 from webots_mcp.server import create_server
-from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.retention import Limit
 
 pytestmark = pytest.mark.anyio
 
@@ -35,8 +35,8 @@ async def test_the_server_keeps_as_much_as_it_was_told(file: Path, recorded: Rec
     robot = recorded.robot()
     for i in range(10):
         robot.state(i * 1.0, {"x": float(i)})
-    retention = Retention(state=Limit(rows=4, spared_rows=0))
-    async with Client(create_server(file, file.parent, retention=retention)):
+    limits = {"state": Limit(rows=4)}
+    async with Client(create_server(file, file.parent, limits=limits)):
         with anyio.fail_after(10):
             while recorded.connection.execute("SELECT count(*) FROM state").fetchone()[0] > 4:
                 await anyio.sleep(0.02)

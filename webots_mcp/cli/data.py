@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command, open_recording, reading
 from webots_mcp.cli.history import RANGE, range_of
-from webots_mcp.cli.limits import LIMITS, retention_of
+from webots_mcp.cli.limits import LIMITS, limits_of
 from webots_mcp.cli.progress import shown_progress
 from webots_mcp.cli.tables import print_notes, print_table
 from webots_mcp.errors import InvalidInputError
@@ -91,33 +91,49 @@ def prune(arguments: argparse.Namespace) -> None:
 
     Rows go in the order in which they were recorded, whatever their run. Runs with a label or a
     note, and those marked by 'webots-mcp keep', lose nothing and do not count. A LIMIT is a size
-    (500MB), an age (30d), a number of rows (100000rows), several of them with commas between, or
-    all, which keeps everything. A size or a number of rows always holds; an age spares the newest
-    rows, as many as the options tell. Robots may record meanwhile. The MCP server does the same
-    every few seconds.
+    (500MB), an age (30d), a number of rows (100000rows), several of them with commas between; all,
+    which keeps everything; or default. What is given belongs to the database from then on, and
+    servers keep to it; with --dry-run it is only tried. A size or a number of rows always holds; an
+    age spares the newest rows, as many as the options tell. Robots may record meanwhile. The MCP
+    server does the same every few seconds.
     """
-    from webots_mcp.store.retention import plan
+    from webots_mcp.store.retention import in_force, plan
+    from webots_mcp.store.retention.limits import set_limits
+    from webots_mcp.store.retention.stock import file_sizes
 
-    retention = retention_of(arguments)
+    limits = limits_of(arguments)
     if arguments.dry_run:
         with reading(arguments) as connection:
-            return _print_plan(plan(connection, retention), "would go")
+            wanted = plan(connection, in_force(connection, limits))
+            _print_plan(wanted, "would go")
+            return _print_disk(wanted, file_sizes(connection))
     with _writable(arguments) as (recording, connection):
+        set_limits(connection, limits, "prune")
+        retention = in_force(connection)
         _print_plan(plan(connection, retention), "goes")
         _print_purged(_prune(recording, connection, retention))
 
 
 @command(
     "keep", DATA_DIR, DATABASE,
-    argument("run_ids", type=int, nargs="+", metavar="RUN", help="as 'webots-mcp runs' lists them"),
-    argument("--release", action="store_true", help="let retention have them again"),
+    argument("run_ids", type=int, nargs="*", metavar="RUN", help="as 'webots-mcp runs' lists them"),
+    argument("--release", action="store_true", help="let retention have them again"), *LIMITS,
 )  # fmt: skip
 def keep(arguments: argparse.Namespace) -> None:
-    """Mark runs of which nothing is ever pruned."""
-    from webots_mcp.store.retention import mark_kept
+    """Mark runs of which nothing is ever pruned, or set how much is kept of the others.
 
+    The limits belong to the database and hold at once, whoever maintains it; 'default' goes back
+    to what holds where nothing is set. 'webots-mcp status' shows them.
+    """
+    from webots_mcp.store.retention import mark_kept
+    from webots_mcp.store.retention.limits import set_limits
+
+    limits = limits_of(arguments)
+    if not arguments.run_ids and not limits:
+        raise InvalidInputError("name runs to keep, or a limit to set: --keep-states 20GB")
     with _writable(arguments) as (_, connection):
         mark_kept(connection, arguments.run_ids, keep=not arguments.release)
+        set_limits(connection, limits, "keep")
 
 
 @contextmanager
@@ -177,6 +193,22 @@ def _print_plan(wanted: Plan, going: str) -> None:
         ids, size = _ranges(wanted.kept_run_ids), size_text(wanted.kept_bytes)
         why = "kept because of a label, a note or a mark, and not counted"
         print_notes([f"{why}: run {ids}, about {size}"])
+
+
+def _print_disk(wanted: Plan, sizes: dict[str, int]) -> None:
+    """What lies on the disk: limits are about the rows, not about summaries and free room."""
+    from webots_mcp.store.retention.notation import size_text
+
+    held = dict(wanted.held_bytes)
+    beside = {"pictures": held.pop("image"), "log": sizes["log_beside_bytes"]}
+    free = sizes["free_in_file_bytes"]
+    rest = max(sizes["file_bytes"] - free - sum(held.values()), 0)
+    inside = {**{f"{kind}s": size for kind, size in held.items()}, "free": free}
+    inside["summaries, runs, commands"] = rest
+    parts = ", ".join(f"{name} {size_text(size)}" for name, size in inside.items())
+    others = ", ".join(f"{name} {size_text(size)}" for name, size in beside.items())
+    whole = size_text(sizes["file_bytes"])
+    print_notes([f"the file has {whole}, about: {parts}; beside it {others}"])
 
 
 def _ranges(numbers: Sequence[int]) -> str | None:

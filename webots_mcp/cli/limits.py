@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Final
 from webots_mcp.cli.command import argument
 
 if TYPE_CHECKING:
-    from webots_mcp.store.retention import Retention
+    from webots_mcp.store.retention import Limit
 
+_BACK: Final = "default"
 _KINDS: Final = {
     "state": "recorded states",
     "rollup": "rollups and change points",
@@ -75,20 +76,18 @@ LIMITS: Final = (
 )
 
 
-def retention_of(arguments: argparse.Namespace) -> Retention:
-    """The limits that were given, and the defaults of those that were not.
+def limits_of(arguments: argparse.Namespace) -> dict[str, Limit | float | None]:
+    """The limits that were given, by the names of `Retention`; None goes back to the default.
 
     Raises:
         InvalidInputError: A text is no limit, or a number is negative.
     """
-    from dataclasses import replace
-
     from webots_mcp.store.retention import DEFAULT
     from webots_mcp.store.retention.notation import parse_limit
 
-    names = (*_KINDS, "outlive")
-    asked = {name: getattr(arguments, name) for name in names}
+    asked = {name: getattr(arguments, name) for name in (*_KINDS, "outlive")}
     given = {name: value for name, value in asked.items() if not isinstance(value, _Default)}
     for kind in given.keys() & _KINDS.keys():
-        given[kind] = parse_limit(given[kind], getattr(DEFAULT, kind))
-    return replace(DEFAULT, **given)
+        text = given[kind]
+        given[kind] = None if text == _BACK else parse_limit(text, getattr(DEFAULT, kind))
+    return given

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 def status(arguments: argparse.Namespace) -> None:
     """Show the robots: whether they run, how old their data is, what could not be recorded."""
     import webots_mcp.store.recording as recordings
+    from webots_mcp.store.retention.limits import described
+    from webots_mcp.store.retention.stock import file_sizes
     from webots_mcp.store.robots import list_robots
 
     recording = open_recording(arguments)
@@ -42,6 +44,8 @@ def status(arguments: argparse.Namespace) -> None:
         facts = {
             "database": str(recording.database),
             **recordings.storage(connection),
+            "limits": described(connection),
+            "file": file_sizes(connection),
             "robots": [_facts(view) for view in views],
         }
     print(json.dumps(facts, indent=2) if arguments.json else _as_text(facts))
@@ -100,7 +104,15 @@ def _facts(view: View) -> dict[str, Any]:
 def _as_text(facts: dict[str, Any]) -> str:
     robots = "\n".join(_robot_as_text(robot) for robot in facts["robots"])
     where = "\n".join(facts[name] for name in ("database", "storage") if name in facts)
-    return f"{where}\n{robots or 'no robot was recorded yet'}"
+    kept = ", ".join(f"{kind} {text}" for kind, text in facts["limits"].items())
+    sizes = ", ".join(_size_as_text(name, size) for name, size in facts["file"].items())
+    return f"{where}\n{sizes}\nkept: {kept}\n{robots or 'no robot was recorded yet'}"
+
+
+def _size_as_text(name: str, size_bytes: int) -> str:
+    from webots_mcp.store.retention.notation import size_text
+
+    return f"{name.removesuffix('_bytes').replace('_', ' ')} {size_text(size_bytes)}"
 
 
 def _robot_as_text(robot: dict[str, Any]) -> str:

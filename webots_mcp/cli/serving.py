@@ -5,11 +5,16 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command
 from webots_mcp.cli.ending import ending_in_time
-from webots_mcp.cli.limits import LIMITS, retention_of
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.cli.limits import LIMITS, limits_of
+from webots_mcp.errors import InvalidInputError, WebotsMCPError
+
+if TYPE_CHECKING:
+    from webots_mcp.contract import Database
+    from webots_mcp.store.retention import Asked
 
 
 @command(
@@ -29,6 +34,8 @@ def serve(arguments: argparse.Namespace) -> None:
         claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
 
     While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
+    Limits belong to the database: what 'webots-mcp prune' or 'keep' has set, or another server that
+    runs, holds on, and is said.
     A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
     commas between, or all, which keeps everything. 'webots-mcp prune --dry-run' with the same
     limits tells what would go.
@@ -39,18 +46,37 @@ def serve(arguments: argparse.Namespace) -> None:
 
     logging.basicConfig(level=logging.WARNING, stream=sys.stderr)
     database, data_dir = resolve_database(arguments.database, arguments.data_dir)
-    retention = retention_of(arguments)
+    limits = limits_of(arguments)
     if sys.stdin.isatty():
         print(
             f"webots-mcp: serving {database} to an MCP client on stdin and stdout; Ctrl-C ends it. "
             "Clients start this command themselves, see 'webots-mcp serve --help'.",
             file=sys.stderr,
         )
+    if limits and not arguments.read_only:
+        _ask_for(limits, database, data_dir)
     from webots_mcp.server import create_server
 
-    server = create_server(database, data_dir, read_only=arguments.read_only, retention=retention)
+    server = create_server(database, data_dir, read_only=arguments.read_only, limits=limits)
     with ending_in_time():
         server.run()
+
+
+def _ask_for(limits: Asked, database: Database, data_dir: Path) -> None:
+    """Set the limits where that is this server's to do; say which others hold."""
+    from webots_mcp.errors import NoDatabaseError
+    from webots_mcp.store.recording import Recording
+    from webots_mcp.store.retention.limits import ask_at_start
+
+    try:
+        with Recording(database, data_dir).writer() as connection:
+            notes = ask_at_start(connection, limits)
+    except NoDatabaseError:
+        return  # they are set when there is one
+    except WebotsMCPError as error:  # which the tools tell, in an answer
+        notes = [f"the limits were not set: {error}"]
+    for note in notes:
+        print(f"webots-mcp: {note}", file=sys.stderr)
 
 
 @command(

@@ -33,7 +33,8 @@ from webots_mcp.server.tools.trends import TrendTools
 from webots_mcp.server.tools.world import WorldTools
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.retention import DEFAULT, Retention, Upkeep
+from webots_mcp.store.retention import Asked, Upkeep
+from webots_mcp.store.retention.limits import ask_where_unset
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "
@@ -69,7 +70,7 @@ def create_server(
     data_dir: Path,
     *,
     read_only: bool = False,
-    retention: Retention = DEFAULT,
+    limits: Asked | None = None,
 ) -> MCPServer:
     """An MCP server over a recording; it starts whether or not anything was recorded yet.
 
@@ -77,9 +78,11 @@ def create_server(
         database: A file, or a database in memory that a bridge in this process shares.
         data_dir: The folder of the pictures.
         read_only: Leave out the tools that change the simulation, and never write.
-        retention: How much of the recording is kept while the server runs and may write.
+        limits: What it asks for of how much is kept; a database where somebody has set limits
+            keeps to those.
     """
-    recording = Recording(database, data_dir, read_only)
+    asked = dict(limits or {})
+    recording = Recording(database, data_dir, read_only, asked)
     families = [family(recording) for family in FAMILIES]
     mcp = MCPServer(
         "webots-mcp",
@@ -87,18 +90,22 @@ def create_server(
         version=__version__,
         instructions=INSTRUCTIONS,
         tools=[tool for family in families for tool in tools_of(family, read_only=read_only)],
-        lifespan=_maintaining(None if read_only else database, Upkeep(data_dir, retention)),
+        lifespan=_maintaining(None if read_only else database, Upkeep(data_dir), asked),
     )
     add_resources(mcp, recording)
     return mcp
 
 
 def _maintaining(
-    database: Database | None, retain: Upkeep
+    database: Database | None, retain: Upkeep, asked: Asked
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[None]]:
     """Keep the log short, the rollups current and the file small, if the server may write."""
+    unasked = dict(asked)
 
     def work(connection: Connection) -> None:
+        if unasked:
+            ask_where_unset(connection, unasked)
+            unasked.clear()
         roll(connection, pause_s=_PAUSE_S)
         retain(connection)
 

@@ -89,6 +89,9 @@ class WorldAnswer(Answer):
         default=None, description="Other robots in the same simulation."
     )
     database: str | None = None
+    retention: dict[str, Any] | None = Field(
+        default=None, description="How much is kept, set by whom; size of the database."
+    )
     data_dir: str | None = None
 
 

@@ -7,9 +7,19 @@ the database: `.schema` in the `sqlite3` shell shows them.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
-from sqlalchemy import Column, Float, ForeignKey, Index, Integer, Text, UniqueConstraint, text
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    Text,
+    UniqueConstraint,
+    text,
+)
 from sqlmodel import Field, SQLModel
 
 SQLModel.metadata.naming_convention = {
@@ -335,3 +345,20 @@ class Lease(SQLModel, table=True):
     name: str = Field(sa_column=Column(Text, primary_key=True))
     holder: str = _text(nullable=False)
     until_wall_time_s: float = _number(nullable=False)
+
+
+class RetentionLimit(SQLModel, table=True):
+    """How much of a kind is kept; without a number all of it, without a row the default."""
+
+    __tablename__: ClassVar[Any] = "retention_limit"
+    kind: str = Field(
+        sa_column=Column(Text, primary_key=True, comment="state, rollup, log, event, image or run")
+    )
+    size_bytes: int | None = _column(BigInteger, "on the disk; of pictures their files")
+    rows: int | None = _column(BigInteger)
+    age_s: float | None = _number("since it was recorded, in wall time")
+    times: float | None = _number(
+        "run only: what is left of one stays so many times longer than its states; 0 for ever"
+    )
+    set_by: str = _text("serve, prune or keep", nullable=False)
+    set_wall_time_s: float = _number(nullable=False)

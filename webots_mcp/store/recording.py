@@ -33,6 +33,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.schema import create_schema, require_current, schema_version
 from webots_mcp.store.queue import any_unfinished
+from webots_mcp.store.retention.limits import Asked
 from webots_mcp.store.robots import Robot, resolve_robot, robot_name
 from webots_mcp.store.runs import Run, current_run, fetch_run
 from webots_mcp.store.sessions import Session
@@ -119,11 +120,15 @@ class Recording:
     """A database, the folder of its pictures, and whether the asker may write.
 
     Nothing is created here: without a database every question is answered with how to get one.
+
+    Attributes:
+        limits: Those of how much is kept that the asker would like to hold.
     """
 
     database: Database
     data_dir: Path
     read_only: bool = False
+    limits: Asked = field(default_factory=dict[str, Any])
     _migrating: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @contextmanager

@@ -11,6 +11,8 @@ from webots_mcp.server.parameters import RobotName, RunId
 from webots_mcp.server.results import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.server.shortening import cut_text, round_number
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
+from webots_mcp.store.retention.limits import described, unheeded
+from webots_mcp.store.retention.stock import file_sizes
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.runs import Run, count_runs
 from webots_mcp.store.sessions import Session, companions, fetch_session
@@ -72,8 +74,18 @@ class WorldTools:
                 devices=_devices(view.robot.devices),
                 companions=_companions(view),
                 database=name_of(self._recording.database),
+                retention=self._retention(view),
                 data_dir=str(self._recording.data_dir),
             )
+
+    def _retention(self, view: View) -> dict[str, Any]:
+        """What is kept of the recording, how large it is, and which limits of ours do not hold."""
+        notes = unheeded(view.connection, self._recording.limits)
+        return {
+            "kept": described(view.connection),
+            **file_sizes(view.connection),
+            **({"not_in_force": notes} if notes else {}),
+        }
 
 
 def _liveliest(robots: list[Any]) -> list[Any]:

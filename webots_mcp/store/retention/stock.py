@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.store.retention.pages import INDEX_BYTES, disk_shares
@@ -99,6 +100,22 @@ def holdings(connection: sqlite3.Connection, table: str, runs: Sequence[Run]) ->
         for run in runs
         if run.id in rows
     ]
+
+
+def file_sizes(connection: sqlite3.Connection) -> dict[str, int]:
+    """Bytes of the database on the disk: the file, what of it is free, and the log beside it."""
+
+    def pragma(name: str) -> int:
+        return int(connection.execute(f"PRAGMA {name}").fetchone()[0])
+
+    page_bytes = pragma("page_size")
+    sizes = {
+        "file_bytes": pragma("page_count") * page_bytes,
+        "free_in_file_bytes": pragma("freelist_count") * page_bytes,
+    }
+    (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
+    log = Path(f"{file}-wal")
+    return sizes | {"log_beside_bytes": log.stat().st_size if file and log.exists() else 0}
 
 
 def count_rows(connection: sqlite3.Connection, table: str, run_id: int) -> int:

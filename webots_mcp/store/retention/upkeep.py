@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
+from webots_mcp.store.retention.limits import in_force
 from webots_mcp.store.retention.planning import plan
-from webots_mcp.store.retention.policy import DEFAULT, Retention
+from webots_mcp.store.retention.policy import Retention
 from webots_mcp.store.retention.purge import Purged, purge
 
 INTERVAL_S: Final = 2.0
@@ -27,7 +28,7 @@ class Upkeep:
 
     Args:
         data_dir: The folder that the paths of pictures are relative to.
-        retention: The limits.
+        limits: Tells the limits, whenever it is asked.
         interval_s: Between two plans at least; more where planning takes long.
         budget_s: How long a call may last, rests included; a write more at most.
     """
@@ -35,13 +36,13 @@ class Upkeep:
     def __init__(
         self,
         data_dir: Path,
-        retention: Retention = DEFAULT,
+        limits: Callable[[sqlite3.Connection], Retention] = in_force,
         *,
         interval_s: float = INTERVAL_S,
         budget_s: float = BUDGET_S,
     ) -> None:
         self._data_dir = data_dir
-        self._retention = retention
+        self._limits = limits
         self._interval_s = interval_s
         self._budget_s = budget_s
         self._next_plan_s = 0.0
@@ -76,7 +77,7 @@ class Upkeep:
 
     def _planned(self, connection: sqlite3.Connection) -> Iterator[Purged]:
         started_s = time.monotonic()
-        wanted = plan(connection, self._retention)
+        wanted = plan(connection, self._limits(connection))
         took_s = time.monotonic() - started_s
         self._next_plan_s = started_s + max(self._interval_s, took_s / PLANNING_SHARE)
         pages = int(connection.execute("PRAGMA page_count").fetchone()[0])

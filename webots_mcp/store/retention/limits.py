@@ -174,4 +174,4 @@ def _another_server(connection: sqlite3.Connection) -> bool:
 
 
 def _lives(pid: int, now_s: float) -> bool:
-    return pid != os.getpid() and process_alive(pid, now_s)
+    return pid != os.getpid() and process_alive(pid, None, now_s)

@@ -2,8 +2,14 @@
 
 The log of a WAL database grows until a checkpoint copies it back. An automatic checkpoint would
 be the slowest step of a control loop (5 ms at p99.9, measured), so the bridge's connection makes
-none. Exactly one maintainer does: whoever holds the lease. More than one checkpointing at an
-instant is also what SQLite's WAL-reset bug needs (all versions before 3.51.3).
+none. Exactly one maintainer does: whoever holds the lease.
+
+Nearly all is copied without the write lock (a PASSIVE checkpoint), and only what is left when the
+log is long is copied with it, to begin the log anew (RESTART). In SQLite before 3.51.3 a checkpoint
+without the lock can damage the file, if it starts while another's commit begins the log anew (the
+WAL-reset bug). A commit does that only where the whole log has been copied. So the maintainer
+commits before each checkpoint, the renewed lease: that commit is not copied before a checkpoint
+does it, and only the holder of the lease makes one.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -19,7 +25,13 @@ from pathlib import Path
 from typing import Final, Literal
 
 from webots_mcp.adoption import adopt
-from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect, identify_files, is_busy
+from webots_mcp.connection import (
+    CHECKPOINT_TIMEOUT_MS,
+    connect,
+    identify_files,
+    is_busy,
+    never_wait,
+)
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.notice import say
 from webots_mcp.schema import require_current
@@ -28,8 +40,9 @@ INTERVAL_S: Final = 1.0
 HURRIED_INTERVAL_S: Final = 0.25  # while the log grows fast: a long one takes long to copy
 LEASE_S: Final = 5.0
 _LATEST_S: Final = 2 * LEASE_S  # one that ends later was taken before the clock was set back
-WAL_RESET_FIXED: Final = (3, 51, 3)
-WAL_LIMIT_BYTES: Final = 1_000_000
+WAL_LIMIT_BYTES: Final = 1_000_000  # a shorter log is left alone
+LONG_LOG_BYTES: Final = 12_000_000  # it begins anew, for which rows wait a few milliseconds
+LONGEST_LOG_BYTES: Final = 32_000_000  # its file is cut
 FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
 
 # Taken when free, ours already, or (by a server) held by a bridge; the row counts as changed in
@@ -75,6 +88,7 @@ class Maintainer(threading.Thread):
         self._held_before = False
         self._interval_s = HURRIED_INTERVAL_S
         self._data_version = -1
+        self._log_bytes = 0  # after the last checkpoint
         self._complained = ""
         self.failures = 0  # rounds that were not finished
 
@@ -155,27 +169,38 @@ class Maintainer(threading.Thread):
         return connection.execute(TAKE_LEASE, values).rowcount > 0
 
     def _checkpoint(self, connection: sqlite3.Connection) -> None:
-        """Copy the log back and cut it, if it is long and grew since the last time.
-
-        Cutting takes the write lock, and rows wait meanwhile. Where SQLite has no WAL-reset bug,
-        most is copied before without the lock; a checkpoint that starts without it, while a commit
-        restarts the log, is what the bug needs.
-        """
+        """Copy the log back, if it is long and grew since the last time; cut it once it rests."""
         log = Path(f"{self._database}-wal")
-        log_bytes = log.stat().st_size if log.exists() else 0
-        if log_bytes > FAST_GROWTH_BYTES:
-            self._interval_s = HURRIED_INTERVAL_S
-        if log_bytes < WAL_LIMIT_BYTES:
+        if not log.exists() or log.stat().st_size < WAL_LIMIT_BYTES:
             return
         version = int(connection.execute("PRAGMA data_version").fetchone()[0])
-        if version != self._data_version:
-            self._data_version = version
-            if sqlite3.sqlite_version_info >= WAL_RESET_FIXED:
-                connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
-            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
-            # The first commit into an emptied log waits until the disk has the log's header. Made
-            # here it costs no control loop its time: 5 ms at p99.9.
+        rests, self._data_version = version == self._data_version, version
+        log_bytes = self._copy_log(connection, "PASSIVE")
+        if log_bytes - self._log_bytes > FAST_GROWTH_BYTES:
+            self._interval_s = HURRIED_INTERVAL_S
+        if rests or log_bytes > LONG_LOG_BYTES:
+            cut = rests or log_bytes > LONGEST_LOG_BYTES
+            self._copy_log(connection, "TRUNCATE" if cut else "RESTART")
+            # The first commit into a new log waits until the disk has the log's header. Made here
+            # it costs no control loop its time: 5 ms at p99.9.
             self._take_lease(connection, time.time())
+            log_bytes = 0
+        self._log_bytes = log_bytes
+
+    def _copy_log(self, connection: sqlite3.Connection, how: str) -> int:
+        """Checkpoint after a commit of one's own, without which the log might begin anew meanwhile.
+
+        Returns:
+            How long the log is.
+        """
+        if not self._take_lease(connection, time.time()):
+            return 0
+        never_wait(connection)  # for readers, with the write lock in hand
+        try:
+            ((_, pages, _),) = connection.execute(f"PRAGMA wal_checkpoint({how})").fetchall()
+        finally:
+            connection.execute(f"PRAGMA busy_timeout={CHECKPOINT_TIMEOUT_MS}")
+        return int(pages) * int(connection.execute("PRAGMA page_size").fetchone()[0])
 
     def _give_back(self) -> None:
         if self._connection is None:

@@ -59,3 +59,68 @@ def test_a_lease_that_was_taken_before_the_clock_was_set_back_is_free(
         (holder,) = connection.execute(HOLDER).fetchone()
     assert (holder != "server 1 other") is taken
     maintainer._disconnect()  # pyright: ignore[reportPrivateUsage]
+
+
+def test_a_log_is_copied_while_it_is_written_begun_anew_when_it_is_long_and_cut_when_it_rests(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("webots_mcp.maintenance.LONG_LOG_BYTES", 5_000_000)
+    assert isinstance(recorded.database, Path)
+    log = Path(f"{recorded.database}-wal")
+    robot = recorded.robot()
+    maintainer = Maintainer(recorded.database, "server")
+
+    def grow(rows: int) -> int:
+        """The log's length after so many rows, and a round of the maintainer."""
+        for i in range(rows):
+            robot.state(i * 1.0, {"text": "x" * 3000})
+        assert maintainer.tick()
+        return log.stat().st_size
+
+    whole = grow(100)
+    assert whole > 1_000_000
+    with closing(sqlite3.connect(recorded.database, isolation_level=None)) as reader:
+        assert grow(10) == whole  # all was copied, and the next commit began the log anew
+        reader.execute("BEGIN")
+        reader.execute("SELECT count(*) FROM state").fetchone()
+        long = grow(200)  # what the reader looks at keeps the log from that
+        assert long > 5_000_000
+    assert grow(10) < long + 1_000_000
+    assert grow(100) < long + 1_000_000  # where 3 MB would have been added
+    assert grow(0) < 10_000
+    assert recorded.connection.execute("SELECT count(*) FROM state").fetchone() == (420,)
+    assert recorded.connection.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+    maintainer._disconnect()  # pyright: ignore[reportPrivateUsage]
+
+
+def test_before_each_checkpoint_there_is_a_commit_that_no_checkpoint_has_copied(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else another's commit could begin the log anew while a checkpoint starts."""
+    monkeypatch.setattr("webots_mcp.maintenance.LONG_LOG_BYTES", 0)
+    assert isinstance(recorded.database, Path)
+    robot = recorded.robot()
+    maintainer = Maintainer(recorded.database, "server")
+    statements: list[str] = []
+    maintainer.tick()
+    maintainer._connection.set_trace_callback(statements.append)  # pyright: ignore[reportPrivateUsage, reportOptionalMemberAccess]
+    for i in range(100):
+        robot.state(i * 1.0, {"text": "x" * 9000})
+    maintainer.tick()
+    found = [text[:11] for text in statements if "wal_checkpoint" in text or "INTO lease" in text]
+    assert found == ["INSERT INTO", "PRAGMA wal_", "INSERT INTO", "PRAGMA wal_", "INSERT INTO"]
+    maintainer._disconnect()  # pyright: ignore[reportPrivateUsage]
+
+
+def test_where_another_took_the_lease_no_checkpoint_is_made(recorded: Recorded) -> None:
+    assert isinstance(recorded.database, Path)
+    robot = recorded.robot()
+    maintainer = Maintainer(recorded.database, "bridge")
+    assert maintainer.tick()
+    for i in range(100):
+        robot.state(i * 1.0, {"text": "x" * 9000})
+    taken = ("server 1 other", time.time() + LEASE_S)
+    recorded.connection.execute("UPDATE lease SET holder = ?, until_wall_time_s = ?", taken)
+    assert maintainer._copy_log(maintainer._connection, "RESTART") == 0  # pyright: ignore[reportPrivateUsage, reportArgumentType]
+    assert Path(f"{recorded.database}-wal").stat().st_size > 1_000_000
+    maintainer._disconnect()  # pyright: ignore[reportPrivateUsage]

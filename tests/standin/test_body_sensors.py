@@ -157,6 +157,11 @@ def test_a_bumper_is_pressed_where_the_robot_runs_into_something(tmp_path: Path)
     drive(robot, -5.0, -5.0, 5)
     assert (front.getValue(), back.getValue()) == (0.0, 0.0)
     assert front.getType() == TouchSensor.BUMPER
+    drive(robot, 5.0, 5.0, 10)
+    assert front.getValue() == 1.0
+    robot.simulationReset()
+    robot.step(STEP_MS)
+    assert front.getValue() == 0.0
 
 
 def test_a_force_sensor_shows_what_stops_the_robot(

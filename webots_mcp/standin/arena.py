@@ -199,6 +199,7 @@ class Arena:
         for body in self._movable:
             if body.is_pushed:
                 self.slide(body, seconds)
+                body.touched.clear()
                 if self._clear(body):
                     body.stop()
 
@@ -216,6 +217,7 @@ class Arena:
         for shape in movable.solid_shapes:
             if push := shape.push(x, y, pusher.footprint.radius_m):
                 pusher.touched.append(push)
+                movable.touched.clear()
                 movable.move(movable.x - push[0], movable.y - push[1], movable.yaw_rad)
                 self._clear(movable, pusher)
 

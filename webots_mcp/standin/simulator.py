@@ -219,6 +219,7 @@ class Simulator:
         for body in self.arena.bodies:
             self.stand_anew(body)
             body.stop()
+            body.touched.clear()
         for robot in self.robots:
             robot.vehicle.reset()
             robot.ahead_ms = 0.0

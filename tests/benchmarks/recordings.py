@@ -24,7 +24,10 @@ _END_RUN: Final = (
     "UPDATE run SET rows = :rows, last_sim_time_s = :sim_s, last_wall_time_s = :wall_s, "
     "ended_wall_time_s = :wall_s"
 )
-_LOG: Final = "INSERT INTO log VALUES (NULL, 1, ?, ?, 'info', 'controller', ?)"
+_LOG: Final = (
+    "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
+    "VALUES (1, ?, ?, 'info', 'controller', ?)"
+)
 
 
 def record(file: Path, rows: int) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge import recorder
+from webots_mcp.bridge import encoding, recorder
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, Database
 from webots_mcp.entries import waiting_path
@@ -65,6 +65,13 @@ def send(
     )
     assert cursor.lastrowid is not None
     return cursor.lastrowid
+
+
+@pytest.fixture(params=["orjson", "standard library"])
+def encoder(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both encoders give the same text."""
+    if request.param != "orjson":
+        monkeypatch.setattr(encoding, "orjson", None)
 
 
 @pytest.fixture

@@ -5,7 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
+from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
+from webots_mcp.bridge.text import cut
+
 MOST_CHANGES: Final = 1000  # in one run; a text that changes in every row is no mode
+_MOST_KEYS: Final = 1000  # a state of more is no list of what a robot is at
+_LONGEST: Final = 1000  # characters; a longer text is no mode either
 _UNSEEN: Final = object()
 
 
@@ -29,8 +34,10 @@ class Changes:
         """The (name, before, after) of what changed since the last look; usually nothing."""
         changed: list[tuple[str, object, object]] = []
         last = self._last
+        if len(state) > _MOST_KEYS:
+            return changed
         for key, value in state.items():
-            if type(value) is not str and type(value) is not bool:
+            if type(value) is not bool and not (type(value) is str and len(value) <= _LONGEST):
                 continue
             before = last.get(key, _UNSEEN)
             if before is value or before == value:
@@ -38,5 +45,5 @@ class Changes:
             last[key] = value
             if before is not _UNSEEN and self._count < MOST_CHANGES:
                 self._count += 1
-                changed.append((str(key), before, value))
+                changed.append((cut(key_text(key), MAX_KEY_CHARACTERS), before, value))
         return changed

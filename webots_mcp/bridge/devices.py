@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import pairwise
 from typing import Any, Final
 
 SECTORS: Final = 8
@@ -21,10 +22,10 @@ _READERS: Final[dict[str, Callable[[Any], object]]] = {
     "GPS": lambda device: device.getValues(),
     "Gyro": lambda device: device.getValues(),
     "InertialUnit": lambda device: device.getRollPitchYaw(),
-    "Lidar": lambda device: _summarise_ranges(device),
+    "Lidar": lambda device: _summarise_lidar(device),
     "LightSensor": lambda device: device.getValue(),
     "PositionSensor": lambda device: device.getValue(),
-    "RangeFinder": lambda device: _summarise_ranges(device),
+    "RangeFinder": lambda device: _summarise_range_finder(device),
     "TouchSensor": lambda device: _read_touch(device),
 }
 
@@ -86,25 +87,50 @@ def _first_enabled(devices: dict[str, Any], kind: str) -> Any:
 
 def _read_touch(device: Any) -> object:
     """A force-3d sensor has a vector, the others a number."""
-    force_3d = getattr(device, "FORCE3D", None)
-    return device.getValues() if force_3d and device.getType() == force_3d else device.getValue()
+    if device.getType() != getattr(device, "FORCE3D", None):
+        return device.getValue()
+    force = device.getValues()  # in Webots a bare pointer to the three
+    return [force[i] for i in range(3)] if force else None
 
 
-def _summarise_ranges(device: Any) -> dict[str, object] | None:
+def _summarise_lidar(device: Any) -> dict[str, object] | None:
+    """Its image is layer after layer, each from left to right."""
+    return _summarise_ranges(device, device.getHorizontalResolution())
+
+
+def _summarise_range_finder(device: Any) -> dict[str, object] | None:
+    """Its image is row after row, each from left to right."""
+    return _summarise_ranges(device, device.getWidth())
+
+
+def _summarise_ranges(device: Any, columns: int) -> dict[str, object] | None:
     """The nearest distance and where, and the minimum of eight sectors; None before data.
 
     Testing the raw pointer first matters: reading a null one can kill the interpreter.
     """
     if not device.range_image:
         return None
-    ranges = device.getRangeImage()
-    finite = [(value, i) for i, value in enumerate(ranges) if math.isfinite(value)]
-    nearest = min(finite, default=None)
-    width = max(1, math.ceil(len(ranges) / SECTORS))
-    sectors = [min(ranges[i : i + width]) for i in range(0, len(ranges), width)]
+    ranges: list[float] = device.getRangeImage()
+    directions = _column_minima(ranges, columns)
+    nearest = min(filter(math.isfinite, directions), default=None)
     return {
         "count": len(ranges),
-        "min_m": nearest[0] if nearest else math.inf,
-        "min_index": nearest[1] if nearest else None,
-        "sector_min_m": sectors,
+        "min_m": math.inf if nearest is None else nearest,
+        "min_index": None if nearest is None else ranges.index(nearest),
+        "sector_min_m": _sector_minima(directions),
     }
+
+
+def _column_minima(ranges: list[float], columns: int) -> list[float]:
+    """The nearest distance in each direction, over all layers or rows."""
+    if not 0 < columns < len(ranges):
+        return ranges
+    rows = [ranges[i : i + columns] for i in range(0, len(ranges), columns)]
+    return list(map(min, zip(*rows, strict=False)))
+
+
+def _sector_minima(directions: list[float]) -> list[float]:
+    """From left to right; of fewer than eight directions each is a sector of its own."""
+    count = min(SECTORS, len(directions))
+    bounds = [len(directions) * i // count for i in range(count + 1)]
+    return [min(directions[i:j]) for i, j in pairwise(bounds)]

@@ -12,6 +12,7 @@ from webots_mcp.bridge.text import cut, storable
 
 MOST_LOG_CHARACTERS: Final = 10_000
 _NOT_LOST: Final = ("nan", "inf", "-inf", "bytes", "surrogate")
+_CUT: Final = ("text[", "key[", "dict cut")
 _MOST_LOST_PATHS: Final = 20
 
 
@@ -30,7 +31,8 @@ class Journal:
         row = (clock.sim_time_s, time.time(), encoded.text, encoded.odd_text)
         self._recorder.record("state", clock.run, row)
         if encoded.odd:
-            self._count_replaced(encoded.odd)
+            self.values_replaced += len(encoded.odd) - bool(encoded.unnamed) + encoded.unnamed
+            self._say_lost(encoded.odd)
 
     def log(self, level: str, source: str, message: str) -> None:
         """Record a line, or its beginning."""
@@ -46,11 +48,11 @@ class Journal:
         row = (self._clock.sim_time_s, time.time(), kind, name, text)
         self._recorder.record("event", self._clock.run, row)
 
-    def _count_replaced(self, odd: dict[str, str]) -> None:
+    def _say_lost(self, odd: dict[str, str]) -> None:
         """Named in `odd` all the same; a value that is not in the row is said once a path."""
-        self.values_replaced += len(odd)
         for path, kind in odd.items():
             if kind in _NOT_LOST or path in self._lost or len(self._lost) >= _MOST_LOST_PATHS:
                 continue
             self._lost.add(path)
-            self.log("warning", "bridge", f"{path or 'state'} could not be stored: {kind}")
+            what = "was cut" if kind.startswith(_CUT) else "could not be stored"
+            self.log("warning", "bridge", f"{path or 'state'} {what}: {kind}")

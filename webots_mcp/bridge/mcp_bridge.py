@@ -372,7 +372,7 @@ class MCPBridge:
         self._reloads.fire()
         encoded = encode(state)
         if not encoded.text.startswith("{"):
-            raise TypeError(f"publish() takes a dict, got {type(state).__name__}: {state!r:.80}")
+            raise TypeError(f"publish() takes a dict, got {type(state).__name__}")
         self._journal.state(encoded)
         if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             for name, before, after in self._changes.look(state):

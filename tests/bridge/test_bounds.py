@@ -1,0 +1,442 @@
+"""What one row costs, whatever is published: counted by what was looked at, never by a clock."""
+
+from __future__ import annotations
+
+import collections
+import ctypes
+import json
+import math
+import sqlite3
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.bridge.conftest import Recording
+from webots_mcp import MCPBridge
+from webots_mcp.bridge import encoding
+from webots_mcp.bridge.cleaning import MAX_NAMED
+from webots_mcp.bridge.encoding import MAX_ROW_BYTES, Encoded
+
+MANY = 200_000
+POSE = [1.5, 2.5, 0.25]
+MOST_LOOKED_AT = 20_000
+
+
+def circle() -> list[Any]:
+    round_and_round: list[Any] = []
+    round_and_round.append(round_and_round)
+    return round_and_round
+
+
+def shared_lists() -> list[Any]:
+    node: list[Any] = [1.5]
+    for _ in range(60):
+        node = [node, node]
+    return node
+
+
+def shared_dicts() -> dict[str, Any]:
+    node: dict[str, Any] = {"x": 1.5}
+    for _ in range(60):
+        node = {"left": node, "right": node}
+    return node
+
+
+def family(depth: int = 10, parent: Any = None) -> dict[str, Any]:
+    """A tree whose nodes know their parents."""
+    node: dict[str, Any] = {"parent": parent, "name": "joint", "children": []}
+    if depth:
+        node["children"] = [family(depth - 1, node) for _ in range(2)]
+    return node
+
+
+class Lazy:
+    """Each has two of its kind inside, made when it is asked."""
+
+    asked = 0
+
+    def tolist(self) -> list[Lazy]:
+        Lazy.asked += 1
+        return [Lazy(), Lazy()]
+
+
+class Hidden:
+    """Shown in a few characters, where a test fails."""
+
+    def __init__(self, make: Callable[[], Any]) -> None:
+        self.make = make
+
+    def tolist(self) -> Any:
+        return self.make()
+
+
+class Shy(Lazy):
+    """It is a number to nobody, whatever it is added to."""
+
+    def __radd__(self, other: float) -> float:
+        return other
+
+
+class Endless(Sequence[int]):
+    """It says that it has three items, and never comes to an end."""
+
+    asked = 0
+
+    def __len__(self) -> int:
+        return 3
+
+    def __getitem__(self, index: Any) -> Any:
+        Endless.asked += 1
+        return index
+
+    def __iter__(self) -> Iterator[int]:
+        while True:
+            yield self[0]
+
+
+class EndlessList(list[int]):
+    asked = 0
+
+    def __iter__(self) -> Iterator[int]:
+        while True:
+            EndlessList.asked += 1
+            yield 0
+
+
+class EndlessDict(dict[str, int]):
+    asked = 0
+
+    def items(self) -> Any:
+        while True:
+            EndlessDict.asked += 1
+            yield f"key {EndlessDict.asked}", 0
+
+
+MONSTERS: dict[str, Callable[[], Any]] = {
+    "a circle": circle,
+    "shared lists": shared_lists,
+    "shared dicts": shared_dicts,
+    "links to parents": family,
+    "a lazy tree": Lazy,
+    "lazy trees among numbers": lambda: [0.5, *(Shy() for _ in range(100))],
+    "no end": Endless,
+    "a list without end": lambda: EndlessList([1, 2, 3]),
+    "a dict without end": lambda: EndlessDict(a=1, b=2),
+    "many keys": lambda: dict.fromkeys(map(str, range(MANY)), 0.5),
+    "many ordered keys": lambda: collections.OrderedDict.fromkeys(range(MANY), 0.5),
+    "many numbers": lambda: [0.5] * MANY,
+    "many texts": lambda: ["x" * 1000] * MANY,
+    "many rows": lambda: [[0.5] * 1000] * 200,
+    "a set": lambda: set(range(MANY)),
+    "a range": lambda: range(10**12),
+    "a long text": lambda: "x" * 50_000_000,
+    "a long text that is escaped": lambda: "\1" * 10_000_000,
+    "a long text beyond ASCII": lambda: "\U0001f916" * 10_000_000,
+    "a long key": lambda: {"x" * 50_000_000: 1},
+    "long keys": lambda: {f"{i}" * 1000: math.nan for i in range(3000)},
+    "bytes": lambda: b"x" * 200_000_000,
+    "a view": lambda: memoryview(bytearray(200_000_000)),
+    "an array": lambda: np.zeros(MANY),
+    "an array of objects": lambda: np.array([circle() for _ in range(1000)], dtype=object),
+    "a C array": lambda: (ctypes.c_double * MANY)(),
+    "nothing but gaps": lambda: {f"key {i}": math.nan for i in range(3900)},
+    "gaps of many kinds": lambda: [math.nan, math.inf] * 9000,
+    "a chain": lambda: chain(100_000),
+}
+
+
+def chain(length: int) -> list[Any]:
+    node: list[Any] = []
+    for _ in range(length):
+        node = [node]
+    return node
+
+
+def is_valid(text: str) -> bool:
+    """Whether SQLite can read it as a JSON object."""
+    connection = sqlite3.connect(":memory:")
+    try:
+        (kind,) = connection.execute("SELECT json_type(?)", (text,)).fetchone()
+    finally:
+        connection.close()
+    return kind == "object"
+
+
+def count_values(value: Any) -> int:
+    inside: Any = value.values() if isinstance(value, dict) else value
+    return 1 + sum(map(count_values, inside)) if isinstance(value, (dict, list)) else 1
+
+
+def assert_bounded(encoded: Encoded) -> None:
+    assert is_valid(encoded.text)
+    assert len(encoded.text.encode()) <= MAX_ROW_BYTES
+    assert count_values(json.loads(encoded.text)) <= MOST_LOOKED_AT + 1
+    assert len(encoded.odd) <= MAX_NAMED + 1
+    assert len(encoded.odd_text or "") <= 200_000
+
+
+@pytest.mark.usefixtures("encoder")
+@pytest.mark.parametrize("make", MONSTERS.values(), ids=MONSTERS)
+def test_what_is_too_much_is_cut_and_named_and_the_rest_of_the_row_is_kept(
+    make: Callable[[], Any],
+) -> None:
+    Lazy.asked = Endless.asked = EndlessList.asked = EndlessDict.asked = 0
+    encoded = encoding.encode({"monster": make(), "pose": POSE})
+    assert_bounded(encoded)
+    assert json.loads(encoded.text)["pose"] == POSE
+    asked = Lazy.asked + Endless.asked + EndlessList.asked + EndlessDict.asked
+    assert asked <= 2 * MOST_LOOKED_AT
+    if not asked or Lazy.asked:
+        assert any(path == "monster" or path.startswith("monster.") for path in encoded.odd)
+
+
+@pytest.mark.usefixtures("encoder")
+@pytest.mark.parametrize("make", MONSTERS.values(), ids=MONSTERS)
+def test_a_monster_is_no_whole_state_either(make: Callable[[], Any]) -> None:
+    monster = make()
+    encoded = encoding.encode(monster)
+    if isinstance(monster, Mapping):
+        assert_bounded(encoded)
+    assert len(encoded.text.encode()) <= MAX_ROW_BYTES
+
+
+@pytest.mark.usefixtures("encoder")
+def test_what_is_cut_is_counted_and_said_once(bridge: MCPBridge, recording: Recording) -> None:
+    for _ in range(2):
+        bridge.publish(
+            {"l": circle(), "t": "x" * 200_000, "gaps": dict.fromkeys(range(900), math.nan)}
+        )
+    assert bridge.stats().values_replaced == 2 * 902
+    (odd, _) = [json.loads(odd) for odd in recording.rows("SELECT odd FROM state")]
+    assert odd["t"] == "text[200000]"
+    assert set(odd.values()) == {"too deep", "text[200000]", "nan"}
+    logged = recording.rows("SELECT message FROM log WHERE source = 'bridge'")
+    assert len(logged) == 2
+    assert "t was cut: text[200000]" in logged
+
+
+@pytest.mark.usefixtures("encoder")
+def test_more_than_a_thousand_odd_values_are_counted(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish({"gaps": dict.fromkeys(range(2000), math.nan)})
+    (odd,) = [json.loads(odd) for odd in recording.rows("SELECT odd FROM state")]
+    assert len(odd) == 1001
+    assert odd[""] == "1000 more"
+    assert bridge.stats().values_replaced == 2000
+    logged = recording.rows("SELECT message FROM log WHERE source = 'bridge'")
+    assert logged == ["state could not be stored: 1000 more"]
+
+
+@pytest.mark.usefixtures("encoder")
+def test_of_a_state_with_too_many_keys_the_first_are_kept() -> None:
+    text, odd, _ = encoding.encode({f"key{i}": i for i in range(MANY)})
+    assert list(json.loads(text)) == [f"key{i}" for i in range(1000)]
+    assert odd == {"": f"dict[{MANY}]"}
+
+
+@pytest.mark.usefixtures("encoder")
+def test_of_a_text_and_of_a_key_the_beginning_is_kept() -> None:
+    text, odd, _ = encoding.encode({"t": "ab" * 100_000, "k" * 300: 1})
+    assert json.loads(text) == {"t": "ab" * 50_000, "k" * 200: 1}
+    assert odd == {"t": "text[200000]", "k" * 200: "key[300]"}
+
+
+@pytest.mark.usefixtures("encoder")
+def test_a_row_as_large_as_the_table_says_is_stored_whole() -> None:
+    state = {
+        "scan": [0.123456789] * 10_000,
+        "links": {f"link{i}": {"x": 0.5, "ok": True, "n": None} for i in range(450)},
+        "note": "ä" * 50_000,
+    }
+    text, odd, _ = encoding.encode(state)
+    assert json.loads(text) == state
+    assert odd == {}
+
+
+@pytest.mark.usefixtures("encoder")
+@pytest.mark.parametrize("depth", [19, 20, 21])
+def test_twenty_levels_are_kept_with_and_without_odd_values(depth: int) -> None:
+    value: Any = 0.5
+    for _ in range(depth - 1):
+        value = [value]
+    for gap in ({}, {"gap": math.nan}):
+        odd = encoding.encode({"a": value, **gap}).odd
+        assert ("too deep" in odd.values()) == (depth > 20)
+
+
+def test_a_state_of_plain_values_is_looked_at_once_and_never_copied(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(encoding, "Cleaner", None)
+    state = {"pose": POSE, "p": np.float64(1.5), "mode": "cruise", "grid": [[1, 2], [3, 4]]}
+    assert json.loads(encoding.encode(state).text) == {**state, "p": 1.5}
+
+
+class Touched(ctypes.Structure):
+    _fields_ = (
+        ("id", ctypes.c_int),
+        ("position", ctypes.c_double * 3),
+        ("size_on_image", ctypes.c_int * 2),
+        ("colors", ctypes.POINTER(ctypes.c_double)),
+        ("_model", ctypes.c_char_p),
+    )
+
+
+@pytest.mark.usefixtures("encoder")
+def test_what_ctypes_holds_is_recorded_as_numbers(bridge: MCPBridge, recording: Recording) -> None:
+    class Derived(Touched):
+        _fields_ = (("flag", ctypes.c_bool),)
+
+    seen = Derived(7, (1.0, 2.0, 3.0), (64, 48))
+    seen.flag = True
+    bridge.publish(
+        {
+            "position": seen.position,
+            "matrix": ((ctypes.c_float * 2) * 2)((1, 2), (3, 4)),
+            "force": ctypes.c_double(0.5),
+            "name": (ctypes.c_char * 4)(*b"abc"),
+            "wide": (ctypes.c_wchar * 3)(*"abc"),
+            "empty": (ctypes.c_double * 0)(),
+            "seen": [seen],
+        }
+    )
+    (state,) = recording.states()
+    assert state == {
+        "position": [1.0, 2.0, 3.0],
+        "matrix": [[1.0, 2.0], [3.0, 4.0]],
+        "force": 0.5,
+        "name": "YWJjAA==",
+        "wide": "abc",
+        "empty": [],
+        "seen": [
+            {
+                "id": 7,
+                "position": [1.0, 2.0, 3.0],
+                "size_on_image": [64, 48],
+                "colors": None,
+                "_model": None,
+                "flag": True,
+            }
+        ],
+    }
+    (odd,) = recording.rows("SELECT odd FROM state")
+    assert json.loads(odd) == {
+        "name": "bytes",
+        "seen.0.colors": "null pointer",
+        "seen.0._model": "pointer of unknown length",
+    }
+
+
+NOWHERE = 8  # an address that ends the process when it is followed
+
+
+@pytest.mark.usefixtures("encoder")
+@pytest.mark.parametrize(
+    "pointer",
+    [
+        ctypes.cast(NOWHERE, ctypes.POINTER(ctypes.c_double)),
+        ctypes.cast(NOWHERE, ctypes.c_char_p),
+        ctypes.cast(NOWHERE, ctypes.c_wchar_p),
+        ctypes.c_void_p(NOWHERE),
+        ctypes.byref(ctypes.c_double()),
+        ctypes.cast(NOWHERE, ctypes.POINTER(Touched)),
+    ],
+    ids=lambda pointer: type(pointer).__name__,
+)
+def test_a_pointer_is_named_and_never_followed(pointer: Any) -> None:
+    text, odd, _ = encoding.encode({"touch": pointer, "pose": POSE})
+    assert json.loads(text) == {"touch": None, "pose": POSE}
+    assert odd == {"touch": "pointer of unknown length"}
+
+
+def test_an_array_of_c_strings_is_not_read_through() -> None:
+    names = (ctypes.c_char_p * 2)()
+    ctypes.cast(names, ctypes.POINTER(ctypes.c_void_p))[0] = NOWHERE
+    assert json.loads(encoding.encode({"names": names}).text) == {"names": [None, None]}
+
+
+def test_a_null_pointer_is_named() -> None:
+    null = ctypes.POINTER(ctypes.c_double)()
+    assert encoding.encode({"touch": null}) == ('{"touch":null}', {"touch": "null pointer"}, 0)
+
+
+class LidarPoint:
+    """As in Webots: nothing but attributes."""
+
+    def __init__(self) -> None:
+        self.x, self.y, self.z, self.layer, self.time = 0.5, 1.5, 2.5, 1, 0.032
+
+
+@pytest.mark.usefixtures("encoder")
+def test_the_points_of_a_lidar_are_recorded_as_numbers() -> None:
+    text, odd, _ = encoding.encode({"cloud": [LidarPoint(), LidarPoint()]})
+    point = {"x": 0.5, "y": 1.5, "z": 2.5, "layer": 1, "time": 0.032}
+    assert json.loads(text) == {"cloud": [point, point]}
+    assert odd == {}
+
+
+def test_ctypes_is_not_imported_for_a_state_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "ctypes")
+    assert encoding.encode({"handle": object()}).odd == {"handle": "type object"}
+    assert "ctypes" not in sys.modules
+
+
+LEAVES: st.SearchStrategy[Any] = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(st.characters(exclude_categories=()))
+    | st.binary(max_size=8)
+    | st.sampled_from(
+        [10**400, -(2**63), 2**64, object(), Lazy(), Shy(), Hidden(circle), Hidden(shared_dicts)]
+    )
+    | st.builds(np.float32, st.floats(width=32))
+    | st.builds(ctypes.c_double, st.floats())
+    | st.integers(0, 25_000).map(lambda count: Hidden(lambda: [0.5] * count))
+    | st.integers(0, 200_000).map(lambda count: Hidden(lambda: "ä" * count))
+)
+KEYS: st.SearchStrategy[Any] = (
+    st.text(st.characters(exclude_categories=())) | st.integers() | st.none() | st.binary()
+)
+
+
+def repeated(item: Any, count: int) -> list[Any]:
+    return [item] * count
+
+
+VALUES: st.SearchStrategy[Any] = st.recursive(
+    LEAVES,
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.tuples(inner, inner)
+        | st.dictionaries(KEYS, inner, max_size=4)
+        | st.builds(repeated, inner, st.integers(0, 300))
+    ),
+    max_leaves=20,
+)
+
+
+@settings(deadline=None)
+@given(st.dictionaries(KEYS, VALUES, max_size=5), st.booleans())
+def test_whatever_is_published_sqlite_can_read_it_and_it_is_bounded_and_what_is_odd_is_named(
+    state: dict[Any, Any], with_orjson: bool
+) -> None:
+    Lazy.asked = 0
+    with pytest.MonkeyPatch.context() as patch:
+        if not with_orjson:
+            patch.setattr(encoding, "orjson", None)
+        encoded = encoding.encode(state)
+        stored = json.loads(encoded.text)
+        again = encoding.encode(stored)
+    assert_bounded(encoded)
+    assert Lazy.asked <= 2 * MOST_LOOKED_AT
+    if not any(kind.startswith(("array[", "dict", "too deep")) for kind in encoded.odd.values()):
+        assert json.loads(again.text) == stored
+        assert again.odd == {}

@@ -1,0 +1,329 @@
+"""A copy of any value that JSON can hold, of bounded size.
+
+What stands near the top comes first: where there is no room for everything, it is the depths that
+are cut.
+"""
+
+from __future__ import annotations
+
+import base64
+import enum
+import math
+from collections import deque
+from collections.abc import Iterable, Mapping
+from itertools import compress, islice
+from json.encoder import encode_basestring
+from operator import not_
+from typing import Any, Final, NamedTuple, TypeAlias, cast
+
+from webots_mcp.bridge.conversions import (
+    MOST_ITEMS,
+    NoCounterpartError,
+    convert,
+    item_count,
+    kind_name,
+)
+
+MAX_ROOM: Final = MOST_ITEMS
+ROOM_OF_A_VALUE: Final = 5  # an item of an array of numbers takes 1
+MAX_DEPTH: Final = 20
+MAX_BYTES: Final = 1024
+MAX_TEXT_BYTES: Final = 100_000
+MAX_TEXTS_BYTES: Final = 300_000  # of all texts of a row
+MAX_KEYS_BYTES: Final = 150_000  # of all keys of a row
+MAX_KEY_CHARACTERS: Final = 200
+MAX_NAMED: Final = 1000
+_TOP_KEYS: Final = 1000  # of a state that has more keys than there is room for
+_MOST_PATHS_CHARACTERS: Final = 50_000  # of all together
+_MOST_REASON_CHARACTERS: Final = 200
+_LONGEST_ESCAPE: Final = 6
+
+
+# Where a value stands: its path is put together only where it has to be named.
+Place: TypeAlias = "tuple[Place | None, str | int]"
+
+
+class _Unfilled(NamedTuple):
+    """A copy whose items are still to come."""
+
+    cleaned: dict[str, object] | list[object]
+    value: object
+    items: Iterable[Any]
+    place: Place
+    depth: int
+
+
+class Cleaner:
+    """Copies one value, and names in `odd` what it had to replace or to cut.
+
+    Attributes:
+        odd: Dotted path to kind.
+        unnamed: How many more there are that `odd` does not name.
+    """
+
+    def __init__(self) -> None:
+        self.odd: dict[str, str] = {}
+        self.unnamed = 0
+        self._room = MAX_ROOM
+        self._texts_bytes = MAX_TEXTS_BYTES
+        self._keys_bytes = MAX_KEYS_BYTES
+        self._paths = _MOST_PATHS_CHARACTERS
+        self._unfilled: deque[_Unfilled] = deque()
+
+    def clean(self, state: object) -> object:
+        """The plain counterpart of any value; one that fails costs itself and no other."""
+        cleaned = self._value(state, (None, ""), 0)
+        while self._unfilled:
+            self._fill(self._unfilled.popleft())
+        if self.unnamed:
+            named = self.odd.get("")
+            more = f"{self.unnamed} more"
+            self.odd[""] = f"{named}; {more}" if named else more
+        return cleaned
+
+    def _value(self, value: Any, place: Place, depth: int) -> object:
+        try:
+            return self._plain(value, place, depth)
+        except Exception as error:  # noqa: BLE001  (any object may fail in its own way)
+            return self._replaced(place, failure(value, error))
+
+    def _plain(self, value: Any, place: Place, depth: int) -> object:
+        kind = type(value)  # pyright: ignore[reportUnknownVariableType]
+        if value is None or kind is bool:
+            return value
+        if kind is float:
+            return value if math.isfinite(value) else self._replaced(place, str(value))
+        if isinstance(value, int):
+            return self._int(int(value), place)
+        if isinstance(value, float):
+            return self._plain(float(value), place, depth)
+        if isinstance(value, str):
+            return self._text(str(value.value) if isinstance(value, enum.Enum) else value, place)
+        if depth >= MAX_DEPTH:
+            return self._replaced(place, "too deep")
+        if kind is dict:
+            return self._mapping(cast("dict[object, object]", value), place, depth)
+        if isinstance(value, (list, tuple, set, frozenset, deque)):
+            return self._items(cast("Iterable[object]", value), place, depth)
+        if isinstance(value, Mapping):
+            return self._mapping(cast("Mapping[object, object]", value), place, depth)
+        return self._object(value, place, depth)
+
+    # -- numbers and texts ---------------------------------------------------------------------
+
+    def _int(self, value: int, place: Place) -> int | float | None:
+        if -(2**63) <= value < 2**63:
+            return value
+        try:
+            return float(value)
+        except OverflowError:
+            return self._replaced(place, "int")
+
+    def _text(self, value: str, place: Place) -> str:
+        most_bytes = min(MAX_TEXT_BYTES, self._texts_bytes)
+        text = _without_surrogates(value[:most_bytes])
+        if (size_bytes := _size_bytes(text)) > most_bytes:
+            text = text[: most_bytes // _LONGEST_ESCAPE]
+            size_bytes = _size_bytes(text)
+        self._texts_bytes -= size_bytes
+        if text != value:
+            self._name(place, "surrogate" if len(text) == len(value) else f"text[{len(value)}]")
+        return text
+
+    def _bytes(self, value: memoryview, place: Place) -> str | None:
+        count = value.nbytes
+        if count > MAX_BYTES:
+            return self._replaced(place, f"bytes[{count}]")
+        text = base64.b64encode(value.tobytes()).decode("ascii")
+        if len(text) > self._texts_bytes:
+            return self._replaced(place, f"bytes[{count}]")
+        self._texts_bytes -= len(text)
+        self._name(place, "bytes")
+        return text
+
+    # -- dicts ---------------------------------------------------------------------------------
+
+    def _mapping(self, value: Mapping[object, object], place: Place, depth: int) -> object:
+        count = len(value)
+        if not self._take(ROOM_OF_A_VALUE * count):
+            self._name(place, f"dict[{count}]")
+            if depth:
+                return None
+            count = _TOP_KEYS
+            self._take(ROOM_OF_A_VALUE * count)
+        cleaned: dict[str, object] = {}
+        items = islice(value.items(), count)
+        self._unfilled.append(_Unfilled(cleaned, value, items, place, depth + 1))
+        return cleaned
+
+    def _fill(self, unfilled: _Unfilled) -> None:
+        cleaned, value, items, place, depth = unfilled
+        try:
+            if isinstance(cleaned, dict):
+                self._fill_dict(cleaned, items, place, depth)
+            else:
+                cleaned.extend(self._value(item, (place, i), depth) for i, item in enumerate(items))
+        except Exception as error:  # noqa: BLE001  (as for any value)
+            self._name(place, failure(value, error))
+
+    def _fill_dict(
+        self, cleaned: dict[str, object], items: Iterable[Any], place: Place, depth: int
+    ) -> None:
+        for key, item in items:
+            name = self._key(key, place)
+            self._keys_bytes -= _size_bytes(name)
+            if self._keys_bytes < 0:
+                self._name(place, f"dict cut after {len(cleaned)}")
+                return
+            cleaned[name] = self._value(item, (place, name), depth)
+
+    def _key(self, key: object, place: Place) -> str:
+        try:
+            text = key_text(key)
+        except Exception:  # noqa: BLE001  (as with values: it costs itself)
+            name, kind = f"<{kind_name(key)}>", "key"
+        else:
+            name, kind = _without_surrogates(text[:MAX_KEY_CHARACTERS]), "surrogate"
+            if name == text:
+                return name
+            if len(text) > MAX_KEY_CHARACTERS:
+                kind = f"key[{len(text)}]"
+        self._name((place, name), kind)
+        return name
+
+    # -- arrays --------------------------------------------------------------------------------
+
+    def _items(self, value: Iterable[object], place: Place, depth: int) -> object:
+        if (count := item_count(value)) > self._room:
+            return self._replaced(place, f"array[{count}]")
+        items: list[Any] = list(islice(value, count))
+        kinds = set(map(type, items))
+        if _are_numbers(items, kinds):
+            self._take(count)
+            return self._numbers(_plain_numbers(items, kinds), place)
+        count, room = _nested(items)
+        if room > self._room:
+            return self._replaced(place, f"array[{count}]")
+        self._take(ROOM_OF_A_VALUE * len(items))
+        cleaned: list[object] = []
+        self._unfilled.append(_Unfilled(cleaned, value, items, place, depth + 1))
+        return cleaned
+
+    def _numbers(self, items: list[Any], place: Place) -> list[Any]:
+        """What lidars and cameras give: thousands of numbers, without a call for each."""
+        finite = list(map(math.isfinite, items))
+        kinds = set(map(str, compress(items, map(not_, finite))))
+        if not kinds:
+            return items
+        if len(kinds) == 1:
+            self._name((place, "*"), kinds.pop())
+        else:
+            for i, item in compress(enumerate(items), map(not_, finite)):
+                self._name((place, i), str(item))
+        return [item if good else None for item, good in zip(items, finite, strict=True)]
+
+    # -- everything else -----------------------------------------------------------------------
+
+    def _object(self, value: Any, place: Place, depth: int) -> object:
+        if isinstance(value, (bytes, bytearray, memoryview)):
+            return self._bytes(memoryview(cast("bytes", value)), place)
+        return self._plain(convert(value), place, depth + 1)
+
+    def _take(self, room: int) -> bool:
+        if room > self._room:
+            return False
+        self._room -= room
+        return True
+
+    def _replaced(self, place: Place, kind: str) -> None:
+        self._name(place, kind)
+
+    def _name(self, place: Place, kind: str) -> None:
+        if len(self.odd) + self.unnamed < MAX_NAMED and len(path := _path(place)) <= self._paths:
+            self._paths -= len(path)
+            self.odd[path] = kind
+        else:
+            self.unnamed += 1
+
+
+def _path(place: Place) -> str:
+    """Dotted; empty for the whole state."""
+    names: list[str] = []
+    above, name = place
+    while above is not None:
+        names.append(str(name))
+        above, name = above
+    return ".".join(reversed(names))
+
+
+def key_text(key: object) -> str:
+    """Object keys as the JSON encoder writes them; any other key as its text."""
+    if key is None or isinstance(key, bool):
+        return {None: "null", True: "true", False: "false"}[key]
+    if isinstance(key, (str, int)):  # also enums of them, whose own text is another
+        return str.__str__(key) if isinstance(key, str) else int.__repr__(key)
+    return str(key)
+
+
+def _size_bytes(text: str) -> int:
+    """As JSON, without the quotes."""
+    quoted = encode_basestring(text)
+    return (len(quoted) if quoted.isascii() else len(quoted.encode())) - 2
+
+
+def _without_surrogates(text: str) -> str:
+    return text.encode("utf-8", "replace").decode()
+
+
+def _are_numbers(items: list[Any], kinds: set[type]) -> bool:
+    """Whether all are, and none is an integer that has to be looked at."""
+    if not kinds or not all(issubclass(kind, (float, int)) for kind in kinds):
+        return False
+    if not any(issubclass(kind, int) for kind in kinds):
+        return True
+    return all(isinstance(item, float) or -(2**63) <= item < 2**63 for item in items)
+
+
+def _plain_numbers(items: list[Any], kinds: set[type]) -> list[Any]:
+    """Those of classes of their own (numpy's, enums) as Python's."""
+    return items if kinds <= {float, int, bool} else [_plain_number(item) for item in items]
+
+
+def _plain_number(item: Any) -> float:
+    if isinstance(item, float):
+        return float(item)
+    return item if isinstance(item, bool) else int(item)
+
+
+def _nested(items: list[Any]) -> tuple[int, int]:
+    """How many items a list of equal lists has, as its first ones show, and the room they take."""
+    count, lists, inside = len(items), 0, items
+    for _ in range(MAX_DEPTH):
+        if not _are_equal_lists(inside):
+            break
+        lists += count
+        inside = cast("list[Any]", inside[0])
+        count *= len(inside)
+    numeric = lists and inside and isinstance(inside[0], (float, int))
+    return count, ROOM_OF_A_VALUE * lists + count * (1 if numeric else ROOM_OF_A_VALUE)
+
+
+def _are_equal_lists(items: list[Any]) -> bool:
+    if not items or not all(isinstance(item, (list, tuple)) for item in items):
+        return False
+    return len(set(map(len, items))) == 1
+
+
+def failure(value: object, error: Exception) -> str:
+    """Why a value is not stored."""
+    if isinstance(error, NoCounterpartError):
+        return str(error)
+    return f"type {kind_name(value)}: {_reason(error)}"
+
+
+def _reason(error: Exception) -> str:
+    """Its text, which may be long, or fail as well."""
+    try:
+        return str(error)[:_MOST_REASON_CHARACTERS]
+    except Exception:  # noqa: BLE001  (an exception of the user's own)
+        return kind_name(error)

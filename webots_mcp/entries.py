@@ -90,7 +90,8 @@ STATEMENTS: Final[dict[Kind, str]] = {
     # The process that asked for the reload is gone; that this one runs is the proof that it worked.
     "reload confirmed": (
         "UPDATE command SET status = 'done', finished_wall_time_s = :now, "
-        "finished_sim_time_s = :sim_time, result = json_object('run_id', :run) "
+        "finished_sim_time_s = :sim_time, result = json_object('run_id', :run, 'mode', :mode, "
+        "'why', 'a reload keeps the mode') "
         "WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND action = 'reload' "
         "AND status = 'claimed' AND issued_wall_time_s IS NOT NULL"
     ),

@@ -92,7 +92,10 @@ def test_a_pause_in_the_middle_of_steps_says_that_they_were_interrupted(
     recording.send("resume")
     drive(1)
     status, _, error = recording.fate(step)
-    assert (status, error) == ("failed", f"interrupted by command {pause} (pause)")
+    assert (status, error) == (
+        "failed",
+        f"interrupted by command {pause} (pause) after 3 of 100 steps",
+    )
 
 
 @pytest.mark.parametrize("steps", [0, -1, 2.5, "three", True, 1_000_000])

@@ -75,7 +75,7 @@ def test_a_change_lasts_until_the_next_one_also_beyond_the_range(
     (help_needed,) = told(standing, "change", start_s=150.0, end_s=220.0)
     assert (help_needed.start_s, help_needed.end_s, help_needed.ongoing) == (200.0, 300.0, False)
     (cruise,) = told(standing, "change", start_s=290.0, end_s=310.0)
-    assert (cruise.start_s, cruise.end_s, cruise.ongoing) == (300.0, 399.9, True)
+    assert (cruise.start_s, cruise.end_s, cruise.ongoing) == (300.0, 399.9, False)
 
 
 def test_two_limits_on_one_signal_are_two_events(standing: sqlite3.Connection) -> None:

@@ -13,6 +13,8 @@ import pytest
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import CONTROLLER, Start, has_states
 from webots_mcp.connection import connect
+from webots_mcp.errors import CommandRefusedError
+from webots_mcp.server.addressee import find_addressee
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.recording import look
@@ -157,6 +159,56 @@ def test_an_extern_and_an_intern_controller_of_one_simulator_are_companions(
         assert filed.rows("SELECT extern FROM session ORDER BY extern") == [0, 1]
         wait(simulation, filed, filed.send("pause"))
         assert {status(filed, name) for name in ("rover", "referee")} == {"paused"}
+
+
+def test_the_reload_of_an_extern_controller_is_answered_when_its_process_has_ended(
+    extern_world: Path, connect_extern: Connect, filed: Recording
+) -> None:
+    with Simulation(extern_world) as simulation:
+        process = connect_extern(simulation)
+        simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+        result = wait(simulation, filed, filed.send("reload"))
+        assert "start it by hand" in result["controller"]
+        assert process.wait(10) == 0
+        connection = connect(filed.database, "reader")
+        assert "start it by hand" in (look(connection, "rover").status.why or "")
+        with pytest.raises(CommandRefusedError, match="start it by hand"):
+            find_addressee(connection, "rover", "pause")
+        connection.close()
+
+
+def test_a_robot_that_was_left_in_the_pause_of_another_is_told_by_whom(
+    extern_world: Path, connect_extern: Connect, filed: Recording, tmp_path: Path, data_dir: Path
+) -> None:
+    referee = tmp_path / "referee.py"
+    referee.write_text(CONTROLLER + LOOP)
+    text = extern_world.read_text(encoding="utf-8")
+    robot = 'Robot { name "referee" controller "referee" supervisor TRUE }'
+    extern_world.write_text(text + robot, encoding="utf-8")
+    environment = {"WEBOTS_MCP_DATA_DIR": str(data_dir)}
+    with Simulation(
+        extern_world, controllers={"referee": referee}, environment=environment
+    ) as simulation:
+        simulation.wait_for(lambda: simulation.controller("referee").is_running)
+        process = connect_extern(simulation)
+        simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+        simulation.wait_for(lambda: filed.rows("SELECT count(*) FROM session") == [2])
+        (newest,) = filed.rows("SELECT name FROM robot WHERE id = (SELECT max(id) FROM robot)")
+        wait(simulation, filed, filed.send("pause"))
+        other = "referee" if newest == "rover" else "rover"
+        if newest == "rover":
+            process.kill()
+            process.wait()
+        else:
+            simulation.controller("referee").kill()
+
+        def why() -> bool:
+            connection = connect(filed.database, "reader")
+            said = look(connection, other).status.why or ""
+            connection.close()
+            return f"robot {newest!r} paused the simulation" in said
+
+        simulation.wait_for(why, timeout_s=20)
 
 
 def test_a_killed_extern_controllers_hold_is_taken_over_by_the_next_one(

@@ -25,6 +25,7 @@ READING = {
     "webots_get_logs",
     "webots_monitor",
     "webots_list_commands",
+    "webots_wait_for_command",
     "webots_list_signals",
     "webots_query_history",
     "webots_get_trends",

@@ -48,11 +48,11 @@ class Actions:
         self._album = album
         self._call_back = call_back
         self._throttle = throttle
-        self.reloading = False
+        self.reloading: Command | None = None
         self._generators: Final[dict[str, Callable[[Command], Progress]]] = {
             "pause": self._pause,
-            "resume": lambda command: self._run(command, "real_time"),
-            "fast": lambda command: self._run(command, "fast"),
+            "resume": self._resume,
+            "fast": self._fast,
             "step": self._step,
             "reset": self._reset,
             "reload": self._reload,
@@ -78,8 +78,17 @@ class Actions:
         self._hold.take(command)
         return self._mode()
 
-    def _run(self, command: Command, mode: str) -> Progress:
-        self._hold.release(command, mode)
+    def _resume(self, command: Command) -> Progress:
+        before = self._hold.mode_before if self._hold.held else self._simulation.mode_name
+        self._hold.release(command, "real_time")
+        why = "resume means real time"
+        if before == "fast":
+            why += "; it ran fast before, and the command fast goes on so"
+        return {**self._mode(), "why": why}
+        yield
+
+    def _fast(self, command: Command) -> Progress:
+        self._hold.release(command, "fast")
         return self._mode()
         yield
 
@@ -94,15 +103,20 @@ class Actions:
         steps = _whole_number(command.params, "steps", 1, MAX_STEPS)
         from_s, from_step = self._clock.sim_time_s, self._clock.steps_seen
         self._hold.release(command, stepping=True)
-        while (made := self._clock.steps_seen - from_step) < steps:
-            yield
+        try:
+            while (made := self._clock.steps_seen - from_step) < steps:
+                yield
+        except CommandRefusedError as interruption:
+            made = self._clock.steps_seen - from_step
+            text = f"{interruption} after {made} of {steps} steps"
+            raise CommandRefusedError(text) from None
         self._hold.take(command)
         advanced_s = round(self._clock.sim_time_s - from_s, 6)
         return {"steps": made, "advanced_s": advanced_s, **self._mode()}
 
     def _reset(self, command: Command) -> Progress:
         """Ask for the reset; done when simulation time went back, which takes a physics step."""
-        run = self._clock.run
+        run, held = self._clock.run, self._hold.held
         self._queue.issue(command)
         self._hold.release(command)  # first: a paused simulation makes no physics step
         self._clock.await_reset()
@@ -116,18 +130,19 @@ class Actions:
                     f"{_RESET_TIMEOUT_S:.0f} s"
                 )
             yield
-        return {"run_id": self._clock.run.id, "sim_time_s": self._clock.sim_time_s}
+        why = "a reset takes a step, which ended the pause" if held else "a reset keeps the mode"
+        return {"run_id": self._clock.run.id, **self._mode(), "why": f"{why}; time goes on"}
 
     def _reload(self, command: Command) -> Progress:
         """Ask for the reload; this process ends, and the next session confirms the command."""
         self._queue.issue(command)
-        self.reloading = True
+        self.reloading = command
         self._hold.release(command)  # first: after worldReload() Webots answers nothing but quit
         self._simulation.robot.worldReload()
         deadline_s = time.monotonic() + _RELOAD_TIMEOUT_S
         while time.monotonic() < deadline_s:
             yield
-        self.reloading = False
+        self.reloading = None
         raise CommandRefusedError(
             f"worldReload() was called, but the controller still runs after "
             f"{_RELOAD_TIMEOUT_S:.0f} s; a dialog may be open in Webots (start it with --batch)"

@@ -21,6 +21,7 @@ from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.connection import is_busy
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.errors import CommandRefusedError
+from webots_mcp.settlement import EXTERN
 
 Handler = Callable[[dict[str, Any]], object]
 
@@ -57,6 +58,7 @@ class Control:
         )
         self._handlers: dict[str, Handler] = {}
         self._under_way: dict[Command, Progress] = {}
+        self._reported = False
         self._next_poll_s = 0.0
 
     def register(self, action: str, handler: Handler) -> None:
@@ -80,6 +82,14 @@ class Control:
     def take_over(self, mode_before: str) -> None:
         """Hold the loop from its next step on, as the session before this one held it."""
         self._hold.take_over(mode_before)
+
+    def report_end(self, *, extern: bool) -> None:
+        """The process is about to end: say what no successor will say of a reload."""
+        command = self.actions.reloading
+        if command is not None and extern and not self._reported:
+            self._reported = True
+            self._under_way.pop(command, None)
+            self._succeed(command, {"controller": f"it has ended; {EXTERN}"})
 
     def let_go(self) -> None:
         """No command will be served any more."""
@@ -180,9 +190,11 @@ class Control:
 
     def _interrupt_steps(self, by: Command) -> None:
         for command in [c for c in self._under_way if c.action == "step"]:
-            del self._under_way[command]
-            reason = CommandRefusedError(f"interrupted by command {by.id} ({by.action})")
-            self._fail(command, reason)
+            progress = self._under_way.pop(command)
+            try:
+                progress.throw(CommandRefusedError(f"interrupted by command {by.id} ({by.action})"))
+            except CommandRefusedError as reason:
+                self._fail(command, reason)
 
     def _succeed(self, command: Command, result: object) -> None:
         replaced = self._queue.succeed(command, result, self._clock.sim_time_s)

@@ -267,12 +267,13 @@ class MCPBridge:
         if self._closed:
             return
         self._closed = True
+        reason = reason or self._end_reason
         self._let_go()
         atexit.unregister(self._close_at_exit)
         open_bridges.leave(self.robot)
         if self._maintainer is not None:
             self._maintainer.stop()
-        self._recorder.close(reason or self._end_reason, self._clock.sim_time_s)
+        self._recorder.close(reason, self._clock.sim_time_s)
 
     def __enter__(self) -> MCPBridge:
         return self
@@ -332,7 +333,8 @@ class MCPBridge:
             self._reloads.happened()
         if registration is not None:
             times = {"now": time.time(), "sim_time": self._clock.sim_time_s}
-            self._recorder.record("reload confirmed", run, times)
+            mode = self._simulation.mode_name if self._simulation.supervisor else None
+            self._recorder.record("reload confirmed", run, {**times, "mode": mode})
             if registration.held_mode is not None:
                 self._control.take_over(registration.held_mode)
 
@@ -340,6 +342,7 @@ class MCPBridge:
         """A hold that nobody could end any more would stop the whole simulation."""
         try:
             self._control.let_go()
+            self._control.report_end(extern=self._identity.extern)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("close", error)
 
@@ -365,6 +368,7 @@ class MCPBridge:
 
     def _end(self) -> None:
         """Webots may kill the process from here on, or let the loop say its last words."""
+        self._control.report_end(extern=self._identity.extern)
         self._recorder.end(self._end_reason, self._clock.sim_time_s)
 
     def _record_state(self, state: Mapping[Any, Any]) -> None:

@@ -67,7 +67,7 @@ def _require_action(view: View, action: str) -> None:
 
 
 def _require_live(view: View) -> Session:
-    """Its session; one that asked for a reload has a successor soon, which will run the command."""
+    """Its session; one that Webots reloads has a successor soon, which will run the command."""
     session = view.session
     if session is not None and (view.robot.live or _is_reloading(session, view.now_s)):
         return session
@@ -79,6 +79,8 @@ def _require_live(view: View) -> Session:
 
 def _is_reloading(session: Session, now_s: float) -> bool:
     ended_s = session.ended_wall_time_s or session.last_seen_wall_time_s
+    if session.extern:
+        return False
     return session.end_reason == "reload" and now_s - ended_s < ISSUED_TIME_TO_LIVE_S
 
 

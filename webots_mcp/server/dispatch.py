@@ -63,13 +63,26 @@ class Dispatcher:
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
 
+    async def wait(self, command_id: int, timeout_s: float, report: Report) -> CommandAnswer:
+        """Go on waiting for a command that was sent before; nothing is taken back at the deadline.
+
+        Raises:
+            InvalidInputError: There is no such command.
+        """
+        started_s = time.monotonic()
+        await to_thread.run_sync(self._recording.settle)
+        command = await self._watch(command_id, timeout_s, report)
+        waited_s = round(time.monotonic() - started_s, 3)
+        return await to_thread.run_sync(self._answer, command, waited_s)
+
     async def _send(self, request: Request, report: Report) -> Command:
         command = await to_thread.run_sync(self._enqueue, request)
         try:
-            return await self._watch(command.id, request.timeout_s, report)
+            command = await self._watch(command.id, request.timeout_s, report)
+            return await to_thread.run_sync(self._at_the_deadline, command)
         except anyio.get_cancelled_exc_class():
             with anyio.CancelScope(shield=True):
-                await to_thread.run_sync(self._take_back, command.id, "the asker went away")
+                await to_thread.run_sync(self._leave, command.id)
             raise
 
     def _enqueue(self, request: Request) -> Command:
@@ -90,7 +103,7 @@ class Dispatcher:
             while not (command := fetch_command(connection, command_id)).is_final:
                 waited_s = time.monotonic() - started_s
                 if waited_s >= timeout_s:
-                    return await to_thread.run_sync(self._at_the_deadline, command_id)
+                    return command
                 if waited_s >= next_report_s:
                     next_report_s += _REPORT_INTERVAL_S
                     await to_thread.run_sync(self._recording.settle)
@@ -98,9 +111,15 @@ class Dispatcher:
                 await anyio.sleep(_POLL_INTERVAL_S)
             return command
 
-    def _at_the_deadline(self, command_id: int) -> Command:
+    def _at_the_deadline(self, command: Command) -> Command:
+        if command.is_final:
+            return command
         self._recording.settle()
-        return self._take_back(command_id, "nobody claimed it in time; it will not run")
+        return self._take_back(command.id, "nobody claimed it in time; it will not run")
+
+    def _leave(self, command_id: int) -> None:
+        with self._recording.writer() as connection:
+            CommandQueue(connection).leave(command_id, "the asker went away")
 
     def _take_back(self, command_id: int, why: str) -> Command:
         with self._recording.writer() as connection:
@@ -142,14 +161,16 @@ def _progress(command: Command, waited_s: float) -> str:
 
 def _hint(view: View, command: Command) -> str | None:
     """What to do next where an outcome does not speak for itself."""
+    if command.status == "pending":
+        return "no controller has claimed it yet"
     if command.status == "done":
         return command.error  # what of the result had to be replaced
     if command.status == "failed":
         return _instructions(view, command.action)
     if command.status == "claimed":
         return (
-            "the controller is still at it; webots_list_commands will show how it ended; do not "
-            "send it again"
+            "the controller is still at it: go on waiting with webots_wait_for_command, "
+            f"command_id {command.id}; do not send it again"
         )
     if command.status == "lost":
         return "it may have run in part: look at the robot before you send it again"

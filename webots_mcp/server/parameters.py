@@ -9,6 +9,9 @@ from pydantic import AfterValidator, Field
 from webots_mcp import contract
 from webots_mcp.store.history.event import Kind
 
+# Clients put a call aside after two minutes; some of this time is for a busy database.
+MAX_WAIT_S: Final = 90
+
 
 def _as_id(value: int) -> int:
     if value >= 2**63:  # what SQLite can compare with
@@ -44,7 +47,8 @@ EndS = Annotated[
     _Seconds | None, Field(description="Up to, not including, this simulation time, s.")
 ]
 TimeoutS = Annotated[
-    float, Field(ge=0.1, le=600, description="How long to wait for the outcome, wall seconds.")
+    float,
+    Field(ge=0.1, le=MAX_WAIT_S, description="How long to wait for the outcome, wall seconds."),
 ]
 _CURSOR: Final = "From the previous answer, to go on where it ended."
 Cursor = Annotated[_Id | None, Field(ge=0, description=_CURSOR)]

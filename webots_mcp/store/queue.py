@@ -71,6 +71,7 @@ _CANCEL: Final = (
     "UPDATE command SET status = 'cancelled', finished_wall_time_s = :now, error = :why "
     "WHERE id = :id AND status = 'pending'"
 )
+_NOTE: Final = "UPDATE command SET error = :note WHERE id = :id AND status = 'claimed'"
 _NEWEST: Final = (
     f"SELECT {_COLUMNS} FROM command WHERE robot_id = :robot_id "
     "AND (:before_id IS NULL OR id < :before_id) AND (:status IS NULL OR status = :status) "
@@ -144,6 +145,12 @@ class CommandQueue:
                 f"({command.action!r}); use another key"
             )
         return command
+
+    def leave(self, command_id: int, why: str) -> None:
+        """Nobody waits any more: it is taken back, or goes on where it has begun, with a note."""
+        if not self.cancel(command_id, why):
+            values = {"id": command_id, "note": f"{why}; it goes on"}
+            _while_busy(lambda: self._connection.execute(_NOTE, values))
 
     def cancel(self, command_id: int, why: str) -> bool:
         """Take back a command that nobody has claimed; True if it will now never run."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
 
-from webots_mcp.contract import HEARTBEAT_LATE_S, REMOTE_SILENCE_S, host_name
+from webots_mcp.contract import HEARTBEAT_LATE_S, PAUSED, REMOTE_SILENCE_S, host_name
 from webots_mcp.liveness import process_alive
 from webots_mcp.store.rows import columns_of
 
@@ -83,6 +83,11 @@ _COMPANIONS: Final = (
     f"SELECT {_COLUMNS} FROM session WHERE instance = :instance "
     "AND id <> :id AND ended_wall_time_s IS NULL ORDER BY id"
 )
+_LEFT_HOLDING: Final = (
+    f"SELECT {_COLUMNS} FROM session WHERE instance = :instance AND hold = '{PAUSED}' "
+    "AND last_seen_wall_time_s >= :started AND id = (SELECT max(id) FROM session n "
+    "WHERE n.robot_id = session.robot_id) ORDER BY id DESC LIMIT 1"
+)
 
 
 def newest_session(connection: sqlite3.Connection, robot_id: int) -> Session | None:
@@ -100,6 +105,13 @@ def companions(connection: sqlite3.Connection, session: Session, now_s: float) -
     values = {"instance": session.instance, "id": session.id}
     rows = connection.execute(_COMPANIONS, values).fetchall()
     return [found for row in rows if (found := _session(row)) and found.is_alive(now_s)]
+
+
+def left_holding(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:
+    """The newest session in the same simulation, if it is gone and held its loop to the end."""
+    values = {"instance": session.instance, "started": session.started_wall_time_s}
+    found = _session(connection.execute(_LEFT_HOLDING, values).fetchone())
+    return found if found is not None and not found.is_alive(now_s) else None
 
 
 def _session(row: tuple[Any, ...] | None) -> Session | None:

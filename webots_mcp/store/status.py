@@ -6,9 +6,10 @@ import sqlite3
 from typing import Final, NamedTuple
 
 from webots_mcp.contract import BUILT_IN_ACTIONS, HEARTBEAT_INTERVAL_S, PAUSED
+from webots_mcp.settlement import EXTERN
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.runs import Run
-from webots_mcp.store.sessions import Session, companions
+from webots_mcp.store.sessions import Session, companions, left_holding
 from webots_mcp.store.states import recent_interval_s
 
 NEVER_SEEN: Final = "never seen"
@@ -24,7 +25,8 @@ _HOLD_SINCE_BEAT: Final = (
 )
 
 _CLAIMED: Final = (
-    "SELECT id, action, claimed_wall_time_s FROM command WHERE robot_id = ? AND session_id = ? "
+    "SELECT id, action, coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
+    "WHERE robot_id = ? AND session_id = ? "
     "AND status = 'claimed' ORDER BY id DESC"
 )
 
@@ -37,6 +39,11 @@ _ENDED: Final = {
     "crashed": "its controller process is gone without having finished (killed or crashed)",
     "replaced": "a newer session took its place",
 }
+_RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
+_LEFT_PAUSED: Final = (
+    "robot {0!r} paused the simulation, and its controller has ended since: press play in Webots, "
+    "or start that controller again and resume it there"
+)
 _SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
     "breakpoint, another controller looping, or an extern controller missing; from inside the "
@@ -79,7 +86,7 @@ def judge(
     if session is None:
         return Status(NEVER_SEEN)
     if not session.is_alive(now_s):
-        return _stopped(session, now_s, _ENDED.get(session.end_reason or "crashed"))
+        return _stopped(session, now_s, _why_ended(session))
     if holder := find_holder(connection, session, now_s):
         return Status(PAUSED, None if holder is session else _held_elsewhere(connection, holder))
     fresh = session.heartbeat_is_fresh(now_s)
@@ -93,6 +100,12 @@ def judge(
     return _stopped(session, now_s, _why_standing(connection, session, now_s))
 
 
+def _why_ended(session: Session) -> str | None:
+    if session.end_reason == "reload" and session.extern:
+        return _RELOADED_EXTERN
+    return _ENDED.get(session.end_reason or "crashed")
+
+
 def _why_standing(connection: sqlite3.Connection, session: Session, now_s: float) -> str:
     """Why the time of a living controller, which its bridge does not hold, stands still."""
     if inside := handler_at_work(connection, session, now_s):
@@ -101,8 +114,10 @@ def _why_standing(connection: sqlite3.Connection, session: Session, now_s: float
         return _NOT_STARTED
     # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
     beaten_since_s = session.last_seen_wall_time_s - session.moved_wall_time_s
-    alive = session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S
-    return _STANDING if alive else _SILENT
+    if session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S:
+        return _STANDING
+    left = left_holding(connection, session, now_s)
+    return _SILENT if left is None else _LEFT_PAUSED.format(robot_name(connection, left.robot_id))
 
 
 def handler_at_work(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:

@@ -43,7 +43,7 @@ class Rehearsal(InProcessSimulation):
         Raises:
             WouldBlockError: The loop has been held by a pause for 2 s of wall time.
         """
-        if self.mode is not Mode.PAUSE:
+        if self.mode is not Mode.PAUSE or message[:2] == ("ask", "simulation_set_mode"):
             self._held_since_s = None
         elif self._held_since_s is None:
             self._held_since_s = time.monotonic()

@@ -53,6 +53,16 @@ class CommandTools:
         request = Request(robot, action, params or {}, timeout_s)
         return await self._dispatcher.ask(request, reporter(ctx))
 
+    @tool("Wait for a command", READS)
+    async def webots_wait_for_command(
+        self,
+        command_id: Annotated[int, Field(ge=1, le=2**63 - 1, description="From its answer.")],
+        ctx: Context[Any],
+        timeout_s: TimeoutS = _WAIT_S,
+    ) -> CommandAnswer:
+        """Go on waiting for a command that was still under way when its call was answered."""
+        return await self._dispatcher.wait(command_id, timeout_s, reporter(ctx))
+
     @tool("List the commands", READS)
     def webots_list_commands(
         self,

@@ -15,7 +15,7 @@ from webots_mcp.server.addressee import find_addressee
 from webots_mcp.server.boundary import ACTS, RESTARTS, reporter, tool
 from webots_mcp.server.dispatch import Dispatcher, Request
 from webots_mcp.server.keyboard import press_reset
-from webots_mcp.server.parameters import RobotName, TimeoutS
+from webots_mcp.server.parameters import MAX_WAIT_S, RobotName, TimeoutS
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.store.recording import Recording
 
@@ -23,7 +23,6 @@ Control = Literal["pause", "resume", "fast", "step", "reset", "reload"]
 
 _WAIT_S: Final = 10.0
 _RELOAD_WAIT_S: Final = 30.0
-_LONGEST_STEP_WAIT_S: Final = 300.0
 _RESET_POLL_S: Final = 0.05
 
 
@@ -53,14 +52,18 @@ class ControlTools:
         timeout_s: Annotated[
             float | None,
             Field(
-                ge=0.1, le=600, description="By default 10 s, for reload 30, for step up to 300."
+                ge=0.1,
+                le=MAX_WAIT_S,
+                description="By default 10 s, for reload 30, for step up to 90; then "
+                "webots_wait_for_command goes on waiting.",
             ),
         ] = None,
     ) -> CommandAnswer:
         """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
 
         Needs a controller that is a Supervisor. The whole simulation is steered, not one robot
-        alone. `reload` restarts all controllers with their code as it is on disk now.
+        alone. `reload` restarts the controllers that Webots starts, with their code as it is on
+        disk now; an extern controller ends, and somebody has to start it again by hand.
         """
         params = {"steps": steps} if command == "step" else {}
         waiting_s = timeout_s or await to_thread.run_sync(self._usual_wait_s, command, steps, robot)
@@ -70,7 +73,10 @@ class ControlTools:
     async def webots_world_reload(
         self, ctx: Context[Any], robot: RobotName = None, timeout_s: TimeoutS = _RELOAD_WAIT_S
     ) -> CommandAnswer:
-        """Reload the world from disk and restart all controllers; waits until a new one records."""
+        """Reload the world from disk and restart its controllers; waits until a new one records.
+
+        An extern controller ends, and somebody has to start it again by hand.
+        """
         return await self._dispatcher.ask(Request(robot, "reload", {}, timeout_s), reporter(ctx))
 
     @tool("Reset the world", RESTARTS)
@@ -113,7 +119,7 @@ class ControlTools:
         with self._recording.reader() as connection:
             run = find_addressee(connection, robot, command).run
             step_ms = (run.basic_time_step_ms if run else None) or 32.0
-        return min(_WAIT_S + 2 * steps * step_ms / 1000, _LONGEST_STEP_WAIT_S)
+        return min(_WAIT_S + 2 * steps * step_ms / 1000, MAX_WAIT_S)
 
     async def _reset_by_keys(self, robot: str | None, timeout_s: float) -> CommandAnswer:
         """Press the keys, then wait for the run that a reset begins."""

@@ -10,6 +10,7 @@ from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.parameters import RobotName, RunId
 from webots_mcp.server.results import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.server.shortening import cut_text, round_number
+from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention.limits import described, unheeded
 from webots_mcp.store.retention.stock import file_sizes
@@ -111,7 +112,8 @@ def _pace(view: View, run: Run) -> float | None:
 
 def _run(view: View, run: Run) -> dict[str, Any]:
     """What the run is; `rows` is as of its last heartbeat."""
-    ended = {"ended_by": run.end_reason} if run.ended_wall_time_s is not None else {}
+    end_reason = run.end_reason or dict(gone_sessions(view.connection)).get(run.session_id)
+    ended = {"ended_by": end_reason} if end_reason is not None else {}
     return {
         "id": run.id,
         "began_by": run.start_reason,

@@ -26,7 +26,8 @@ class Event:
             threshold, silent (no value), flat, jump, oscillation; command, log, noticed (by the
             bridge), image.
         end_s: Equal to the start for what has no duration; of a change when the value ended.
-        ongoing: It lasts up to the newest row of the run; of a command, it is not finished.
+        ongoing: It lasts up to the newest row of a run that goes on; of a command, it is not
+            finished.
         name: The signal, the action, the level or the device that it is about.
         details: What there is to say about it, by kind.
         around: Values of a few signals when it began.

@@ -8,6 +8,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
+from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.history.detection import Detection
 from webots_mcp.store.history.event import Event, EventOptions, Kind
@@ -29,6 +30,7 @@ from webots_mcp.store.history.stored import (
 
 MOST_AROUND: Final = 6  # values that are told with an event
 
+_IS_OPEN: Final = "SELECT id, session_id, ended_wall_time_s IS NULL FROM run WHERE id = ?"
 _ROW_AT: Final = (
     "SELECT data FROM state WHERE run_id = ? AND sim_time_s <= ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
@@ -115,7 +117,16 @@ def collect(
         if recorded is not None:
             detection = Detection(connection, known, options, deadline, *recorded.bounds)
             found += detection.events_touching(recorded.segment, notes)
-    return found, notes
+    over = _runs_over(connection, [segment.run_id for segment in time_range.segments])
+    ended = [replace(e, ongoing=False) if e.ongoing and e.run_id in over else e for e in found]
+    return ended, notes
+
+
+def _runs_over(connection: sqlite3.Connection, run_ids: Sequence[int]) -> set[int]:
+    """Those in which nothing goes on any more: they have ended, or their process is gone."""
+    gone = dict(gone_sessions(connection))
+    told = [connection.execute(_IS_OPEN, (run_id,)).fetchone() for run_id in set(run_ids)]
+    return {run_id for run_id, session_id, is_open in told if not is_open or session_id in gone}
 
 
 def _context(

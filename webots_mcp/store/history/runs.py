@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.runs import fetch_run
@@ -30,6 +31,10 @@ _RUNS: Final = (
     "WHERE run_id = r.id), r.started_sim_time_s)) "
     "FROM run r JOIN session s ON s.id = r.session_id JOIN robot b ON b.id = r.robot_id "
 )
+_WHAT: Final = (
+    "run_id", "robot", "session_id", "controller", "controller_sha256", "git_commit", "world",
+    "start_reason", "end_reason", "label", "note", "purged_rows", "rows",
+)  # fmt: skip
 _PAGE: Final = (
     f"{_RUNS} WHERE (:robot IS NULL OR r.robot_id = :robot) AND (:before IS NULL OR r.id < :before)"
     " ORDER BY r.id DESC LIMIT :limit"
@@ -61,7 +66,7 @@ class RunInfo:
     """A run.
 
     Attributes:
-        end_reason: None while it goes on.
+        end_reason: None while it goes on; where its process is gone, how that will be judged.
         duration_s: Simulated seconds.
         held_s: Of the wall time, that for which the simulation was paused by a command.
         rows: State rows, of which retention has deleted `purged_rows`.
@@ -133,7 +138,8 @@ def list_runs(
     robot_id = None if robot is None else resolve_robot(connection, robot, time.time()).id
     page = {"robot": robot_id, "before": before_id, "limit": limit + 1}
     rows: list[Any] = connection.execute(_PAGE, page).fetchall()
-    runs = tuple(_info(connection, row) for row in rows[:limit])
+    gone = dict(gone_sessions(connection))
+    runs = tuple(_info(connection, row, gone) for row in rows[:limit])
     total = connection.execute(_TOTAL, {"robot": robot_id}).fetchone()[0]
     return RunList(runs, total, runs[-1].run_id if len(rows) > limit else None)
 
@@ -144,9 +150,8 @@ def run_info(connection: sqlite3.Connection, run_id: int) -> RunInfo:
     Raises:
         UnknownRunError: There is none of that id.
     """
-    return _info(
-        connection, connection.execute(_ONE, (fetch_run(connection, run_id).id,)).fetchone()
-    )
+    row = connection.execute(_ONE, (fetch_run(connection, run_id).id,)).fetchone()
+    return _info(connection, row, dict(gone_sessions(connection)))
 
 
 def annotate_run(
@@ -185,10 +190,13 @@ def pace(duration_s: float, wall_s: float) -> float | None:
     return duration_s / wall_s if wall_s >= 1 else None
 
 
-def _info(connection: sqlite3.Connection, row: tuple[Any, ...]) -> RunInfo:
+def _info(connection: sqlite3.Connection, row: tuple[Any, ...], gone: dict[int, str]) -> RunInfo:
+    """One run; `gone` tells of sessions that look open how they ended."""
     *what, started_wall_s, last_wall_s, started_s, last_s = row
+    named = dict(zip(_WHAT, what, strict=True))
+    named["end_reason"] = named["end_reason"] or gone.get(named["session_id"])
     return RunInfo(
-        *what,
+        **named,
         started_wall_time_s=started_wall_s,
         wall_duration_s=last_wall_s - started_wall_s,
         held_s=_held_s(connection, row[0], last_wall_s),

@@ -96,6 +96,24 @@ def test_walls_have_the_color_of_their_appearance() -> None:
     assert {shape.color for shape in walls.shapes} == {(0.9, 0.2, 0.1)}
 
 
+def test_the_wall_of_a_circle_arena_is_round(tmp_path: Path) -> None:
+    world = tmp_path / "circle.wbt"
+    world.write_text(
+        "#VRML_SIM R2025a utf8\nWorldInfo { }\nCircleArena { radius 0.5 }\n"
+        'E-puck { controller "<extern>" turretSlot [ Lidar { fieldOfView 6.28 maxRange 2 } ] }',
+        encoding="utf-8",
+    )
+    robot = InProcessSupervisor(world=world)
+    lidar = robot.getDevice("lidar")
+    lidar.enable(32)
+    drive(robot, ["left wheel motor", "right wheel motor"], 0.0, 1)
+    ranges = lidar.getLayerRangeImage(0)  # its slot is 9.5 mm behind the middle
+    assert min(ranges) == pytest.approx(0.5 - 0.0095, abs=0.002)
+    assert max(ranges) == pytest.approx(0.5 + 0.0095, abs=0.002)
+    drive(robot, ["left wheel motor", "right wheel motor"], 6.28, 140)
+    assert robot.simulation.robot("e-puck").position[0] == pytest.approx(0.5 - 0.037, abs=0.001)
+
+
 def test_solids_inside_solids_are_obstacles() -> None:
     simulation = InProcessSimulation(WORLDS / "rooms_r2025a.wbt")
     arena = simulation._simulator.arena  # pyright: ignore[reportPrivateUsage]

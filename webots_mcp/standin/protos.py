@@ -7,6 +7,7 @@ here, not even those of a project: their files are not read.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from math import cos, pi, sin, tan
 from typing import Any, Final
 
 from webots_mcp.standin.e_puck import E_PUCK, e_puck
@@ -17,6 +18,12 @@ from webots_mcp.standin.vrml import Node, Parser, descendants_of
 _DEFINITIONS: Final = definitions_in(
     E_PUCK
     + """
+CircleArena {
+  SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  SFString name "circle arena"
+  SFFloat radius 1  SFString contactMaterial "default"  SFNode floorAppearance NULL
+  SFVec2f floorTileSize 0.5 0.5  SFFloat wallThickness 0.01  SFFloat wallHeight 0.1
+  SFNode wallAppearance NULL  SFInt32 subdivision 48
+}
 Floor {
   SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  SFString name "floor"
   SFString contactMaterial "default"  SFVec2f size 10 10  SFVec2f tileSize 0.5 0.5
@@ -71,6 +78,21 @@ def _rectangle_arena(fields: Mapping[str, Any]) -> str:
     return f"Solid {{ children [ {floor} {boxes} ] }}"
 
 
+def _circle_arena(fields: Mapping[str, Any]) -> str:
+    radius, thickness, height = fields["radius"], fields["wallThickness"], fields["wallHeight"]
+    count = max(fields["subdivision"], 8)
+    middle_m, z = radius + thickness / 2.0, height / 2.0
+    length_m = 2.0 * (radius + thickness) * tan(pi / count)
+    look = f'{_look(fields["wallAppearance"])} name "wall"'
+    boxes = " ".join(
+        f"SolidBox {{ translation {middle_m * cos(angle)} {middle_m * sin(angle)} {z} "
+        f"rotation 0 0 1 {angle} size {thickness} {length_m} {height} {look} }}"
+        for angle in (2.0 * pi * i / count for i in range(count))
+    )
+    floor = f"Floor {{ size {2 * radius} {2 * radius} {_look(fields['floorAppearance'])} }}"
+    return f"Solid {{ children [ {floor} {boxes} ] }}"
+
+
 def _look(appearance: Node | None) -> str:
     """An appearance of the same color, if it says which."""
     color: list[float] | None = appearance.fields.get("baseColor") if appearance else None
@@ -90,6 +112,7 @@ def _box(fields: Mapping[str, Any], color: str, middle_z_m: float = 0.0) -> str:
 
 
 PROTOS: Final[dict[str, Callable[[Mapping[str, Any]], str]]] = {
+    "CircleArena": _circle_arena,
     "Floor": _floor,
     "RectangleArena": _rectangle_arena,
     "SolidBox": lambda fields: _box(fields, "0.6 0.6 0.6"),

@@ -6,6 +6,7 @@ fixtures that use it.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,16 +37,17 @@ def webots_database(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryDatabase]
 
 
 @pytest.fixture
-def webots_robot_factory() -> RobotFactory:
+def webots_robot_factory(pytestconfig: pytest.Config) -> RobotFactory:
     """Makes robots of the stand-in, without a process.
 
     `webots_robot_factory(name=None, *, world=..., supervisor=True, duration_s=inf)`: a robot of a
-    world, by name or the first. After `duration_s` of simulated time its `step` returns -1. Robots
-    share a world when they are given the `simulation` of the first as `world`.
+    world, by name or the first. A world's path is one in pytest's rootdir. After `duration_s` of
+    simulated time its `step` returns -1. Robots share a world when they are given the `simulation`
+    of the first as `world`.
     """
     from webots_mcp.testing import RobotFactory
 
-    return RobotFactory()
+    return RobotFactory(pytestconfig.rootpath)
 
 
 @pytest.fixture
@@ -74,14 +76,29 @@ def webots_recording(webots_database: MemoryDatabase) -> Recording:
 
 
 @pytest.fixture
-def webots_simulation(tmp_path: Path) -> Iterator[SimulationFactory]:
+def webots_simulation(
+    tmp_path: Path, request: pytest.FixtureRequest
+) -> Iterator[SimulationFactory]:
     """Starts a world whose controllers are real processes that record into the test's folder.
 
     `webots_simulation(world=..., controllers={"rover": file}, environment={})`: paused before its
     first step; `run_for(duration_s)` lets it run, `recording` is what its controllers recorded.
+    Paths are those in pytest's rootdir. A failure shows in which file the recording is.
     """
-    from webots_mcp.testing import SimulationFactory
+    from webots_mcp.testing import RecordedSimulation, SimulationFactory
 
-    factory = SimulationFactory(tmp_path)
+    def tell(simulation: RecordedSimulation) -> None:
+        node: pytest.Item = request.node
+        node.add_report_section("call", "recording", f"{simulation.recording.database}\n")
+
+    factory = SimulationFactory(tmp_path, request.config.rootpath, tell)
     yield factory
     factory.close()
+
+
+def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str] | None:
+    """Show a command's status with the reason, which pytest itself would cut off."""
+    commands = sys.modules.get("webots_mcp.testing.commands")
+    if commands is None or not isinstance(left, commands.Status):
+        return None
+    return [f"{left!r} {op} {right!r}"]

@@ -26,6 +26,20 @@ def test_the_documentations_examples_work_as_printed(pytester: pytest.Pytester) 
     pytester.runpytest_subprocess("-Werror", "-p", "no:cacheprovider").assert_outcomes(passed=6)
 
 
+def test_the_documentations_failure_is_todays(pytester: pytest.Pytester) -> None:
+    text = (ROOT / "docs" / "testing.md").read_text("utf-8")
+    (code,) = re.findall(r"```python\n# test_rover.py\n(.*?)```", text, re.DOTALL)
+    (shown,) = re.findall(r"```text\n(.*?)```", text, re.DOTALL)
+    assert "below(0.1)" in code
+    pytester.makepyfile(test_rover=code.replace("below(0.1)", "below(0.2)"))
+    _copy_project(pytester.path)
+    told = pytester.runpytest_subprocess("-Werror", "-p", "no:cacheprovider").stdout
+    for line in shown.splitlines():
+        begin, cut, end = line.partition("...")
+        pattern = begin.replace("[", "[[]") + "*" * bool(cut) + end
+        told.fnmatch_lines([f"*{pattern.strip('-')}*"])
+
+
 def _copy_project(folder: Path) -> None:
     for name in ("worlds/arena.wbt", "controllers/rover/rover.py"):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -57,6 +71,104 @@ def test_a_failure_shows_the_users_line_and_the_reason(pytester: pytest.Pytester
         ]
     )
     result.stdout.no_fnmatch_line("*signals.py*")
+
+
+STUCK = """
+from controller import Robot
+from webots_mcp import MCPBridge
+robot = Robot()
+bridge = MCPBridge(robot)
+bridge.publish({"x": 1})
+robot.step(16)
+while True:
+    pass
+"""
+
+
+def test_a_controller_that_hangs_is_named_and_the_recordings_file_too(
+    pytester: pytest.Pytester,
+) -> None:
+    pytester.makepyfile(stuck=STUCK)
+    pytester.makepyfile(
+        """
+        def test_it(webots_simulation):
+            simulation = webots_simulation(controllers={"rover": "stuck.py"})
+            simulation.run_for(1, timeout_s=3)
+        """
+    )
+    result = pytester.runpytest_inprocess()
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(
+        [
+            ">*simulation.run_for(1, timeout_s=3)",
+            f"E*the controller of 'rover' ({pytester.path / 'stuck.py'}, process *) "
+            "does not come to its next step(); simulated time stands at 0.016 s",
+            "E*not the case after 3 s; the console says:",
+            "*Captured recording call*",
+            "*mcp_data_1*webots.db",
+        ]
+    )
+    result.stdout.no_fnmatch_line("*simulation.py:*: TimeoutError")
+
+
+def test_a_plain_assertion_that_fails_names_the_recordings_file(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        def test_it(webots_simulation):
+            assert webots_simulation().time_s > 0
+        """
+    )
+    result = pytester.runpytest_inprocess()
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines(["*Captured recording call*", "*mcp_data_1*webots.db"])
+
+
+def test_a_command_that_is_not_done_says_why_in_the_failure(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        def honk(command):
+            raise RuntimeError("the horn of the small grey robot is gone since Tuesday")
+
+        def test_failed(webots_robot, webots_bridge, webots_recording):
+            webots_bridge.register_command("honk", honk)
+            sent = webots_recording.send("honk")
+            webots_robot.step(32)
+            webots_bridge.get_command()
+            assert sent.status == "done"
+
+        def test_pending(webots_bridge, webots_recording):
+            sent = webots_recording.send("honk")
+            assert (sent.status, sent.result) == ("done", None)
+        """
+    )
+    result = pytester.runpytest_inprocess("-p", "no:cacheprovider")
+    result.assert_outcomes(failed=2)
+    result.stdout.fnmatch_lines(
+        [
+            "E*assert 'failed' (RuntimeError: the horn of the small grey robot is gone since "
+            "Tuesday*) == 'done'",
+            "E*'pending' (no get_command() of its controller has come to it yet) != 'done'",
+        ]
+    )
+
+
+def test_paths_are_those_in_the_rootdir_wherever_pytest_is_started(
+    pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytester.makeini("[pytest]")
+    _copy_project(pytester.path)
+    pytester.path.joinpath("tests").mkdir()
+    pytester.path.joinpath("tests", "test_paths.py").write_text(
+        "RELATIVE = 'worlds/arena.wbt'\n"
+        "def test_world(webots_simulation):\n"
+        "    webots_simulation(RELATIVE, controllers={'rover': 'controllers/rover/rover.py'})\n"
+        "def test_robot(webots_robot_factory):\n"
+        "    assert webots_robot_factory(world=RELATIVE).getName() == 'rover'\n"
+        "def test_absolute(webots_simulation, pytestconfig):\n"
+        "    webots_simulation(pytestconfig.rootpath / RELATIVE)\n"
+    )
+    monkeypatch.chdir(pytester.path / "tests")
+    pytester.runpytest_inprocess("-p", "no:cacheprovider").assert_outcomes(passed=3)
 
 
 def test_a_fixture_of_the_users_own_wins(pytester: pytest.Pytester) -> None:

@@ -4,11 +4,31 @@ from __future__ import annotations
 
 import json
 from contextlib import closing
-from typing import Any
+from typing import Any, Final
 
 from webots_mcp.connection import connect
 from webots_mcp.contract import Database
 from webots_mcp.store.queue import Command, fetch_command
+
+_UNFINISHED: Final = {
+    "pending": "no get_command() of its controller has come to it yet",
+    "claimed": "its handler has not returned yet",
+}
+
+
+class Status(str):
+    """A command's status; wherever an assertion shows it, it says why it is not `done`."""
+
+    reason: str
+
+    def __new__(cls, status: str, reason: str) -> Status:
+        """A text as any other, with the reason beside it."""
+        made = super().__new__(cls, status)
+        made.reason = reason
+        return made
+
+    def __repr__(self) -> str:
+        return f"{str(self)!r} ({self.reason})" if self.reason else f"{str(self)!r}"
 
 
 class RecordedCommand:
@@ -34,9 +54,10 @@ class RecordedCommand:
         return json.loads(self._fetch().params)
 
     @property
-    def status(self) -> str:
+    def status(self) -> Status:
         """`pending`, `claimed`, then `done`, `failed`, `expired`, `cancelled` or `lost`."""
-        return self._fetch().status
+        command = self._fetch()
+        return Status(command.status, _why_not_done(command))
 
     @property
     def is_final(self) -> bool:
@@ -57,3 +78,10 @@ class RecordedCommand:
     def _fetch(self) -> Command:
         with closing(connect(self._database, "reader")) as connection:
             return fetch_command(connection, self.id)
+
+
+def _why_not_done(command: Command) -> str:
+    """What a person has to know of a command that is not done; empty for one that is."""
+    if command.status == "done":
+        return ""
+    return command.error or _UNFINISHED.get(command.status, "")

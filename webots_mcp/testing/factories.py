@@ -18,6 +18,10 @@ World = str | Path | InProcessSimulation
 class RobotFactory:
     """Makes robots of the stand-in, without a process."""
 
+    def __init__(self, root: Path | None = None) -> None:
+        """Worlds that are named by a relative path lie in `root`; None for the current folder."""
+        self._root = root or Path()
+
     @overload
     def __call__(
         self,
@@ -50,7 +54,8 @@ class RobotFactory:
 
         Args:
             name: The robot's name; None for the first.
-            world: A .wbt file, or the `simulation` of another robot to share its world.
+            world: A .wbt file, by its path in `root` or an absolute one; or the `simulation` of
+                another robot to share its world.
             supervisor: Whether it is of the class `Supervisor`, else `Robot`.
             duration_s: Of a world that is loaded for it: after so much simulated time its `step`
                 returns -1.
@@ -60,7 +65,7 @@ class RobotFactory:
             StandInError: Another object controls the robot.
         """
         if not isinstance(world, InProcessSimulation):
-            world = Rehearsal(world, duration_s=duration_s)
+            world = Rehearsal(self._root / world, duration_s=duration_s)
         kind = InProcessSupervisor if supervisor else InProcessRobot
         return kind(name, world=world)
 
@@ -68,9 +73,23 @@ class RobotFactory:
 class SimulationFactory:
     """Starts simulations whose controllers record into folders of the test's."""
 
-    def __init__(self, folder: Path) -> None:
-        """Nothing is started yet; each simulation gets a data folder of its own in `folder`."""
+    def __init__(
+        self,
+        folder: Path,
+        root: Path | None = None,
+        on_start: Callable[[RecordedSimulation], object] = lambda _: None,
+    ) -> None:
+        """Nothing is started yet.
+
+        Args:
+            folder: Each simulation gets a data folder of its own in it.
+            root: Where worlds and controllers lie that are named by a relative path; None for the
+                current folder.
+            on_start: Is called with each simulation that was started.
+        """
         self._folder = folder
+        self._root = root or Path()
+        self._on_start = on_start
         self._started: list[RecordedSimulation] = []
 
     def __call__(
@@ -83,15 +102,17 @@ class SimulationFactory:
         console: Callable[[str], object] | None = None,
     ) -> RecordedSimulation:
         """A simulation that is paused before its first step; arguments and errors as there."""
+        files = {name: self._root / file for name, file in (controllers or {}).items()}
         simulation = RecordedSimulation(
-            world,
+            self._root / world,
             data_dir=data_dir or self._folder / f"mcp_data_{len(self._started) + 1}",
-            controllers=controllers,
+            controllers=files,
             environment=environment,
             console=console,
         )
         self._started.append(simulation)
         simulation.start()
+        self._on_start(simulation)
         return simulation
 
     def close(self) -> None:

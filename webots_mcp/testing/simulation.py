@@ -6,18 +6,20 @@ import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, THROTTLE_VARIABLE
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.schema import require_current
 from webots_mcp.standin import Mode, Simulation, StandInError
+from webots_mcp.standin.controllers import Controller
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.testing.recording import Recording
 
 _CONSOLE_LINES: Final = 30
+T = TypeVar("T")
 
 
 class RecordedSimulation(Simulation):
@@ -83,9 +85,11 @@ class RecordedSimulation(Simulation):
 
         Raises:
             AssertionError: A controller ended with an error; the text ends with the console.
-            TimeoutError: It took too long; the text ends with the console.
+            TimeoutError: It took too long; the text names the controllers that hang, and ends
+                with the console.
             StandInError: The simulation has been quit.
         """
+        __tracebackhide__ = True
         self._seen_s, self._ends_in_s = self.time_s, duration_s
         self.fast()
         self.wait_for(self._is_at_rest, timeout_s)
@@ -95,6 +99,30 @@ class RecordedSimulation(Simulation):
                     f"the controller of {controller.name!r} ended with status "
                     f"{controller.exit_code}; the console says:\n{self._last_lines()}"
                 )
+
+    def wait_for(self, condition: Callable[[], T], timeout_s: float = 10.0) -> T:
+        """As of `Simulation`; the message begins with the controllers that hang."""
+        __tracebackhide__ = True
+        try:
+            return super().wait_for(condition, timeout_s)
+        except TimeoutError as error:
+            hanging = [why for each in self._runner.controllers if (why := self._why_hung(each))]
+            raise TimeoutError("\n".join([*hanging, str(error)])) from None
+
+    def _why_hung(self, controller: Controller) -> str | None:
+        """Why the simulation waits for this controller; None if it does not."""
+        if controller.holds_up and not self._is_held(controller.name):
+            connected = controller.connection is not None
+            what = "does not come to its next step()" if connected else "has made no Robot() yet"
+        elif controller.has_left and controller.is_running:
+            what = "has let go of its robot, but its process does not end"
+        else:
+            return None
+        which = "an extern program" if controller.file is None else f"{controller.file}"
+        return (
+            f"the controller of {controller.name!r} ({which}, process {controller.pid}) {what}; "
+            f"simulated time stands at {self.time_s:g} s"
+        )
 
     def _notice(self) -> None:
         """Called in the simulation's thread after each physics step."""
@@ -110,10 +138,7 @@ class RecordedSimulation(Simulation):
     def _is_at_rest(self) -> bool:
         if not self.is_running:
             return True
-        return self.mode is Mode.PAUSE and not any(
-            (each.holds_up and not self._is_held(each.name)) or (each.has_left and each.is_running)
-            for each in self._runner.controllers
-        )
+        return self.mode is Mode.PAUSE and not any(map(self._why_hung, self._runner.controllers))
 
     def _is_held(self, name: str) -> bool:
         """Whether a bridge holds the controller's loop: it asks for no step until it is resumed."""

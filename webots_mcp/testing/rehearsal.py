@@ -41,13 +41,14 @@ class Rehearsal(InProcessSimulation):
         """As of `InProcessSimulation`.
 
         Raises:
-            WouldBlockError: The loop has been held by a pause for 2 s of wall time.
+            WouldBlockError: The loop steps, and a pause has held it for 2 s of wall time; all else
+                goes through, so that its end can resume.
         """
         if self.mode is not Mode.PAUSE or message[:2] == ("ask", "simulation_set_mode"):
             self._held_since_s = None
         elif self._held_since_s is None:
             self._held_since_s = time.monotonic()
-        elif time.monotonic() - self._held_since_s > HOLD_LIMIT_S:
+        elif message[0] == "step" and time.monotonic() - self._held_since_s > HOLD_LIMIT_S:
             raise WouldBlockError(
                 f"the simulation is paused and nobody resumed it for {HOLD_LIMIT_S:g} s: send "
                 "'resume' before get_command() takes the 'pause', or run the controller as a "

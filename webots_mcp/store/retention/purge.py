@@ -1,9 +1,9 @@
 """Carrying out a plan, a little at a time, so that no writer has to wait for it.
 
-Rows go one by one, in transactions of about a millisecond; between two of them the caller rests
-for longer than the lock was held. The tables take turns, and space that became free goes back to
-the disk in between. Where another writer holds the lock, it is tried again later. State rows go
-only after they were rolled up.
+Rows go in transactions of about a millisecond, as many at once as that allows; between two of them
+the caller rests for longer than the lock was held. The tables take turns, and space that became
+free goes back to the disk in between. Where another writer holds the lock, it is tried again later.
+State rows go only after they were rolled up.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.connection import ShortWrites, is_busy
+from webots_mcp.connection import LONGEST_WRITE_S, ShortWrites, Step, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.history.rollup import roll, watermark
 from webots_mcp.store.images import inside
-from webots_mcp.store.retention.planning import OLD_COMMANDS, ROLLED, Plan, Step, plan
+from webots_mcp.store.retention.planning import OLD_COMMANDS, ROLLED, Plan, plan
+from webots_mcp.store.retention.planning import Step as Going
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
 from webots_mcp.store.retention.stock import TABLES
 
@@ -48,7 +49,27 @@ _DELETE: Final = {
     for table in ROLLED
 }
 _DELETE["command"] = "DELETE FROM command WHERE id = :id"
-_COUNT_PURGED: Final = "UPDATE run SET purged_rows = purged_rows + 1 WHERE id = ?"
+# Rows without files go many at once, in one statement: see `Step`. What is left in `going` went.
+_GOING: Final = "CREATE TEMP TABLE IF NOT EXISTS going (id INTEGER PRIMARY KEY, run_id INTEGER)"
+_NOT_GOING: Final = (
+    "DELETE FROM going WHERE run_id IN (SELECT id FROM run WHERE {kept}) "
+    "OR NOT EXISTS (SELECT 1 FROM {table} WHERE id = going.id)"
+)
+_COUNT_PURGED: Final = (
+    "UPDATE run SET purged_rows = purged_rows + "
+    "(SELECT count(*) FROM going WHERE run_id = run.id) WHERE id IN (SELECT run_id FROM going)"
+)
+_DELETE_GOING: Final = "DELETE FROM {table} WHERE id IN (SELECT id FROM going)"
+_STEPS: Final = {
+    table: Step(
+        f"purge_{table}",
+        ("step",),
+        _NOT_GOING.format(table=table, kept=KEPT),
+        *((_COUNT_PURGED,) if table == "state" else ()),
+        _DELETE_GOING.format(table=table),
+    )
+    for table in ("state", "log", "event")
+}
 _SESSION: Final = "SELECT session_id FROM run WHERE id = ?"
 _FORGET_SESSION: Final = (
     "DELETE FROM session WHERE id = ? AND ended_wall_time_s IS NOT NULL "
@@ -140,6 +161,18 @@ def purge(
     yield from work.give_back()
 
 
+class _Pace:
+    """How many to take at once, so that they take about the time that the lock may be held."""
+
+    def __init__(self) -> None:
+        self.count = 8
+
+    def measure(self, count: int, held_s: float) -> None:
+        """Go on from what these have taken; twice as many at most."""
+        fitting = count * LONGEST_WRITE_S / max(held_s, 1e-6)
+        self.count = max(1, min(int(fitting), 2 * self.count, BATCH_ROWS))
+
+
 class _Purge:
     def __init__(self, connection: sqlite3.Connection, data_dir: Path, spare_pages: int) -> None:
         self._connection = connection
@@ -147,7 +180,8 @@ class _Purge:
         self._spare_pages = spare_pages
         self._failures = 0
         self._writes = ShortWrites(connection)
-        self._vacuuming = ShortWrites(connection)
+        self._vacuuming = _Pace()
+        self._paces = {table: _Pace() for table in _STEPS}
         self.purged = Purged()
 
     def in_turn(self, tables: Sequence[Iterator[Purged]]) -> Iterator[Purged]:
@@ -167,7 +201,7 @@ class _Purge:
         while self._give_some_back():
             yield self.purged
 
-    def carry_out(self, table: str, steps: Sequence[Step]) -> Iterator[Purged]:
+    def carry_out(self, table: str, steps: Sequence[Going]) -> Iterator[Purged]:
         """Delete what has to go of a table."""
         find = self._in_time if table in TABLES else self._by_owner
         for keys in find(table, steps):
@@ -178,7 +212,7 @@ class _Purge:
                     keys = keys[self._delete_some(table, keys) :]
                 yield self.purged
 
-    def _in_time(self, table: str, steps: Sequence[Step]) -> Iterator[list[dict[str, Any]]]:
+    def _in_time(self, table: str, steps: Sequence[Going]) -> Iterator[list[dict[str, Any]]]:
         """Keys in the order in which the rows were recorded, so that whole pages become free."""
         left: dict[int, int] = {step.owner_id: step.rows for step in steps}
         bounds = {step.owner_id: step.bound for step in steps}
@@ -204,7 +238,7 @@ class _Purge:
             left = {run_id: rows for run_id, rows in left.items() if rows}
             yield keys
 
-    def _by_owner(self, table: str, steps: Sequence[Step]) -> Iterator[list[dict[str, Any]]]:
+    def _by_owner(self, table: str, steps: Sequence[Going]) -> Iterator[list[dict[str, Any]]]:
         """Keys of summaries and runs of a run, of commands of a robot."""
         for step in steps:
             left = step.rows
@@ -212,7 +246,7 @@ class _Purge:
                 yield keys
                 left -= len(keys)
 
-    def _keys_of(self, table: str, step: Step, limit: int) -> list[dict[str, Any]]:
+    def _keys_of(self, table: str, step: Going, limit: int) -> list[dict[str, Any]]:
         if table == "run":
             return [{"id": step.owner_id, "run_id": step.owner_id}]
         if table == "command":
@@ -226,6 +260,8 @@ class _Purge:
 
     def _delete_some(self, table: str, keys: Sequence[dict[str, Any]]) -> int:
         """One short transaction; returns how many of the keys are done, 0 where it was locked."""
+        if table in _STEPS:
+            return self._unless_locked(lambda: self._run_step(table, keys))
         deleted = 0
 
         def delete(key: dict[str, Any]) -> None:
@@ -235,8 +271,22 @@ class _Purge:
         done = self._unless_locked(lambda: self._writes.write(keys, delete))
         if done:
             self.purged.rows[table] += deleted
-            self._note(self._writes)
+            self._note(self._writes.held_s)
         return done
+
+    def _run_step(self, table: str, keys: Sequence[dict[str, Any]]) -> int:
+        pace = self._paces[table]
+        some = keys[: pace.count]
+        self._connection.execute(_GOING)
+        self._connection.execute("DELETE FROM going")
+        self._connection.executemany("INSERT INTO going VALUES (:id, :run_id)", some)
+        started_s = time.perf_counter()
+        _STEPS[table].run(self._connection, None)
+        held_s = time.perf_counter() - started_s
+        pace.measure(len(some), held_s)
+        self.purged.rows[table] += self._first("SELECT count(*) FROM going")
+        self._note(held_s)
+        return len(some)
 
     def _delete(self, table: str, key: dict[str, Any]) -> int:
         """How many rows; none of a run that was marked since the plan."""
@@ -245,8 +295,6 @@ class _Purge:
         deleted = self._connection.execute(_DELETE[table], key).rowcount
         if not deleted:
             return 0
-        if table == "state":
-            self._connection.execute(_COUNT_PURGED, (key["run_id"],))
         if session is not None:
             self._connection.execute(_FORGET_SESSION, (session,))
         if path and not self._first(_IN_USE, path):
@@ -265,21 +313,26 @@ class _Purge:
 
     def _give_some_back(self) -> bool:
         """One short transaction of it; whether there may be more."""
-        pages = range(self._pragma("freelist_count") - self._spare_pages)
-        if self._pragma("auto_vacuum") != 2 or not pages:
+        free = self._pragma("freelist_count")
+        if self._pragma("auto_vacuum") != 2 or free <= self._spare_pages:
             return False
-        given = self._unless_locked(lambda: self._vacuuming.write(pages, self._give_page_back))
-        if given:
-            self.purged.freed_bytes += given * self._pragma("page_size")
-            self._note(self._vacuuming)
+        pages = min(self._vacuuming.count, free - self._spare_pages)
+        self._unless_locked(lambda: self._give_pages_back(pages))
         return True
 
-    def _give_page_back(self, _: int) -> None:
-        self._connection.execute("PRAGMA incremental_vacuum(1)").fetchall()
+    def _give_pages_back(self, pages: int) -> int:
+        started_s = time.perf_counter()
+        # execute() would stop after the first page.
+        self._connection.executescript(f"PRAGMA incremental_vacuum({pages})")
+        held_s = time.perf_counter() - started_s
+        self._vacuuming.measure(pages, held_s)
+        self.purged.freed_bytes += pages * self._pragma("page_size")
+        self._note(held_s)
+        return pages
 
-    def _note(self, writes: ShortWrites) -> None:
-        self.purged.held_s = writes.held_s
-        self.purged.longest_held_s = max(self.purged.longest_held_s, writes.held_s)
+    def _note(self, held_s: float) -> None:
+        self.purged.held_s = held_s
+        self.purged.longest_held_s = max(self.purged.longest_held_s, held_s)
 
     def _first(self, query: str, *values: object) -> Any:
         row = self._connection.execute(query, values).fetchone()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from typing import Final, Protocol
 
@@ -55,7 +55,7 @@ def measure_peers(bench: Bench) -> Iterable[Line]:
 
 
 @contextmanager
-def _noting(missing: list[str]) -> Iterator[None]:
+def _noting(missing: list[str]) -> Generator[None]:
     """Note what is not installed, and go on without it."""
     try:
         yield

@@ -11,7 +11,7 @@ from mcp import Client
 from tests.server.conftest import Connect
 from tests.store.recorded import Recorded
 from webots_mcp.server import create_server
-from webots_mcp.store.retention import Limit
+from webots_mcp.store.retention import Limit, Retention, prune
 
 pytestmark = pytest.mark.anyio
 
@@ -41,3 +41,15 @@ async def test_the_server_keeps_as_much_as_it_was_told(file: Path, recorded: Rec
             while recorded.connection.execute("SELECT count(*) FROM state").fetchone()[0] > 4:
                 await anyio.sleep(0.02)
     assert recorded.connection.execute("SELECT min(sim_time_s) FROM state").fetchone() == (6.0,)
+
+
+async def test_a_run_whose_states_are_all_gone_is_not_said_to_have_had_none(
+    connect: Connect, file: Path, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, {"x": 1.0})
+    prune(recorded.connection, file.parent, Retention(state=Limit(rows=0)), rest=False)
+    async with connect() as client:
+        answer = await client.call_tool("webots_get_robot_state", {})
+    assert answer.structured_content is not None
+    assert "retention has deleted 1" in answer.structured_content["hint"]

@@ -28,6 +28,7 @@ _PUBLISH: Final = (
     "controller's loop every 5th is (throttle_interval), or each one with force=True"
 )
 _EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND rows > 0"
+_PURGED: Final = "SELECT purged_rows FROM run WHERE id = ?"
 _EVENTS: Final = 10
 _SHOWN_ODD: Final = 20
 _SHOWN_DEVICES: Final = 30
@@ -117,6 +118,12 @@ class StateTools:
 def _nothing_yet(view: View) -> str:
     """A robot that published before a reset will publish again."""
     run_id = view.run.id if view.run else 0
+    (purged_rows,) = view.connection.execute(_PURGED, (run_id,)).fetchone() or (0,)
+    if purged_rows:
+        return (
+            f"all states of this run are gone: retention has deleted {purged_rows}; their 10 s "
+            "summaries are left, ask webots_get_trends"
+        )
     earlier = view.connection.execute(_EARLIER, (view.robot.id, run_id)).fetchone()[0]
     if earlier is None:
         return _PUBLISH

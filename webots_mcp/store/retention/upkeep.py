@@ -16,8 +16,8 @@ from webots_mcp.store.retention.purge import Purged, purge
 INTERVAL_S: Final = 2.0
 PLANNING_SHARE: Final = 0.02  # of the time: looking at ten million rows takes a second
 BUDGET_S: Final = 0.75  # of each round of the maintainer, nine tenths of it at rest
-# What stays free in the file, for the rows to come: so much of the file, but no more than 10 MB.
-SPARE_SHARE: Final = 20
+# What stays free in the file for the rows to come: a tenth of it, but no more than 10 MB.
+SPARE_SHARE: Final = 10
 MOST_SPARE_PAGES: Final = 2500
 
 

@@ -140,7 +140,7 @@ def adopt(connection: sqlite3.Connection, database: Path) -> int:
         database: Its file.
 
     Returns:
-        How many entries were written.
+        How many rows and other writes that was.
 
     Raises:
         sqlite3.Error: The database is locked; what is in is in, the rest waits.
@@ -173,7 +173,7 @@ def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:
     while piece := next_entries(file, offset):
         taken = take_in(connection, session_id, [entry for _, entry in piece])
         offset = max(end for end, entry in piece if entry.number <= taken.number)
-        count += len(taken.written)
+        count += sum(entry.kind != "run" for entry in taken.written)
         unfit += taken.unfit
     if count:
         connection.execute(_RECOUNT, (session_id,))

@@ -166,9 +166,12 @@ class WaitingFile:
         Raises:
             OSError: They could not be written; what was written of them is no whole line.
         """
-        if self._file is None or os.fstat(self._file.fileno()).st_nlink == 0:
-            self._file = self._made()  # or somebody deleted it
-        self._write(self._file, b"".join(encoded(entry) for entry in entries))
+        file = former = self._file
+        if file is None or os.fstat(file.fileno()).st_nlink == 0:
+            file = self._file = self._made()
+            if former is not None:  # somebody deleted it
+                former.close()
+        self._write(file, b"".join(encoded(entry) for entry in entries))
 
     def read(self, offset: int) -> list[tuple[int, Entry]]:
         """The next entries from that byte on; see `next_entries`."""
@@ -198,12 +201,16 @@ class WaitingFile:
     def _made(self) -> FileIO:
         """A new file that says who records, with all that a deleted one still holds."""
         file = open(self.path, "a+b", buffering=0, opener=_open_privately)  # noqa: SIM115
-        if not lock(file.fileno()) or os.fstat(file.fileno()).st_nlink == 0:
-            raise OSError(f"{self.path} is locked by another process")
-        file.truncate(0)
-        header = self._header or encoded({_VERSION: FORMAT, **self._describe_session()})
-        self._is_whole = True
-        self._write(file, header + self._content())
+        try:
+            if not lock(file.fileno()) or os.fstat(file.fileno()).st_nlink == 0:
+                raise OSError(f"{self.path} is locked by another process")
+            file.truncate(0)
+            header = self._header or encoded({_VERSION: FORMAT, **self._describe_session()})
+            self._is_whole = True
+            self._write(file, header + self._content())
+        except BaseException:
+            file.close()
+            raise
         self._header = header
         return file
 

@@ -43,7 +43,7 @@ def _run(benchmark: Benchmark, options: argparse.Namespace, number: str) -> Sect
     say("...")
     with tempfile.TemporaryDirectory(prefix="webots-mcp-bench-") as folder:
         effort = _QUICK if options.quick else 1.0
-        return benchmark.run(Bench(Path(folder), effort, say, options.rows))
+        return benchmark.run(Bench(Path(folder), effort, say, options.rows, options.kills))
 
 
 def _show(text: str) -> None:
@@ -69,6 +69,9 @@ def _parser(names: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("--quick", action="store_true", help="smaller counts: under a minute")
     parser.add_argument(
         "--rows", type=int, metavar="ROWS", help="length of the long recording (1000000)"
+    )
+    parser.add_argument(
+        "--kills", type=int, metavar="KILLS", help="controllers killed beside others (60)"
     )
     parser.add_argument(
         "--only",

@@ -25,12 +25,14 @@ class Bench:
         effort: 1 for a full run; counts shrink with it.
         say: Shows on a terminal what is going on.
         rows: How long the long recording is, where that was asked for.
+        kills: How many controllers are killed beside others, where that was asked for.
     """
 
     folder: Path
     effort: float
     say: Callable[[str], None]
     rows: int | None = None
+    kills: int | None = None
 
     def count(self, full: int, least: int = 1) -> int:
         """How often to do what a full run does `full` times."""

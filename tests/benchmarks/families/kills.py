@@ -9,24 +9,27 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable
-from contextlib import closing
+from collections.abc import Generator, Iterable
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from tests.benchmarks.processes import environment
 from tests.benchmarks.registry import Bench, benchmark
+from tests.benchmarks.servers import our_server
 from tests.benchmarks.table import Line, Target
+from webots_mcp.adoption import adopt
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.entries import waiting_paths
 from webots_mcp.store.queue import CommandQueue
 
-_KILLS = 20
+_KILLS = 60
 _LONGEST_LIFE_S = 0.3
 _COMMANDS = 5  # for each life
 _ROWS_OF = (
     "SELECT json_extract(data, '$.n') FROM state JOIN run ON run.id = run_id "
-    "JOIN session ON session.id = session_id WHERE pid = ? ORDER BY state.id"
+    "WHERE session_id = (SELECT max(id) FROM session WHERE pid = ?) ORDER BY state.id"
 )
 
 
@@ -34,68 +37,98 @@ _ROWS_OF = (
 class _Toll:
     """What the kills of some controllers cost."""
 
-    at_once: int
+    robots: int
     pause_s: float
+    served: bool = False
     kills: int = 0
     published: int = 0
+    waited: int = 0
     lost: int = 0
-    uncounted: int = 0
     damaged: int = 0
     ran: int = 0
     twice: int = 0
 
-    def line(self, what: str, rows: int, target: Target | None = None) -> Line:
-        """So many rows of those published."""
+    def line(self) -> Line:
+        """Rows lost of those published, and how many had not been in the database yet."""
+        server = " and a server" if self.served else ""
+        loop = f"{1000 * self.pause_s:g} ms loops" if self.pause_s else "no pause"
         return Line(
-            what, f"{self.kills} kills", f"{self.published:,} published", rows, "rows", target
+            f"rows lost, {self.robots} robots{server}, {loop}",
+            f"{self.kills} kills",
+            f"{self.published:,} published, {self.waited:,} taken in after the kill",
+            self.lost,
+            "rows",
+            Target(0),
         )
 
 
 @benchmark("kills", "controllers killed (SIGKILL) while they record")
 def measure_kills(bench: Bench) -> Iterable[Line]:
-    alone, crowd, files = _Toll(1, 0.008), _Toll(4, 0.0), _Toll(1, 0.0)
-    for name, toll in (("alone", alone), ("crowd", crowd)):
-        bench.say(name)
-        _kill_bridges(bench.place(name), toll, bench.count(_KILLS // toll.at_once))
+    tolls = [_Toll(1, 0.008), _Toll(3, 0.0005, True), _Toll(3, 0.008, True), _Toll(4, 0.0)]
+    for number, toll in enumerate(tolls):
+        kills = bench.kills if bench.kills and toll.served else bench.count(_KILLS)
+        place = bench.place(f"{number}")
+        with _serving(place / DATABASE_NAME, toll.served):
+            for life in range(-(-kills // toll.robots)):
+                bench.say(f"{toll.robots} robots, {toll.kills} of {kills} kills")
+                _kill_bridges(place, toll, random.Random(life))
+        _inspect(place, toll)
+        yield toll.line()
     bench.say("JSON files")
+    files = _Toll(1, 0.0)
     _kill_files(bench.place("files"), files, bench.count(_KILLS))
-    yield alone.line("rows lost, one robot, 8 ms loop", alone.lost, Target(0))
-    yield crowd.line("rows lost, 4 robots without a pause", crowd.lost)
-    yield crowd.line("the same, not counted as waiting", crowd.uncounted, Target(0))
-    damaged, twice = alone.damaged + crowd.damaged, alone.twice + crowd.twice
+    damaged, twice = sum(toll.damaged for toll in tolls), sum(toll.twice for toll in tolls)
     torn = f"JSON files torn: {files.damaged} of {files.kills}"
-    kills = f"{alone.kills + crowd.kills} kills"
-    yield Line("databases damaged", kills, torn, damaged, "files", Target(0))
-    ran = f"{alone.ran + crowd.ran} ran"
+    kills = f"{sum(toll.kills for toll in tolls)} kills"
+    yield Line("databases damaged, or out of order", kills, torn, damaged, "files", Target(0))
+    ran = f"{sum(toll.ran for toll in tolls)} ran"
     yield Line("commands run twice", ran, f"{_COMMANDS} for each life", twice, "twice", Target(0))
 
 
-def _kill_bridges(folder: Path, toll: _Toll, rounds: int) -> None:
-    lives = random.Random(toll.at_once)
-    for _ in range(rounds):
-        victims = [_start("bridge", folder, f"rover {n}", toll) for n in range(toll.at_once)]
-        first = [_first_line(victim) for victim in victims]
-        _send_commands(folder / DATABASE_NAME, toll.at_once)
+@contextmanager
+def _serving(database: Path, served: bool) -> Generator[None]:
+    """A server over the database, which maintains it, for as long as that lasts."""
+    if not served:
+        yield
+        return
+    server = our_server(database)
+    line, pipe = [server.command, *server.args], subprocess.PIPE
+    with subprocess.Popen(line, stdin=pipe, stdout=pipe, env=server.env) as process:
+        yield
+        process.kill()
+
+
+def _kill_bridges(folder: Path, toll: _Toll, lives: random.Random) -> None:
+    """One life of each robot: they end at different moments, the others record meanwhile."""
+    victims = [_start("bridge", folder, f"rover {n}", toll) for n in range(toll.robots)]
+    first = [_first_line(victim) for victim in victims]
+    _send_commands(folder / DATABASE_NAME, toll.robots)
+    for victim in lives.sample(victims, len(victims)):
         time.sleep(lives.uniform(0, _LONGEST_LIFE_S))
-        for victim in victims:
-            victim.kill()
-        told = [start + _rest(victim) for start, victim in zip(first, victims, strict=True)]
+        victim.kill()
+    told = [start + _rest(victim) for start, victim in zip(first, victims, strict=True)]
+    with closing(connect(folder / DATABASE_NAME, "writer")) as connection:
+        _open_next(connection, folder / DATABASE_NAME)
         for victim, lines in zip(victims, told, strict=True):
-            _count_rows(folder / DATABASE_NAME, victim.pid, lines, toll)
-    _inspect(folder, toll)
+            _count_rows(connection, victim.pid, lines, toll)
 
 
-def _count_rows(database: Path, pid: int, lines: list[str], toll: _Toll) -> None:
+def _open_next(connection: sqlite3.Connection, database: Path) -> None:
+    """As whoever opens the database next; the server may be at it already."""
+    deadline_s = time.monotonic() + 10
+    while waiting_paths(database) and time.monotonic() < deadline_s:
+        adopt(connection, database)
+
+
+def _count_rows(connection: sqlite3.Connection, pid: int, lines: list[str], toll: _Toll) -> None:
     number, waiting = map(int, lines[-1].split())
-    with closing(connect(database, "reader")) as connection:
-        recorded = [row[0] for row in connection.execute(_ROWS_OF, (pid,))]
+    recorded = [row[0] for row in connection.execute(_ROWS_OF, (pid,))]
     if recorded != list(range(len(recorded))):
         toll.damaged += 1  # a gap, or out of order
-    lost = max(0, number + 1 - len(recorded))
     toll.kills += 1
     toll.published += number + 1
-    toll.lost += lost
-    toll.uncounted += max(0, lost - waiting)
+    toll.waited += waiting
+    toll.lost += len(set(range(number + 1)) - set(recorded))
 
 
 def _inspect(folder: Path, toll: _Toll) -> None:

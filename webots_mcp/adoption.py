@@ -158,6 +158,8 @@ def _adopt_file(connection: sqlite3.Connection, path: Path) -> int:
                 path.unlink()
         if os.name == "nt":  # where an open file cannot be deleted; who finds it passes it over
             path.unlink()
+    except FileNotFoundError:  # another took it in meanwhile
+        return 0
     except (OSError, ValueError) as error:
         say(f"what waits in {path} cannot be taken in: {error}")
         return 0

@@ -188,12 +188,12 @@ class WaitingFile:
 
     def close(self, *, remove: bool) -> None:
         """Without `remove` it stays for whoever opens the database next."""
-        if self._file is None:
+        file, self._file = self._file, None
+        if file is None:
             return
         if remove:
-            self.empty()  # who finds it before it is gone finds nothing in it
-        self._file.close()
-        self._file = None
+            file.truncate(len(self._header))  # who finds it before it is gone finds nothing in it
+        file.close()
         if remove:
             with contextlib.suppress(OSError):
                 self.path.unlink()

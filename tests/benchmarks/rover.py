@@ -27,6 +27,10 @@ class Rover:
         self._time_s += duration_ms / 1000
         return 0
 
+    def reset(self) -> None:
+        """Simulation time begins again."""
+        self._time_s = 0.0
+
     def pace(self) -> None:
         """Let one step pass in real time."""
         self._time_s += self._step_s

@@ -133,12 +133,11 @@ class Backlog:
 
     def close(self) -> str | None:
         """Close the file; where it holds entries, it stays, and is named."""
-        if self._file is None:
+        file, self._file = self._file, None
+        if file is None:
             return None
-        waits, path = bool(self._in_file), self._file.path
-        self._file.close(remove=not waits)
-        self._file = None
-        return str(path) if waits else None
+        file.close(remove=not self._in_file)
+        return str(file.path) if self._in_file else None
 
     def leave_file(self) -> None:
         """In a forked child: the file belongs to the parent."""

@@ -266,14 +266,14 @@ class MCPBridge:
         """
         if self._closed:
             return
-        self._closed = True
         reason = reason or self._end_reason
         self._let_go()
-        atexit.unregister(self._close_at_exit)
         open_bridges.leave(self.robot)
         if self._maintainer is not None:
             self._maintainer.stop()
         self._recorder.close(reason, self._clock.sim_time_s)
+        self._closed = True  # last: an interrupted call is made up for at the exit
+        atexit.unregister(self._close_at_exit)
 
     def __enter__(self) -> MCPBridge:
         return self

@@ -445,10 +445,9 @@ class Recorder:
     def _disconnect(self) -> None:
         if self.registration is not None:
             deregister(self.registration.session_id)
-        if self.connection is not None:
-            self.connection.close()
-        self.connection = None
-        self.registration = None
+        connection, self.connection, self.registration = self.connection, None, None
+        if connection is not None:
+            connection.close()
 
     # -- opening -------------------------------------------------------------------------------
 

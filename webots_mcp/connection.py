@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, Literal, TypeVar
 
-from webots_mcp.contract import Database, MemoryDatabase
-from webots_mcp.errors import DatabaseError, NoDatabaseError
+from webots_mcp.contract import APPLICATION_ID, Database, MemoryDatabase
+from webots_mcp.errors import DatabaseError, ForeignDatabaseError, NoDatabaseError
 
 Role = Literal["loop", "writer", "reader"]
 Result = TypeVar("Result")
@@ -27,6 +27,11 @@ _UNWRITABLE: Final = ("readonly database", "unable to open database file")
 _CALLED_OFF: Final = "called off"
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
 
+# One statement, so one moment: another starter may be making the tables right now.
+_STAMPS: Final = (
+    "SELECT (SELECT application_id FROM pragma_application_id), "
+    "(SELECT user_version FROM pragma_user_version), (SELECT count(*) FROM sqlite_master)"
+)
 # All that a statement may raise because of the database.
 FAILURES: Final = (sqlite3.Error, sqlite3.Warning, UnicodeDecodeError, SystemError)
 
@@ -64,6 +69,7 @@ def connect(
         NoDatabaseError: The file is missing and `create` is false.
         DatabaseError: The folder cannot be made, the file cannot be opened, its log cannot be
             read where nothing can be written, or SQLite is too old.
+        ForeignDatabaseError: With `create`, the file belongs to another application.
         sqlite3.Error: The file is no database, or is locked for longer than 5 s.
     """
     if sqlite3.sqlite_version_info < OLDEST_SQLITE:
@@ -79,10 +85,11 @@ def connect(
         raise DatabaseError(f"{database} cannot be opened: {error}; check the folder") from error
     try:
         if create:
+            schema_version(connection)  # first: another application's file stays as it is
             _make_wal(connection)
         for pragma in _PRAGMAS[role]:
             connection.execute(f"PRAGMA {pragma}").fetchall()
-    except sqlite3.Error as error:
+    except Exception as error:
         connection.close()
         if role == "reader" and isinstance(database, Path) and is_unwritable(error):
             return _open_frozen(database)
@@ -319,6 +326,25 @@ def _exists(file: Path) -> bool:
         return file.exists()
     except OSError as error:
         raise DatabaseError(f"{file} cannot be looked at: {error}") from error
+
+
+def schema_version(connection: sqlite3.Connection) -> int:
+    """The schema version of a database of ours; 0 for an empty file.
+
+    Raises:
+        ForeignDatabaseError: The file holds tables of another application.
+        sqlite3.DatabaseError: The file is no database, or is damaged.
+    """
+    application_id, version, tables = connection.execute(_STAMPS).fetchone()
+    if application_id == APPLICATION_ID:
+        return int(version)
+    if tables:
+        (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
+        raise ForeignDatabaseError(
+            f"the SQLite database {file} belongs to another application (application_id "
+            f"{application_id}, expected {APPLICATION_ID}); choose another file"
+        )
+    return 0
 
 
 def _make_wal(connection: sqlite3.Connection) -> None:

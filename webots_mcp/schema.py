@@ -12,37 +12,13 @@ import time
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.connection import transaction
-from webots_mcp.contract import APPLICATION_ID, SCHEMA_VERSION, new_uuid
-from webots_mcp.errors import ForeignDatabaseError, SchemaTooNewError, SchemaTooOldError
+from webots_mcp.connection import schema_version, transaction
+from webots_mcp.contract import SCHEMA_VERSION, new_uuid
+from webots_mcp.errors import SchemaTooNewError, SchemaTooOldError
 
 SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
 
-# One statement, so one moment: another starter may be making the tables right now.
-_STAMPS: Final = (
-    "SELECT (SELECT application_id FROM pragma_application_id), "
-    "(SELECT user_version FROM pragma_user_version), (SELECT count(*) FROM sqlite_master)"
-)
 _NEW_RECORDING: Final = "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)"
-
-
-def schema_version(connection: sqlite3.Connection) -> int:
-    """The schema version of a database of ours; 0 for an empty file.
-
-    Raises:
-        ForeignDatabaseError: The file holds tables of another application.
-        sqlite3.DatabaseError: The file is no database, or is damaged.
-    """
-    application_id, version, tables = connection.execute(_STAMPS).fetchone()
-    if application_id == APPLICATION_ID:
-        return int(version)
-    if tables:
-        (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
-        raise ForeignDatabaseError(
-            f"the SQLite database {file} belongs to another application (application_id "
-            f"{application_id}, expected {APPLICATION_ID}); choose another file"
-        )
-    return 0
 
 
 def require_current(connection: sqlite3.Connection) -> None:

@@ -4,9 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from tests.bridge.interrupting import Interrupter, drive, make_template, places
 
 
+@pytest.mark.filterwarnings(  # Python closes the file that was just being opened, and says so
+    "ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning"
+)
 def test_wherever_an_interrupt_comes_rows_are_written_once_and_nothing_stays_held(
     tmp_path: Path,
 ) -> None:

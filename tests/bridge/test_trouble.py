@@ -124,11 +124,16 @@ def test_a_deleted_database_is_made_again_and_told(
 
 @pytest.mark.usefixtures("retry_at_once")
 @pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be moved there")
+@pytest.mark.parametrize("schema", [b"CREATE nonsense", b"CREATE \xff\xfe"])
 def test_a_database_that_is_damaged_in_mid_run_is_moved_aside_and_a_new_one_begun(
-    bridge: MCPBridge, file: Path, filed: Recording, capfd: pytest.CaptureFixture[str]
+    bridge: MCPBridge,
+    file: Path,
+    filed: Recording,
+    capfd: pytest.CaptureFixture[str],
+    schema: bytes,
 ) -> None:
     bridge.publish({"n": 0})
-    damage_schema(file)
+    damage_schema(file, schema)
     bridge.publish({"n": 1})
     bridge.publish({"n": 2})
     catch_up(bridge)
@@ -136,6 +141,18 @@ def test_a_database_that_is_damaged_in_mid_run_is_moved_aside_and_a_new_one_begu
     assert len(list(file.parent.glob(f"{DATABASE_NAME}.damaged-*"))) >= 1
     assert filed.rows("SELECT count(*) FROM event WHERE kind = 'storage'") == [1]
     assert capfd.readouterr().err.count("was damaged") == 1
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be moved there")
+def test_a_schema_whose_text_is_no_text_is_damage_at_the_start_as_well(
+    robot: InProcessSupervisor, file: Path, filed: Recording
+) -> None:
+    MCPBridge(robot, data_dir=file.parent).close()
+    damage_schema(file, b"CREATE \xff\xfe")
+    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
+        bridge.publish({"n": 1})
+    assert numbers(filed) == [1]
+    assert len(list(file.parent.glob(f"{DATABASE_NAME}.damaged-*"))) >= 1
 
 
 def test_a_damaged_database_is_moved_aside_at_the_start(
@@ -176,10 +193,12 @@ def test_a_database_of_another_application_is_left_alone(
     connection = sqlite3.connect(other)
     connection.execute("CREATE TABLE customer (name)")
     connection.close()
+    content = other.read_bytes()
     with MCPBridge(robot, database=other, throttle_interval=1) as bridge:
         bridge.publish({"n": 1})
     assert "belongs to another application" in capfd.readouterr().err
-    assert Recording(other).rows("SELECT name FROM sqlite_master") == ["customer"]
+    assert other.read_bytes() == content
+    assert [path.name for path in tmp_path.iterdir()] == ["other.db"]
 
 
 def test_a_newer_schema_is_said_and_the_robot_drives_on(
@@ -387,10 +406,11 @@ def poll_until(bridge: MCPBridge, reached: Callable[[], bool]) -> None:
         assert time.monotonic() < deadline_s
 
 
-def damage_schema(file: Path) -> None:
+def damage_schema(file: Path, schema: bytes) -> None:
     """Make every statement fail that is prepared from now on."""
     other = sqlite3.connect(file, isolation_level=None)
     other.execute("PRAGMA writable_schema=ON")
-    other.execute("UPDATE sqlite_master SET sql = 'CREATE nonsense' WHERE name = 'state'")
+    damage = "UPDATE sqlite_master SET sql = CAST(? AS TEXT) WHERE name = 'state'"
+    other.execute(damage, (schema,))
     other.execute("PRAGMA schema_version=9999")
     other.close()

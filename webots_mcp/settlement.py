@@ -6,6 +6,7 @@ Standard library only, because the bridge imports it inside a robot's controller
 from __future__ import annotations
 
 import sqlite3
+import time
 from typing import Final
 
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, host_name
@@ -73,6 +74,12 @@ def settle(connection: sqlite3.Connection, now_s: float) -> None:
         else:
             continue
         connection.execute(LOSE, {"id": command_id, "now": now_s, "why": why})
+
+
+def settle_gone(connection: sqlite3.Connection) -> None:
+    """Settle where a session looks open and is not: views and SQL can't judge processes."""
+    if gone_sessions(connection):
+        settle(connection, time.time())
 
 
 def gone_sessions(connection: sqlite3.Connection) -> list[tuple[int, str]]:

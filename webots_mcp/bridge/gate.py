@@ -16,7 +16,7 @@ QUIT: Final = -1
 Method = Callable[..., int]
 
 _STEPPING: Final = ("step", "stepBegin", "stepEnd")
-_GUARD: Final = "_webots_mcp_guard"  # of a robot
+_GUARD: Final = "_webots_mcp_guard"  # of a robot; None of its class
 _MARK: Final = "_webots_mcp_asks"  # of a method
 
 
@@ -48,6 +48,7 @@ class StepGate:
         self._robot = robot
         self._of_robot: dict[str, Any] = vars(robot)
         owner: Any = _owner_of_step(robot)
+        setattr(owner, _GUARD, None)
         for name in _STEPPING:
             method: Any = getattr(owner, name, None)
             if method is not None and not hasattr(method, _MARK):
@@ -70,7 +71,7 @@ class StepGate:
 def _guarded(name: str, method: Method) -> Method:
     @functools.wraps(method)
     def ask_first(robot: Any, *args: Any, **kwargs: Any) -> int:
-        guard: Guard | None = robot.__dict__.get(_GUARD)
+        guard: Guard | None = robot._webots_mcp_guard  # by name: this is in every step's way
         if guard is None:
             return method(robot, *args, **kwargs)
         make = functools.partial(method, robot, *args, **kwargs)

@@ -31,6 +31,7 @@ from webots_mcp.server.tools.state import StateTools
 from webots_mcp.server.tools.timeline import TimelineTools
 from webots_mcp.server.tools.trends import TrendTools
 from webots_mcp.server.tools.world import WorldTools
+from webots_mcp.settlement import settle_gone
 from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention import Asked, Upkeep
@@ -99,13 +100,14 @@ def create_server(
 def _maintaining(
     database: Database | None, retain: Upkeep, asked: Asked
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[None]]:
-    """Keep the log short, the rollups current and the file small, if the server may write."""
+    """Keep the log short, what ended and the rollups current, the file small, if it may write."""
     unasked = dict(asked)
 
     def work(connection: Connection) -> None:
         if unasked:
             ask_where_unset(connection, unasked)
             unasked.clear()
+        settle_gone(connection)
         roll(connection, pause_s=_PAUSE_S)
         retain(connection)
 

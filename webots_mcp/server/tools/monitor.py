@@ -15,7 +15,7 @@ from pydantic import Field
 from webots_mcp.server.boundary import READS, reporter, tool
 from webots_mcp.server.fitting import BUDGET, answer_about, notes_of
 from webots_mcp.server.history_results import MonitorAnswer
-from webots_mcp.server.parameters import RobotName
+from webots_mcp.server.parameters import MAX_WAIT_S, RobotName
 from webots_mcp.server.tools.events import fitting_events
 from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
 from webots_mcp.server.watching import Window, movement, window_from
@@ -42,7 +42,7 @@ class MonitorTools:
         self,
         ctx: Context[Any],
         duration_s: Annotated[
-            float, Field(ge=1, le=120, description="How long to watch, wall seconds.")
+            float, Field(ge=1, le=MAX_WAIT_S, description="How long to watch, wall seconds.")
         ] = 10,
         lookback_s: Annotated[
             float | None,

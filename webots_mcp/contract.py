@@ -26,8 +26,14 @@ THROTTLE_VARIABLE: Final = "WEBOTS_MCP_THROTTLE_INTERVAL"
 
 CommandStatus = Literal["pending", "claimed", "done", "failed", "expired", "cancelled", "lost"]
 FINAL_STATUSES: Final = ("done", "failed", "expired", "cancelled", "lost")
-LogLevel = Literal["debug", "info", "warning", "error"]
-LOG_LEVELS: Final[tuple[LogLevel, ...]] = get_args(LogLevel)  # in rising order
+LogLevel = Literal["debug", "info", "warning", "error", "critical"]
+LOG_LEVELS: Final[tuple[LogLevel, ...]] = get_args(LogLevel)  # rising; in `logging` 10, 20, ... 50
+_LEVEL_ALIASES: Final[dict[str, LogLevel]] = {
+    **{level: level for level in LOG_LEVELS},
+    "warn": "warning",
+    "err": "error",
+    "fatal": "critical",
+}
 
 PAUSED: Final = "paused"  # how a bridge holds its controller's loop, as the session tells it
 STEPPING: Final = "stepping"
@@ -43,6 +49,20 @@ HEARTBEAT_LATE_S: Final = 2.0  # a session silent for longer is not looping
 REMOTE_SILENCE_S: Final = 10.0  # one on another host, whose process cannot be asked, is dead then
 ISSUED_TIME_TO_LIVE_S: Final = 60.0  # how long a reload may take until it counts as lost
 MAX_STEPS: Final = 100_000
+
+
+def find_log_level(level: object) -> LogLevel | None:
+    """The level that somebody means by a name, in either case, or by a number of `logging`.
+
+    Returns:
+        None for what is neither. A number between two levels is the lower one; less than 10 is
+        `debug`.
+    """
+    if isinstance(level, str):
+        return _LEVEL_ALIASES.get(level.strip().lower())
+    if isinstance(level, bool) or not isinstance(level, (int, float)) or level != level:
+        return None
+    return LOG_LEVELS[int(min(max(level // 10 - 1, 0), len(LOG_LEVELS) - 1))]
 
 
 def host_name() -> str:

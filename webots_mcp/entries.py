@@ -58,8 +58,8 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "VALUES (?, ?, ?, ?, ?, ?)"
     ),
     "log": (
-        "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
-        "VALUES (?, ?, ?, ?, ?, ?)"
+        "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message, logger) "
+        "VALUES (?, ?, ?, ?, ?, ?, ?)"
     ),
     "image": (
         "INSERT INTO image (run_id, sim_time_s, wall_time_s, kind, device, path, width, height, "

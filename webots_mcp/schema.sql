@@ -120,7 +120,7 @@ CREATE TABLE log (
 	run_id INTEGER NOT NULL, 
 	sim_time_s FLOAT NOT NULL, 
 	wall_time_s FLOAT NOT NULL, 
-	level TEXT NOT NULL /* debug, info, warning, error */, 
+	level TEXT NOT NULL /* debug, info, ... critical */, 
 	source TEXT NOT NULL /* controller or bridge */, 
 	message TEXT NOT NULL, logger TEXT /* name of the Python logger, where one logged it */ NULL, 
 	CONSTRAINT fk_log_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE

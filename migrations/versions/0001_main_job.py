@@ -293,7 +293,7 @@ def upgrade() -> None:
         sa.Column("run_id", sa.Integer(), nullable=False),
         sa.Column("sim_time_s", sa.Float(), nullable=False),
         sa.Column("wall_time_s", sa.Float(), nullable=False),
-        sa.Column("level", sa.Text(), nullable=False, comment="debug, info, warning, error"),
+        sa.Column("level", sa.Text(), nullable=False, comment="debug, info, ... critical"),
         sa.Column("source", sa.Text(), nullable=False, comment="controller or bridge"),
         sa.Column("message", sa.Text(), nullable=False),
         sa.ForeignKeyConstraint(

@@ -31,7 +31,11 @@ HUGE = 2**63
             f"run_id must be an id from an earlier answer, not {HUGE}",
         ),
         ("plot", {"run_ids": [1, HUGE]}, "run_ids.1 must be an id from an earlier answer"),
-        ("get_logs", {"level": "loud"}, "level must be 'debug', 'info', 'warning' or 'error', not"),
+        (
+            "get_logs",
+            {"level": "loud"},
+            "level must be 'debug', 'info', 'warning', 'error' or 'critical', not",
+        ),
         ("query_sql", {"sql": "x" * 10**6}, "sql must have at most"),
     ],
 )

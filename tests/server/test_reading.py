@@ -265,6 +265,27 @@ async def test_log_lines_are_paged_towards_older_ones(connect: Connect, recorded
         assert "less than end_s" in await fail(client, "webots_get_logs", start_s=5, end_s=5)
 
 
+async def test_log_lines_come_from_before_a_reset_too_each_with_its_run(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    before = robot.run_id
+    robot.log(60.0, "before the reset", "critical")
+    robot.run_id = robot.begin_run("reset")
+    robot.log(0.5, "after the reset")
+    recorded.robot("other").log(1.0, "of another robot")
+    async with connect() as client:
+        newest = await ask(client, "webots_get_logs", robot="rover")
+        rows = [(row[2], row[3]) for row in newest["lines"]["rows"]]
+        assert rows == [("before the reset", before), ("after the reset", robot.run_id)]
+        ranged = await ask(client, "webots_get_logs", robot="rover", last_s=10)
+        assert [row[2] for row in ranged["lines"]["rows"]] == ["after the reset"]
+        earlier = await ask(client, "webots_get_logs", run_id=before)
+        assert [row[2] for row in earlier["lines"]["rows"]] == ["before the reset"]
+        grave = await ask(client, "webots_get_logs", robot="rover", level="critical")
+        assert [row[1] for row in grave["lines"]["rows"]] == ["critical"]
+
+
 async def test_a_camera_frame_comes_as_a_picture_with_its_age(
     connect: Connect, recorded: Recorded, file: Path
 ) -> None:

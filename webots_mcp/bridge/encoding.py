@@ -42,7 +42,7 @@ beyond 64 bits: they become the nearest float, as which SQLite reads them.
 from __future__ import annotations
 
 import json
-from collections import Counter, OrderedDict, defaultdict
+from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable, Iterable
 from typing import Any, Final, NamedTuple, cast
 
@@ -63,6 +63,7 @@ _MOST_SHORT_KEYS: Final = 10_000
 _FLOATS: Final = frozenset((float,))
 _SHORT_ARRAY: Final = 16
 _CONTAINERS: Final[tuple[Any, ...]] = (dict, list, tuple)
+_MANY: Final = (dict, list, tuple, set, frozenset, deque)
 _PLAIN_DICTS: Final = (OrderedDict, defaultdict, Counter)
 
 # Keys that were looked at once: the same come back with every row.
@@ -110,6 +111,14 @@ def is_small(value: object) -> bool:
     except Exception:  # noqa: BLE001  (whatever an object of the user's does)
         return False
     return True
+
+
+def text_of(value: object) -> str:
+    """A value as the text that a person reads; of a large one its JSON, which is bounded."""
+    if isinstance(value, str):
+        return value
+    is_large = issubclass(type(value), _MANY) and not is_small(value)
+    return encode(value).text if is_large else str(value)
 
 
 # -- the ordinary way --------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.text import cut, storable
 
 MOST_LOG_CHARACTERS: Final = 10_000
+_MOST_LOGGER_CHARACTERS: Final = 200
 _NOT_LOST: Final = ("nan", "inf", "-inf", "bytes", "surrogate")
 _CUT: Final = ("text[", "key[", "dict cut")
 _MOST_LOST_PATHS: Final = 20
@@ -34,10 +35,11 @@ class Journal:
             self.values_replaced += len(encoded.odd) - bool(encoded.unnamed) + encoded.unnamed
             self._say_lost(encoded.odd)
 
-    def log(self, level: str, source: str, message: str) -> None:
+    def log(self, level: str, source: str, message: str, logger: str | None = None) -> None:
         """Record a line, or its beginning."""
         text = storable(cut(message, MOST_LOG_CHARACTERS))
-        row = (self._clock.sim_time_s, time.time(), level, source, text)
+        name = None if logger is None else storable(cut(logger, _MOST_LOGGER_CHARACTERS))
+        row = (self._clock.sim_time_s, time.time(), level, source, text, name)
         self._recorder.record("log", self._clock.run, row)
 
     def event(

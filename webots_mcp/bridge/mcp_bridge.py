@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.bridge import open_bridges
 from webots_mcp.bridge.changes import Changes
@@ -17,7 +17,7 @@ from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.commands import describe
 from webots_mcp.bridge.control import Control, Handler
 from webots_mcp.bridge.devices import read_devices
-from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.encoding import encode, text_of
 from webots_mcp.bridge.heart import Heart
 from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
@@ -34,9 +34,13 @@ from webots_mcp.contract import (
     THROTTLE_VARIABLE,
     Database,
     MemoryDatabase,
+    find_log_level,
     resolve_database,
 )
 from webots_mcp.maintenance import Maintainer
+
+if TYPE_CHECKING:
+    import logging
 
 _FALSE: Final = ("", "0", "false", "no", "off")
 _CALM_S: Final = 0.5  # a loop that recorded nothing for so long stands still
@@ -160,19 +164,38 @@ class MCPBridge:
 
     # -- beside the state ----------------------------------------------------------------------
 
-    def log(self, message: object, level: str = "info") -> None:
-        """Record a line.
+    def log(self, message: object, level: str | int = "info") -> None:
+        """Record a line, of which the first 10,000 characters are kept.
 
         Args:
             message: Its text.
-            level: `debug`, `info`, `warning` or `error`; anything else counts as `info`.
+            level: `debug`, `info`, `warning` (or `warn`), `error` or `critical`, in either case,
+                or a number as in `logging` (`logging.WARNING`); anything else counts as `info`.
         """
+        self._log(message, level, None)
+
+    def log_handler(self, level: int | str = 0) -> logging.Handler:
+        """A handler that records what a controller logs with Python's `logging`.
+
+            logging.getLogger().addHandler(bridge.log_handler())
+
+        Each line has its level and the name of its logger. Any thread may log. A message that
+        cannot be formatted is recorded as it was given, with the reason; nothing raises.
+
+        Args:
+            level: The handler passes on this level and those above it.
+        """
+        from webots_mcp.bridge.log_handler import LogHandler  # `logging` costs a tenth of a start
+
+        return LogHandler(self._log, level)
+
+    def _log(self, message: object, level: object, logger: str | None) -> None:
         try:
-            if level not in LOG_LEVELS:
-                known = ", ".join(LOG_LEVELS)
-                self._recorder.complain("level", f"log level {level!r} is none of {known}")
-                level = "info"
-            self._journal.log(level, "controller", str(message))
+            known = find_log_level(level)
+            if known is None:
+                names = ", ".join(LOG_LEVELS)
+                self._recorder.complain("level", f"log level {level!r:.80} is none of {names}")
+            self._journal.log(known or "info", "controller", text_of(message), logger)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("log", error)
 
@@ -204,8 +227,8 @@ class MCPBridge:
                 exception is its error.
 
         Raises:
-            ValueError: The name is built in, or empty.
-            TypeError: The handler is not a plain function.
+            ValueError: The name is built in, empty, over 100 characters, or not printable.
+            TypeError: The name is no text, or the handler is not a plain function.
         """
         self._control.register(action, handler)
 

@@ -1,4 +1,4 @@
-"""Log lines of a run: by text, level and time."""
+"""Log lines of a run, or of all runs of a robot: by text, level and time."""
 
 from __future__ import annotations
 
@@ -24,18 +24,22 @@ class LogLine:
     level: str
     source: str
     message: str
+    logger: str | None
 
 
 _COLUMNS: Final = columns_of(LogLine)
+_RANKS: Final = " ".join(f"WHEN '{level}' THEN {rank}" for rank, level in enumerate(LOG_LEVELS))
 _MATCHING: Final = (
-    "FROM log WHERE run_id = :run_id AND sim_time_s >= :start_s AND sim_time_s < :end_s "
+    "AND sim_time_s >= :start_s AND sim_time_s < :end_s "
     "AND (:before_id IS NULL OR id < :before_id) "
     "AND (:text = '' OR instr(lower(message), :text) > 0) "
-    "AND CASE level WHEN 'debug' THEN 0 WHEN 'info' THEN 1 WHEN 'warning' THEN 2 ELSE 3 END "
-    ">= :lowest"
+    f"AND CASE level {_RANKS} ELSE {LOG_LEVELS.index('error')} END >= :lowest"
 )
-_NEWEST: Final = f"SELECT {_COLUMNS} {_MATCHING} ORDER BY sim_time_s DESC, id DESC LIMIT :limit"
-_COUNT: Final = f"SELECT count(*) FROM (SELECT 1 {_MATCHING} LIMIT {COUNT_LIMIT})"
+_OF_RUN: Final = f"FROM log WHERE run_id = :run_id {_MATCHING}"
+# The newest lines are wanted: from the end of the table, not run by run.
+_OF_ROBOT: Final = (
+    f"FROM log WHERE +run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) {_MATCHING}"
+)
 
 
 @dataclass(frozen=True)
@@ -43,34 +47,44 @@ class LogFilter:
     """Which lines are asked for.
 
     Args:
-        run_id: The run.
+        run_id: The run; None for all runs of the robot.
         window: Simulation time.
         text: Part of the message; ASCII letters match in either case.
         lowest_level: This level and those above it.
         before_id: Only lines with smaller ids, to page towards older ones.
+        robot_id: The robot, where no run is given.
     """
 
-    run_id: int
+    run_id: int | None
     window: Window
     text: str = ""
     lowest_level: str = "debug"
     before_id: int | None = None
+    robot_id: int | None = None
 
 
 def newest_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
     """The newest lines that match, oldest first; with a limit of -1 all of them."""
-    rows = connection.execute(_NEWEST, {**_values(asked), "limit": limit}).fetchall()
+    order = "id" if asked.run_id is None else "sim_time_s DESC, id"
+    query = f"SELECT {_COLUMNS} {_source(asked)} ORDER BY {order} DESC LIMIT :limit"
+    rows = connection.execute(query, {**_values(asked), "limit": limit}).fetchall()
     return [LogLine(*row) for row in reversed(rows)]
 
 
 def count_lines(connection: sqlite3.Connection, asked: LogFilter) -> int:
     """How many lines match; `COUNT_LIMIT` stands for that many or more."""
-    return int(connection.execute(_COUNT, _values(asked)).fetchone()[0])
+    query = f"SELECT count(*) FROM (SELECT 1 {_source(asked)} LIMIT {COUNT_LIMIT})"
+    return int(connection.execute(query, _values(asked)).fetchone()[0])
+
+
+def _source(asked: LogFilter) -> str:
+    return _OF_ROBOT if asked.run_id is None else _OF_RUN
 
 
 def _values(asked: LogFilter) -> dict[str, object]:
     return {
         "run_id": asked.run_id,
+        "robot_id": asked.robot_id,
         "start_s": asked.window.start_s,
         "end_s": asked.window.end_s,
         "text": asked.text.lower(),

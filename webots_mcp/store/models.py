@@ -273,7 +273,7 @@ class Log(SQLModel, table=True):
     run_id: int = _to("run")
     sim_time_s: float = _number(nullable=False)
     wall_time_s: float = _number(nullable=False)
-    level: str = _text("debug, info, warning, error", nullable=False)
+    level: str = _text("debug, info, ... critical", nullable=False)
     source: str = _text("controller or bridge", nullable=False)
     message: str = _text(nullable=False)
     logger: str | None = _text("name of the Python logger, where one logged it")

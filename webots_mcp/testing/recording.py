@@ -131,7 +131,7 @@ class Recording:
         """The lines that were logged in the run, in order.
 
         Args:
-            level: `debug`, `info`, `warning` or `error`: this one and those above it.
+            level: `debug`, `info`, `warning`, `error` or `critical`: this one and those above it.
             text: Part of the line.
 
         Raises:

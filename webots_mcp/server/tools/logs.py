@@ -15,7 +15,7 @@ from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, count_lines, 
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.window import resolve_window
 
-LOG_COLUMNS: Final = ("sim_time_s", "level", "message")
+LOG_COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
 _LONGEST_MESSAGE: Final = 500
 _BUDGET: Final = 6_000
 
@@ -43,20 +43,31 @@ class LogTools:
         robot: RobotName = None,
         run_id: RunId = None,
     ) -> LogsAnswer:
-        """The newest log lines of a run, oldest first; lines of the bridge begin with 'bridge:'."""
+        """The newest log lines, oldest first, each with its run.
+
+        Of all runs of the robot, so also from before a reset; with a run_id or a range of time of
+        that run, or the current one. Lines of the bridge begin with 'bridge:', those of Python's
+        logging with '[name of the logger]'.
+        """
         with self._recording.view(robot, run_id) as view:
             run = view.require_run()
+            one_run = any(bound is not None for bound in (run_id, last_s, start_s, end_s))
             window = resolve_window(
                 run.last_sim_time_s, last_s=last_s, start_s=start_s, end_s=end_s
             )
-            asked = LogFilter(run.id, window, filter_text, level or "debug", cursor)
+            subject = run.id if one_run else None
+            lowest = level or "debug"
+            asked = LogFilter(subject, window, filter_text, lowest, cursor, view.robot.id)
             return _answer(view, asked, lines)
 
 
 def log_row(line: LogLine) -> list[object]:
     """A line as a row under `LOG_COLUMNS`."""
     message = line.message if line.source == "controller" else f"{line.source}: {line.message}"
-    return [round(line.sim_time_s, 3), line.level, cut_text(message, _LONGEST_MESSAGE)]
+    if line.logger is not None:
+        message = f"[{line.logger}] {message}"
+    text = cut_text(message, _LONGEST_MESSAGE)
+    return [round(line.sim_time_s, 3), line.level, text, line.run_id]
 
 
 def _answer(view: View, asked: LogFilter, limit: int) -> LogsAnswer:

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, get_args
 
+from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.history.leaves import Value
 
@@ -14,7 +15,7 @@ Kind = Literal[
     "command", "log", "noticed", "image",
 ]  # fmt: skip
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-LEVELS: Final = ("debug", "info", "warning", "error")
+LEVELS: Final = LOG_LEVELS
 
 
 @dataclass(frozen=True)

@@ -43,7 +43,7 @@ _ONE: Final = f"{_RUNS} WHERE r.id = ?"
 _TOTAL: Final = "SELECT count(*) FROM run WHERE :robot IS NULL OR robot_id = :robot"
 _NOTABLE: Final = (
     "SELECT 'log ' || level, count(*) FROM log WHERE run_id = :run "
-    "AND level IN ('warning', 'error') GROUP BY level UNION ALL "
+    "AND level IN ('warning', 'error', 'critical') GROUP BY level UNION ALL "
     "SELECT kind, count(*) FROM event WHERE run_id = :run "
     "AND kind NOT IN ('change', 'start', 'reset', 'reload') GROUP BY kind UNION ALL "
     "SELECT 'command ' || status, count(*) FROM command c JOIN run r ON r.id = :run "

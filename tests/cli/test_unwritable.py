@@ -14,6 +14,8 @@ from mcp import Client, StdioServerParameters
 from tests import unprivileged
 from tests.server.conftest import ask, fail
 from tests.store.recorded import Recorded
+from webots_mcp.contract import new_uuid
+from webots_mcp.entries import waiting_path
 from webots_mcp.store.migrate import upgrade
 
 pytestmark = [
@@ -99,6 +101,16 @@ def test_the_status_says_it_to_programs_as_well(artifact: Path) -> None:
     facts = json.loads(ended.stdout)
     assert facts["storage"].startswith(SAID)
     assert [robot["runs"] for robot in facts["robots"]] == [2]
+
+
+def test_what_waits_beside_it_is_said_not_to_be_in_it(recorded: Recorded) -> None:
+    assert isinstance(recorded.database, Path)
+    recorded.close()
+    waiting_path(recorded.database, new_uuid()).touch()
+    with unprivileged.unwritable(recorded.database.parent):
+        ended = run("-m", "webots_mcp", "runs", "--database", str(recorded.database))
+    assert ended.returncode == 0
+    assert "without what waits beside it in 1 files" in ended.stderr
 
 
 async def test_a_read_only_server_answers_from_it_and_says_how(artifact: Path) -> None:

@@ -25,6 +25,7 @@ from webots_mcp.connection import (
     text_of,
 )
 from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.entries import waiting_paths
 from webots_mcp.errors import (
     DatabaseError,
     NoDatabaseError,
@@ -48,6 +49,10 @@ GETTING_STARTED: Final = (
 )
 
 _FROZEN: Final = "the file cannot be written from here: read as it lies on the disk"
+_NOT_IN: Final = (
+    "; without what waits beside it in {} files named ...-waiting-...: a copy of all of them where "
+    "one can write, opened by webots-mcp serve, takes it in"
+)
 
 
 @dataclass(frozen=True)
@@ -258,7 +263,11 @@ def view_of(connection: sqlite3.Connection, robot: Robot, run_id: int | None, no
 
 def storage(connection: sqlite3.Connection) -> dict[str, Any]:
     """What an answer says of the file that it was read from; nothing where robots may record."""
-    return {"storage": _FROZEN} if isinstance(connection, FrozenConnection) else {}
+    if not isinstance(connection, FrozenConnection):
+        return {}
+    (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
+    waiting = [path.name for path in waiting_paths(Path(file))]
+    return {"storage": f"{_FROZEN}{_NOT_IN.format(len(waiting)) if waiting else ''}"}
 
 
 def name_of(database: Database) -> str:

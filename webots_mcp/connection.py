@@ -26,6 +26,10 @@ CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wai
 _UNWRITABLE: Final = ("readonly database", "unable to open database file")
 _CALLED_OFF: Final = "called off"
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
+_ABOUT_A_VALUE: Final = (
+    "malformed JSON", "JSON cannot hold", "JSON path", "to UTF-8 column", "integer overflow",
+    "user-defined function",
+)  # fmt: skip
 
 # One statement, so one moment: another starter may be making the tables right now.
 _STAMPS: Final = (
@@ -269,10 +273,18 @@ def is_busy(error: Exception) -> bool:
     return isinstance(error, sqlite3.OperationalError) and "locked" in str(error)
 
 
+def is_about_a_value(error: Exception) -> bool:
+    """Whether a single value cannot be read, by SQLite or as text; the file is whole."""
+    if isinstance(error, UnicodeDecodeError):  # else it is SQLite's own message that is no text
+        return not any(words in text_of(error) for words in _DAMAGE)
+    return isinstance(error, sqlite3.Error) and any(s in str(error) for s in _ABOUT_A_VALUE)
+
+
 def is_damage(error: Exception) -> bool:
     """Whether SQLite says that the file itself is broken, or never was a database."""
-    text = text_of(error)
-    return isinstance(error, FAILURES) and any(words in text for words in _DAMAGE)
+    if not isinstance(error, FAILURES) or is_about_a_value(error):
+        return False
+    return any(words in text_of(error) for words in _DAMAGE)
 
 
 def text_of(error: Exception) -> str:

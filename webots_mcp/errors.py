@@ -7,6 +7,7 @@ of its own.
     ├── DatabaseError               the file, not the question, is the problem
     │   ├── NoDatabaseError         nothing has been recorded there yet
     │   ├── ForeignDatabaseError    the file is not a recording of this package
+    │   ├── MalformedRowError       a row holds a value that no bridge has written
     │   ├── SchemaTooNewError       a newer webots-mcp wrote it
     │   └── SchemaTooOldError       an older webots-mcp wrote it: migrate first
     ├── InvalidInputError           the question is the problem; the text says how to ask
@@ -37,6 +38,10 @@ class NoDatabaseError(DatabaseError):
 
 class ForeignDatabaseError(DatabaseError):
     """The file is no SQLite database, or belongs to another application."""
+
+
+class MalformedRowError(DatabaseError):
+    """A row holds a value that cannot be read; the file is whole."""
 
 
 class SchemaTooNewError(DatabaseError):

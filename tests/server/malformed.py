@@ -1,16 +1,28 @@
-"""Recordings in which one value is of a wrong kind, as other programs may leave it."""
+"""Recordings in which one value is of a wrong kind, as other programs may leave it.
+
+`python -m tests.server.malformed [table[.column]]` damages each column of each table with each kind
+of wrong value, asks every tool, and prints how many calls gave no usable answer.
+"""
 
 from __future__ import annotations
 
+import logging
+import shutil
 import sqlite3
+import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
+import anyio
+from mcp import Client
 from PIL import Image
 
-from tests.store.recorded import Recorded, insert
+from tests.store.recorded import Recorded, RecordedRobot, insert
+from webots_mcp.server import create_server
 from webots_mcp.store.history.rollup import roll
 
 ROWS: Final = 60
@@ -34,6 +46,40 @@ _WRONG_JSON: Final = (
 )  # fmt: skip
 
 
+KEYED: Final = ("rollup", "change")
+READING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
+    ("webots_list_robots", {}),
+    ("webots_get_world_info", {}),
+    ("webots_get_robot_state", {}),
+    ("webots_get_sensors", {}),
+    ("webots_get_full_state", {}),
+    ("webots_get_camera", {}),
+    ("webots_get_logs", {}),
+    ("webots_monitor", {"lookback_s": 3600}),
+    ("webots_list_commands", {}),
+    ("webots_list_signals", {}),
+    ("webots_query_history", {"signals": ["*"]}),
+    ("webots_query_history", {"signals": ["*"], "raw": True}),
+    ("webots_get_trends", {}),
+    ("webots_find_events", {}),
+    ("webots_get_timeline", {}),
+    ("webots_list_runs", {}),
+    ("webots_compare_runs", {"run_ids": [1, 2]}),
+)
+DRAWING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
+    ("webots_plot", {}),
+    ("webots_plot", {"kind": "trajectory"}),
+)
+ACTING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
+    ("webots_annotate_run", {"note": "x"}),
+    ("webots_send_command", {"action": "dance", "timeout_s": 0.1}),
+    ("webots_simulation_control", {"command": "pause", "timeout_s": 0.1}),
+)
+_ACTED_ON: Final = ("robot", "session", "run", "command")
+_DRAWN: Final = ("state", "rollup", "run", "signal", "change")
+_UNUSABLE: Final = ("a defect of webots-mcp", "is damaged", "cannot be used", "cannot be read")
+
+
 class Damage(NamedTuple):
     """One value of a wrong kind in the newest row of a table."""
 
@@ -42,38 +88,32 @@ class Damage(NamedTuple):
     value: Any
 
     def apply(self, connection: sqlite3.Connection) -> None:
-        row = "(SELECT max(rowid) FROM {0})" if self.table not in KEYED else "{1}"
-        where = f"WHERE rowid = (SELECT max(rowid) FROM {self.table})"
-        if self.table in KEYED:  # WITHOUT ROWID
-            where = "WHERE (run_id, signal_id) = (SELECT max(run_id), max(signal_id) FROM {0})"
-        del row
+        where = f"rowid = (SELECT max(rowid) FROM {self.table})"
+        if self.table in KEYED:  # they have no rowid
+            where = f"(run_id, signal_id) = (SELECT max(run_id), max(signal_id) FROM {self.table})"
         new, values = ("?", (self.value,)) if self.value is not _NOT_UTF8 else (_NOT_UTF8, ())
         connection.execute("PRAGMA foreign_keys=OFF")
-        connection.execute(
-            f"UPDATE {self.table} SET {self.column} = {new} {where.format(self.table)}", values
-        )
+        connection.execute(f"UPDATE {self.table} SET {self.column} = {new} WHERE {where}", values)
 
     def __str__(self) -> str:
         return f"{self.table}.{self.column} = {self.value!r:.40}"
 
 
-KEYED: Final = ("rollup", "change")
-
-
-def record(file: Path, *, live: bool) -> None:
-    """A robot with something in every table; `live` as if its controller were running."""
+def record(file: Path) -> None:
+    """Two runs of a robot that seems to live, with something in every table."""
     recorded = Recorded(file)
     robot = recorded.robot("rover", actions='{"dance": "Dance."}')
-    _fill(robot, file.parent)
-    if not live:
-        robot.end_run("finished")
-        robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
+    for reason in ("reset", None):
+        _fill(robot, file.parent)
+        if reason:
+            robot.end_run(reason)
+            robot.begin_run(reason)
     roll(recorded.connection)
     recorded.connection.execute("INSERT INTO lease VALUES ('maintenance', 'x', 1.0)")
     recorded.close()
 
 
-def _fill(robot: Any, folder: Path) -> None:
+def _fill(robot: RecordedRobot, folder: Path) -> None:
     began = robot.now
     for step in range(ROWS):
         robot.now = began + step * 0.1 - ROWS * 0.1
@@ -115,3 +155,46 @@ def damages(file: Path) -> Iterator[Damage]:
             if (table, column) in JSON_COLUMNS:
                 yield from (Damage(table, column, value) for value in _WRONG_JSON)
     connection.close()
+
+
+async def unusable_answers(base: Path, folder: Path, damage: Damage) -> tuple[int, list[str]]:
+    """How many calls were made on a copy with this damage, and those that gave nothing usable."""
+    shutil.copytree(base, folder)
+    with closing(sqlite3.connect(folder / "webots.db")) as connection, connection:
+        try:
+            damage.apply(connection)
+        except sqlite3.IntegrityError:  # the schema itself keeps it out
+            return 0, []
+    bad: list[str] = []
+    calls = (*READING, *(DRAWING if damage.table in _DRAWN else ()),
+             *(ACTING if damage.table in _ACTED_ON else ()))  # fmt: skip
+    async with Client(create_server(folder / "webots.db", folder)) as client:
+        for tool, arguments in calls:
+            with anyio.fail_after(60):
+                answer = await client.call_tool(tool, arguments)
+            said = "".join(block.text for block in answer.content if block.type == "text")
+            rest = said.removeprefix(f"Error executing tool {tool}").strip(": ")
+            if answer.is_error and (not rest or any(words in rest for words in _UNUSABLE)):
+                bad.append(f"{tool} after {damage}: {rest or 'plain'}"[:400])
+    return len(calls), bad
+
+
+async def _survey(only: str) -> None:
+    made, bad = 0, list[str]()
+    with TemporaryDirectory() as folder:
+        base = Path(folder) / "base"
+        base.mkdir()
+        record(base / "webots.db")
+        wanted = [damage for damage in damages(base / "webots.db") if only in str(damage)]
+        for number, damage in enumerate(wanted):
+            calls, unusable = await unusable_answers(base, Path(folder) / str(number), damage)
+            shutil.rmtree(Path(folder) / str(number))
+            made += calls
+            bad += unusable
+    print(*bad, sep="\n")
+    print(f"{len(wanted)} damages, {made} calls, {len(bad)} without a usable answer")
+
+
+if __name__ == "__main__":
+    logging.disable(logging.CRITICAL)
+    anyio.run(_survey, "".join(sys.argv[1:]))

@@ -8,19 +8,27 @@ from __future__ import annotations
 
 import functools
 import inspect
+import logging
 from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final, ParamSpec, TypeVar, cast, get_type_hints
 
+from mcp import MCPError
 from mcp.server.mcpserver import Context
 from mcp.server.mcpserver.exceptions import ToolError
 from mcp.server.mcpserver.tools import Tool
 from mcp.types import CallToolResult, TextContent, ToolAnnotations
 
-from webots_mcp.errors import NoDatabaseError, NothingRecordedError, WebotsMCPError
+from webots_mcp.errors import (
+    MalformedRowError,
+    NoDatabaseError,
+    NothingRecordedError,
+    WebotsMCPError,
+)
 from webots_mcp.server.arguments import CheckedTool
 from webots_mcp.server.results import Answer, CommandAnswer
 from webots_mcp.server.shortening import compact_json
+from webots_mcp.store.sound import Unsound, past_unsound_rows
 
 READS: Final = ToolAnnotations(read_only_hint=True, open_world_hint=False)
 ACTS: Final = ToolAnnotations(
@@ -29,7 +37,10 @@ ACTS: Final = ToolAnnotations(
 RESTARTS: Final = ACTS.model_copy(update={"destructive_hint": True})
 
 _BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
+_LONGEST_DEFECT: Final = 200
 _DECLARATION: Final = "webots_mcp_declaration"
+
+_log = logging.getLogger(__name__)
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -90,55 +101,88 @@ def _declared(family: object) -> Iterator[tuple[Callable[..., Any], Declaration]
             yield getattr(family, name), declaration
 
 
-def _wrap(method: Callable[..., Any], empty: Callable[[str], Any]) -> Callable[..., Any]:
+def _wrap(method: Callable[..., Any], empty: Callable[[str], Any] | None) -> Callable[..., Any]:
     @functools.wraps(method)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
         try:
-            return _as_result(method(*args, **kwargs))
-        except WebotsMCPError as error:
-            return _as_result(_answer_error(error, empty))
+            if empty is not None:
+                try:
+                    return _as_result(method(*args, **kwargs))
+                except Exception as error:  # noqa: BLE001  (the next line tells which)
+                    _require_over_a_value(error)
+            with past_unsound_rows() as unsound:
+                return _as_result(method(*args, **kwargs), unsound)
+        except Exception as error:  # noqa: BLE001  (each becomes an answer)
+            return _as_result(_answer_error(method.__name__, error, empty))
 
     return wrapper
 
 
-def _wrap_async(method: Callable[..., Any], empty: Callable[[str], Any]) -> Callable[..., Any]:
+def _wrap_async(
+    method: Callable[..., Any], empty: Callable[[str], Any] | None
+) -> Callable[..., Any]:
     @functools.wraps(method)
     async def wrapper(*args: Any, **kwargs: Any) -> Any:
         try:
-            return _as_result(await method(*args, **kwargs))
-        except WebotsMCPError as error:
-            return _as_result(_answer_error(error, empty))
+            if empty is not None:
+                try:
+                    return _as_result(await method(*args, **kwargs))
+                except Exception as error:  # noqa: BLE001  (the next line tells which)
+                    _require_over_a_value(error)
+            with past_unsound_rows() as unsound:
+                return _as_result(await method(*args, **kwargs), unsound)
+        except Exception as error:  # noqa: BLE001  (each becomes an answer)
+            return _as_result(_answer_error(method.__name__, error, empty))
 
     return wrapper
 
 
-def _answer_error(error: WebotsMCPError, empty: Callable[[str], Any]) -> Any:
-    """Our errors tell the model what to do; any other is a defect and stays on the server."""
-    if isinstance(error, (NoDatabaseError, NothingRecordedError)):
+def _require_over_a_value(error: Exception) -> None:
+    """Raise the error again unless it may be owed to a value that no bridge has written."""
+    ours = isinstance(error, (WebotsMCPError, MCPError, ToolError))
+    if ours and not isinstance(error, MalformedRowError):
+        raise error
+
+
+def _answer_error(tool: str, error: Exception, empty: Callable[[str], Any] | None) -> Any:
+    """Our errors tell the model what to do; of a defect the server's log has the rest."""
+    if empty is not None and isinstance(error, (NoDatabaseError, NothingRecordedError)):
         return empty(str(error))
-    raise ToolError(str(error)) from error
+    if isinstance(error, WebotsMCPError):
+        raise ToolError(str(error)) from error
+    if isinstance(error, (MCPError, ToolError)):
+        raise error
+    _log.exception("%s failed", tool)
+    raise ToolError(
+        f"a defect of webots-mcp, or rows that it did not write ({type(error).__name__}: "
+        f"{str(error)[:_LONGEST_DEFECT]}); ask for another range or by another tool, and report "
+        "what the server wrote to stderr"
+    ) from error
 
 
-def _empty_answer(method: Callable[..., Any], annotations: ToolAnnotations) -> Callable[[str], Any]:
-    """How to answer that nothing was recorded: in the tool's own form, or as an error."""
+def _empty_answer(
+    method: Callable[..., Any], annotations: ToolAnnotations
+) -> Callable[[str], Any] | None:
+    """How a reading tool answers that nothing was recorded; None for one that acts.
+
+    A reading tool can be asked twice; one that acts looks past unsound rows at once.
+    """
     if not annotations.read_only_hint:
-        return _refuse
+        return None
     answer = get_type_hints(method)["return"]
     if isinstance(answer, type) and issubclass(answer, Answer):
         return lambda text: answer(status="never seen", hint=text)
     return lambda text: [text]
 
 
-def _refuse(text: str) -> Any:
-    raise ToolError(text)
-
-
-def _as_result(answer: Any) -> Any:
+def _as_result(answer: Any, unsound: Unsound | None = None) -> Any:
     """Structured content and the same as compact text; pictures and their captions as they are."""
+    left_out = unsound.described() if unsound else []
     if not isinstance(answer, Answer):
-        return answer
+        return [*answer, compact_json({"left_out": left_out})] if left_out else answer
+    answer.left_out = left_out or None
     data = answer.model_dump(mode="json", exclude_none=True)
+    text = compact_json(data)
+    text.encode()  # what UTF-8 cannot hold would end the connection to the client
     bad = isinstance(answer, CommandAnswer) and answer.outcome in _BAD_ENDS
-    return CallToolResult(
-        content=[TextContent(text=compact_json(data))], structured_content=data, is_error=bad
-    )
+    return CallToolResult(content=[TextContent(text=text)], structured_content=data, is_error=bad)

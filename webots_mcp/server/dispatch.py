@@ -86,8 +86,9 @@ class Dispatcher:
             raise
 
     def _enqueue(self, request: Request) -> Command:
-        with self._recording.writer() as connection:
+        with self._recording.reader() as connection:
             view = find_addressee(connection, request.robot, request.action)
+        with self._recording.writer() as connection:
             return CommandQueue(connection).enqueue(
                 view.robot.id,
                 request.action,

@@ -31,6 +31,9 @@ class Answer(BaseModel):
         default=None, description="Where the recording cannot be written: how it was read."
     )
     hint: str | None = Field(default=None, description="What to do next.")
+    left_out: list[str] | None = Field(
+        default=None, description="Rows and values that no bridge has written; they do not count."
+    )
 
 
 class StateAnswer(Answer):

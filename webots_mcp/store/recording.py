@@ -19,6 +19,7 @@ from webots_mcp.connection import (
     FrozenConnection,
     Role,
     connect,
+    is_about_a_value,
     is_busy,
     is_damage,
     is_unwritable,
@@ -28,6 +29,7 @@ from webots_mcp.contract import Database, MemoryDatabase
 from webots_mcp.entries import waiting_paths
 from webots_mcp.errors import (
     DatabaseError,
+    MalformedRowError,
     NoDatabaseError,
     NothingRecordedError,
     SchemaTooOldError,
@@ -38,6 +40,7 @@ from webots_mcp.store.retention.limits import Asked
 from webots_mcp.store.robots import Robot, resolve_robot, robot_name
 from webots_mcp.store.runs import Run, current_run, fetch_run
 from webots_mcp.store.sessions import Session
+from webots_mcp.store.sound import shadow_if_asked
 from webots_mcp.store.states import State, newest_state
 from webots_mcp.store.status import Status, judge, stopped_for
 
@@ -140,6 +143,7 @@ class Recording:
     def reader(self) -> Generator[sqlite3.Connection]:
         """A connection of its own that cannot write."""
         with self._opened("reader") as connection:
+            shadow_if_asked(connection)
             yield connection
 
     @contextmanager
@@ -191,7 +195,8 @@ class Recording:
         try:
             yield
         except FAILURES as error:
-            raise DatabaseError(_explain(error, self.database)) from error
+            kind = MalformedRowError if is_about_a_value(error) else DatabaseError
+            raise kind(_explain(error, self.database)) from error
 
     def _open(self, role: Role) -> sqlite3.Connection:
         try:
@@ -283,6 +288,8 @@ def _explain(error: Exception, database: Database) -> str:
             f"the database at {name} stayed locked by another process: ask again; if it lasts, "
             "look for a program that holds a transaction open (a sqlite3 shell?)"
         )
+    if is_about_a_value(error):
+        return f"the database at {name} holds a value that cannot be read: {text}"
     if is_damage(error):
         return (
             f"the database at {name} is damaged ({text}): the bridge moves such a file aside at "

@@ -42,7 +42,14 @@ from webots_mcp.store.history.compare import (
     compare_code,
     compare_runs,
 )
-from webots_mcp.store.history.runs import MOST_RUNS, RunInfo, annotate_run, list_runs, pace
+from webots_mcp.store.history.runs import (
+    MOST_RUNS,
+    RunInfo,
+    annotate_run,
+    list_runs,
+    pace,
+    run_info,
+)
 from webots_mcp.store.recording import Recording, View, look
 
 RUN_COLUMNS: Final = (
@@ -132,11 +139,13 @@ class RunTools:
 
         A run with either is kept for good: retention deletes nothing of it.
         """
+        with self._recording.view(robot, run_id) as view:
+            run = view.require_run()
         with self._recording.writer() as connection:
-            run = look(connection, robot, run_id).require_run()
-            told = annotate_run(connection, run.id, label=_change(label), note=_change(note))
-            header = look(connection, robot, run_id).header()
-            return RunsAnswer(**header, runs=without_empty(RUN_COLUMNS, [run_row(told)]))
+            annotate_run(connection, run.id, label=_change(label), note=_change(note))
+        with self._recording.view(robot, run.id) as view:
+            told = run_info(view.connection, run.id)
+            return RunsAnswer(**view.header(), runs=without_empty(RUN_COLUMNS, [run_row(told)]))
 
 
 def _change(text: str) -> str | None:

@@ -160,7 +160,7 @@ def annotate_run(
     *,
     label: str | None = None,
     note: str | None = None,
-) -> RunInfo:
+) -> None:
     """Give a run a label (short, to find it by) or a note; an empty text takes it away.
 
     Args:
@@ -180,9 +180,8 @@ def annotate_run(
             raise InvalidInputError(
                 f"the {name} has {len(text)} characters; at most {longest} are kept"
             )
-    fetch_run(connection, run_id)
-    connection.execute(_ANNOTATE, {"run": run_id, "label": label, "note": note})
-    return run_info(connection, run_id)
+    if not connection.execute(_ANNOTATE, {"run": run_id, "label": label, "note": note}).rowcount:
+        fetch_run(connection, run_id)  # says which there are
 
 
 def pace(duration_s: float, wall_s: float) -> float | None:

@@ -1,0 +1,62 @@
+"""A value that no bridge has written costs its row, named in the answer, and never the tool."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.server.conftest import Connect, ask
+from tests.server.malformed import Damage, damages, record, unusable_answers
+from tests.store.recorded import Recorded
+
+pytestmark = pytest.mark.anyio
+
+# Of each column some; `python -m tests.server.malformed` tries all of them.
+TRIED = (b"\x00\xff\x01", '{"x": ', "[1, 2]", '{"x": "\\ud800"}')
+TABLES = ("robot", "session", "run", "state", "event", "command", "log", "image", "signal",
+          "rollup", "change")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("base")
+    record(folder / "webots.db")
+    return folder
+
+
+@pytest.mark.parametrize("table", TABLES)
+async def test_a_wrong_value_anywhere_leaves_every_tool_with_an_answer(
+    base: Path, tmp_path: Path, table: str
+) -> None:
+    wanted = [
+        damage
+        for damage in damages(base / "webots.db")
+        if damage.table == table and damage.value in TRIED
+    ]
+    assert wanted
+    for number, damage in enumerate(wanted):
+        assert (await unusable_answers(base, tmp_path / str(number), damage))[1] == []
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (Damage("state", "data", "nonsense"), "state 2: data is no sound JSON"),
+        (Damage("state", "sim_time_s", "late"), "state 2: sim_time_s is no sound number"),
+        (Damage("state", "odd", "[]"), "state 2: odd is no sound JSON"),
+    ],
+)
+async def test_a_row_that_is_left_out_is_named_and_the_others_are_told(
+    recorded: Recorded, connect: Connect, damage: Damage, said: str
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, {"x": 1})
+    robot.state(2.0, {"x": 2})
+    damage.apply(recorded.connection)
+    async with connect(read_only=True) as client:
+        answer = await ask(client, "webots_get_full_state")
+        assert answer["left_out"] == [said]
+        assert answer["state"] == {"x": 2 if damage.column == "odd" else 1}
+        recorded.connection.execute("DELETE FROM state WHERE id = 2")
+        assert "left_out" not in await ask(client, "webots_get_full_state")

@@ -1,0 +1,165 @@
+"""Reading past rows that hold what no bridge writes: the one place that knows what is sound.
+
+Other programs may write to a recording, and SQLite takes any value in any column. Checking each
+value would cost every question half of its time, so that a question is asked without it first; one
+that fails over a value is asked again of `shadow`, which costs only the rows that are not sound.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+from collections.abc import Generator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import Any, Final, cast
+
+MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
+MAX_SIM_TIME_S: Final = 1e10
+MAX_WALL_TIME_S: Final = 253_402_300_799.0  # the end of the year 9999
+_MAX_INTEGER: Final = 2**53  # no id or count is larger, and a float holds it
+_MAX_FLOAT: Final = 1.7e308
+_SHOWN: Final = 5
+
+_OBJECTS: Final = frozenset(
+    {"robot.devices", "session.versions", "session.actions", "state.data", "state.odd",
+     "event.data", "command.params"}
+)  # fmt: skip
+_OF_TEXTS: Final = frozenset({"robot.devices", "session.actions", "state.odd"})
+_VALUES: Final = frozenset({"command.result"})
+# A row that refers to one that is not sound would lead there.
+_REFERENCES: Final = {
+    "session": (("robot_id", "robot"),),
+    "run": (("session_id", "session"), ("robot_id", "robot")),
+}
+_TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
+                  "signal", "rollup", "change", "watermark")  # fmt: skip
+_COLUMNS: Final = 'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)'
+
+
+class Unsound:
+    """The values that a question met and left out, in the order in which it met them."""
+
+    def __init__(self) -> None:
+        self._met: dict[str, None] = {}
+
+    def note(self, table: str, row: object, column: str, kind: str) -> None:
+        """Called by SQLite for each such value; its row, or the value, is not seen."""
+        self._met[f"{table} {row}: {column} is no sound {kind}"] = None
+
+    def described(self) -> list[str]:
+        """The first few, and how many more there are."""
+        more = len(self._met) - _SHOWN
+        return [*list(self._met)[:_SHOWN], *([f"and {more} more"] if more > 0 else [])]
+
+
+_reading: ContextVar[Unsound | None] = ContextVar("reading past unsound rows", default=None)
+
+
+@contextmanager
+def past_unsound_rows() -> Generator[Unsound]:
+    """Readers that are opened inside, in this context, do not see what is not sound."""
+    unsound = Unsound()
+    token = _reading.set(unsound)
+    try:
+        yield unsound
+    finally:
+        _reading.reset(token)
+
+
+def shadow_if_asked(connection: sqlite3.Connection) -> None:
+    """Inside `past_unsound_rows` give a reader views of the sound rows under the tables' names."""
+    if (unsound := _reading.get()) is not None:
+        _shadow(connection, unsound)
+
+
+def _shadow(connection: sqlite3.Connection, unsound: Unsound) -> None:
+    connection.text_factory = _as_text
+    connection.create_function("unsound", 4, unsound.note)
+    connection.create_function("sound_json", 2, _is_sound_json, deterministic=True)
+    connection.execute("PRAGMA query_only=OFF")  # a view of this connection alone
+    for table in _TABLES:
+        connection.execute(_view(connection, table))
+    connection.execute("PRAGMA query_only=ON")
+
+
+def _as_text(stored: bytes) -> str:
+    return stored.decode("utf-8", "replace")
+
+
+def _view(connection: sqlite3.Connection, table: str) -> str:
+    columns = connection.execute(_COLUMNS, (table,)).fetchall()
+    keys = [name for name, _, _, _, key in columns if key]
+    row = " || '/' || ".join(keys)
+    shown: list[str] = []
+    needed: list[str] = []
+    for name, kind, required, default, key in columns:
+        check, said = _check(table, name, kind)
+        left_out = f"unsound('{table}', {row}, '{name}', '{said}')"
+        if key and len(keys) == 1:
+            shown.append(name)
+        elif required and default is None:
+            shown.append(name)
+            needed.append(f"CASE WHEN {check} THEN 1 ELSE {left_out} END")
+        else:
+            whole = check if required else f"{name} IS NULL OR {check}"
+            shown.append(
+                f"CASE WHEN {whole} THEN {name} "
+                f"ELSE coalesce({left_out}, {default or 'NULL'}) END AS {name}"
+            )
+    for name, other in _REFERENCES.get(table, ()):
+        there = f"EXISTS (SELECT 1 FROM temp.{other} AS other WHERE other.id = {table}.{name})"
+        left_out = f"unsound('{table}', {row}, '{name}', 'reference')"
+        needed.append(f"CASE WHEN {there} THEN 1 ELSE {left_out} END")
+    where = " AND ".join(needed) or "1"
+    return f"CREATE TEMP VIEW {table} AS SELECT {', '.join(shown)} FROM main.{table} WHERE {where}"
+
+
+def _check(table: str, name: str, kind: str) -> tuple[str, str]:
+    """An SQL condition that a sound value meets, and what such a value is called."""
+    place = f"{table}.{name}"
+    if place in _OBJECTS | _VALUES:
+        what = "texts" if place in _OF_TEXTS else "value" if place in _VALUES else "object"
+        checked = f"sound_json(CAST({name} AS BLOB), '{what}')"  # it may be no UTF-8
+        return f"CASE typeof({name}) WHEN 'text' THEN {checked} ELSE 0 END", "JSON"
+    if kind == "TEXT":
+        return f"typeof({name}) = 'text'", "text"
+    if kind == "INTEGER":
+        return f"typeof({name}) = 'integer' AND abs({name} / 2) <= {_MAX_INTEGER // 2}", "integer"
+    limit = _MAX_FLOAT
+    if name.endswith("time_s"):
+        limit = MAX_WALL_TIME_S if name.endswith("wall_time_s") else MAX_SIM_TIME_S
+    return f"typeof({name}) IN ('real', 'integer') AND abs({name}) <= {limit!r}", "number"
+
+
+def _is_sound_json(stored: bytes, what: str) -> int:
+    """Whether it is JSON that SQLite, Python and a client read alike, and of the right shape."""
+    try:
+        value: Any = json.loads(stored.decode(), parse_constant=_refuse)
+        json.dumps(value, ensure_ascii=False).encode()
+        _require_plain(value, MAX_DEPTH)
+    except (ValueError, RecursionError, OverflowError):
+        return 0
+    if what == "value":
+        return 1
+    members = cast("dict[str, Any]", value) if isinstance(value, dict) else None
+    if members is None or what == "object":
+        return int(members is not None)
+    return int(all(isinstance(member, str) for member in members.values()))
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(constant)
+
+
+def _require_plain(value: Any, levels: int) -> None:
+    """Raise where it is nested too deeply, or holds a number that is no finite float."""
+    if isinstance(value, (dict, list)):
+        if not levels:
+            raise ValueError("too deep")
+        each = cast("dict[str, Any] | list[Any]", value)
+        for member in each.values() if isinstance(each, dict) else each:
+            _require_plain(member, levels - 1)
+    elif isinstance(value, (int, float)) and not math.isfinite(value):
+        raise ValueError("not finite")

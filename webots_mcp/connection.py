@@ -13,7 +13,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Final, Literal, TypeVar
 
-from webots_mcp.contract import APPLICATION_ID, Database, MemoryDatabase
+from webots_mcp.contract import (
+    APPLICATION_ID,
+    PRIVATE_FILE,
+    Database,
+    MemoryDatabase,
+    make_folder,
+)
 from webots_mcp.errors import DatabaseError, ForeignDatabaseError, NoDatabaseError
 
 Role = Literal["loop", "writer", "reader"]
@@ -322,15 +328,24 @@ def _identify(file: str) -> tuple[int, int]:
 def _file_uri(file: Database, create: bool) -> str:
     assert not isinstance(file, MemoryDatabase)
     if create:
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise DatabaseError(f"the folder {file.parent} cannot be made: {error}") from error
+        _make(file)
     elif not _exists(file):
         raise NoDatabaseError(
             f"no database at {file}: no controller with an MCPBridge has recorded there yet"
         )
     return f"{file.absolute().as_uri()}?mode={'rwc' if create else 'rw'}"
+
+
+def _make(file: Path) -> None:
+    """An empty file that is its owner's alone, as SQLite then makes the log beside it."""
+    try:
+        make_folder(file.parent)
+    except OSError as error:
+        raise DatabaseError(f"the folder {file.parent} cannot be made: {error}") from error
+    try:
+        os.close(os.open(file, os.O_CREAT | os.O_RDWR, PRIVATE_FILE))
+    except OSError as error:
+        raise DatabaseError(f"{file} cannot be opened for writing: {error}") from error
 
 
 def _exists(file: Path) -> bool:

@@ -24,6 +24,9 @@ DATA_DIR_VARIABLE: Final = "WEBOTS_MCP_DATA_DIR"
 STRICT_VARIABLE: Final = "WEBOTS_MCP_STRICT"
 THROTTLE_VARIABLE: Final = "WEBOTS_MCP_THROTTLE_INTERVAL"
 
+PRIVATE_FOLDER: Final = 0o700  # recordings hold pictures and logs: they are their owner's alone
+PRIVATE_FILE: Final = 0o600
+
 CommandStatus = Literal["pending", "claimed", "done", "failed", "expired", "cancelled", "lost"]
 FINAL_STATUSES: Final = ("done", "failed", "expired", "cancelled", "lost")
 LogLevel = Literal["debug", "info", "warning", "error", "critical"]
@@ -120,6 +123,15 @@ class MemoryDatabase:
 
 
 Database = Path | MemoryDatabase
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder that is its owner's alone; one that is there already keeps its mode.
+
+    Raises:
+        OSError: It cannot be made.
+    """
+    folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
 
 
 def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:

@@ -7,6 +7,8 @@ import io
 import json
 import math
 import sqlite3
+import stat
+import sys
 import tracemalloc
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager
@@ -209,6 +211,30 @@ def test_columns_come_in_the_order_in_which_they_first_appear(recorder: Recorder
     publish(recorder, 1.0, {"new": 4, "z": 5})
     header = exported(recorder.connection, "csv").splitlines()[0].decode()
     assert header == ",".join([*HEAD, "z", "a.y", "a.b", "new"])
+
+
+def test_cells_that_a_spreadsheet_would_run_are_made_harmless_on_request(
+    recorder: Recorder,
+) -> None:
+    recorder.publish(0.0, {"=name": "=1+1", "a": "@x", "b": "+x", "c": "-x", "n": -1.5, "t": "x=1"})
+    wanted = resolve_range(recorder.connection, run_id=1)
+    found: list[list[str]] = []
+    for safe in (False, True):
+        sink = io.BytesIO()
+        export(recorder.connection, wanted, "csv", sink, safe_cells=safe)
+        found += [row[len(HEAD) :] for row in csv.reader(io.StringIO(sink.getvalue().decode()))]
+    assert found == [
+        ["=name", "a", "b", "c", "n", "t"], ["=1+1", "@x", "+x", "-x", "-1.5", "x=1"],
+        ["'=name", "a", "b", "c", "n", "t"], ["'=1+1", "'@x", "'+x", "'-x", "-1.5", "x=1"],
+    ]  # fmt: skip
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")
+def test_an_exported_file_is_its_owners_alone(recorder: Recorder, tmp_path: Path) -> None:
+    recorder.publish(0.0, {"x": 1})
+    file = tmp_path / "rows.csv"
+    export_file(recorder.connection, resolve_range(recorder.connection, run_id=1), "csv", file)
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
 
 def test_a_long_array_is_one_column(recorder: Recorder) -> None:

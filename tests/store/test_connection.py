@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
+import stat
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 
 from tests.memory import memory_connection
 from webots_mcp.connection import ShortWrites, Step, connect, is_busy, is_damage, transaction
+from webots_mcp.schema import create_schema
 
 LEASE = "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (?, 'somebody', 0)"
 COUNT = "SELECT count(*) FROM lease"
@@ -98,3 +101,20 @@ def test_a_file_that_is_no_database_is_damage_and_not_busy(tmp_path: Path) -> No
         connect(file, "writer", create=True)
     assert is_damage(refused.value)
     assert not is_busy(refused.value)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")
+def test_what_is_made_is_its_owners_alone_and_what_was_there_keeps_its_mode(tmp_path: Path) -> None:
+    file = tmp_path / "project" / "mcp_data" / "webots.db"
+    with closing(connect(file, "writer", create=True)) as connection:
+        create_schema(connection)
+        made = [file.with_name(f"{file.name}{suffix}") for suffix in ("", "-wal", "-shm")]
+        assert [stat.S_IMODE(each.stat().st_mode) for each in made] == [0o600] * 3
+        assert stat.S_IMODE(file.parent.stat().st_mode) == 0o700
+    shared = tmp_path / "shared"
+    shared.mkdir(mode=0o755)
+    (shared / "webots.db").touch(mode=0o644)
+    with closing(connect(shared / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+    assert stat.S_IMODE(shared.stat().st_mode) == 0o755
+    assert stat.S_IMODE((shared / "webots.db").stat().st_mode) == 0o644

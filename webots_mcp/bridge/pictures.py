@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.contract import CAMERA_FOLDER
+from webots_mcp.contract import CAMERA_FOLDER, make_folder
 from webots_mcp.errors import CommandRefusedError
 
 _PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n"
@@ -56,7 +56,7 @@ class Album:
     def make_room(self, path: str) -> Path:
         """The file that a picture is to be written to: its folder exists, it does not."""
         file = self._data_dir / path
-        file.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(file.parent)
         file.unlink(missing_ok=True)
         return file
 

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
              help="a .csv, .jsonl or .parquet file (default: CSV to stdout)"),
     argument("--format", choices=("csv", "jsonl", "parquet"),
              help="where the file's name does not tell it"),
+    argument("--safe-cells", action="store_true",
+             help="in CSV, an apostrophe before texts that a spreadsheet would run as a formula "
+             "(they begin with =, +, - or @)"),
 )  # fmt: skip
 def export(arguments: argparse.Namespace) -> None:
     """Write recorded states as a table: one row per state, one column per value.
@@ -48,11 +51,12 @@ def export(arguments: argparse.Namespace) -> None:
     if file is None and form == "parquet" and sys.stdout.isatty():
         raise InvalidInputError("Parquet is not for a terminal: give a file with -o")
     with reading(arguments) as connection, shown_progress("exporting") as progress:
-        wanted = range_of(connection, arguments)
+        wanted, safe = range_of(connection, arguments), arguments.safe_cells
         if file is None:
-            write(connection, wanted, form, sys.stdout.buffer, progress)
+            write(connection, wanted, form, sys.stdout.buffer, progress, safe_cells=safe)
         else:
-            print(f"{file}: {export_file(connection, wanted, form, file, progress)} rows")
+            rows = export_file(connection, wanted, form, file, progress, safe_cells=safe)
+            print(f"{file}: {rows} rows")
     print_notes(wanted.notes, sys.stderr)  # stdout may be the table
 
 

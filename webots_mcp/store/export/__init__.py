@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
+from webots_mcp.contract import PRIVATE_FILE
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.export.parquet import write_parquet
 from webots_mcp.store.export.rows import Progress, Source
@@ -35,6 +36,8 @@ def export(
     form: str,
     sink: BinaryIO,
     progress: Progress | None = None,
+    *,
+    safe_cells: bool = False,
 ) -> int:
     """Write the state rows of a range, as many as there are now, flattened.
 
@@ -47,6 +50,7 @@ def export(
         form: One of `FORMATS`.
         sink: Takes bytes; need not be seekable.
         progress: Called now and then with the rows read so far and in all.
+        safe_cells: See `write_csv`; the other formats have no cells that could be formulas.
 
     Returns:
         The number of rows.
@@ -59,7 +63,10 @@ def export(
     if chosen is None:
         raise InvalidInputError(f"no format {form!r}: choose one of {', '.join(FORMATS)}")
     source = Source.of(connection, wanted.segments, chosen.passes, progress)
-    chosen.write(source, sink)
+    if safe_cells and form == "csv":
+        write_csv(source, sink, safe_cells=True)
+    else:
+        chosen.write(source, sink)
     return source.total
 
 
@@ -69,8 +76,10 @@ def export_file(
     form: str,
     file: Path,
     progress: Progress | None = None,
+    *,
+    safe_cells: bool = False,
 ) -> int:
-    """As `export`, into a file that appears only when it is complete.
+    """As `export`, into a file of its owner alone that appears only when it is complete.
 
     Raises:
         InvalidInputError: Also where the file cannot be written.
@@ -78,7 +87,8 @@ def export_file(
     aside = file.with_name(f"{file.name}.part")
     try:
         with aside.open("wb") as sink:
-            rows = export(connection, wanted, form, sink, progress)
+            aside.chmod(PRIVATE_FILE)
+            rows = export(connection, wanted, form, sink, progress, safe_cells=safe_cells)
         os.replace(aside, file)  # noqa: PTH105
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error

@@ -11,33 +11,44 @@ from typing import Any, BinaryIO, Final
 from webots_mcp.store.export.rows import HEAD, Source, as_text
 
 _SPELLED: Final = ("bool", "text", "numbers")
+_FORMULAS: Final = ("=", "+", "-", "@", "\t", "\r")
 _encode: Final = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
 
 
-def write_csv(source: Source, sink: BinaryIO) -> None:
+def write_csv(source: Source, sink: BinaryIO, *, safe_cells: bool = False) -> None:
     r"""One line per row under a line of column names; UTF-8, lines end as in RFC 4180.
 
     What a row lacks, or is null, is empty; flags are `true` and `false`; what was not finite is
     `nan`, `inf` or `-inf`; a long array is its JSON text; a NUL character is `\0`, because many
     readers of CSV end there.
+
+    A spreadsheet runs a text that begins with =, +, - or @ as a formula. With `safe_cells` such a
+    text (also a name) gets an apostrophe before it; numbers are left as they are.
     """
+    spell = _harmless if safe_cells else _without_nul
     columns = source.columns()
     names = [column.name for column in columns]
     # The writer itself turns numbers into text, and null into nothing.
     spelled = [i for i, column in enumerate(columns, len(HEAD)) if column.kind in _SPELLED]
     text = io.TextIOWrapper(sink, "utf-8", newline="")
     writer = csv.writer(text)
-    writer.writerow(map(_without_nul, (*HEAD, *names)))
+    writer.writerow(map(spell, (*HEAD, *names)))
     for row in source.rows(pass_number=2):
         cells: list[object] = [*row.head, *map(row.values.get, names)]
         for i in spelled:
-            cells[i] = _without_nul(as_text(cells[i]))
+            value = cells[i]
+            cells[i] = (spell if isinstance(value, str) else _without_nul)(as_text(value))
         writer.writerow(cells)
     text.detach()
 
 
 def _without_nul(text: str | None) -> str | None:
     return text.replace("\0", "\\0") if text else text
+
+
+def _harmless(text: str | None) -> str | None:
+    plain = _without_nul(text)
+    return f"'{plain}" if plain and plain.startswith(_FORMULAS) else plain
 
 
 def write_json_lines(source: Source, sink: BinaryIO) -> None:

@@ -15,7 +15,13 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.connection import transaction
-from webots_mcp.contract import CAMERA_FOLDER, SCREENSHOT_FOLDER, new_uuid
+from webots_mcp.contract import (
+    CAMERA_FOLDER,
+    PRIVATE_FILE,
+    SCREENSHOT_FOLDER,
+    make_folder,
+    new_uuid,
+)
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.json_folder.reading import (
     COMMANDS,
@@ -147,8 +153,9 @@ def _copy(picture: FoundPicture, file: Path, made: list[Path]) -> Path:
         raise InvalidInputError(f"{file} is there already: move it away first")
     made.append(file)
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
+        make_folder(file.parent)
         shutil.copy2(picture.file, file)
+        file.chmod(PRIVATE_FILE)
     except OSError as error:
         raise InvalidInputError(f"the pictures cannot be copied: {error}") from error
     return file

@@ -151,7 +151,10 @@ def damages(file: Path) -> Iterator[Damage]:
         for column, kind, key in columns.fetchall():
             if key and column in ("id", "name"):
                 continue
-            yield from (Damage(table, column, value) for value in _WRONG_BY_TYPE[kind])
+            yield from (
+                Damage(table, column, value)
+                for value in _WRONG_BY_TYPE[kind.replace("BIGINT", "INTEGER")]
+            )
             if (table, column) in JSON_COLUMNS:
                 yield from (Damage(table, column, value) for value in _WRONG_JSON)
     connection.close()

@@ -125,7 +125,7 @@ def _check(table: str, name: str, kind: str) -> tuple[str, str]:
         return f"CASE typeof({name}) WHEN 'text' THEN {checked} ELSE 0 END", "JSON"
     if kind == "TEXT":
         return f"typeof({name}) = 'text'", "text"
-    if kind == "INTEGER":
+    if "INT" in kind:
         return f"typeof({name}) = 'integer' AND abs({name} / 2) <= {_MAX_INTEGER // 2}", "integer"
     limit = _MAX_FLOAT
     if name.endswith("time_s"):

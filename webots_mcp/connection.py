@@ -343,7 +343,10 @@ def _make(file: Path) -> None:
     except OSError as error:
         raise DatabaseError(f"the folder {file.parent} cannot be made: {error}") from error
     try:
-        os.close(os.open(file, os.O_CREAT | os.O_RDWR, PRIVATE_FILE))
+        # Never one that is there: closing it would drop the locks of this process on it.
+        os.close(os.open(file, os.O_CREAT | os.O_EXCL | os.O_RDWR, PRIVATE_FILE))
+    except FileExistsError:
+        return
     except OSError as error:
         raise DatabaseError(f"{file} cannot be opened for writing: {error}") from error
 

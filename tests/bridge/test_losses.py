@@ -8,7 +8,9 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -152,6 +154,46 @@ def test_recording_goes_on_after_the_write_ahead_log_was_deleted(
     catch_up(bridge)
     bridge.publish({"n": 2})
     assert numbers(filed)[-1] == 2
+
+
+@POSIX
+@pytest.mark.parametrize("part", [0.0, 0.5])
+@pytest.mark.usefixtures("retry_at_once")
+def test_recording_goes_on_after_the_write_ahead_log_was_cut_short(
+    bridge: MCPBridge, file: Path, filed: Recording, part: float, capfd: pytest.CaptureFixture[str]
+) -> None:
+    log = Path(f"{file}-wal")
+    for n in range(50):
+        bridge.publish({"n": n})
+    heartbeat_now(bridge)
+    os.truncate(log, int(log.stat().st_size * part))
+    deadline_s = time.monotonic() + 20
+    n = 50
+    while "cut short" not in capfd.readouterr().err:
+        bridge.publish({"n": n})
+        heartbeat_now(bridge)
+        n += 1
+        assert time.monotonic() < deadline_s
+    bridge.publish({"n": n})
+    catch_up(bridge)
+    assert numbers(filed)[-1] == n
+    assert filed.rows("PRAGMA integrity_check") == ["ok"]
+
+
+def test_a_log_that_checkpoints_empty_counts_as_whole(
+    bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    with closing(connect(file, "writer")) as maintainer:
+        for n in range(60):
+            bridge.publish({"n": n, "padding": "x" * 2000})
+            heartbeat_now(bridge)
+            if n % 7 == 0:
+                maintainer.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+            if n % 11 == 0:
+                maintainer.execute("PRAGMA wal_checkpoint(RESTART)").fetchall()
+    assert bridge.stats().rows_dropped == 0
+    assert numbers(filed) == list(range(60))
+    assert filed.rows("SELECT count(*) FROM run") == [1]
 
 
 @pytest.mark.usefixtures("retry_at_once")

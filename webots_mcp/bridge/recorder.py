@@ -28,6 +28,7 @@ from webots_mcp.bridge.backlog import Backlog, Row
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.drops import Drops
 from webots_mcp.bridge.identity import Identity
+from webots_mcp.bridge.log_watch import LogWatch
 from webots_mcp.bridge.opening import is_ours, move_aside, open_session, why_readers_block
 from webots_mcp.bridge.pulse import Health, Pulse, write_pulse
 from webots_mcp.bridge.registration import (
@@ -88,6 +89,7 @@ class Recorder:
         self._obstacle = "too many wait"
         self._seen_whole = 0
         self._files: tuple[int, ...] = ()
+        self._log_watch: LogWatch | None = None
         self._retry_at_s = 0.0
         self._off: str | None = None
         self.run = clock.run
@@ -406,10 +408,12 @@ class Recorder:
         """A deleted or replaced file still takes rows, which nobody would ever see."""
         if self.connection is None:
             return
-        if self._files == identify_files(self._database):
-            self._seen_whole = self.rows_written
-        else:
+        if self._files != identify_files(self._database):
             self._start_over("the database file or its write-ahead log was deleted or replaced")
+        elif self._log_watch is not None and not self._log_watch.is_whole():
+            self._start_over("the database's write-ahead log was cut short")
+        else:
+            self._seen_whole = self.rows_written
 
     def _replace_files(self, why: str) -> None:
         """Keep a damaged database under another name; begin a new one."""
@@ -476,6 +480,8 @@ class Recorder:
         opened = open_session(self._database, *who, patient=patient)
         self.connection, self.registration = opened
         self._files = identify_files(self._database)
+        if isinstance(self._database, Path):
+            self._log_watch = LogWatch(f"{self._database}-wal")
         if (why := why_readers_block(self.connection)) is not None:
             self.complain("journal", f"{self._database} {why}")
 

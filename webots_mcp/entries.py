@@ -253,6 +253,16 @@ def next_entries(file: BinaryIO, offset: int) -> list[tuple[int, Entry]]:
     return entries
 
 
+def count_rows(path: Path) -> int:
+    """How many rows wait in a file; 0 where there is none."""
+    offset, rows = 0, 0
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        while entries := next_entries(file, offset):
+            offset = entries[-1][0]
+            rows += sum(entry.kind != "run" for _, entry in entries)
+    return rows
+
+
 def read_header(file: BinaryIO) -> dict[str, Any] | None:
     """Who recorded; None where the first line was cut off.
 

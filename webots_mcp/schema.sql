@@ -37,11 +37,11 @@ CREATE TABLE session (
 	moved_wall_time_s FLOAT /* when simulation time was last seen to grow */, 
 	sim_time_s FLOAT /* simulation time at last_seen_wall_time_s */, 
 	hold TEXT /* paused or stepping while the bridge holds the loop */, 
-	rows_waiting INTEGER DEFAULT 0 NOT NULL /* rows not yet written, in the controller's memory */, 
+	rows_waiting INTEGER DEFAULT 0 NOT NULL /* rows that still waited in the file beside or in memory */, 
 	rows_dropped INTEGER DEFAULT 0 NOT NULL /* rows that could never be written */, 
 	last_error TEXT /* newest thing that could not be recorded, and why */, 
 	ended_wall_time_s FLOAT, 
-	end_reason TEXT /* finished, reload, crashed, replaced */, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, process TEXT /* which process of that pid; null where the system does not tell */ NULL, last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */ NULL, extern INTEGER /* 1 where nobody starts the controller again */ NULL, hold_mode TEXT /* simulation mode to go back to when the hold ends */ NULL, adopted_rows INTEGER DEFAULT 0 /* rows of its spill file that were taken in */ NOT NULL, 
+	end_reason TEXT /* finished, reload, crashed, replaced */, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, process TEXT /* which process of that pid; null where the system does not tell */ NULL, last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */ NULL, extern INTEGER /* 1 where nobody starts the controller again */ NULL, hold_mode TEXT /* simulation mode to go back to when the hold ends */ NULL, adopted_rows INTEGER DEFAULT 0 /* number of the last entry taken in from its file beside */ NOT NULL, 
 	CONSTRAINT fk_session_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_session_robot_id_id ON session (robot_id, id);

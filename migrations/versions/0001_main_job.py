@@ -111,7 +111,7 @@ def upgrade() -> None:
             sa.Integer(),
             server_default=sa.text("0"),
             nullable=False,
-            comment="rows not yet written, in the controller's memory",
+            comment="rows that still waited in the file beside or in memory",
         ),
         sa.Column(
             "rows_dropped",

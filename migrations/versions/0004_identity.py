@@ -38,7 +38,7 @@ COLUMNS = {
             sa.Integer(),
             server_default=sa.text("0"),
             nullable=False,
-            comment="rows of its spill file that were taken in",
+            comment="number of the last entry taken in from its file beside",
         ),
     ),
     "run": (

@@ -94,7 +94,7 @@ def test_status_tells_what_runs_and_what_could_not_be_recorded(
         str(tmp_path / "webots.db"),
         f"{rover.name} (Supervisor): running",
         "simulation time 1.500 s",
-        "rows waiting 4, dropped 1",
+        "rows waiting 4 (in the controller's memory), dropped 1",
         "last error: disk full",
     ):
         assert words in text

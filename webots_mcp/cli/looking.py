@@ -86,6 +86,7 @@ def tail(arguments: argparse.Namespace) -> None:
 
 def _facts(view: View) -> dict[str, Any]:
     from webots_mcp.store.runs import count_runs
+    from webots_mcp.store.waiting import waiting
 
     session = view.session
     return {
@@ -94,7 +95,7 @@ def _facts(view: View) -> dict[str, Any]:
         "live": view.robot.live,
         "runs": count_runs(view.connection, view.robot.id),
         "rows": view.run.rows if view.run else 0,
-        "rows_waiting": session.rows_waiting if session else 0,
+        **waiting(view.connection, session),
         "rows_dropped": session.rows_dropped if session else 0,
         "last_error": session.last_error if session else None,
         "controller": session.controller if session else None,
@@ -119,10 +120,11 @@ def _robot_as_text(robot: dict[str, Any]) -> str:
     time_text = "no data yet"
     if robot["sim_time_s"] is not None:
         time_text = f"simulation time {robot['sim_time_s']:.3f} s, {robot['age_s']:.1f} s old"
+    where = f" (in {robot['waiting_in']})" if "waiting_in" in robot else ""
     lines = [
         f"{robot['robot']} ({robot['kind']}): {robot['status']}",
         f"  run {robot['run_id']} (recorded: {robot['runs']}), {robot['rows']} rows, {time_text}",
-        f"  rows waiting {robot['rows_waiting']}, dropped {robot['rows_dropped']}",
+        f"  rows waiting {robot['rows_waiting']}{where}, dropped {robot['rows_dropped']}",
     ]
     lines += [f"  {robot['why']}"] if robot["why"] else []
     lines += [f"  last error: {robot['last_error']}"] if robot["last_error"] else []

@@ -114,7 +114,7 @@ class Session(SQLModel, table=True):
     moved_wall_time_s: float | None = _number("when simulation time was last seen to grow")
     sim_time_s: float | None = _number("simulation time at last_seen_wall_time_s")
     hold: str | None = _text("paused or stepping while the bridge holds the loop")
-    rows_waiting: int = _count("rows not yet written, in the controller's memory")
+    rows_waiting: int = _count("rows that still waited in the file beside or in memory")
     rows_dropped: int = _count("rows that could never be written")
     last_error: str | None = _text("newest thing that could not be recorded, and why")
     ended_wall_time_s: float | None = _number()
@@ -126,7 +126,7 @@ class Session(SQLModel, table=True):
     )
     extern: bool | None = _column(Integer, "1 where nobody starts the controller again")
     hold_mode: str | None = _text("simulation mode to go back to when the hold ends")
-    adopted_rows: int = _count("rows of its spill file that were taken in")
+    adopted_rows: int = _count("number of the last entry taken in from its file beside")
 
 
 class Run(SQLModel, table=True):

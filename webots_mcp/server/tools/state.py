@@ -22,6 +22,7 @@ from webots_mcp.store.events import newest_events
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.sessions import fetch_session
 from webots_mcp.store.states import State, select
+from webots_mcp.store.waiting import waiting
 
 _PUBLISH: Final = (
     "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "
@@ -192,7 +193,7 @@ def _recorder(view: View) -> dict[str, Any] | None:
     error = cut_text(session.last_error, _ERROR_CHARACTERS) if session.last_error else None
     return {
         "rows_recorded": view.run.rows if view.run else 0,
-        "rows_waiting": session.rows_waiting,
+        **waiting(view.connection, session),
         "rows_dropped": session.rows_dropped,
         "last_error": error,
         "heartbeat_age_s": round(session.silent_s(view.now_s), 2),

@@ -2,66 +2,21 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
-
-import anyio
-from mcp import Client
 
 from tests.benchmarks.measuring import Samples, alternate
 from tests.benchmarks.processes import Program
 from tests.benchmarks.programs.wide_robot import STEP_S
 from tests.benchmarks.registry import Bench, benchmark
-from tests.benchmarks.servers import our_server
+from tests.benchmarks.servers import RunningServer
 from tests.benchmarks.table import Line, Target, duration
 from webots_mcp.contract import DATABASE_NAME
 
 _ROBOTS: Final = 6
 _BLOCK_S: Final = 10
 _BLOCKS: Final = 3
-_LOOK_INTERVAL_S: Final = 1.0
-_LOOK: Final = {"robot": "rover 0", "lookback_s": 60}
-
-
-@dataclass
-class _Server:
-    """`webots-mcp serve` with a client, as long as its `with` block lasts.
-
-    Args:
-        database: Of the robots.
-        looking: Whether the client asks once a second what happened in the last minute.
-    """
-
-    database: Path
-    looking: bool
-    _over: threading.Event = field(default_factory=threading.Event)
-    _ready: threading.Event = field(default_factory=threading.Event)
-
-    def __enter__(self) -> None:
-        self._over.clear()
-        self._ready.clear()
-        self._thread = threading.Thread(target=lambda: anyio.run(self._be_client))
-        self._thread.start()
-        self._ready.wait()
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-
-    async def _be_client(self) -> None:
-        try:
-            async with Client(our_server(self.database)) as client:
-                await client.list_tools()
-                self._ready.set()
-                while not await anyio.to_thread.run_sync(self._over.wait, _LOOK_INTERVAL_S):
-                    if self.looking:
-                        await client.call_tool("webots_monitor", _LOOK)
-        finally:
-            self._ready.set()
 
 
 @benchmark("beside", "publish() of 88 signals, 1.5 kB, by 6 robots at 62.5 Hz, beside a server")
@@ -77,9 +32,9 @@ def measure_beside(bench: Bench) -> Iterable[Line]:
             robot.hear()
         contenders = {
             "no server": _driving(robots, steps, nullcontext()),
-            "an idle server": _driving(robots, steps, _Server(database, looking=False)),
+            "an idle server": _driving(robots, steps, RunningServer(database, looking=False)),
             "a server that looks back each second": _driving(
-                robots, steps, _Server(database, looking=True)
+                robots, steps, RunningServer(database, looking=True)
             ),
         }
         bench.say("16 ms steps")

@@ -50,7 +50,7 @@ def _publish(bench: Bench, *, orjson: bool) -> Iterable[Line]:
         duration(ours.p50),
         f"raw sqlite3 + json.dumps {duration(raw.p50)}",
         ratio(ours, raw),
-        target=None if orjson else Target(1.6),
+        target=None if orjson else Target(1.5),
     )
     yield Line(
         f"p99.9, {encoder}",

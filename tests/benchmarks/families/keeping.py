@@ -122,7 +122,7 @@ def _purge(bench: Bench, file: Path) -> Iterable[Line]:
     ours, undisturbed = Samples(beside_purge), Samples(alone)
     what = "publish() of a robot beside it"
     beside = f"with no purge {duration(undisturbed.worst)}"
-    yield Line(f"worst {what}", duration(ours.worst), beside, ours.worst * 1e3, "ms", Target(15))
+    yield Line(f"worst {what}", duration(ours.worst), beside, ours.worst * 1e3, "ms", Target(5))
     beside = f"with no purge {duration(undisturbed.p50)}"
     yield Line(f"p50 {what}", duration(ours.p50), beside, ours.p50 / undisturbed.p50)
     rows = purge.purged.rows["state"]

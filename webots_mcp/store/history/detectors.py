@@ -13,6 +13,7 @@ from webots_mcp.store.history.jolts import find_jumps, find_leaps, find_to_and_f
 from webots_mcp.store.history.motion import Motion, find_stays
 from webots_mcp.store.history.ranges import Segment
 from webots_mcp.store.history.registry import Signal
+from webots_mcp.store.history.rollup_tables import both
 from webots_mcp.store.history.shapes import unwrap
 from webots_mcp.store.history.signals import resolve_signals
 from webots_mcp.store.history.spans import MOSTLY, Beyond, Flat, Silent, Span
@@ -26,9 +27,10 @@ DETECTED: Final[tuple[Kind, ...]] = (
 
 OF_NUMBERS: Final = frozenset[Kind]({"silent", "flat", "jump", "oscillation"})
 
+_OF_SIGNAL: Final = both("rows, present, changes", "run_id = :run AND signal_id = :signal")
 _OF_RUN: Final = (  # also the rows that do not hold the signal
-    "SELECT max(sum(rows), (SELECT rows FROM run WHERE id = all_rollup.run_id)), sum(present), "
-    "sum(changes) FROM all_rollup WHERE run_id = ? AND signal_id = ?"
+    "SELECT max(sum(rows), (SELECT rows FROM run WHERE id = :run)), sum(present), sum(changes) "
+    f"FROM {_OF_SIGNAL}"
 )
 # What a robot swings with; sensors swing by nature while it drives.
 _SWINGING: Final = re.compile(
@@ -67,7 +69,8 @@ class Search:
         """Whether it holds of a signal in the segment, or else in the run as far as rolled up."""
         if holds(here):
             return True
-        of_run = self.connection.execute(_OF_RUN, (self.segment.run_id, signal.id)).fetchone()
+        values = {"run": self.segment.run_id, "signal": signal.id}
+        of_run = self.connection.execute(_OF_RUN, values).fetchone()
         return of_run[0] is not None and holds(Summary(*of_run))
 
 

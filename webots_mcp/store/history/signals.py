@@ -17,6 +17,7 @@ from webots_mcp.store.history.leaves import Kind, Value, flatten, parse
 from webots_mcp.store.history.ranges import TimeRange
 from webots_mcp.store.history.registry import MAX_SIGNALS, Signal, by_name, registered, seen_now
 from webots_mcp.store.history.rollup import watermark
+from webots_mcp.store.history.rollup_tables import both
 from webots_mcp.store.history.snapshot import in_one_snapshot
 from webots_mcp.store.history.subject import Subject, find_subject
 from webots_mcp.store.history.summary import Summary, summarise
@@ -31,9 +32,14 @@ _OLDEST_AFTER: Final = (  # by ids, from the watermark on: see `tiers`
     "SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE id > ? AND +run_id = ? "
     "ORDER BY id LIMIT ?"
 )
+_TOTALS_OF_EACH: Final = both(
+    "signal_id, sum(rows) AS rows, sum(present) AS present, min(first_sim_time_s) AS first_s, "
+    "max(last_sim_time_s) AS last_s, min(min) AS min, max(max) AS max",
+    "run_id = :run GROUP BY signal_id",
+)
 _TOTALS: Final = (
-    "SELECT signal_id, sum(rows), sum(present), min(first_sim_time_s), max(last_sim_time_s), "
-    "min(min), max(max) FROM all_rollup WHERE run_id = ? GROUP BY signal_id"
+    "SELECT signal_id, sum(rows), sum(present), min(first_s), max(last_s), min(min), max(max) "
+    f"FROM {_TOTALS_OF_EACH} GROUP BY signal_id"
 )
 
 
@@ -227,7 +233,7 @@ def _stored(connection: sqlite3.Connection, run_id: int) -> dict[int | None, Sum
     """What the rollups of a run come to, by signal id, as far as a list shows it."""
     totals: dict[int | None, Summary] = {}
     for signal_id, rows, present, first_s, last_s, low, high in connection.execute(
-        _TOTALS, (run_id,)
+        _TOTALS, {"run": run_id}
     ):
         times = {"first_sim_time_s": first_s, "last_sim_time_s": last_s}
         totals[signal_id] = Summary(rows, present, **times, min=low, max=high)

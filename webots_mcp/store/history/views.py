@@ -19,6 +19,7 @@ from webots_mcp.store.history.gaps import GAP_INTERVALS, rhythm_of
 from webots_mcp.store.history.ranges import Segment, just_after
 from webots_mcp.store.history.registry import Signal
 from webots_mcp.store.history.rollup import BUCKET_S, bucket_of, watermark
+from webots_mcp.store.history.rollup_tables import both
 from webots_mcp.store.history.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.history.spans import Condition, Span, joined, spans_in_pieces, spans_in_rows
 from webots_mcp.store.history.summary import Summary, summarise, usable_numbers
@@ -33,9 +34,13 @@ LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
 _OF_SIGNAL: Final = (
     "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
 )
+_COUNTS_OF_EACH: Final = both(
+    "signal_id, sum(rows) AS rows, sum(present) AS present, sum(changes) AS changes",
+    "run_id = :run AND bucket >= :first AND bucket < :end GROUP BY signal_id",
+)
 _COUNTS: Final = (
-    "SELECT signal_id, sum(rows), sum(present), sum(changes) FROM all_rollup "
-    "WHERE run_id = ? AND bucket >= ? AND bucket < ? GROUP BY signal_id"
+    "SELECT signal_id, sum(rows), sum(present), sum(changes) "
+    f"FROM {_COUNTS_OF_EACH} GROUP BY signal_id"
 )
 _USUAL_RANGE: Final = f"SELECT avg(max - min) {_OF_SIGNAL}"
 _WIDEST: Final = (  # also at its border with the bucket before
@@ -212,7 +217,8 @@ class LongView:
     @functools.cached_property
     def _totals(self) -> dict[int, Summary]:
         """Rows count also where they lack the signal: as many as of the one that is in most."""
-        found = self._connection.execute(_COUNTS, self._span).fetchall()
+        span = dict(zip(("run", "first", "end"), self._span, strict=True))
+        found = self._connection.execute(_COUNTS, span).fetchall()
         rows = max((counted for _, counted, *_ in found), default=0)
         return {signal_id: Summary(rows, *counts) for signal_id, _, *counts in found}
 

@@ -49,7 +49,7 @@ class SqlTools:
 
         Tables: robot, session (a controller process), run(id, robot_id, session_id, rows, label,
         last_sim_time_s), state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path),
-        rollup(run_id, signal_id, bucket of 10 s, min, max, sum, present), change, log, event,
+        all_rollup(run_id, signal_id, bucket of 10 s, min, max, sum, present), change, log, event,
         command, image. Views: robot_now, robot_run, robot_trajectory, robot_period, robot_event,
         robot_log, robot_command. Ask by run_id and sim_time_s: they are indexed. Values of a state:
         json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.

@@ -217,7 +217,7 @@ class LongView:
     @functools.cached_property
     def _totals(self) -> dict[int, Summary]:
         """Rows count also where they lack the signal: as many as of the one that is in most."""
-        span = dict(zip(("run", "first", "end"), self._span, strict=True))
+        span: dict[str, int] = dict(zip(("run", "first", "end"), self._span, strict=True))
         found = self._connection.execute(_COUNTS, span).fetchall()
         rows = max((counted for _, counted, *_ in found), default=0)
         return {signal_id: Summary(rows, *counts) for signal_id, _, *counts in found}

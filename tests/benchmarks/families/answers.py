@@ -35,7 +35,9 @@ _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
     "webots_simulation_control": {"command": "resume"},
     "webots_annotate_run": {"label": "benchmark"},
     "webots_compare_runs": {"run_ids": [1, 2]},
+    "webots_wait_for_command": {"command_id": 1},
 }
+_LAST: Final = ("webots_compare_runs", "webots_wait_for_command")
 _ROWS_AND_BYTES: Final = "SELECT count(*), coalesce(sum(length(data)), 0) FROM state"
 _IS_CREATED: Final = "SELECT 1 FROM sqlite_master WHERE name = 'state'"
 
@@ -81,9 +83,9 @@ async def _ask_all(bench: Bench) -> list[_Answer]:
 
 
 def _order(tool: Tool) -> tuple[bool, bool]:
-    """Those that act after those that read; two runs are compared when there are two."""
+    """Those that act after those that read; last, those that ask about what came of that."""
     reads = bool(tool.annotations and tool.annotations.read_only_hint)
-    return tool.name == "webots_compare_runs", not reads
+    return tool.name in _LAST, not reads
 
 
 async def _answers(bench: Bench, client: Client, tools: list[Tool]) -> AsyncIterator[_Answer]:

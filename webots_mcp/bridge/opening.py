@@ -39,7 +39,7 @@ def open_session(
     connection = connect(database, "loop", create=True, patient=patient)
     try:
         _prepare(connection, database, patient)
-        if isinstance(database, Path):
+        if patient and isinstance(database, Path):  # else the maintainer does
             adopt(connection, database)
         registration = register(connection, identity, session_uuid, actions)
         never_wait(connection)

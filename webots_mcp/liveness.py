@@ -13,6 +13,7 @@ from typing import Any, Final
 # A controller may be silent for hours (paused in Webots) and live; so it is not the silence that
 # decides. But a process that started after the last sign of life has only inherited the pid: after
 # a reboot, in a container that was started again. Clocks are trusted to so much:
+_PIDS: Final = 2**31  # no system gives a process a higher id
 _TOLERANCE_S: Final = 2.0
 _WINDOWS_EPOCH_S: Final = 11_644_473_600  # from 1601 to 1970
 
@@ -27,6 +28,8 @@ def process_alive(pid: int, process: str | None, last_seen_wall_time_s: float) -
             identity is not known. Where the system does not tell either when a process started
             (macOS), any process of that pid counts.
     """
+    if not (_is_pid(pid) and isinstance(last_seen_wall_time_s, (int, float))):  # pyright: ignore[reportUnnecessaryIsInstance]
+        return False  # no bridge has written this: a recording may come from anywhere
     now = process_identity(pid) if process is not None else None
     if now is not None:
         return now == process
@@ -37,6 +40,10 @@ def process_alive(pid: int, process: str | None, last_seen_wall_time_s: float) -
     if started_s is None:
         return False
     return started_s <= last_seen_wall_time_s + _TOLERANCE_S
+
+
+def _is_pid(pid: object) -> bool:
+    return isinstance(pid, int) and 0 < pid < _PIDS
 
 
 def process_identity(pid: int) -> str | None:

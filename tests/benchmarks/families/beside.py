@@ -57,10 +57,14 @@ def _driving(
 
 def _lines(beside: str, blocks: list[list[Any]]) -> Iterable[Line]:
     answers = [answer for block in blocks for answer in block]
-    waiting = [rows for answer in answers for rows in answer["waiting"]]
-    share = 100 * sum(rows > 0 for rows in waiting) / len(waiting)
-    ours, most = f"{share:.3g} %", f"{max(waiting)} rows at most, {len(waiting):,} calls"
-    yield Line(f"returned with rows waiting, {beside}", ours, most, share, "%", Target(2))
+    for what, key, target in (
+        ("returned with rows not in the database yet", "waiting", 2),
+        ("of them in memory only, which a kill loses", "in_memory", 0),
+    ):
+        waiting = [rows for answer in answers for rows in answer[key]]
+        share = 100 * sum(rows > 0 for rows in waiting) / len(waiting)
+        most = f"{max(waiting)} rows at most, {len(waiting):,} calls"
+        yield Line(f"{what}, {beside}", f"{share:.3g} %", most, share, "%", Target(target))
     took = Samples([[s for answer in answers for s in answer["durations"]]])
     beside_worst = f"p50 {duration(took.p50)}, p99.9 {duration(took.p999)}"
     yield Line(

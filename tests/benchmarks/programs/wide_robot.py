@@ -24,15 +24,16 @@ def main(folder: Path, number: int) -> None:
     with MCPBridge(robot, folder, throttle_interval=1) as bridge:
         say("ready")
         for line in sys.stdin:
-            waiting, durations = list[int](), list[float]()
+            waiting, in_memory, durations = list[int](), list[int](), list[float]()
             for i in range(int(line)):
                 robot.pace()
                 started = time.perf_counter()
                 bridge.publish(states[i % len(states)])
                 durations.append(time.perf_counter() - started)
                 waiting.append(bridge.stats().rows_waiting)
+                in_memory.append(bridge._recorder._backlog.rows_in_memory)  # pyright: ignore[reportPrivateUsage]
                 bridge.get_command()
-            say({"durations": durations, "waiting": waiting})
+            say({"durations": durations, "waiting": waiting, "in_memory": in_memory})
 
 
 if __name__ == "__main__":

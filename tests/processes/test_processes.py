@@ -113,7 +113,8 @@ while robot.step(16) != -1:
     sent = filed.send("reload")
     simulation.wait_for(lambda: filed.fate(sent)[0] == "done", timeout_s=30)
     simulation.wait_for(lambda: len(filed.rows("SELECT DISTINCT run_id FROM state")) == 2)
-    assert filed.fate(sent)[1] == {"run_id": 2}
+    why = "a reload keeps the mode"
+    assert filed.fate(sent)[1] == {"run_id": 2, "mode": "fast", "why": why}
     assert filed.rows("SELECT end_reason FROM session ORDER BY id") == ["reload", None]
     assert filed.rows("SELECT start_reason FROM run ORDER BY id") == ["start", "reload"]
     assert sum("reloaded" in line for line in simulation.console) == 1

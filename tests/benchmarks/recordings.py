@@ -10,7 +10,7 @@ from typing import Final
 from tests.history.long_recording import CYCLE_S, INTERVAL_S, build
 from tests.history.recording import WALL_START_S
 from webots_mcp.connection import connect
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.rollup.rolling import roll
 
 LINE_INTERVAL_S: Final = 1.0
 _PART_ROWS: Final = 16 * round(CYCLE_S / INTERVAL_S)  # whole cycles: the story goes on at a seam

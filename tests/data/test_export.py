@@ -24,7 +24,7 @@ from tests.memory import memory_connection
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.export import FORMATS, export, export_file, format_of
-from webots_mcp.store.history.ranges import resolve_range
+from webots_mcp.store.reading.ranges import resolve_range
 
 HEAD = ["run_id", "state_id", "sim_time_s", "wall_time_s"]
 

@@ -19,9 +19,9 @@ from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, UnknownRunError
 from webots_mcp.schema import create_schema
 from webots_mcp.settlement import end_session
-from webots_mcp.store.history.rollup import buckets, roll
 from webots_mcp.store.retention import Limit, Retention, mark_kept, plan
 from webots_mcp.store.retention.purge import purge
+from webots_mcp.store.rollup.rolling import buckets, roll
 
 TABLES = ("state", "rollup", "change", "log", "event", "image", "command", "run", "session")
 NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)

@@ -9,8 +9,8 @@ import pytest
 
 from tests.history.recording import record_rover
 from tests.memory import memory_connection
-from webots_mcp.store.history import columns
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.reading import rows as columns
+from webots_mcp.store.rollup.rolling import roll
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from typing import Any, Final
 from tests.history.recording import WALL_START_S, Recorder
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.rollup.rolling import roll
 
 INTERVAL_S: Final = 0.032
 CYCLE_S: Final = 100.0  # 70 s cruise, 6 s stuck within it, 10 s back up, 20 s turn

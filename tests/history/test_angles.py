@@ -7,9 +7,9 @@ import sqlite3
 from typing import Any
 
 from tests.history.recording import Recorder
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.rollup import roll
-from webots_mcp.store.history.signals import known_signals
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.signals.catalogue import known_signals
 
 
 def turning(time_s: float) -> dict[str, Any]:

@@ -11,10 +11,10 @@ import pytest
 
 from tests.history.recording import WALL_START_S, Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.history.event import Event, EventOptions, Threshold
-from webots_mcp.store.history.events import Events, find_events
-from webots_mcp.store.history.jolts import find_jumps, find_to_and_fro
-from webots_mcp.store.history.ranges import resolve_range
+from webots_mcp.store.analysis.jumps import find_jumps, find_to_and_fro
+from webots_mcp.store.detection.event import Event, EventOptions, Threshold
+from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.reading.ranges import resolve_range
 
 
 def ask(connection: sqlite3.Connection, kind: Any, *, bounds: Any = None, **options: Any) -> Events:

@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 
 from tests.history.recording import WALL_START_S, Recorder
-from webots_mcp.store.history.event import Event, EventOptions, Kind, Threshold
-from webots_mcp.store.history.events import find_events
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.detection.event import Event, EventOptions, Kind, Threshold
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
 
 STOPS_S = 200.0  # the robot drives, then stands, at 300 s it drives on
 GOES_ON_S = 300.0

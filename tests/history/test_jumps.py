@@ -10,10 +10,10 @@ from typing import Any
 import pytest
 
 from tests.history.recording import Recorder
-from webots_mcp.store.history.event import Event, EventOptions
-from webots_mcp.store.history.events import find_events
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
 
 
 def record(

@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 
 from tests.history.recording import WALL_START_S, record_rover
-from webots_mcp.store.history.compare import compare_code, compare_runs
-from webots_mcp.store.history.events import find_events
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.rollup import roll
-from webots_mcp.store.history.series import RunHistory, query_history
+from webots_mcp.store.questions.compare import compare_code, compare_runs
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.questions.series import RunHistory, query_history
+from webots_mcp.store.reading.ranges import resolve_range
 from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.rollup.rolling import roll
 
 
 def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:

@@ -21,8 +21,8 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
-from webots_mcp.store.history.ranges import Segment, resolve_range
-from webots_mcp.store.history.wall_time import parse_wall_time
+from webots_mcp.store.reading.ranges import Segment, resolve_range
+from webots_mcp.store.reading.wall_time import parse_wall_time
 
 IN_SEGMENT = (
     "SELECT id FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "

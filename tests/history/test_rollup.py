@@ -18,15 +18,15 @@ from tests.history.recording import Recorder, record_rover
 from tests.memory import memory_connection
 from webots_mcp.connection import connect, never_wait
 from webots_mcp.schema import create_schema
-from webots_mcp.store.history.leaves import flatten
-from webots_mcp.store.history.pages import query_rows
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.rollup import BUCKET_S, forget, roll, watermark
-from webots_mcp.store.history.rollup_tables import Addition, held, store
-from webots_mcp.store.history.series import query_history
-from webots_mcp.store.history.signals import list_signals
-from webots_mcp.store.history.summary import Summary, merge, summarise
-from webots_mcp.store.history.trends import trends
+from webots_mcp.store.analysis.summary import Summary, merge, summarise
+from webots_mcp.store.questions.series import query_history
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.pages import query_rows
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import BUCKET_S, forget, roll, watermark
+from webots_mcp.store.rollup.tables import Addition, held, store
+from webots_mcp.store.signals.catalogue import list_signals
+from webots_mcp.store.signals.flatten import flatten
 
 Rows = list[tuple[float, dict[str, Any]]]
 finite = st.floats(-1e9, 1e9, allow_nan=False) | st.integers(-1000, 1000)

@@ -10,10 +10,10 @@ import pytest
 
 from tests.history.recording import Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.history.pages import query_rows
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.rollup import roll
-from webots_mcp.store.history.series import NumberColumns, query_history
+from webots_mcp.store.questions.series import NumberColumns, query_history
+from webots_mcp.store.reading.pages import query_rows
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
 
 
 def ask(connection: sqlite3.Connection, *names: str, max_points: int = 50, **bounds: Any):

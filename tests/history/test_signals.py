@@ -8,13 +8,13 @@ import pytest
 
 from tests.history.recording import Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
-from webots_mcp.store.history.leaves import Place, flatten, places
-from webots_mcp.store.history.pages import query_rows
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.rollup import roll
-from webots_mcp.store.history.signals import catalogue, list_signals, resolve_signals
-from webots_mcp.store.history.subject import find_subject
-from webots_mcp.store.history.trends import trends
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.pages import query_rows
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.subject import find_subject
+from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.signals.catalogue import catalogue, list_signals, resolve_signals
+from webots_mcp.store.signals.flatten import Place, flatten, places
 
 
 def test_every_leaf_has_a_dotted_name() -> None:

@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from tests.history.recording import Recorder
 from tests.memory import memory_connection
-from webots_mcp.store.history import columns
-from webots_mcp.store.history.event import EventOptions, Threshold
-from webots_mcp.store.history.events import find_events
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.detection.event import EventOptions, Threshold
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading import rows as columns
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
 
 Spans = list[tuple[str | None, float, float]]
 

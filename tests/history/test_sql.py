@@ -15,8 +15,8 @@ from tests.history.recording import record_rover
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
-from webots_mcp.store.history.schema_text import describe_schema
-from webots_mcp.store.history.sql import query_sql
+from webots_mcp.store.questions.schema_text import describe_schema
+from webots_mcp.store.questions.sql import query_sql
 
 
 def test_a_select_answers_with_columns_and_rows(rover: sqlite3.Connection) -> None:

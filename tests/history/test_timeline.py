@@ -8,9 +8,9 @@ import pytest
 
 from tests.history.recording import WALL_START_S, Recorder
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.history.event import Event
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.timeline import timeline
+from webots_mcp.store.detection.event import Event
+from webots_mcp.store.questions.timeline import timeline
+from webots_mcp.store.reading.ranges import resolve_range
 
 
 def test_the_timeline_merges_all_sources_in_order(rover: sqlite3.Connection) -> None:

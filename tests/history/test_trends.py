@@ -14,9 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.history.recording import Recorder
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.rollup import roll
-from webots_mcp.store.history.shapes import (
+from webots_mcp.store.analysis.features import (
     find_oscillation,
     find_spikes,
     fit_line,
@@ -24,8 +22,10 @@ from webots_mcp.store.history.shapes import (
     time_effect,
     unwrap,
 )
-from webots_mcp.store.history.trend import Trend
-from webots_mcp.store.history.trends import RunTrends, trends
+from webots_mcp.store.questions.trend import Trend
+from webots_mcp.store.questions.trends import RunTrends, trends
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
 
 Course = Callable[[float], float | None]  # from the time; None leaves the key out
 numbers = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=50)

@@ -11,8 +11,8 @@ import pytest
 
 from tests.history.recording import Recorder, record_rover
 from tests.memory import memory_connection
-from webots_mcp.store.history.ranges import TimeRange, resolve_range
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.reading.ranges import TimeRange, resolve_range
+from webots_mcp.store.rollup.rolling import roll
 
 State = Callable[[float], dict[str, Any]]
 

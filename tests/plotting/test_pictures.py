@@ -32,7 +32,7 @@ from webots_mcp.plotting.ground import paint_ground
 from webots_mcp.plotting.signals import compose_timeline
 from webots_mcp.plotting.timeline import paint_timeline
 from webots_mcp.plotting.trajectory import compose_ground
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.rollup.rolling import roll
 
 Ask = dict[str, Any]
 

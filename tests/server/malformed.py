@@ -23,7 +23,7 @@ from PIL import Image
 
 from tests.store.recorded import Recorded, RecordedRobot, insert
 from webots_mcp.server import create_server
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.rollup.rolling import roll
 
 ROWS: Final = 60
 JSON_COLUMNS: Final = {

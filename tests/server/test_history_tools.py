@@ -12,7 +12,7 @@ from tests.server.conftest import ask, fail, pictures_of, text_of
 from tests.server.story import WAYS, Way, client_on, copy_of, rows_of, write_story
 from tests.store.recorded import Recorded
 from webots_mcp.connection import connect
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.rollup.rolling import roll
 
 pytestmark = pytest.mark.anyio
 

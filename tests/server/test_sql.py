@@ -14,7 +14,7 @@ from tests.server.conftest import Connect, ask, fail, text_of
 from tests.store.recorded import Recorded
 from webots_mcp.contract import MemoryDatabase
 from webots_mcp.server import create_server
-from webots_mcp.store.history.sql_process import FOLDER, LINE, Statement, decode
+from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, decode
 
 pytestmark = pytest.mark.anyio
 

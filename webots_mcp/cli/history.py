@@ -26,11 +26,11 @@ from webots_mcp.cli.tables import print_notes, print_table
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.store.history.compare import Comparison
-    from webots_mcp.store.history.event import EventOptions
-    from webots_mcp.store.history.ranges import TimeRange
-    from webots_mcp.store.history.series import RunHistory
-    from webots_mcp.store.history.trends import RunTrends, StateTrend
+    from webots_mcp.store.detection.event import EventOptions
+    from webots_mcp.store.questions.compare import Comparison
+    from webots_mcp.store.questions.series import RunHistory
+    from webots_mcp.store.questions.trends import RunTrends, StateTrend
+    from webots_mcp.store.reading.ranges import TimeRange
 
 RUN: Final = argument(
     "--run", type=int, dest="run_id", metavar="ID", help="that run instead of the newest one"
@@ -52,7 +52,7 @@ SIGNALS: Final = argument("signals", nargs="*", metavar="SIGNAL", help="names, w
 )  # fmt: skip
 def runs(arguments: argparse.Namespace) -> None:
     """List the runs: when, with which code, how long, how fast, how they ended."""
-    from webots_mcp.store.history.runs import list_runs
+    from webots_mcp.store.questions.runs import list_runs
 
     with reading(arguments) as connection:
         found = list_runs(connection, robot=arguments.robot, limit=arguments.n)
@@ -82,7 +82,7 @@ def history(arguments: argparse.Namespace) -> None:
 
     Without a range the whole newest run is shown.
     """
-    from webots_mcp.store.history.series import query_history
+    from webots_mcp.store.questions.series import query_history
 
     with reading(arguments) as connection:
         found = query_history(
@@ -102,7 +102,7 @@ def history(arguments: argparse.Namespace) -> None:
 )  # fmt: skip
 def trends(arguments: argparse.Namespace) -> None:
     """Say in one line each what the signals did; what changed most comes first."""
-    from webots_mcp.store.history.trends import trends as find_trends
+    from webots_mcp.store.questions.trends import trends as find_trends
 
     with reading(arguments) as connection:
         found = find_trends(
@@ -128,7 +128,7 @@ def trends(arguments: argparse.Namespace) -> None:
 )  # fmt: skip
 def events(arguments: argparse.Namespace) -> None:
     """Find what happened: changes, stuck, gaps, jumps, silent sensors, commands, warnings."""
-    from webots_mcp.store.history.events import find_events
+    from webots_mcp.store.questions.events import find_events
 
     with reading(arguments) as connection:
         found = find_events(
@@ -192,7 +192,7 @@ def plot(arguments: argparse.Namespace) -> None:
 )  # fmt: skip
 def compare(arguments: argparse.Namespace) -> None:
     """Compare runs: duration, distance, time per mode, events, and the signals that differ most."""
-    from webots_mcp.store.history.compare import compare_code, compare_runs
+    from webots_mcp.store.questions.compare import compare_code, compare_runs
 
     names = arguments.signal or ["*"]
     with reading(arguments) as connection:
@@ -207,7 +207,7 @@ def compare(arguments: argparse.Namespace) -> None:
 
 def range_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> TimeRange:
     """What the arguments of `RANGE` ask for."""
-    from webots_mcp.store.history.ranges import resolve_range
+    from webots_mcp.store.reading.ranges import resolve_range
 
     return resolve_range(
         connection,
@@ -222,8 +222,8 @@ def range_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> T
 
 
 def _options(arguments: argparse.Namespace) -> EventOptions:
-    from webots_mcp.store.history.event import KINDS, EventOptions
-    from webots_mcp.store.history.thresholds import thresholds_on
+    from webots_mcp.store.detection.event import KINDS, EventOptions
+    from webots_mcp.store.detection.thresholds import thresholds_on
 
     limits = thresholds_on(
         arguments.signal or (), arguments.above, arguments.below, arguments.for_s

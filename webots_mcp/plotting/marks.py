@@ -8,8 +8,8 @@ from typing import Final
 
 from webots_mcp.plotting.parts import Part
 from webots_mcp.plotting.spans import Lane, Span
-from webots_mcp.store.history.event import Event, EventOptions, Kind
-from webots_mcp.store.history.events import Events, find_events
+from webots_mcp.store.detection.event import Event, EventOptions, Kind
+from webots_mcp.store.questions.events import Events, find_events
 
 MOST_EVENTS: Final = 500
 MOST_LANES: Final = 5

@@ -9,13 +9,13 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
-from webots_mcp.store.history.event import EventOptions
-from webots_mcp.store.history.motion import find_motion
-from webots_mcp.store.history.ranges import TimeRange, recorded_bounds
-from webots_mcp.store.history.registry import Signal
-from webots_mcp.store.history.series import RunHistory, query_history
-from webots_mcp.store.history.signals import one_signal, signals_of
+from webots_mcp.store.analysis.motion import find_motion
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.questions.series import RunHistory, query_history
+from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.signals.catalogue import one_signal, signals_of
+from webots_mcp.store.signals.registry import Signal
 
 Known = dict[str, Signal]
 

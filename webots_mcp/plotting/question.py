@@ -10,8 +10,8 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, Picture, Sheet
 from webots_mcp.plotting.signals import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
-from webots_mcp.store.history.ranges import TimeRange, resolve_range
-from webots_mcp.store.history.trends import trends
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.ranges import TimeRange, resolve_range
 
 PlotKind = Literal["signals", "trajectory"]
 

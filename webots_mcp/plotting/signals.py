@@ -16,7 +16,7 @@ from webots_mcp.plotting.panels import MOST_PANELS, by_scale, by_signal
 from webots_mcp.plotting.parts import Part, known_signals, listed, mode_signal, parts_of, title_of
 from webots_mcp.plotting.spans import Lane, Span, lane_of
 from webots_mcp.plotting.timeline import Timeline, paint_timeline
-from webots_mcp.store.history.ranges import TimeRange
+from webots_mcp.store.reading.ranges import TimeRange
 
 MOST_LANES: Final = 4
 

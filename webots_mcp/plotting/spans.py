@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.store.history.changes import Point, spelled
-from webots_mcp.store.history.gaps import Gap
-from webots_mcp.store.history.series import ChangeColumns, RunHistory
+from webots_mcp.store.questions.series import ChangeColumns, RunHistory
+from webots_mcp.store.reading.changes import Point, spelled
+from webots_mcp.store.reading.gaps import Gap
 
 MOST_VALUES: Final = 8  # colours that can be told apart
 OTHER_VALUES: Final = "others"

@@ -22,11 +22,11 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.path import read_path
 from webots_mcp.plotting.spans import Lane, lane_of
-from webots_mcp.store.history.event import EventOptions
-from webots_mcp.store.history.motion import find_motion
-from webots_mcp.store.history.ranges import TimeRange
-from webots_mcp.store.history.registry import Signal
-from webots_mcp.store.history.signals import one_signal
+from webots_mcp.store.analysis.motion import find_motion
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.signals.catalogue import one_signal
+from webots_mcp.store.signals.registry import Signal
 
 _FLAGS: Final = ("bumper", "collision", "collided", "contact", "touching", "stuck")
 

@@ -32,10 +32,10 @@ from webots_mcp.server.tools.timeline import TimelineTools
 from webots_mcp.server.tools.trends import TrendTools
 from webots_mcp.server.tools.world import WorldTools
 from webots_mcp.settlement import settle_gone
-from webots_mcp.store.history.rollup import roll
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention import Asked, Upkeep
 from webots_mcp.store.retention.limits import ask_where_unset
+from webots_mcp.store.rollup.rolling import roll
 
 INSTRUCTIONS: Final = (
     "A flight recorder and remote control for Webots robot simulations. Begin with "

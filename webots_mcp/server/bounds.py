@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.store.history.ranges import TimeRange, resolve_range
+from webots_mcp.store.reading.ranges import TimeRange, resolve_range
 from webots_mcp.store.recording import View
 
 MOST_RUNS: Final = 5  # of which one answer tells

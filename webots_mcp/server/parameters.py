@@ -7,7 +7,7 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field
 
 from webots_mcp import contract
-from webots_mcp.store.history.event import Kind
+from webots_mcp.store.detection.event import Kind
 
 # Clients put a call aside after two minutes; some of this time is for a busy database.
 MAX_WAIT_S: Final = 90

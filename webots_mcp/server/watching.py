@@ -9,14 +9,14 @@ from typing import Any, Final
 
 from webots_mcp.server.bounds import newest_runs
 from webots_mcp.server.fitting import figure
-from webots_mcp.store.history.columns import Columns, read_columns
-from webots_mcp.store.history.deadline import Deadline
-from webots_mcp.store.history.event import EventOptions
-from webots_mcp.store.history.motion import find_motion, path_length, places_of
-from webots_mcp.store.history.ranges import Segment, TimeRange, resolve_range
-from webots_mcp.store.history.registry import Signal
-from webots_mcp.store.history.signals import known_signals
+from webots_mcp.store.analysis.motion import find_motion, path_length, places_of
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import Segment, TimeRange, resolve_range
+from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.recording import View
+from webots_mcp.store.signals.catalogue import known_signals
+from webots_mcp.store.signals.registry import Signal
 
 _ROW_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 

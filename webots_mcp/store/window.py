@@ -1,6 +1,6 @@
 """The stretch of a run that a question about its log is about, in simulation seconds.
 
-Other than the ranges of `store.history.ranges` it is not bounded by the state rows: the last lines
+Other than the ranges of `store.reading.ranges` it is not bounded by the state rows: the last lines
 of a controller often come after its last state, and some controllers only log.
 """
 

@@ -13,20 +13,20 @@ from webots_mcp.connection import Role, connect
 from webots_mcp.contract import LOG_LEVELS, Database
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.schema import schema_version
+from webots_mcp.store.detection.event import KINDS, EventOptions, Kind
+from webots_mcp.store.detection.event import Event as FoundEvent
 from webots_mcp.store.events import Event, newest_events
-from webots_mcp.store.history.columns import read_columns
-from webots_mcp.store.history.deadline import Deadline
-from webots_mcp.store.history.event import KINDS, EventOptions, Kind
-from webots_mcp.store.history.event import Event as FoundEvent
-from webots_mcp.store.history.events import find_events
-from webots_mcp.store.history.ranges import resolve_range, whole_run
-from webots_mcp.store.history.registry import Signal, registered
-from webots_mcp.store.history.rollup import roll
-from webots_mcp.store.history.signals import resolve_signals
-from webots_mcp.store.history.subject import Subject, find_subject
 from webots_mcp.store.logs import LogFilter, LogLine, newest_lines
+from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.queue import CommandQueue, list_commands
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import resolve_range, whole_run
+from webots_mcp.store.reading.rows import read_columns
+from webots_mcp.store.reading.subject import Subject, find_subject
+from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.runs import runs_of
+from webots_mcp.store.signals.catalogue import resolve_signals
+from webots_mcp.store.signals.registry import Signal, registered
 from webots_mcp.store.states import fetch_state, states_of
 from webots_mcp.store.window import Window
 from webots_mcp.testing.commands import RecordedCommand
@@ -115,7 +115,7 @@ class Recording:
 
         Args:
             kinds: `stuck`, `jump`, `oscillation`, `silent`, `flat`, `gap`, ...; none for all.
-            options: More fields of `webots_mcp.store.history.event.EventOptions`.
+            options: More fields of `webots_mcp.store.detection.event.EventOptions`.
 
         Raises:
             InvalidInputError: There is no such kind.

@@ -18,13 +18,13 @@ from tests.benchmarks.table import Line, Target, duration
 from tests.history.long_recording import CYCLE_S
 from webots_mcp.connection import connect
 from webots_mcp.plotting import plot
-from webots_mcp.store.history.event import EventOptions
-from webots_mcp.store.history.events import find_events
-from webots_mcp.store.history.ranges import resolve_range
-from webots_mcp.store.history.series import query_history
-from webots_mcp.store.history.signals import list_signals
-from webots_mcp.store.history.trends import trends
+from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.logs import LogFilter, count_lines, newest_lines
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.questions.series import query_history
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.signals.catalogue import list_signals
 from webots_mcp.store.window import Window
 
 _SMALL: Final = 10_000  # rows

@@ -21,8 +21,8 @@ from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.schema import create_schema
 from webots_mcp.store.export import FORMATS, export_file
-from webots_mcp.store.history.ranges import resolve_range
 from webots_mcp.store.json_folder import import_folder
+from webots_mcp.store.reading.ranges import resolve_range
 from webots_mcp.store.retention import Limit, Purged, Retention, prune
 
 _ROWS: Final = 100_000

@@ -19,7 +19,7 @@ from tests.history.recording import Recorder
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.schema import create_schema
-from webots_mcp.store.history.rollup import roll
+from webots_mcp.store.rollup.rolling import roll
 
 _ROBOTS: Final = 6
 _SECONDS: Final = 30

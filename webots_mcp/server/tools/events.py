@@ -36,10 +36,10 @@ from webots_mcp.server.parameters import (
     Until,
 )
 from webots_mcp.server.results import Table
-from webots_mcp.store.history.event import KINDS, Event, EventOptions, Kind, Threshold
-from webots_mcp.store.history.events import choose, find_events
-from webots_mcp.store.history.ranges import TimeRange
-from webots_mcp.store.history.thresholds import thresholds_on
+from webots_mcp.store.detection.event import KINDS, Event, EventOptions, Kind, Threshold
+from webots_mcp.store.detection.thresholds import thresholds_on
+from webots_mcp.store.questions.events import choose, find_events
+from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.recording import Recording, View
 
 EVENT_COLUMNS: Final = ("kind", "run_id", "start_s", "duration_s", "ongoing", "name", "details")

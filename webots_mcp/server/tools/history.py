@@ -42,17 +42,17 @@ from webots_mcp.server.parameters import (
     StartS,
     Until,
 )
-from webots_mcp.store.history.pages import Page, query_rows
-from webots_mcp.store.history.ranges import TimeRange
-from webots_mcp.store.history.series import (
+from webots_mcp.store.questions.series import (
     DEFAULT_POINTS,
     ChangeColumns,
     NumberColumns,
     RunHistory,
     query_history,
 )
-from webots_mcp.store.history.signals import signals_of
+from webots_mcp.store.reading.pages import Page, query_rows
+from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.signals.catalogue import signals_of
 
 _SHOWN_GAPS: Final = 10
 _CELL_CHARACTERS: Final = 28  # of a bucket of a numeric signal: min, max, mean and last

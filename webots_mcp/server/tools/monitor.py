@@ -19,9 +19,9 @@ from webots_mcp.server.parameters import MAX_WAIT_S, RobotName
 from webots_mcp.server.tools.events import fitting_events
 from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
 from webots_mcp.server.watching import Window, movement, window_from
-from webots_mcp.store.history.event import KINDS, Event, EventOptions, Kind
-from webots_mcp.store.history.events import choose, find_events
-from webots_mcp.store.history.trends import trends
+from webots_mcp.store.detection.event import KINDS, Event, EventOptions, Kind
+from webots_mcp.store.questions.events import choose, find_events
+from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.recording import Recording, View
 
 _REPORT_INTERVAL_S: Final = 1.0

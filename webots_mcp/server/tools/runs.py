@@ -35,14 +35,14 @@ from webots_mcp.server.parameters import (
     ShownLimit,
 )
 from webots_mcp.server.results import Table
-from webots_mcp.store.history.compare import (
+from webots_mcp.store.questions.compare import (
     Comparison,
     Difference,
     Group,
     compare_code,
     compare_runs,
 )
-from webots_mcp.store.history.runs import (
+from webots_mcp.store.questions.runs import (
     MOST_RUNS,
     RunInfo,
     annotate_run,

@@ -19,8 +19,8 @@ from webots_mcp.server.fitting import (
 )
 from webots_mcp.server.history_results import SignalsAnswer
 from webots_mcp.server.parameters import Cursor, Limit, RobotName, RunId
-from webots_mcp.store.history.signals import SignalInfo, list_signals
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.signals.catalogue import SignalInfo, list_signals
 
 SIGNAL_COLUMNS: Final = (
     "signal", "kind", "unit", "last", "min", "max", "first_s", "last_s", "null_share",

@@ -18,9 +18,9 @@ from webots_mcp.server.history_results import SqlAnswer
 from webots_mcp.server.parameters import ShownLimit
 from webots_mcp.server.results import Table
 from webots_mcp.server.shortening import cut_text
-from webots_mcp.store.history.deadline import QUESTION_DEADLINE_S
-from webots_mcp.store.history.sql import Cell, Result, require_select
-from webots_mcp.store.history.sql_process import FOLDER, LINE, Statement, as_file, decode
+from webots_mcp.store.questions.sql import Cell, Result, require_select
+from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, as_file, decode
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.recording import Recording
 
 DEFAULT_ROWS: Final = 100

@@ -22,9 +22,9 @@ from webots_mcp.server.parameters import (
     Until,
 )
 from webots_mcp.server.tools.events import events_table
-from webots_mcp.store.history.event import EventOptions
-from webots_mcp.store.history.ranges import TimeRange
-from webots_mcp.store.history.timeline import STORED, timeline
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.questions.timeline import STORED, timeline
+from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.recording import Recording, View
 
 DEFAULT_LIMIT: Final = 50

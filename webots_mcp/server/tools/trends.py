@@ -33,9 +33,9 @@ from webots_mcp.server.parameters import (
     Until,
 )
 from webots_mcp.server.shortening import cut_text
-from webots_mcp.store.history.ranges import TimeRange
-from webots_mcp.store.history.trend import Trend
-from webots_mcp.store.history.trends import RunTrends, StateTrend, trends
+from webots_mcp.store.questions.trend import Trend
+from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
+from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.recording import Recording, View
 
 TREND_COLUMNS: Final = (

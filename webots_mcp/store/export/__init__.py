@@ -13,7 +13,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.export.parquet import write_parquet
 from webots_mcp.store.export.rows import Progress, Source
 from webots_mcp.store.export.text import write_csv, write_json_lines
-from webots_mcp.store.history.ranges import TimeRange
+from webots_mcp.store.reading.ranges import TimeRange
 
 
 class Format(NamedTuple):

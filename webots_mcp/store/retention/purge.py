@@ -18,12 +18,12 @@ from typing import Any, Final
 
 from webots_mcp.connection import LONGEST_WRITE_S, ShortWrites, Step, is_busy
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
-from webots_mcp.store.history.rollup import roll, watermark
 from webots_mcp.store.images import inside
 from webots_mcp.store.retention.planning import OLD_COMMANDS, ROLLED, Plan, plan
 from webots_mcp.store.retention.planning import Step as Going
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
 from webots_mcp.store.retention.stock import TABLES
+from webots_mcp.store.rollup.rolling import roll, watermark
 
 BATCH_ROWS: Final = 500
 ROLLED_ROWS: Final = 100

@@ -1,0 +1,1 @@
+"""Arithmetic on what was read: no SQL, and no words for people."""

@@ -1,0 +1,215 @@
+"""What a stretch of one signal comes to, and how two such stretches become one.
+
+The same numbers stand in a row of the `rollup` table, in a bucket of `query_history` and in the
+line of a signal list, so that a question over any stretch is a merge of parts.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from operator import attrgetter, mul, ne
+from typing import Any, Final, NamedTuple, cast
+
+from webots_mcp.store.signals.flatten import Value
+
+_NUMBERS: Final = frozenset({int, float, bool})
+_LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
+_INTEGERS: Final = 2**63  # SQLite takes no larger ones: they become floats
+
+
+class Summary(NamedTuple):
+    """Fields in the order of the rollup's columns; the numbers are None where there are none.
+
+    Attributes:
+        rows: State rows that held the signal; where rows were read as columns, all of them.
+        present: Of them with a value.
+        changes: Values unlike the one before, within the stretch.
+        squares: Sum of squared deviations from the mean.
+        sines: Sum of sines, of an angle.
+        cosines: Sum of cosines, of an angle.
+    """
+
+    rows: int = 0
+    present: int = 0
+    changes: int = 0
+    first: float | None = None
+    first_sim_time_s: float | None = None
+    last: float | None = None
+    last_sim_time_s: float | None = None
+    min: float | None = None
+    min_sim_time_s: float | None = None
+    max: float | None = None
+    max_sim_time_s: float | None = None
+    sum: float | None = None
+    squares: float | None = None
+    sines: float | None = None
+    cosines: float | None = None
+
+    @property
+    def mean(self) -> float | None:
+        """The arithmetic mean."""
+        return None if self.sum is None else self.sum / self.present
+
+    @property
+    def direction(self) -> float | None:
+        """The circular mean, of an angle."""
+        if self.sines is None or self.cosines is None:
+            return None
+        return circular_mean(self.sines, self.cosines, self.present)
+
+    @property
+    def deviation(self) -> float | None:
+        """The standard deviation of the sample, with n - 1."""
+        if self.squares is None or self.present < 2:
+            return None
+        return math.sqrt(self.squares / (self.present - 1))
+
+    @property
+    def circular_deviation(self) -> float | None:
+        """Of an angle sqrt(-2 ln R) with the mean resultant length R.
+
+        K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.3.1.
+        """
+        if self.sines is None or self.cosines is None or self.present < 2:
+            return None
+        length = min(1.0, math.hypot(self.sines, self.cosines) / self.present)
+        return math.sqrt(-2 * math.log(length)) if length > 0 else None
+
+
+def circular_mean(sines: float, cosines: float, count: int) -> float | None:
+    """The direction of the resultant vector: atan2(sum of sines, sum of cosines).
+
+    K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.2.1. None where the vectors
+    cancel out, because then no direction is meant.
+    """
+    if count == 0 or math.hypot(sines, cosines) < 1e-9 * count:
+        return None
+    return math.atan2(sines, cosines)
+
+
+def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = False) -> Summary:
+    """Summarise the values of one signal, given in order with their simulation times.
+
+    The squares are summed in a second pass over the deviations from the mean (T. F. Chan, G. H.
+    Golub, R. J. LeVeque, "Algorithms for computing the sample variance", The American
+    Statistician 37, 1983): no cancellation where the mean is large. Of text only the times.
+    """
+    rows = len(values)
+    number_times, numbers = usable_numbers(times, values)
+    if not numbers:
+        return _without_numbers(times, values)
+    total = math.fsum(numbers)
+    mean = total / len(numbers)
+    deviations = [number - mean for number in numbers]
+    low, high = min(numbers), max(numbers)
+    return Summary(
+        rows,
+        len(numbers),
+        sum(map(ne, numbers, numbers[1:])),
+        numbers[0],
+        number_times[0],
+        numbers[-1],
+        number_times[-1],
+        low,
+        number_times[numbers.index(low)],
+        high,
+        number_times[numbers.index(high)],
+        total,
+        math.fsum(map(mul, deviations, deviations)),
+        math.fsum(map(math.sin, numbers)) if angle else None,
+        math.fsum(map(math.cos, numbers)) if angle else None,
+    )
+
+
+def _without_numbers(times: Sequence[float], values: Sequence[Value]) -> Summary:
+    held = [time for time, value in zip(times, values, strict=True) if type(value) is str]
+    if not held:
+        return Summary(len(values))
+    return Summary(len(values), len(held), first_sim_time_s=held[0], last_sim_time_s=held[-1])
+
+
+def usable_numbers(
+    times: Sequence[float], values: Sequence[Value]
+) -> tuple[Sequence[float], Sequence[float]]:
+    """The usable numbers among the values, with their times; not copied where all are usable.
+
+    Not usable are null, text, NaN, and what is larger than 1e100.
+    """
+    if _NUMBERS.issuperset(map(type, values)) and _usable(cast("Sequence[float]", values)):
+        return times, cast("Sequence[float]", values)
+    pairs = [
+        (time, float(cast("float", value)))
+        for time, value in zip(times, values, strict=True)
+        if type(value) in _NUMBERS and -_LARGEST <= cast("float", value) <= _LARGEST
+    ]
+    return [time for time, _ in pairs], [value for _, value in pairs]
+
+
+def _usable(numbers: Sequence[float]) -> bool:
+    """All at once: a NaN would show in the sum, and hide in the extremes."""
+    if not numbers or not min(numbers) > -_INTEGERS or not max(numbers) < _INTEGERS:
+        return False
+    return math.isfinite(sum(numbers))
+
+
+def merge(parts: Sequence[Summary]) -> Summary:
+    """One summary of stretches that follow each other, in order.
+
+    Counts, extremes, first and last are exact; the squares are combined by the formula of Chan,
+    Golub and LeVeque (see `summarise`): each part's own plus count * (its mean - the mean) ** 2.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    rows = sum(part.rows for part in parts)
+    filled = [part for part in parts if part.sum is not None]
+    if not filled:
+        return _merged_without_numbers(rows, [part for part in parts if part.present])
+    count = sum(part.present for part in filled)
+    total = math.fsum(_column(filled, "sum"))
+    low = min(filled, key=attrgetter("min"))
+    high = max(filled, key=attrgetter("max"))
+    first, last = filled[0], filled[-1]
+    return Summary(
+        rows,
+        count,
+        sum(part.changes for part in filled) + sum(a.last != b.first for a, b in pairwise(filled)),
+        first.first,
+        first.first_sim_time_s,
+        last.last,
+        last.last_sim_time_s,
+        low.min,
+        low.min_sim_time_s,
+        high.max,
+        high.max_sim_time_s,
+        total,
+        _merged_squares(filled, total / count),
+        _sum_where_angle(filled, "sines"),
+        _sum_where_angle(filled, "cosines"),
+    )
+
+
+def _merged_without_numbers(rows: int, held: Sequence[Summary]) -> Summary:
+    if not held:
+        return Summary(rows)
+    first_s, last_s = held[0].first_sim_time_s, held[-1].last_sim_time_s
+    present = sum(part.present for part in held)
+    return Summary(rows, present, first_sim_time_s=first_s, last_sim_time_s=last_s)
+
+
+def _merged_squares(parts: Sequence[Any], mean: float) -> float:
+    shifts = [part.sum / part.present - mean for part in parts]
+    return math.fsum(
+        part.squares + part.present * shift * shift
+        for part, shift in zip(parts, shifts, strict=True)
+    )
+
+
+def _sum_where_angle(parts: Sequence[Summary], field: str) -> float | None:
+    sums = _column(parts, field)
+    return None if None in sums else math.fsum(sums)
+
+
+def _column(parts: Sequence[Summary], field: str) -> list[Any]:
+    return list(map(attrgetter(field), parts))

@@ -1,0 +1,1 @@
+"""Events: what was stored when it happened, and what is found in values."""

@@ -1,0 +1,127 @@
+"""What an event is, and what counts as one."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal, get_args
+
+from webots_mcp.contract import LOG_LEVELS
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.signals.flatten import Value
+
+Kind = Literal[
+    "run", "gap", "change", "stuck", "threshold", "silent", "flat", "jump", "oscillation",
+    "command", "log", "noticed", "image",
+]  # fmt: skip
+KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+LEVELS: Final = LOG_LEVELS
+
+
+@dataclass(frozen=True)
+class Event:
+    """Something that happened in a run.
+
+    Attributes:
+        kind: run (it began or ended), gap (no rows), change (of a text or flag), stuck,
+            threshold, silent (no value), flat, jump, oscillation; command, log, noticed (by the
+            bridge), image.
+        end_s: Equal to the start for what has no duration; of a change when the value ended.
+        ongoing: It lasts up to the newest row of a run that goes on; of a command, it is not
+            finished.
+        name: The signal, the action, the level or the device that it is about.
+        details: What there is to say about it, by kind.
+        around: Values of a few signals when it began.
+    """
+
+    kind: Kind
+    run_id: int
+    start_s: float
+    end_s: float
+    wall_time_s: float
+    name: str | None = None
+    details: dict[str, Any] = field(default_factory=dict[str, Any])
+    ongoing: bool = False
+    around: dict[str, Value] = field(default_factory=dict[str, Value])
+
+    @property
+    def duration_s(self) -> float:
+        """How long it lasted, in simulated seconds."""
+        return self.end_s - self.start_s
+
+
+@dataclass(frozen=True)
+class Threshold:
+    """A signal above or below a value for at least `for_s` simulated seconds."""
+
+    signal: str
+    above: float | None = None
+    below: float | None = None
+    for_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if (self.above is None) == (self.below is None):
+            raise InvalidInputError(f"threshold on {self.signal!r}: give either above or below")
+
+    def holds(self, value: float) -> bool:
+        """Whether the value is beyond the threshold."""
+        return value > self.above if self.above is not None else value < (self.below or 0.0)
+
+
+@dataclass(frozen=True)
+class EventOptions:
+    """What counts as an event.
+
+    Attributes:
+        kinds: Which kinds are looked for.
+        signals: Names, with `*`, of the signals that are looked at.
+        position: The two signals of the position in metres; None finds them by name (`pose.0`
+            and `pose.1`, `position.x` and `position.y`, `gps.0` and so on).
+        mode: The text signal of the mode; None finds it by name (`mode`, `state`, ...).
+        moving_modes: Modes in which the robot should move; None for all but those whose name says
+            that they do not (idle, stop, wait, turn, ...).
+        commanded: The signal of the commanded speed; None finds it by name (`commanded`, `cmd`,
+            `target_speed`, else `speed`, `velocity`), and without any the mode alone tells.
+        min_commanded: A commanded speed of at least this should move the robot.
+        stuck_m: Stuck is who should move and stays within this distance ...
+        stuck_s: ... for so long.
+        thresholds: For the kind "threshold".
+        silent_s: Without a value for so long, though it mostly has one.
+        flat_s: Exactly the same number for so long, though it mostly changes.
+        jump_score: How many times larger than the usual step (modified z-score) a jump is.
+        jump_m: A position jumps by at least so much between two rows.
+        oscillation_turns: Turning points in a row.
+        oscillation_period_s: The longest period that counts.
+        log_level: Log lines of this level and above.
+    """
+
+    kinds: tuple[Kind, ...] = KINDS
+    signals: tuple[str, ...] = ("*",)
+    position: tuple[str, str] | None = None
+    mode: str | None = None
+    moving_modes: tuple[str, ...] | None = None
+    commanded: str | None = None
+    min_commanded: float = 0.01
+    stuck_m: float = 0.05
+    stuck_s: float = 3.0
+    thresholds: tuple[Threshold, ...] = ()
+    silent_s: float = 1.0
+    flat_s: float = 20.0
+    jump_score: float = 12.0
+    jump_m: float = 0.3
+    oscillation_turns: int = 6
+    oscillation_period_s: float = 5.0
+    log_level: str = "warning"
+
+    def __post_init__(self) -> None:
+        unknown = [kind for kind in self.kinds if kind not in KINDS]
+        if unknown:
+            raise InvalidInputError(f"unknown kind {unknown[0]!r}; there is {', '.join(KINDS)}")
+        if self.log_level not in LEVELS:
+            raise InvalidInputError(
+                f"unknown log level {self.log_level!r}; there is {', '.join(LEVELS)}"
+            )
+        for name in ("stuck_m", "stuck_s", "silent_s", "flat_s", "jump_score", "jump_m"):
+            value = getattr(self, name)
+            if not 0 < value < math.inf:
+                raise InvalidInputError(f"{name}={value} must be a number above 0")

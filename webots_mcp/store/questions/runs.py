@@ -1,0 +1,215 @@
+"""`list_runs` and `annotate_run`: what was run, with which code, and how it ended."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+import time
+from dataclasses import dataclass
+from typing import Any, Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.settlement import gone_sessions
+from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.robots import resolve_robot
+from webots_mcp.store.runs import fetch_run
+
+MOST_RUNS: Final = 200
+MAX_LABEL: Final = 100
+MAX_NOTE: Final = 4000
+
+_RUNS: Final = (
+    "SELECT r.id, b.name, r.session_id, s.controller, s.controller_sha256, s.git_commit, r.world, "
+    "r.start_reason, r.end_reason, r.label, r.note, r.purged_rows, "
+    # Rows, times and what was said last are those of a heartbeat, which newer rows may follow.
+    "r.rows + CASE WHEN r.ended_wall_time_s IS NULL THEN (SELECT count(*) FROM state "
+    "WHERE run_id = r.id AND sim_time_s > CASE WHEN r.rows > 0 THEN r.last_sim_time_s "
+    "ELSE -9e999 END) ELSE 0 END, "
+    "r.started_wall_time_s, max(r.last_wall_time_s, coalesce((SELECT wall_time_s FROM state "
+    "WHERE run_id = r.id ORDER BY sim_time_s DESC, id DESC LIMIT 1), 0)), "
+    "r.started_sim_time_s, max(r.last_sim_time_s, coalesce((SELECT max(sim_time_s) FROM state "
+    "WHERE run_id = r.id), r.started_sim_time_s)) "
+    "FROM run r JOIN session s ON s.id = r.session_id JOIN robot b ON b.id = r.robot_id "
+)
+_WHAT: Final = (
+    "run_id", "robot", "session_id", "controller", "controller_sha256", "git_commit", "world",
+    "start_reason", "end_reason", "label", "note", "purged_rows", "rows",
+)  # fmt: skip
+_PAGE: Final = (
+    f"{_RUNS} WHERE (:robot IS NULL OR r.robot_id = :robot) AND (:before IS NULL OR r.id < :before)"
+    " ORDER BY r.id DESC LIMIT :limit"
+)
+_ONE: Final = f"{_RUNS} WHERE r.id = ?"
+_TOTAL: Final = "SELECT count(*) FROM run WHERE :robot IS NULL OR robot_id = :robot"
+_NOTABLE: Final = (
+    "SELECT 'log ' || level, count(*) FROM log WHERE run_id = :run "
+    "AND level IN ('warning', 'error', 'critical') GROUP BY level UNION ALL "
+    "SELECT kind, count(*) FROM event WHERE run_id = :run "
+    "AND kind NOT IN ('change', 'start', 'reset', 'reload') GROUP BY kind UNION ALL "
+    "SELECT 'command ' || status, count(*) FROM command c JOIN run r ON r.id = :run "
+    "AND r.session_id = c.session_id WHERE c.status IN ('failed', 'lost') "
+    "AND c.claimed_wall_time_s BETWEEN r.started_wall_time_s AND r.last_wall_time_s "
+    "GROUP BY status"
+)
+_HOLDS: Final = (
+    "SELECT kind, wall_time_s FROM event WHERE run_id = ? AND kind IN ('pause', 'resume') "
+    "ORDER BY id"
+)
+_ANNOTATE: Final = (
+    "UPDATE run SET label = CASE WHEN :label IS NULL THEN label ELSE nullif(:label, '') END, "
+    "note = CASE WHEN :note IS NULL THEN note ELSE nullif(:note, '') END WHERE id = :run"
+)
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """A run.
+
+    Attributes:
+        end_reason: None while it goes on; where its process is gone, how that will be judged.
+        duration_s: Simulated seconds.
+        held_s: Of the wall time, that for which the simulation was paused by a command.
+        rows: State rows, of which retention has deleted `purged_rows`.
+        notable: How often what needs attention was stored: warnings, errors, dropped rows,
+            failed or lost commands, trouble with storage.
+    """
+
+    run_id: int
+    robot: str
+    session_id: int
+    controller: str | None
+    controller_sha256: str | None
+    git_commit: str | None
+    world: str | None
+    start_reason: str
+    end_reason: str | None
+    label: str | None
+    note: str | None
+    purged_rows: int
+    rows: int
+    started_wall_time_s: float
+    wall_duration_s: float
+    held_s: float
+    duration_s: float
+    notable: dict[str, int]
+
+    @property
+    def real_time_factor(self) -> float | None:
+        """Simulated seconds per second of wall time, but for the time it was held."""
+        return pace(self.duration_s, self.wall_duration_s - self.held_s)
+
+
+@dataclass(frozen=True)
+class RunList:
+    """Runs, the newest first.
+
+    Attributes:
+        total: How many there are in all.
+        cursor: Give it as `before_id` for older ones; None after the oldest.
+    """
+
+    runs: tuple[RunInfo, ...]
+    total: int
+    cursor: int | None
+
+
+@in_one_snapshot
+def list_runs(
+    connection: sqlite3.Connection,
+    *,
+    robot: str | None = None,
+    limit: int = 20,
+    before_id: int | None = None,
+) -> RunList:
+    """List runs, the newest first.
+
+    Args:
+        connection: Any.
+        robot: Whose; None for all robots.
+        limit: 1 to 200.
+        before_id: Only runs with smaller ids: the `cursor` of the page before.
+
+    Raises:
+        UnknownRobotError: No robot has that name.
+        InvalidInputError: `limit` is out of bounds.
+    """
+    if not 1 <= limit <= MOST_RUNS:
+        raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_RUNS}")
+    robot_id = None if robot is None else resolve_robot(connection, robot, time.time()).id
+    page = {"robot": robot_id, "before": before_id, "limit": limit + 1}
+    rows: list[Any] = connection.execute(_PAGE, page).fetchall()
+    gone = dict(gone_sessions(connection))
+    runs = tuple(_info(connection, row, gone) for row in rows[:limit])
+    total = connection.execute(_TOTAL, {"robot": robot_id}).fetchone()[0]
+    return RunList(runs, total, runs[-1].run_id if len(rows) > limit else None)
+
+
+def run_info(connection: sqlite3.Connection, run_id: int) -> RunInfo:
+    """One run.
+
+    Raises:
+        UnknownRunError: There is none of that id.
+    """
+    row = connection.execute(_ONE, (fetch_run(connection, run_id).id,)).fetchone()
+    return _info(connection, row, dict(gone_sessions(connection)))
+
+
+def annotate_run(
+    connection: sqlite3.Connection,
+    run_id: int,
+    *,
+    label: str | None = None,
+    note: str | None = None,
+) -> None:
+    """Give a run a label (short, to find it by) or a note; an empty text takes it away.
+
+    Args:
+        connection: In the role "writer".
+        run_id: Which run.
+        label: At most 100 characters; None leaves it as it is.
+        note: At most 4,000 characters; None leaves it as it is.
+
+    Raises:
+        UnknownRunError: There is none of that id.
+        InvalidInputError: Neither is given, or one is too long.
+    """
+    if label is None and note is None:
+        raise InvalidInputError("give a label or a note")
+    for name, text, longest in (("label", label, MAX_LABEL), ("note", note, MAX_NOTE)):
+        if text is not None and len(text) > longest:
+            raise InvalidInputError(
+                f"the {name} has {len(text)} characters; at most {longest} are kept"
+            )
+    if not connection.execute(_ANNOTATE, {"run": run_id, "label": label, "note": note}).rowcount:
+        fetch_run(connection, run_id)  # says which there are
+
+
+def pace(duration_s: float, wall_s: float) -> float | None:
+    """The real-time factor; None for less than a second of wall time, which tells nothing."""
+    return duration_s / wall_s if wall_s >= 1 else None
+
+
+def _info(connection: sqlite3.Connection, row: tuple[Any, ...], gone: dict[int, str]) -> RunInfo:
+    """One run; `gone` tells of sessions that look open how they ended."""
+    *what, started_wall_s, last_wall_s, started_s, last_s = row
+    named = dict(zip(_WHAT, what, strict=True))
+    named["end_reason"] = named["end_reason"] or gone.get(named["session_id"])
+    return RunInfo(
+        **named,
+        started_wall_time_s=started_wall_s,
+        wall_duration_s=last_wall_s - started_wall_s,
+        held_s=_held_s(connection, row[0], last_wall_s),
+        duration_s=last_s - started_s,
+        notable=dict(connection.execute(_NOTABLE, {"run": row[0]}).fetchall()),
+    )
+
+
+def _held_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> float:
+    held_s, since_s = 0.0, math.inf
+    for kind, wall_s in (*connection.execute(_HOLDS, (run_id,)), ("resume", end_wall_s)):
+        if kind == "pause":
+            since_s = min(since_s, wall_s)
+        else:
+            held_s += max(0.0, wall_s - since_s)
+            since_s = math.inf
+    return held_s

@@ -1,0 +1,211 @@
+"""`query_history`: signals over a range of any length, in as many buckets as can be read."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.analysis.summary import Summary, merge
+from webots_mcp.store.reading.buckets import Table, Tier, tabulate
+from webots_mcp.store.reading.changes import Point, change_points, longest_values
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.gaps import Gap
+from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
+from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.signals.catalogue import signals_of
+from webots_mcp.store.signals.registry import Signal
+
+DEFAULT_POINTS: Final = 50
+MOST_POINTS: Final = 500
+
+_NEWEST_WALL: Final = (
+    "SELECT coalesce((SELECT wall_time_s FROM state WHERE run_id = run.id "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1), last_wall_time_s) FROM run WHERE id = ?"
+)
+
+
+@dataclass(frozen=True)
+class NumberColumns:
+    """A numeric signal: one item per bucket in each list, None where the bucket has no value.
+
+    Attributes:
+        mean: Of an angle the circular mean.
+        whole: The same for the whole range, with the times of its extremes.
+        odd: How often a value stood there that JSON cannot hold ("nan", "inf"); None if the
+            range is too long for the rows to be looked at.
+    """
+
+    name: str
+    kind: str
+    unit: str | None
+    min: list[float | None]
+    min_sim_time_s: list[float | None]
+    max: list[float | None]
+    max_sim_time_s: list[float | None]
+    mean: list[float | None]
+    last: list[float | None]
+    count: list[int]
+    whole: Summary
+    odd: dict[str, int] | None
+
+
+@dataclass(frozen=True)
+class ChangeColumns:
+    """A text or boolean signal.
+
+    Attributes:
+        points: The newest of its changes, [from then on, value]; the first of all is the value in
+            force when the range begins.
+        total: How many points there are, of which `points` are the last.
+        time_by_value_s: Simulated seconds in each value, the longest first.
+    """
+
+    name: str
+    kind: str
+    points: list[Point]
+    total: int
+    time_by_value_s: dict[str, float]
+
+
+@dataclass(frozen=True)
+class RunHistory:
+    """The part of an answer that is about one run.
+
+    Attributes:
+        tier: "rows" (a bucket is a row), "raw" (made from rows), "rollup" (from 10 s rollups, and
+            from rows at both ends).
+        step_s: Length of a bucket; None in the tier "rows".
+        sim_time_s: Begin of each bucket.
+        rows: Rows of the range; None if it is long and only text was asked for.
+        interval_s: Median simulated time between rows.
+        gaps: Where rows are missing.
+        cut_at_s: The deadline passed; from there on rows are missing in the answer.
+        age_s: Wall time since the run's newest row.
+    """
+
+    run_id: int
+    start_s: float
+    end_s: float
+    tier: Tier
+    step_s: float | None
+    sim_time_s: list[float]
+    numbers: tuple[NumberColumns, ...]
+    changes: tuple[ChangeColumns, ...]
+    rows: int | None
+    interval_s: float | None
+    gaps: tuple[Gap, ...]
+    cut_at_s: float | None
+    age_s: float
+
+
+@dataclass(frozen=True)
+class History:
+    """The answer of `query_history`, one part per run."""
+
+    robot: str
+    runs: tuple[RunHistory, ...]
+    notes: tuple[str, ...]
+
+
+@in_one_snapshot
+def query_history(
+    connection: sqlite3.Connection,
+    time_range: TimeRange,
+    names: Sequence[str],
+    *,
+    max_points: int = DEFAULT_POINTS,
+    deadline_s: float = QUESTION_DEADLINE_S,
+) -> History:
+    """Signals over a range, in columns of at most `max_points` buckets.
+
+    Buckets begin at multiples of their length. An extreme is never lost: each bucket has its
+    minimum and maximum. Up to 30,000 rows are read as they are; of a longer range the 10 s
+    rollups are used inside, and rows at both ends, so that counts and extremes stay exact.
+
+    Args:
+        connection: Any.
+        time_range: From `resolve_range`; over several runs each gets its share of the points.
+        names: Signals, with `*`.
+        max_points: 1 to 500.
+        deadline_s: After it, what was read so far is the answer, and says so.
+
+    Raises:
+        UnknownSignalError, InvalidInputError: A name meets nothing; `max_points` is out of bounds.
+    """
+    if not 1 <= max_points <= MOST_POINTS:
+        raise InvalidInputError(f"max_points={max_points} must be from 1 to {MOST_POINTS}")
+    signals = signals_of(connection, time_range, names)
+    total_s = sum(segment.end_s - segment.start_s for segment in time_range.segments)
+    deadline = Deadline(deadline_s)
+    runs = [
+        _run_history(connection, segment, signals, _share(max_points, segment, total_s), deadline)
+        for segment in time_range.segments
+    ]
+    return History(time_range.robot, tuple(runs), time_range.notes)
+
+
+def _share(max_points: int, segment: Segment, total_s: float) -> int:
+    return max(1, int(max_points * (segment.end_s - segment.start_s) / total_s))
+
+
+def _run_history(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    max_points: int,
+    deadline: Deadline,
+) -> RunHistory:
+    numbers = [signal for signal in signals if signal.is_number]
+    states = [signal for signal in signals if not signal.is_number]
+    table = tabulate(connection, segment, numbers, max_points, deadline)
+    points = change_points(connection, segment, states, deadline)
+    bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
+    return RunHistory(
+        run_id=segment.run_id,
+        start_s=segment.start_s,
+        end_s=segment.end_s,
+        tier=table.tier,
+        step_s=table.step_s,
+        sim_time_s=list(table.starts),
+        numbers=tuple(_columns(signal, table) for signal in numbers),
+        changes=tuple(
+            _change_columns(signal, points[signal.name], segment, bounds[1], max_points)
+            for signal in states
+        ),
+        rows=table.rows,
+        interval_s=table.rhythm.interval_s,
+        gaps=table.rhythm.gaps,
+        cut_at_s=table.cut_at_s,
+        age_s=time.time() - connection.execute(_NEWEST_WALL, (segment.run_id,)).fetchone()[0],
+    )
+
+
+def _columns(signal: Signal, table: Table) -> NumberColumns:
+    cells = table.cells.get(signal.name, [])
+    centre = attrgetter("direction" if signal.kind == "angle" else "mean")
+    return NumberColumns(
+        name=signal.name,
+        kind=signal.kind,
+        unit=signal.unit,
+        min=[cell.min for cell in cells],
+        min_sim_time_s=[cell.min_sim_time_s for cell in cells],
+        max=[cell.max for cell in cells],
+        max_sim_time_s=[cell.max_sim_time_s for cell in cells],
+        mean=[centre(cell) for cell in cells],
+        last=[cell.last for cell in cells],
+        count=[cell.present for cell in cells],
+        whole=merge(cells) if cells else Summary(),
+        odd=None if table.odd is None else dict(table.odd.get(signal.name, {})),
+    )
+
+
+def _change_columns(
+    signal: Signal, points: list[Point], segment: Segment, newest_s: float, max_points: int
+) -> ChangeColumns:
+    seconds = longest_values(points, segment.start_s, min(segment.end_s, newest_s))
+    return ChangeColumns(signal.name, signal.kind, points[-max_points:], len(points), seconds)

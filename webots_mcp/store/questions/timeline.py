@@ -1,0 +1,98 @@
+"""`timeline`: what happened, in order, page by page."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections import Counter
+from dataclasses import dataclass
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.detection.event import Event, EventOptions, Kind
+from webots_mcp.store.questions.events import collect, in_order
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
+from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.snapshot import in_one_snapshot
+
+STORED: Final[tuple[Kind, ...]] = ("run", "gap", "change", "command", "log", "noticed", "image")
+MOST_ENTRIES: Final = 500
+
+Place = tuple[float, int, float, str, str, int]
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """A page of the timeline.
+
+    Attributes:
+        cursor: Give it as `after` for the next page; None after the last event.
+        totals: How many of each kind the whole range has.
+    """
+
+    robot: str
+    events: tuple[Event, ...]
+    cursor: str | None
+    totals: dict[Kind, int]
+    notes: tuple[str, ...]
+
+
+@in_one_snapshot
+def timeline(
+    connection: sqlite3.Connection,
+    time_range: TimeRange,
+    options: EventOptions | None = None,
+    *,
+    limit: int = 50,
+    after: str | None = None,
+    deadline_s: float = QUESTION_DEADLINE_S,
+) -> Timeline:
+    """Events, commands, log lines and pictures of a range in the order in which they happened.
+
+    Args:
+        connection: Any.
+        time_range: From `resolve_range`.
+        options: What counts as an event; None for what was stored when it happened (runs, gaps,
+            changes, commands, logs from the level info on, notices, pictures).
+        limit: 1 to 500.
+        after: The `cursor` of the page before.
+        deadline_s: After it, what was found so far is the answer, and the notes say so.
+
+    Raises:
+        InvalidInputError: `limit` is out of bounds, or `after` is no cursor.
+    """
+    if not 1 <= limit <= MOST_ENTRIES:
+        raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ENTRIES}")
+    options = options or EventOptions(kinds=STORED, log_level="info")
+    found, notes = collect(connection, time_range, options, deadline_s)
+    entries = _entries(found)
+    left = [entry for entry in entries if entry[0] > _read_cursor(after)] if after else entries
+    page = left[:limit]
+    return Timeline(
+        robot=time_range.robot,
+        events=tuple(event for _, event in page),
+        cursor=json.dumps(page[-1][0]) if len(left) > limit else None,
+        totals=dict(Counter(event.kind for event in found)),
+        notes=tuple(dict.fromkeys(notes)),
+    )
+
+
+def _entries(events: list[Event]) -> list[tuple[Place, Event]]:
+    """The events in order, each with its place; events that are equal in all else are counted."""
+    seen: Counter[Place] = Counter()
+    entries: list[tuple[Place, Event]] = []
+    for event in events:
+        place = (*in_order(event), event.kind, event.name or "", 0)
+        entries.append(((*place[:-1], seen[place]), event))
+        seen[place] += 1
+    return sorted(entries, key=lambda entry: entry[0])
+
+
+def _read_cursor(text: str) -> Place:
+    try:
+        wall_s, run_id, start_s, kind, name, number = json.loads(text)
+        return float(wall_s), int(run_id), float(start_s), str(kind), str(name), int(number)
+    except (ValueError, TypeError) as error:
+        raise InvalidInputError(
+            f"after={text!r} is no cursor: give the `cursor` of the page before, as it was"
+        ) from error

@@ -1,0 +1,234 @@
+"""One numeric signal over a range: its trend, and what a person would notice."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final, Literal
+
+from webots_mcp.store.analysis.features import (
+    SLOW_SHARE,
+    Line,
+    Oscillation,
+    Spike,
+    find_oscillation,
+    fit_line,
+    flat_since,
+    time_effect,
+    unwrap,
+)
+from webots_mcp.store.analysis.summary import Summary, summarise
+from webots_mcp.store.rollup.rolling import BUCKET_S
+from webots_mcp.store.signals.registry import Signal
+
+STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
+TOLD_MISSING_SHARE: Final = 0.001
+SWINGING_SHARE: Final = 0.6  # of the range: what swung for less did something else as well
+_HALF_TURN_VARIANCE: Final = -2 * math.log(2 / math.pi)  # of angles spread over half a turn
+
+Shape = Literal["constant", "rising", "falling", "oscillating", "resting", "varying"]
+Monotonic = Literal["rising", "falling"]
+
+
+@dataclass(frozen=True)
+class Trend:
+    """A numeric signal over a range.
+
+    Attributes:
+        summary: Count, first, last, extremes with their times, mean, deviation.
+        mean: Of an angle the circular mean. What is less than a few millionths of the range is
+            rounded away: it comes from adding.
+        deviation: Standard deviation; of an angle that of the unwrapped angle.
+        turned_rad: How far an angle turned, positive as it grows, turns counted; else None.
+        monotonic: "rising", "falling" (never the other way, and not constant), or None.
+        crossings: Of the mean, by more than noise.
+        fast: It varies so fast that the means of 10 s do not show its course.
+        flat_since_s: Since when it rests; None if it does not.
+        spikes: Values that stand out from both neighbours; None where rows were not looked at.
+        missing_share: Rows without a value.
+        change: How much it changed with time, 0 to 2: the share of its variance that is slow
+            (`time_effect`) times its range in units of its largest magnitude. Free of units.
+        says: What a person would notice.
+    """
+
+    name: str
+    kind: str
+    unit: str | None
+    summary: Summary
+    mean: float | None
+    deviation: float | None
+    turned_rad: float | None
+    slope_per_s: float | None
+    r2: float | None
+    shape: Shape
+    monotonic: Monotonic | None
+    crossings: int
+    fast: bool
+    oscillation: Oscillation | None
+    flat_since_s: float | None
+    spikes: tuple[Spike, ...] | None
+    missing_share: float
+    change: float
+    says: str
+
+
+def judge(
+    signal: Signal,
+    summary: Summary,
+    times: Sequence[float],
+    numbers: Sequence[float],
+    spikes: list[Spike] | None,
+    inner_variance: float = 0.0,
+) -> Trend:
+    """Put together what the summary tells and what the course of the numbers tells.
+
+    Args:
+        signal: Whose trend.
+        summary: Of the whole range.
+        times: Of the numbers.
+        numbers: The values, or the means of buckets; at least one.
+        spikes: None where only buckets were looked at.
+        inner_variance: That of the values within the buckets. Where more of it lies there than
+            between them, a course of their means is not that of the values (it may be an alias).
+    """
+    angle = signal.kind == "angle"
+    course = unwrap(numbers) if angle else numbers
+    inner = summary if len(course) == summary.present and not angle else summarise(times, course)
+    mean = inner.mean or 0.0
+    slow = _slow_share(inner, inner_variance, angle=angle)
+    fast = slow < SLOW_SHARE
+    line = _of_all(fit_line(times, course, mean), slow)
+    crossings, swing = 0, None
+    if not fast:
+        crossings, swing = find_oscillation(times, course, mean, inner.deviation or 0.0)
+    monotonic = None if fast else _monotonic(course)
+    rest_s = None if fast else flat_since(times, course)
+    shape = _shape(summary, line, monotonic, swing, rest_s, times[-1] - times[0])
+    trend = Trend(
+        name=signal.name,
+        kind=signal.kind,
+        unit=signal.unit,
+        summary=summary,
+        mean=_rounded(summary.direction if angle else summary.mean, inner),
+        deviation=inner.deviation if angle else summary.deviation,
+        turned_rad=_turned_rad(summary, numbers) if angle and not fast else None,
+        slope_per_s=line.slope_per_s if line else None,
+        r2=line.r2 if line else None,
+        shape=shape,
+        monotonic=monotonic,
+        crossings=crossings,
+        fast=fast,
+        oscillation=swing,
+        flat_since_s=rest_s,
+        spikes=None if spikes is None else tuple(spikes),
+        missing_share=1 - summary.present / summary.rows,
+        change=_change(times, course, inner) * slow * _relative_range(summary),
+        says="",
+    )
+    return replace(trend, says="; ".join(_remarks(trend)))
+
+
+def _slow_share(means: Summary, inner_variance: float, *, angle: bool) -> float:
+    """The share of the variance between the means; 0 where an angle's turns cannot be counted."""
+    if inner_variance == 0 or (angle and inner_variance > _HALF_TURN_VARIANCE):
+        return float(inner_variance == 0)
+    between = (means.squares or 0.0) / means.present
+    return between / (between + inner_variance)
+
+
+def _of_all(line: Line | None, slow: float) -> Line | None:
+    """Of the variance of all values, the line through their means explains so much less."""
+    return line and replace(line, r2=line.r2 * slow)
+
+
+def _turned_rad(summary: Summary, numbers: Sequence[float]) -> float:
+    ends = (summary.first or 0.0, summary.last or 0.0)
+    turned = unwrap([ends[0], *numbers, ends[1]])
+    return turned[-1] - turned[0]
+
+
+def _change(times: Sequence[float], course: Sequence[float], inner: Summary) -> float:
+    return time_effect(times, course, inner.mean or 0.0, inner.squares or 0.0)
+
+
+def _rounded(mean: float | None, inner: Summary) -> float | None:
+    """A mean to a few millionths of the range: about -1.48e-17 is about 0."""
+    span = (inner.max or 0.0) - (inner.min or 0.0)
+    if mean is None or span <= 0:
+        return mean
+    return round(mean, 5 - math.floor(math.log10(span)))
+
+
+def _monotonic(values: Sequence[float]) -> Monotonic | None:
+    if values[0] == values[-1]:
+        return None
+    rising = values[-1] > values[0]
+    if any((b < a) if rising else (b > a) for a, b in pairwise(values)):
+        return None
+    return "rising" if rising else "falling"
+
+
+def _shape(
+    summary: Summary,
+    line: Line | None,
+    monotonic: Monotonic | None,
+    swing: Oscillation | None,
+    rest_s: float | None,
+    whole_s: float,
+) -> Shape:
+    if summary.min == summary.max:
+        return "constant"
+    if swing is not None and swing.end_s - swing.start_s >= SWINGING_SHARE * whole_s:
+        return "oscillating"
+    if monotonic is not None:
+        return monotonic
+    if line is not None and line.r2 >= STRAIGHT_R2:
+        return "rising" if line.slope_per_s > 0 else "falling"
+    return "resting" if rest_s is not None else "varying"
+
+
+def _relative_range(summary: Summary) -> float:
+    assert summary.min is not None and summary.max is not None
+    largest = max(abs(summary.min), abs(summary.max))
+    return (summary.max - summary.min) / largest if largest else 0.0
+
+
+def _remarks(trend: Trend) -> Iterator[str]:
+    summary, unit = trend.summary, f" {trend.unit}" if trend.unit else ""
+    yield _course(trend, unit)
+    if trend.fast:
+        yield f"varies faster than {BUCKET_S:g} s: ask for a shorter range"
+    if trend.flat_since_s is not None and trend.shape != "constant":
+        yield f"flat at {summary.last:.4g} since {trend.flat_since_s:.6g} s"
+    if trend.spikes:
+        largest = max(trend.spikes, key=lambda spike: abs(spike.value - (trend.mean or 0.0)))
+        yield (
+            f"{len(trend.spikes)} spike{'s' if len(trend.spikes) > 1 else ''}, the largest "
+            f"{largest.value:.4g} at {largest.sim_time_s:.6g} s"
+        )
+    if trend.missing_share > TOLD_MISSING_SHARE:
+        yield f"no value in {100 * trend.missing_share:.3g} % of the rows"
+
+
+def _course(trend: Trend, unit: str) -> str:
+    summary = trend.summary
+    if trend.shape == "constant":
+        return f"constant at {summary.last or 0.0:.4g}{unit}"
+    if (swing := trend.oscillation) is not None:
+        how = f"by {swing.amplitude:.3g}{unit} about {trend.mean or 0.0:.4g} every"
+        if trend.shape == "oscillating":
+            return f"swings {how} {swing.period_s:.3g} s"
+        stretch = f"from {swing.start_s:.6g} to {swing.end_s:.6g} s"
+        return f"swung {how} {swing.period_s:.3g} s {stretch}"
+    if trend.shape in ("rising", "falling"):
+        slope = f" ({trend.slope_per_s:.3g}{unit}/s)" if trend.slope_per_s is not None else ""
+        if trend.turned_rad is not None:
+            return f"turns by {trend.turned_rad:.3g}{unit}{slope}"
+        verb = "rises" if trend.shape == "rising" else "falls"
+        return f"{verb} from {summary.first:.4g} to {summary.last:.4g}{unit}{slope}"
+    low, high = f"{summary.min:.4g}", f"{summary.max:.4g}"
+    return f"between {low} (at {summary.min_sim_time_s:.6g} s) and {high}{unit} " + (
+        f"(at {summary.max_sim_time_s:.6g} s)"
+    )

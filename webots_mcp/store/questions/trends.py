@@ -1,0 +1,190 @@
+"""`trends`: what each signal did over a range, what changed most first."""
+
+from __future__ import annotations
+
+import sqlite3
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from webots_mcp.store.analysis.features import find_spikes
+from webots_mcp.store.analysis.summary import summarise, usable_numbers
+from webots_mcp.store.questions.trend import Trend, judge
+from webots_mcp.store.reading.changes import change_points, longest_values
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
+from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
+from webots_mcp.store.reading.rollups import Pieces, read_pieces
+from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
+from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.rollup.rolling import BUCKET_S
+from webots_mcp.store.signals.catalogue import signals_of
+from webots_mcp.store.signals.registry import Signal
+
+
+@dataclass(frozen=True)
+class StateTrend:
+    """A text or boolean signal over a range.
+
+    Attributes:
+        changes: How often it changed within the range.
+        since_s: Since when it has its last value.
+        time_by_value_s: Simulated seconds in each value, the longest first.
+    """
+
+    name: str
+    kind: str
+    changes: int
+    last: str | bool | None
+    since_s: float | None
+    time_by_value_s: dict[str, float]
+
+
+@dataclass(frozen=True)
+class RunTrends:
+    """The part of an answer that is about one run.
+
+    Attributes:
+        resolution_s: None if every row was looked at; else the length of the rollups from which
+            shape, slope and crossings come (counts, extremes, mean and deviation stay exact).
+        numbers: What changed most comes first; at most `limit` of `total`.
+        silent: Names that have no value in the range.
+        cut_at_s: The deadline passed; from there on rows are missing in the answer.
+    """
+
+    run_id: int
+    start_s: float
+    end_s: float
+    resolution_s: float | None
+    rows: int
+    numbers: tuple[Trend, ...]
+    states: tuple[StateTrend, ...]
+    silent: tuple[str, ...]
+    total: int
+    cut_at_s: float | None
+
+
+@dataclass(frozen=True)
+class Trends:
+    """The answer of `trends`, one part per run."""
+
+    robot: str
+    runs: tuple[RunTrends, ...]
+    notes: tuple[str, ...]
+
+
+@in_one_snapshot
+def trends(
+    connection: sqlite3.Connection,
+    time_range: TimeRange,
+    names: Sequence[str] = ("*",),
+    *,
+    limit: int = 100,
+    deadline_s: float = QUESTION_DEADLINE_S,
+) -> Trends:
+    """What each signal did over a range.
+
+    Args:
+        connection: Any.
+        time_range: From `resolve_range`.
+        names: Signals, with `*`.
+        limit: At most so many numeric signals per run: those that changed most.
+        deadline_s: After it, what was read so far is the answer, and says so.
+
+    Raises:
+        UnknownSignalError: A name meets nothing.
+    """
+    signals = signals_of(connection, time_range, names)
+    deadline = Deadline(deadline_s)
+    runs = [
+        run_trends(connection, segment, signals, limit, deadline) for segment in time_range.segments
+    ]
+    return Trends(time_range.robot, tuple(runs), time_range.notes)
+
+
+def run_trends(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    limit: int,
+    deadline: Deadline,
+) -> RunTrends:
+    """The trends of signals in one run."""
+    numbers = [signal for signal in signals if signal.is_number]
+    found: list[Trend | None]
+    if exceeds(connection, segment):
+        pieces = read_pieces(connection, segment, numbers, deadline)
+        found = [_trend_of_pieces(signal, pieces) for signal in numbers]
+        rows = max((pieces.whole(signal.name).rows for signal in numbers), default=0)
+        resolution_s, cut_at_s = BUCKET_S, pieces.cut_at_s
+    else:
+        columns = read_columns(connection, segment, numbers, deadline)
+        found = [_trend_of_rows(signal, columns) for signal in numbers]
+        rows, resolution_s = len(columns.times), None
+        cut_at_s = (columns.times or [segment.start_s])[-1] if columns.cut else None
+    held = sorted((trend for trend in found if trend), key=lambda trend: -trend.change)
+    silent = [signal.name for signal, trend in zip(numbers, found, strict=True) if trend is None]
+    return RunTrends(
+        run_id=segment.run_id,
+        start_s=segment.start_s,
+        end_s=segment.end_s,
+        resolution_s=resolution_s,
+        rows=rows,
+        numbers=tuple(held[:limit]),
+        states=_state_trends(connection, segment, signals, deadline),
+        silent=tuple(silent),
+        total=len(held),
+        cut_at_s=cut_at_s,
+    )
+
+
+def _trend_of_rows(signal: Signal, columns: Columns) -> Trend | None:
+    values = columns.values[signal.name]
+    times, numbers = usable_numbers(columns.times, values)
+    if not numbers:
+        return None
+    summary = summarise(columns.times, values, angle=signal.kind == "angle")
+    return judge(signal, summary, times, numbers, find_spikes(times, numbers))
+
+
+def _trend_of_pieces(signal: Signal, pieces: Pieces) -> Trend | None:
+    summary = pieces.whole(signal.name)
+    if summary.sum is None:
+        return None
+    angle = signal.kind == "angle"
+    middles: list[float] = []
+    means: list[float] = []
+    inner: list[float] = []
+    for _, part in pieces.of(signal.name):
+        centre = part.direction if angle else part.mean
+        if centre is not None and part.first_sim_time_s is not None:
+            middles.append((part.first_sim_time_s + (part.last_sim_time_s or 0.0)) / 2)
+            means.append(centre)
+            inner.append((part.circular_deviation if angle else part.deviation) or 0.0)
+    variance = statistics.fmean(deviation**2 for deviation in inner)
+    return judge(signal, summary, middles, means, None, variance)
+
+
+def _state_trends(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+) -> tuple[StateTrend, ...]:
+    """Text and flags, those that changed most often first."""
+    states = [signal for signal in signals if not signal.is_number]
+    points = change_points(connection, segment, states, deadline)
+    bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
+    end_s = min(segment.end_s, bounds[1])
+    found = [
+        StateTrend(
+            name=signal.name,
+            kind=signal.kind,
+            changes=len(points[signal.name]) - 1,
+            last=points[signal.name][-1].value,
+            since_s=points[signal.name][-1].sim_time_s,
+            time_by_value_s=longest_values(points[signal.name], segment.start_s, end_s),
+        )
+        for signal in states
+        if points[signal.name]
+    ]
+    return tuple(sorted(found, key=lambda state: -state.changes))

@@ -1,0 +1,149 @@
+"""Numeric signals over a segment as a table of buckets, from rows or from rollups."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import count, groupby, pairwise
+from typing import Final, Literal
+
+from webots_mcp.store.analysis.summary import Summary, merge, summarise
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.gaps import Rhythm, rhythm_in, rhythm_of
+from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.rollups import read_pieces
+from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
+from webots_mcp.store.rollup.rolling import BUCKET_S
+from webots_mcp.store.signals.registry import Signal
+
+Tier = Literal["rows", "raw", "rollup"]
+
+_NICE: Final = (1, 1.5, 2, 3, 4, 5, 6, 8)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Buckets of equal length that begin at multiples of it; in the tier "rows" one per row.
+
+    Attributes:
+        tier: "rows" (a bucket is a row), "raw" (made from rows), "rollup" (from 10 s rollups, and
+            from rows at both ends).
+        step_s: Length of a bucket; None in the tier "rows".
+        starts: Begin of each bucket.
+        cells: Per signal one summary per bucket.
+        rows: Rows of the segment; None if it is long and no numeric signal tells.
+        odd: Per signal, how often each value that JSON cannot hold; None if long.
+        cut_at_s: Where the deadline stopped the reading of rows; None if it did not.
+    """
+
+    tier: Tier
+    step_s: float | None
+    starts: list[float]
+    cells: dict[str, list[Summary]]
+    rows: int | None
+    rhythm: Rhythm
+    odd: dict[str, Counter[str]] | None
+    cut_at_s: float | None
+
+
+def tabulate(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    max_points: int,
+    deadline: Deadline,
+) -> Table:
+    """Put a segment into at most `max_points` buckets: from rows up to 30,000 of them."""
+    if exceeds(connection, segment):
+        return _from_rollups(connection, segment, signals, max_points, deadline)
+    columns = read_columns(connection, segment, signals, deadline)
+    return _from_rows(columns, signals, max_points)
+
+
+def _from_rows(columns: Columns, signals: Sequence[Signal], max_points: int) -> Table:
+    times = columns.times
+    step_s = None if len(times) <= max_points else _step(times[0], times[-1], max_points)
+    starts, edges = (times, list(range(len(times) + 1)))
+    if step_s is not None:
+        starts, edges = _edges(times, step_s)
+    spans = list(pairwise(edges))
+    cells = {
+        signal.name: [
+            summarise(times[a:b], columns.values[signal.name][a:b], angle=signal.kind == "angle")
+            for a, b in spans
+        ]
+        for signal in signals
+    }
+    cut_at_s = (times[-1] if times else math.inf) if columns.cut else None
+    tier = "rows" if step_s is None else "raw"
+    rhythm = rhythm_of(times)
+    return Table(tier, step_s, starts, cells, len(times), rhythm, columns.odd, cut_at_s)
+
+
+def _edges(times: Sequence[float], step_s: float) -> tuple[list[float], list[int]]:
+    """The begin of each bucket, also of empty ones, and the index of the first row of each."""
+    numbers = [_number(time, step_s) for time in times]
+    starts: list[float] = []
+    edges = [0]
+    index = 0
+    for number in range(numbers[0], numbers[-1] + 1):
+        starts.append(round(number * step_s, 9))
+        while index < len(numbers) and numbers[index] <= number:
+            index += 1
+        edges.append(index)
+    return starts, edges
+
+
+def _number(time_s: float, step_s: float) -> int:
+    """Which bucket holds a time; what a float's rounding puts just before a border is behind it."""
+    return math.floor(time_s / step_s + 1e-9)
+
+
+def _step(first_s: float, last_s: float, max_points: int, unit_s: float = 0.0) -> float:
+    """The shortest round bucket length (a multiple of `unit_s`) that needs no more buckets."""
+    for step_s in _round_steps(max(unit_s, (last_s - first_s) / max_points / 10, 1e-9)):
+        whole = unit_s == 0 or step_s % unit_s == 0
+        if whole and _number(last_s, step_s) - _number(first_s, step_s) < max_points:
+            return step_s
+    raise AssertionError("the steps go on for ever")
+
+
+def _round_steps(at_least_s: float) -> Iterator[float]:
+    for exponent in count(math.floor(math.log10(at_least_s))):
+        for nice in _NICE:
+            yield nice * 10**exponent if exponent >= 0 else nice / 10**-exponent
+
+
+def _from_rollups(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    max_points: int,
+    deadline: Deadline,
+) -> Table:
+    pieces = read_pieces(connection, segment, signals, deadline)
+    found = {signal.name: pieces.of(signal.name) for signal in signals}
+    numbers = [bucket for buckets in found.values() for bucket, _ in buckets]
+    rhythm = rhythm_in(connection, segment)
+    if not numbers:
+        return Table("rollup", BUCKET_S, [], {}, None, rhythm, None, pieces.cut_at_s)
+    first, last = min(numbers), max(numbers)
+    step_s = _step(first * BUCKET_S, last * BUCKET_S, max_points, BUCKET_S)
+    width = round(step_s / BUCKET_S)
+    indexes = range(first // width, last // width + 1)
+    starts = [index * step_s for index in indexes]
+    cells = {name: _widened(buckets, width, indexes) for name, buckets in found.items()}
+    rows = max(sum(cell.rows for cell in column) for column in cells.values())
+    return Table("rollup", step_s, starts, cells, rows, rhythm, None, pieces.cut_at_s)
+
+
+def _widened(buckets: list[tuple[int, Summary]], width: int, indexes: range) -> list[Summary]:
+    """Buckets of 10 s merged into buckets of `width` times that, with the empty ones."""
+    merged = {
+        index: merge([summary for _, summary in group])
+        for index, group in groupby(buckets, lambda bucket: bucket[0] // width)
+    }
+    return [merged.get(index, Summary()) for index in indexes]

@@ -1,0 +1,143 @@
+"""Recording gaps: where the next row came much later than the rows usually do."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+import statistics
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Final
+
+from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.rollup.rolling import BUCKET_S, bucket_of
+
+GAP_INTERVALS: Final = 3.0  # a gap is longer than so many median intervals
+_SAMPLE_ROWS: Final = 2000
+_ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
+_MOST_BUCKETS: Final = 300  # of a long stretch that are looked into row by row
+
+_TIMES: Final = (  # answered by the index alone
+    "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
+    "ORDER BY sim_time_s LIMIT ?"
+)
+_BEFORE: Final = (
+    "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s < ? "
+    "ORDER BY sim_time_s DESC LIMIT ?"
+)
+# The signal that is in most rows tells how many a bucket has, and its first and last time.
+_BUCKETS: Final = (
+    "SELECT bucket, rows, first_sim_time_s, last_sim_time_s FROM all_rollup "
+    "WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = (SELECT id "
+    "FROM signal s WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND EXISTS "
+    "(SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = s.id) "
+    "ORDER BY s.rows - s.null_rows DESC LIMIT 1) ORDER BY bucket"
+)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """No row between two rows of a run, for longer than usual."""
+
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class Rhythm:
+    """How regularly rows were recorded.
+
+    Attributes:
+        interval_s: The median simulated time between rows; None for fewer than two rows.
+        gaps: In order.
+    """
+
+    interval_s: float | None
+    gaps: tuple[Gap, ...]
+
+
+def with_rows_around(connection: sqlite3.Connection, segment: Segment) -> Segment:
+    """The segment with some rows before and after it: a gap at its end, or all around it, shows."""
+    before = connection.execute(_BEFORE, (segment.run_id, segment.start_s, _ROWS_AROUND)).fetchall()
+    after = _times(connection, segment.run_id, segment.end_s, math.inf, _ROWS_AROUND)
+    start_s = before[-1][0] if before else segment.start_s
+    end_s = math.nextafter(after[-1], math.inf) if after else segment.end_s
+    return Segment(segment.run_id, start_s, end_s)
+
+
+def rhythm_of(times: Sequence[float]) -> Rhythm:
+    """The rhythm of the given times; a gap is an interval of more than three median ones.
+
+    Intervals of zero, while a simulation is paused, do not count for the median.
+    """
+    moving = [after - before for before, after in pairwise(times) if after > before]
+    if not moving:
+        return Rhythm(None, ())
+    interval_s = statistics.median(moving)
+    return Rhythm(interval_s, tuple(_wider(times, interval_s)))
+
+
+def _wider(times: Sequence[float], interval_s: float) -> Iterator[Gap]:
+    limit_s = GAP_INTERVALS * interval_s * (1 + 1e-6)
+    return (Gap(a, b) for a, b in pairwise(times) if b - a > limit_s)
+
+
+def rhythm_in(connection: sqlite3.Connection, segment: Segment) -> Rhythm:
+    """The rhythm of a long segment, from the rollups: rows are read only where some are missing.
+
+    The median is that of the first 2,000 rows. Where more than 300 buckets lack rows, recording
+    is irregular rather than interrupted, and within the others only whole missing buckets count.
+    """
+    sample = _times(connection, segment.run_id, segment.start_s, segment.end_s, _SAMPLE_ROWS)
+    interval_s = rhythm_of(sample).interval_s
+    if interval_s is None:
+        return Rhythm(None, ())
+    gaps: list[Gap] = []
+    before: Sequence[float] = ()
+    for times, complete in _stretches(connection, segment, interval_s):
+        gaps += _wider((*before[-1:], times[0]), interval_s)
+        gaps += () if complete else _wider(times, interval_s)
+        before = times
+    return Rhythm(interval_s, tuple(gaps))
+
+
+def _stretches(
+    connection: sqlite3.Connection, segment: Segment, interval_s: float
+) -> Iterator[tuple[Sequence[float], bool]]:
+    """Times in order: the ends of each bucket that is complete, all times of another."""
+    run_id, reached_s, looked = segment.run_id, segment.start_s, 0
+    span = range(bucket_of(segment.start_s) + 1, bucket_of(segment.end_s))
+    for bucket, rows, first_s, last_s in _counted(connection, run_id, span):
+        start_s, end_s = bucket * BUCKET_S, (bucket + 1) * BUCKET_S
+        if start_s > reached_s and (head := _times(connection, run_id, reached_s, start_s)):
+            yield head, False
+        complete = rows >= BUCKET_S / interval_s - 2 or looked >= _MOST_BUCKETS
+        looked += not complete
+        reached_s = end_s
+        if complete and first_s is not None:
+            yield (first_s, last_s), True
+        elif times := _times(connection, run_id, start_s, end_s):
+            yield times, False
+    if foot := _times(connection, run_id, reached_s, segment.end_s):
+        yield foot, False
+
+
+def rows_by_bucket(connection: sqlite3.Connection, run_id: int, span: range) -> dict[int, int]:
+    """How many rows each bucket has in the rollups: also of a signal that not all of them hold."""
+    return {bucket: rows for bucket, rows, *_ in _counted(connection, run_id, span)}
+
+
+def _counted(
+    connection: sqlite3.Connection, run_id: int, span: range
+) -> list[tuple[int, int, Any, Any]]:
+    """Bucket, rows, and the times of the first and last value; None where there is no value."""
+    bounds = {"run": run_id, "first": span.start, "end": span.stop}
+    return connection.execute(_BUCKETS, bounds).fetchall()
+
+
+def _times(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float, limit: int = -1
+) -> list[float]:
+    rows = connection.execute(_TIMES, (run_id, start_s, end_s, limit))
+    return [time_s for (time_s,) in rows]

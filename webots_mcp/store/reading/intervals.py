@@ -1,0 +1,193 @@
+"""Stretches in which something holds of one signal: beyond a threshold, without a value, flat.
+
+Short segments are read row by row. Of a long one the rollups tell for most buckets whether it
+holds throughout or not at all; only the buckets in between are read.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Final, Literal, Protocol
+
+from webots_mcp.store.analysis.summary import Summary, usable_numbers
+from webots_mcp.store.detection.event import Threshold
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.rollups import Pieces
+from webots_mcp.store.reading.rows import read_columns
+from webots_mcp.store.rollup.rolling import BUCKET_S
+from webots_mcp.store.signals.flatten import Value
+from webots_mcp.store.signals.registry import Signal
+
+MOSTLY: Final = 0.5  # who is silent or flat for longer than this share is so by nature
+
+
+@dataclass(frozen=True)
+class Span:
+    """From the first to the last of rows, one after the other, in all of which it held.
+
+    Attributes:
+        key: What held: spans that touch are one only if it is the same.
+        from_first: It held in the first row that was read: it may have begun before.
+        to_last: It held in the last row that was read: it may go on.
+    """
+
+    start_s: float
+    end_s: float
+    key: Value
+    low: float | None = None
+    high: float | None = None
+    from_first: bool = False
+    to_last: bool = False
+
+
+Verdict = Literal["all", "none", "some"]
+
+
+class Condition(Protocol):
+    """What is looked for."""
+
+    @property
+    def lasting(self) -> bool:
+        """Whether it takes more than one row."""
+        ...
+
+    def of_row(self, value: Value) -> Value:
+        """None if it does not hold; else what holds, as a key."""
+        ...
+
+    def of_bucket(self, summary: Summary) -> Verdict:
+        """Whether it holds in all, none, or some rows of a bucket, as far as that is known."""
+        ...
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """Above or below a threshold."""
+
+    threshold: Threshold
+    lasting: bool = False
+
+    def of_row(self, value: Value) -> Value:
+        """True or None."""
+        held = value is not None and not isinstance(value, str) and self.threshold.holds(value)
+        return True if held else None
+
+    def of_bucket(self, summary: Summary) -> Verdict:
+        """From the extremes."""
+        if summary.min is None or summary.max is None:
+            return "none"
+        ends = {self.threshold.holds(summary.min), self.threshold.holds(summary.max)}
+        if ends == {False}:
+            return "none"
+        return "all" if ends == {True} and summary.present == summary.rows else "some"
+
+
+class Silent:
+    """Without a value."""
+
+    lasting = False
+
+    def of_row(self, value: Value) -> Value:
+        """True or None."""
+        return True if value is None else None
+
+    def of_bucket(self, summary: Summary) -> Verdict:
+        """From the counts."""
+        if summary.present == summary.rows:
+            return "none"
+        return "some" if summary.present else "all"
+
+
+class Flat:
+    """Exactly the same number as before."""
+
+    lasting = True
+
+    def of_row(self, value: Value) -> Value:
+        """The number."""
+        return value
+
+    def of_bucket(self, summary: Summary) -> Verdict:
+        """From the extremes; where it changed, its ends may still be flat."""
+        same = summary.min is not None and summary.min == summary.max
+        return "all" if same and summary.present == summary.rows else "some"
+
+
+def spans_in_rows(
+    times: Sequence[float], values: Sequence[Value], condition: Condition
+) -> Iterator[Span]:
+    """The spans in rows that were read."""
+    start = 0
+    for key, group in groupby(values, condition.of_row):
+        end = start + len(list(group))
+        ends = (start == 0, end == len(values))
+        alone = end - start == 1 and not any(ends)  # else the row before or after may be the same
+        if key is not None and not (condition.lasting and alone):
+            _, held = usable_numbers(times[start:end], values[start:end])
+            low, high = min(held, default=None), max(held, default=None)
+            yield Span(times[start], times[end - 1], key, low, high, *ends)
+        start = end
+
+
+def spans_in_pieces(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signal: Signal,
+    pieces: Pieces,
+    condition: Condition,
+    deadline: Deadline,
+) -> Iterator[list[Span]]:
+    """The spans in a long segment, bucket by bucket; one in between is read until the deadline.
+
+    Flat buckets are looked for whole; of the others only those next to one are read.
+    """
+    buckets = pieces.of(signal.name)
+    verdicts = [condition.of_bucket(summary) for _, summary in buckets]
+    for index, (bucket, summary) in enumerate(buckets):
+        near_whole = "all" in verdicts[max(0, index - 1) : index + 2]
+        part = _bucket_of(segment, bucket)
+        if verdicts[index] == "all":
+            yield [_whole(part, summary, condition)]
+        elif verdicts[index] == "some" and (near_whole or not isinstance(condition, Flat)):
+            columns = read_columns(connection, part, [signal], deadline)
+            yield list(spans_in_rows(columns.times, columns.values[signal.name], condition))
+        else:
+            yield []
+
+
+def _whole(part: Segment, summary: Summary, condition: Condition) -> Span:
+    """Of a bucket in all rows of which it held; without a value, rows are known by bucket only."""
+    first_s, last_s = summary.first_sim_time_s, summary.last_sim_time_s
+    start_s = part.start_s if first_s is None else first_s
+    end_s = part.end_s if last_s is None else last_s
+    key = condition.of_row(summary.last)
+    return Span(start_s, end_s, key, summary.min, summary.max, from_first=True, to_last=True)
+
+
+def _bucket_of(segment: Segment, bucket: int) -> Segment:
+    start_s = max(segment.start_s, bucket * BUCKET_S)
+    return replace(segment, start_s=start_s, end_s=min(segment.end_s, (bucket + 1) * BUCKET_S))
+
+
+def joined(pieces: Iterable[Sequence[Span]]) -> list[Span]:
+    """The spans of pieces whose rows follow each other: what goes on across a border is one."""
+    found: list[Span] = []
+    goes_on = False
+    for spans in pieces:
+        more = list(spans)
+        if goes_on and more and more[0].from_first and more[0].key == found[-1].key:
+            more[0] = _as_one(found.pop(), more[0])
+        found += more
+        goes_on = bool(more) and more[-1].to_last
+    return found
+
+
+def _as_one(before: Span, after: Span) -> Span:
+    lows = [each for each in (before.low, after.low) if each is not None]
+    highs = [each for each in (before.high, after.high) if each is not None]
+    low, high = min(lows, default=None), max(highs, default=None)
+    return replace(before, end_s=after.end_s, low=low, high=high, to_last=after.to_last)

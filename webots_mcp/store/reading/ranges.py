@@ -1,0 +1,232 @@
+"""The one place where time ranges are defined.
+
+A range is half-open, [start, end), and given in one of three ways:
+
+- in simulation seconds of one run (`start_s`, `end_s`; either may be left out, then the range
+  reaches to the run's first row, or up to and with its newest),
+- in seconds back from a run's newest row (`last_s`; that row is in),
+- in wall time (`since`, `until`: ISO 8601 or Unix seconds), across the runs of a robot.
+
+Without `run_id` the run is the robot's newest. Simulation time begins again in each run, so a
+range over several runs is one segment per run.
+"""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from webots_mcp.errors import InvalidRangeError, NothingRecordedError
+from webots_mcp.store.reading.coverage import coverage_notes, purge_notes
+from webots_mcp.store.reading.subject import Subject, find_subject
+from webots_mcp.store.reading.wall_time import parse_wall_time, simulation_times
+
+_PURGED: Final = (
+    "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0 "
+    "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = run.id)"
+)
+_FIRST: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
+_NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"
+_RUNS_IN: Final = (
+    "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s < ? "
+    "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) "
+    "AND (? IS NULL OR id = ?) ORDER BY id DESC LIMIT ?"
+)
+MOST_RUNS: Final = 50  # that one range in wall time may hold
+
+
+@dataclass(frozen=True)
+class Segment:
+    """The part of a range that lies in one run: [start_s, end_s) of simulation time.
+
+    The limits in wall time matter where simulation time stood still (a paused simulation).
+
+    Attributes:
+        open_start: The start is that of the first row: what was stored before it (the begin of
+            the run, a log line) is in the range as well.
+        open_end: The same at the newest row: a last log line, the end of the run.
+    """
+
+    run_id: int
+    start_s: float
+    end_s: float
+    wall_start_s: float = -math.inf
+    wall_end_s: float = math.inf
+    open_start: bool = False
+    open_end: bool = False
+
+    @property
+    def holds_from_s(self) -> float:
+        """Where the range begins for what is not a state row."""
+        return -math.inf if self.open_start else self.start_s
+
+    @property
+    def holds_to_s(self) -> float:
+        """Where the range ends for what is not a state row."""
+        return math.inf if self.open_end else self.end_s
+
+
+@dataclass(frozen=True)
+class TimeRange:
+    """A range that was found in the recording.
+
+    Attributes:
+        segments: One per run, in the order of the runs.
+        notes: What the asker should know: where the range reaches outside the recording, or into
+            what was purged or never recorded.
+    """
+
+    robot_id: int
+    robot: str
+    segments: tuple[Segment, ...]
+    clock: Literal["simulation", "wall"]
+    notes: tuple[str, ...] = ()
+
+
+def resolve_range(
+    connection: sqlite3.Connection,
+    *,
+    robot: str | None = None,
+    run_id: int | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
+    last_s: float | None = None,
+    since: float | str | None = None,
+    until: float | str | None = None,
+) -> TimeRange:
+    """Find what a range means in the recording.
+
+    Raises:
+        InvalidRangeError: Reversed, empty, not finite, or given in two ways at once.
+        UnknownRobotError, AmbiguousRobotError, UnknownRunError: As they say.
+        NothingRecordedError: The run has no state row yet.
+    """
+    _reject_contradictions(start_s, end_s, last_s, since, until)
+    if since is None and until is None:
+        subject = find_subject(connection, robot, run_id)
+        return _in_simulation_time(connection, subject, start_s, end_s, last_s)
+    walls = (parse_wall_time(since, -math.inf), parse_wall_time(until, math.inf))
+    _require_order(*walls, "since", "until")
+    subject = find_subject(connection, robot, run_id)
+    return _in_wall_time(connection, subject, run_id, *walls)
+
+
+def _reject_contradictions(
+    start_s: float | None,
+    end_s: float | None,
+    last_s: float | None,
+    since: float | str | None,
+    until: float | str | None,
+) -> None:
+    simulation = start_s is not None or end_s is not None
+    wall = since is not None or until is not None
+    if simulation + wall + (last_s is not None) > 1:
+        raise InvalidRangeError(
+            "the range is given in two ways: use start_s and end_s (simulation time), or last_s, "
+            "or since and until (wall time)"
+        )
+    if last_s is not None and not 0 < last_s < math.inf:
+        raise InvalidRangeError(f"last_s={last_s} must be a number of seconds above 0")
+    for name, value in (("start_s", start_s), ("end_s", end_s)):
+        if value is not None and not math.isfinite(value):
+            raise InvalidRangeError(f"{name}={value} must be a finite number of seconds")
+
+
+def _require_order(start_s: float, end_s: float, start_name: str, end_name: str) -> None:
+    if start_s >= end_s:
+        what = "empty" if start_s == end_s else "reversed"
+        raise InvalidRangeError(
+            f"the range is {what}: {start_name}={start_s:.13g} must be less than "
+            f"{end_name}={end_s:.13g}"
+        )
+
+
+def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
+    """Simulation times between which a run recorded; None if it has no row.
+
+    Rows that retention deleted count: their rollups are still there.
+    """
+    rows = _row_bounds(connection, run_id)
+    purged = connection.execute(_PURGED, (run_id,)).fetchone()
+    if purged is None:
+        return rows
+    return purged[0], rows[1] if rows else purged[1]
+
+
+def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
+    """Simulation times of a run's first and newest row; None without any."""
+    first = connection.execute(_FIRST, (run_id,)).fetchone()[0]
+    return None if first is None else (first, connection.execute(_NEWEST, (run_id,)).fetchone()[0])
+
+
+def just_after(time_s: float) -> float:
+    """The end of a half-open range that holds `time_s` as its last moment."""
+    return math.nextafter(time_s, math.inf)
+
+
+def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
+    """All rows of a run; None without any."""
+    bounds = recorded_bounds(connection, run_id)
+    if bounds is None:
+        return None
+    return Segment(run_id, bounds[0], just_after(bounds[1]), open_start=True, open_end=True)
+
+
+def _in_simulation_time(
+    connection: sqlite3.Connection,
+    subject: Subject,
+    start_s: float | None,
+    end_s: float | None,
+    last_s: float | None,
+) -> TimeRange:
+    run_id = subject.run_id
+    bounds = recorded_bounds(connection, run_id)
+    if bounds is None:
+        raise NothingRecordedError(
+            f"run {run_id} of robot {subject.robot!r} has no state row yet: its controller has "
+            "not published, or not often enough to be recorded"
+        )
+    first_s, newest_s = bounds
+    if last_s is not None:
+        start_s = newest_s - last_s
+    start = first_s if start_s is None else start_s
+    # An end that is left out holds the newest row, also where the start lies beyond it.
+    end = just_after(max(newest_s, start)) if end_s is None else end_s
+    _require_order(start, end, "start_s", "end_s")
+    segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
+    notes = tuple(coverage_notes(connection, run_id, (start, end), bounds))
+    return TimeRange(subject.robot_id, subject.robot, (segment,), "simulation", notes)
+
+
+def _in_wall_time(
+    connection: sqlite3.Connection,
+    subject: Subject,
+    run_id: int | None,
+    wall_start_s: float,
+    wall_end_s: float,
+) -> TimeRange:
+    wanted = (subject.robot_id, wall_end_s, wall_start_s, run_id, run_id, MOST_RUNS + 1)
+    runs = [run for (run,) in connection.execute(_RUNS_IN, wanted).fetchall()]
+    cuts = (_cut(connection, run, wall_start_s, wall_end_s) for run in reversed(runs[:MOST_RUNS]))
+    segments = tuple(segment for segment in cuts if segment is not None)
+    notes = [] if segments else [f"no row of robot {subject.robot!r} in that wall time"]
+    for segment in segments:
+        notes += purge_notes(connection, segment.run_id, segment.start_s)
+    if len(runs) > MOST_RUNS:
+        notes.append(f"only the newest {MOST_RUNS} runs in that wall time are looked at")
+    return TimeRange(subject.robot_id, subject.robot, segments, "wall", tuple(notes))
+
+
+def _cut(
+    connection: sqlite3.Connection, run_id: int, wall_start_s: float, wall_end_s: float
+) -> Segment | None:
+    """The part of a run in [wall_start_s, wall_end_s)."""
+    recorded = recorded_bounds(connection, run_id)
+    walls = (wall_start_s, wall_end_s)
+    found = simulation_times(connection, run_id, recorded, walls) if recorded else None
+    if found is None:
+        return None
+    start_s, last_s = found
+    return Segment(run_id, start_s, just_after(last_s), *walls, open_start=True, open_end=True)

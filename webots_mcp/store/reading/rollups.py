@@ -1,0 +1,139 @@
+"""Any stretch of a run in pieces of 10 s: rollups where they are complete, rows at the edges.
+
+However long the stretch, counts and extremes are exact: the rollups give the whole buckets inside,
+the state rows what is cut off at both ends, and what came after the watermark.
+"""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import groupby
+from typing import Final
+
+from webots_mcp.store.analysis.summary import Summary, merge, summarise
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.gaps import rows_by_bucket
+from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.rows import Columns, read_columns
+from webots_mcp.store.rollup.rolling import BUCKET_S, bucket_of, buckets, watermark
+from webots_mcp.store.signals.registry import Signal
+
+# By ids, from the watermark on: the + keeps SQLite from sorting all rows of the run instead.
+_FIRST_AFTER: Final = (
+    "SELECT sim_time_s FROM state WHERE id > ? AND +run_id = ? ORDER BY id LIMIT 1"
+)
+# Time stood still right at the start, partly before it in wall time.
+_STOOD_BEFORE: Final = (
+    "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s = ? AND wall_time_s < ?)"
+)
+# Without any, the last bucket of the run was purged: of it the rollup is all there is.
+_ROWS_FROM: Final = "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ?)"
+
+
+class Pieces:
+    """A stretch of a run in buckets of 10 s; parts of a bucket are added in order of time.
+
+    Attributes:
+        cut_at_s: Where the deadline stopped the reading of rows; None if it did not.
+    """
+
+    def __init__(self, signals: Sequence[Signal]) -> None:
+        self.cut_at_s: float | None = None
+        self._signals = signals
+        self._parts: dict[str, defaultdict[int, list[Summary]]] = {
+            signal.name: defaultdict(list) for signal in signals
+        }
+
+    def add_rows(self, columns: Columns) -> None:
+        """Add state rows."""
+        if columns.cut:
+            self.cut_at_s = columns.times[-1] if columns.times else math.inf
+        start = 0
+        for bucket, times in groupby(columns.times, bucket_of):
+            end = start + len(list(times))
+            for signal in self._signals:
+                values = columns.values[signal.name][start:end]
+                summary = summarise(columns.times[start:end], values, angle=signal.kind == "angle")
+                self._parts[signal.name][bucket].append(summary)
+            start = end
+
+    def add_rollups(
+        self, connection: sqlite3.Connection, run_id: int, span: range, deadline: Deadline
+    ) -> None:
+        """Add the stored rollups of those buckets, signal by signal until the deadline.
+
+        As with rows, all count: also those that do not hold the signal.
+        """
+        rows = rows_by_bucket(connection, run_id, span)
+        for signal in self._signals:
+            if signal.id is None:
+                continue
+            if deadline.passed:
+                self.cut_at_s = span.start * BUCKET_S
+                return
+            parts = self._parts[signal.name]
+            missing = dict(rows)
+            for bucket, summary in buckets(connection, run_id, signal.id, span.start, span.stop):
+                whole = max(summary.rows, missing.pop(bucket, 0))
+                counted = summary if whole == summary.rows else summary._replace(rows=whole)
+                parts[bucket].append(counted)
+            for bucket, lacking in missing.items():
+                parts[bucket].append(Summary(lacking))
+
+    def of(self, name: str) -> list[tuple[int, Summary]]:
+        """The buckets of a signal that have rows, in order."""
+        return [(bucket, merge(parts)) for bucket, parts in sorted(self._parts[name].items())]
+
+    def whole(self, name: str) -> Summary:
+        """The summary of the whole stretch."""
+        parts = [summary for _, summary in self.of(name)]
+        return merge(parts) if parts else Summary()
+
+
+def read_pieces(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+) -> Pieces:
+    """Read a stretch of any length; only rows that are not in a whole rollup are looked at."""
+    pieces = Pieces(signals)
+    span = _whole_buckets(connection, segment)
+    if not span:
+        pieces.add_rows(read_columns(connection, segment, signals, deadline))
+        return pieces
+    start_s, end_s = span.start * BUCKET_S, span.stop * BUCKET_S
+    head, foot = replace(segment, end_s=start_s), replace(segment, start_s=end_s)
+    middle = replace(segment, start_s=start_s, end_s=end_s)
+    mark = watermark(connection, segment.run_id)
+    pieces.add_rows(read_columns(connection, head, signals, deadline))
+    pieces.add_rollups(connection, segment.run_id, span, deadline)
+    if (late := rows_after(connection, middle, mark)) is not None:
+        pieces.add_rows(read_columns(connection, late, signals, deadline, after_id=mark))
+    pieces.add_rows(read_columns(connection, foot, signals, deadline))
+    return pieces
+
+
+def rows_after(connection: sqlite3.Connection, segment: Segment, mark: int) -> Segment | None:
+    """The part of a segment whose rows have ids above the watermark; None without any."""
+    first = connection.execute(_FIRST_AFTER, (mark, segment.run_id)).fetchone()
+    if first is None or first[0] >= segment.end_s:
+        return None
+    return replace(segment, start_s=max(segment.start_s, first[0]))
+
+
+def _whole_buckets(connection: sqlite3.Connection, segment: Segment) -> range:
+    """The buckets that lie wholly inside."""
+    first = math.ceil(segment.start_s / BUCKET_S)
+    if first == bucket_of(segment.start_s):
+        start = (segment.run_id, segment.start_s, segment.wall_start_s)
+        first += connection.execute(_STOOD_BEFORE, start).fetchone()[0]
+    end = bucket_of(segment.end_s)
+    if segment.open_end:
+        rows_left = connection.execute(_ROWS_FROM, (segment.run_id, end * BUCKET_S)).fetchone()[0]
+        end += not rows_left
+    return range(first, end)

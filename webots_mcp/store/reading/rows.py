@@ -1,0 +1,186 @@
+"""Reading state rows as columns: one list of times, and one list of values per signal."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.rollup.batch import is_odd, odd_names
+from webots_mcp.store.signals.flatten import Value, flatten, parse, reduce_text, shown
+from webots_mcp.store.signals.registry import Signal
+
+RAW_ROWS: Final = 30_000  # 2 to 3 us each: what a question may read without rollups
+MAX_EXTRACTED: Final = 100  # beyond, decoding the whole row in Python is not slower
+
+_IN_SEGMENT: Final = (
+    "FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
+    "AND wall_time_s >= ? AND wall_time_s < ? AND id > ?"
+)
+_FEWER_THAN: Final = (
+    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? "
+    "AND sim_time_s < ? LIMIT ?)"
+)
+_PURGED_IN: Final = (  # before the first row that is left
+    "SELECT 1 FROM run WHERE id = ? AND purged_rows > 0 AND ? < coalesce("
+    "(SELECT min(sim_time_s) FROM state WHERE run_id = run.id), last_sim_time_s)"
+)
+_CHUNK_ROWS: Final = 2000
+
+
+@dataclass
+class Columns:
+    """State rows of one run, in order.
+
+    Attributes:
+        values: Per signal one value per row; None where the row has none.
+        odd: Per signal, how often each value that JSON cannot hold ("nan", "inf") stood there.
+        cut: The deadline passed; the rows after the last one were not read.
+    """
+
+    run_id: int
+    ids: list[int] = field(default_factory=list[int])
+    times: list[float] = field(default_factory=list[float])
+    walls: list[float] = field(default_factory=list[float])
+    values: dict[str, list[Value]] = field(default_factory=dict[str, list[Value]])
+    odd: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])
+    cut: bool = False
+
+
+def exceeds(connection: sqlite3.Connection, segment: Segment) -> bool:
+    """Whether a segment has more than 30,000 rows, or rows of which only rollups are left.
+
+    Looks at no more index entries than that.
+    """
+    bounds = (segment.run_id, segment.start_s, segment.end_s, RAW_ROWS + 1)
+    if connection.execute(_FEWER_THAN, bounds).fetchone()[0] > RAW_ROWS:
+        return True
+    return connection.execute(_PURGED_IN, (segment.run_id, segment.start_s)).fetchone() is not None
+
+
+def read_columns(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+    *,
+    after_id: int = 0,
+    limit: int = -1,
+) -> Columns:
+    """Read the rows of a segment, in order, until the deadline.
+
+    Args:
+        connection: Any.
+        segment: Which rows.
+        signals: Which values of them; none for times only.
+        deadline: After it no further rows are read, and the answer says that it was cut.
+        after_id: Only rows with greater ids: those after the watermark, or after a page.
+        limit: At most so many rows; -1 for all.
+    """
+    columns = Columns(segment.run_id, values={signal.name: [] for signal in signals})
+    decode = len(signals) > MAX_EXTRACTED or any(signal.decoded for signal in signals)
+    read = _read_decoded if decode else _read_extracted
+    bounds = (segment.run_id, segment.start_s, segment.end_s)
+    parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id, limit)
+    try:
+        with deadline.interrupting(connection):
+            read(connection, signals, parameters, columns, deadline)
+    except sqlite3.OperationalError:
+        if not deadline.passed:
+            raise
+        columns.cut = True
+    for signal in signals:
+        columns.values[signal.name] = cleaned(signal, columns.values[signal.name])
+    return columns
+
+
+def _read_extracted(
+    connection: sqlite3.Connection,
+    signals: Sequence[Signal],
+    parameters: tuple[object, ...],
+    columns: Columns,
+    deadline: Deadline,
+) -> None:
+    """Each path is extracted once; of a long array SQLite gives the text."""
+    paths = tuple(dict.fromkeys(signal.path for signal in signals))
+    extracts = ", json_extract(data, ?)" * len(paths)
+    query = f"SELECT id, sim_time_s, wall_time_s, odd{extracts} {_IN_SEGMENT}"
+    for chunk in _chunks(connection, query, (*paths, *parameters), columns, deadline):
+        read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
+        _extend(columns, read[:3])
+        by_path = dict(zip(paths, read[4:], strict=True))
+        reduced = {
+            path: [reduce_text(text) for text in by_path[path]]
+            for path in {signal.path for signal in signals if signal.reduce}
+        }
+        for signal in signals:
+            if signal.reduce is None:
+                columns.values[signal.name].extend(by_path[signal.path])
+            else:
+                rows = reduced[signal.path]
+                columns.values[signal.name].extend([row.get(signal.reduce) for row in rows])
+        _count_odd(columns, signals, read[3])
+
+
+def _read_decoded(
+    connection: sqlite3.Connection,
+    signals: Sequence[Signal],
+    parameters: tuple[object, ...],
+    columns: Columns,
+    deadline: Deadline,
+) -> None:
+    query = f"SELECT id, sim_time_s, wall_time_s, odd, data {_IN_SEGMENT}"
+    for chunk in _chunks(connection, query, parameters, columns, deadline):
+        read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
+        leaves = [flatten(parse(data)) for data in read[4]]
+        _extend(columns, read[:3])
+        for signal in signals:
+            name = signal.name
+            columns.values[name].extend([row.get(name) for row in leaves])
+        _count_odd(columns, signals, read[3])
+
+
+def _chunks(
+    connection: sqlite3.Connection,
+    query: str,
+    parameters: tuple[object, ...],
+    columns: Columns,
+    deadline: Deadline,
+) -> Iterator[list[Any]]:
+    cursor = connection.execute(f"{query} ORDER BY sim_time_s, id LIMIT ?", parameters)
+    while chunk := cursor.fetchmany(_CHUNK_ROWS):
+        yield chunk
+        if deadline.passed and len(chunk) == _CHUNK_ROWS:
+            columns.cut = True
+            return
+
+
+def _extend(columns: Columns, heads: Sequence[tuple[Any, ...]]) -> None:
+    for column, read in zip((columns.ids, columns.times, columns.walls), heads, strict=True):
+        column.extend(read)
+
+
+def _count_odd(columns: Columns, signals: Sequence[Signal], odds: Sequence[str | None]) -> None:
+    """Count what was odd in the newest rows, whose values are there."""
+    if not any(odds):
+        return
+    for row, odd in enumerate(odds, len(columns.ids) - len(odds)):
+        reasons = odd_names(odd)
+        for name in [signal.name for signal in signals if signal.name in reasons]:
+            if is_odd(reasons, name, columns.values[name][row]):
+                columns.odd.setdefault(name, Counter())[reasons[name]] += 1
+
+
+def cleaned(signal: Signal, values: list[Value]) -> list[Value]:
+    """Every value of the type that the signal's kind promises; the same from SQL and Python."""
+    if signal.kind == "text":
+        return [shown(value) for value in values]
+    if signal.kind == "bool":
+        return [None if value is None else value in (1, True) for value in values]
+    if str in set(map(type, values)):
+        return [None if isinstance(value, str) else value for value in values]
+    return values

@@ -1,0 +1,71 @@
+"""Some rows of a long segment: one every so often, or the newest."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.rows import RAW_ROWS, Columns, cleaned
+from webots_mcp.store.signals.registry import Signal
+
+MOST_SAMPLES: Final = 60_000  # about 12 us each
+
+_TICKS: Final = (
+    "WITH RECURSIVE tick(t) AS (SELECT ? UNION ALL SELECT t + ? FROM tick WHERE t < ?) "
+    "SELECT s.id, s.sim_time_s, s.wall_time_s{extracts} FROM tick "
+    "JOIN state s ON s.id = (SELECT id FROM state WHERE run_id = ? AND sim_time_s >= t "
+    "AND sim_time_s < ? ORDER BY sim_time_s, id LIMIT 1)"
+)
+_NTH_NEWEST: Final = (
+    "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s < ? "
+    "ORDER BY sim_time_s DESC LIMIT 1 OFFSET ?"
+)
+
+
+def read_sampled(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    every_s: float,
+    deadline: Deadline,
+) -> Columns:
+    """The first row at or after every `every_s` seconds; fewer if the deadline passes.
+
+    Args:
+        connection: Any.
+        segment: Of any length.
+        signals: Plain ones (`Signal.is_plain`).
+        every_s: Simulated seconds.
+        deadline: After it no further rows are read.
+    """
+    query = _TICKS.format(extracts=", json_extract(s.data, ?)" * len(signals))
+    ticks = (segment.start_s, every_s, segment.end_s - every_s)
+    paths = tuple(signal.path for signal in signals)
+    rows: list[tuple[object, ...]] = []
+    columns = Columns(segment.run_id)
+    try:
+        with deadline.interrupting(connection):
+            parameters = (*ticks, *paths, segment.run_id, segment.end_s)
+            rows.extend(connection.execute(query, parameters))
+    except sqlite3.OperationalError:
+        if not deadline.passed:
+            raise
+        columns.cut = True
+    distinct = list({row[0]: row for row in rows}.values())  # a gap gives one row several times
+    read = list(zip(*distinct, strict=True)) or [()] * (3 + len(signals))
+    columns.ids, columns.times, columns.walls = (list(column) for column in read[:3])
+    for signal, column in zip(signals, read[3:], strict=True):
+        columns.values[signal.name] = cleaned(signal, list(column))
+    return columns
+
+
+def newest_part(connection: sqlite3.Connection, segment: Segment, rows: int = RAW_ROWS) -> Segment:
+    """The part of a segment that holds its newest rows, at most so many."""
+    found = connection.execute(_NTH_NEWEST, (segment.run_id, segment.end_s, rows)).fetchone()
+    if found is None or found[0] < segment.start_s:
+        return segment
+    return replace(segment, start_s=found[0])

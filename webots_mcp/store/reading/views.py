@@ -1,0 +1,274 @@
+"""How detectors see a segment: all of its rows, or, if it is long, rollups and the rows they name.
+
+Both views answer the same questions, so that a detector is written once.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import sqlite3
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final, Protocol
+
+from webots_mcp.store.analysis.summary import Summary, summarise, usable_numbers
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.gaps import GAP_INTERVALS, rhythm_of
+from webots_mcp.store.reading.intervals import (
+    Condition,
+    Span,
+    joined,
+    spans_in_pieces,
+    spans_in_rows,
+)
+from webots_mcp.store.reading.ranges import Segment, just_after
+from webots_mcp.store.reading.rollups import read_pieces, rows_after
+from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
+from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
+from webots_mcp.store.rollup.rolling import BUCKET_S, bucket_of, watermark
+from webots_mcp.store.rollup.tables import both
+from webots_mcp.store.signals.registry import Signal
+
+JUMP_BUCKETS: Final = 3  # of each signal of a long segment that are read
+JUMP_RANGE: Final = 3.0  # times the usual range of a bucket: there may be a jump in it
+SAMPLES_PER_STAY: Final = 5
+SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
+LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
+
+_OF_SIGNAL: Final = (
+    "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
+)
+_COUNTS_OF_EACH: Final = both(
+    "signal_id, sum(rows) AS rows, sum(present) AS present, sum(changes) AS changes",
+    "run_id = :run AND bucket >= :first AND bucket < :end GROUP BY signal_id",
+)
+_COUNTS: Final = (
+    "SELECT signal_id, sum(rows), sum(present), sum(changes) "
+    f"FROM {_COUNTS_OF_EACH} GROUP BY signal_id"
+)
+_USUAL_RANGE: Final = f"SELECT avg(max - min) {_OF_SIGNAL}"
+_WIDEST: Final = (  # also at its border with the bucket before
+    "SELECT bucket, max(max - min, abs(first - lag(last, 1, first) OVER (ORDER BY bucket))) "
+    f"{_OF_SIGNAL} AND first IS NOT NULL ORDER BY 2 DESC LIMIT ?"
+)
+_RESTS: Final = f"SELECT EXISTS (SELECT 1 {_OF_SIGNAL} AND min = max AND present = rows)"
+
+
+@dataclass(frozen=True)
+class Course:
+    """Numbers of a signal in which jumps are looked for.
+
+    Attributes:
+        usual_steps: Sizes of steps to compare with; empty for those of the numbers themselves.
+    """
+
+    times: Sequence[float]
+    numbers: Sequence[float]
+    usual_steps: Sequence[float] = ()
+
+
+class View(Protocol):
+    """What a detector may ask."""
+
+    notes: list[str]
+    shortest_rest_s: float  # a shorter one may be missed
+
+    def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
+        """Rows close enough to see a stay of that length."""
+        ...
+
+    def summary(self, signal: Signal) -> Summary:
+        """Of the whole segment."""
+        ...
+
+    def spans(self, signal: Signal, condition: Condition) -> list[Span]:
+        """Where the condition holds in every row; across a recording gap it is taken to go on."""
+        ...
+
+    def courses(self, signal: Signal) -> Iterator[Course]:
+        """Where a jump may be."""
+        ...
+
+    def newest(self, signals: Sequence[Signal]) -> Columns:
+        """Rows one after the other: all, or the newest."""
+        ...
+
+
+def view_of(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+) -> View:
+    """The view that suits the length of the segment."""
+    if exceeds(connection, segment):
+        return LongView(connection, segment, signals, deadline)
+    return RowView(read_columns(connection, segment, signals, deadline))
+
+
+class RowView:
+    """All rows of a segment."""
+
+    shortest_rest_s = 0.0
+
+    def __init__(self, columns: Columns) -> None:
+        self.notes: list[str] = []
+        if columns.cut:
+            reached_s = columns.times[-1] if columns.times else 0.0
+            self.notes.append(f"the time was over: searched up to {reached_s:g} s only")
+        self._columns = columns
+
+    def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
+        """All rows."""
+        return self._columns
+
+    def summary(self, signal: Signal) -> Summary:
+        """Of all rows."""
+        return summarise(self._columns.times, self._columns.values[signal.name])
+
+    def spans(self, signal: Signal, condition: Condition) -> list[Span]:
+        """From all rows."""
+        values = self._columns.values[signal.name]
+        return list(spans_in_rows(self._columns.times, values, condition))
+
+    def courses(self, signal: Signal) -> Iterator[Course]:
+        """All of it."""
+        yield Course(*usable_numbers(self._columns.times, self._columns.values[signal.name]))
+
+    def newest(self, signals: Sequence[Signal]) -> Columns:
+        """All rows."""
+        return self._columns
+
+
+class LongView:
+    """The rollups of a long segment, and what has to be read besides."""
+
+    shortest_rest_s = 2 * BUCKET_S  # a shorter one need not fill a bucket
+
+    def __init__(
+        self,
+        connection: sqlite3.Connection,
+        segment: Segment,
+        signals: Sequence[Signal],
+        deadline: Deadline,
+    ) -> None:
+        self.notes: list[str] = []
+        self._connection = connection
+        self._segment = segment
+        self._deadline = deadline
+        self._signals = [signal for signal in signals if signal.is_number]
+        self._span = (segment.run_id, bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
+        late = rows_after(connection, segment, watermark(connection, segment.run_id))
+        if late is not None and segment.end_s - late.start_s > LATE_S:
+            since = f"rows from {late.start_s:g} s on are not rolled up yet"
+            self.notes.append(f"{since}: not searched for silent, flat and jumps")
+
+    def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
+        """A row every fifth of the stay; fewer where that would be too many."""
+        span_s = self._segment.end_s - self._segment.start_s
+        every_s = max(stay_s / SAMPLES_PER_STAY, span_s / MOST_SAMPLES)
+        if every_s > stay_s / 2:
+            self.notes.append(f"stuck for less than {2 * every_s:.3g} s may be missed")
+        plain = [signal for signal in signals if signal.is_plain]
+        found = read_sampled(self._connection, self._segment, plain, every_s, self._deadline)
+        self._add_newest(found, plain, every_s)
+        if found.cut:
+            reached_s = found.times[-1] if found.times else self._segment.start_s
+            self.notes.append(f"the time was over: stuck was searched up to {reached_s:g} s only")
+        return found
+
+    def summary(self, signal: Signal) -> Summary:
+        """Counts from the rollups."""
+        return self._totals.get(signal.id or 0, Summary())
+
+    def spans(self, signal: Signal, condition: Condition) -> list[Span]:
+        """From rollups, and rows where they leave it open."""
+        if condition.lasting and not self._rests(signal):
+            return []
+        if self._deadline.passed:
+            self._cut()
+            return []
+        pieces = read_pieces(self._connection, self._segment, [signal], self._deadline)
+        found = spans_in_pieces(
+            self._connection, self._segment, signal, pieces, condition, self._deadline
+        )
+        spans = joined(found)
+        if self._deadline.passed:
+            self._cut()
+        return spans
+
+    def courses(self, signal: Signal) -> Iterator[Course]:
+        """The few buckets whose range is unusual, each with the rows just before and after it."""
+        values = (self._span[0], signal.id, *self._span[1:])
+        usual = self._connection.execute(_USUAL_RANGE, values).fetchone()[0] or 0.0
+        for bucket, size in self._connection.execute(_WIDEST, (*values, JUMP_BUCKETS)).fetchall():
+            if self._deadline.passed:
+                self._cut()
+            elif size > JUMP_RANGE * usual > 0:
+                yield Course(*self._numbers(signal, bucket), self._usual_steps(signal))
+
+    def newest(self, signals: Sequence[Signal]) -> Columns:
+        """The newest rows."""
+        part = newest_part(self._connection, self._segment)
+        columns = read_columns(self._connection, part, signals, self._deadline)
+        if columns.times and columns.times[0] > self._segment.start_s:
+            since = f"from {columns.times[0]:g} s on only"
+            self.notes.append(f"oscillation and jumps of the position were searched {since}")
+        if columns.cut:
+            self._cut()
+        return columns
+
+    @functools.cached_property
+    def _totals(self) -> dict[int, Summary]:
+        """Rows count also where they lack the signal: as many as of the one that is in most."""
+        span: dict[str, int] = dict(zip(("run", "first", "end"), self._span, strict=True))
+        found = self._connection.execute(_COUNTS, span).fetchall()
+        rows = max((counted for _, counted, *_ in found), default=0)
+        return {signal_id: Summary(rows, *counts) for signal_id, _, *counts in found}
+
+    @functools.cached_property
+    def _sample(self) -> Columns:
+        part = newest_part(self._connection, self._segment, SAMPLE_ROWS)
+        return read_columns(self._connection, part, self._signals, self._deadline)
+
+    @functools.cached_property
+    def _join_s(self) -> float:
+        return _join_s(self._sample.times)
+
+    def _rests(self, signal: Signal) -> bool:
+        values = (self._span[0], signal.id, *self._span[1:])
+        return bool(self._connection.execute(_RESTS, values).fetchone()[0])
+
+    def _add_newest(self, found: Columns, signals: Sequence[Signal], every_s: float) -> None:
+        """The rows after the last sample: who is stuck may be so up to the newest one."""
+        after_s = found.times[-1] if found.times and not found.cut else math.inf
+        part = replace(
+            self._segment, start_s=just_after(max(after_s, self._segment.end_s - 2 * every_s))
+        )
+        newest = read_columns(self._connection, part, signals, self._deadline)
+        found.ids += newest.ids
+        found.times += newest.times
+        found.walls += newest.walls
+        for signal in signals:
+            found.values[signal.name] += newest.values[signal.name]
+
+    def _cut(self) -> None:
+        self.notes.append("the time was over before all was searched: ask for less time or kinds")
+
+    def _numbers(self, signal: Signal, bucket: int) -> tuple[Sequence[float], Sequence[float]]:
+        start_s = max(self._segment.start_s, bucket * BUCKET_S - self._join_s)
+        end_s = min(self._segment.end_s, (bucket + 1) * BUCKET_S + self._join_s)
+        part = replace(self._segment, start_s=start_s, end_s=end_s)
+        columns = read_columns(self._connection, part, [signal], self._deadline)
+        return usable_numbers(columns.times, columns.values[signal.name])
+
+    def _usual_steps(self, signal: Signal) -> list[float]:
+        _, numbers = usable_numbers(self._sample.times, self._sample.values[signal.name])
+        return [abs(after - before) for before, after in pairwise(numbers)]
+
+
+def _join_s(times: Sequence[float]) -> float:
+    """Rows within this time of each other follow directly: there is no gap between them."""
+    return GAP_INTERVALS * (rhythm_of(times).interval_s or 0.0)

@@ -1,0 +1,216 @@
+"""Rollups: 10 s of simulation time of each signal of each run, kept beside the state rows.
+
+`roll` is the maintainer's work, never the control loop's. It also keeps the register of signals,
+and the change points of text and boolean signals. How far it came is told by two marks, the id of
+the last state row that is in: the watermark of all runs, and one of each run that is beyond it. Ids
+are given under the write lock, so a row never comes late.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from typing import Any, Final, NamedTuple
+
+from webots_mcp.store.analysis.summary import Summary, merge, summarise
+from webots_mcp.store.reading.rows import cleaned
+from webots_mcp.store.rollup.batch import Batch, BatchColumn
+from webots_mcp.store.rollup.tables import (
+    Addition,
+    Held,
+    forget,
+    held,
+    move,
+    run_mark,
+    store,
+)
+from webots_mcp.store.signals.flatten import shown
+from webots_mcp.store.signals.registry import Signal, count, enter_signals, seen_now
+
+__all__ = ["BUCKET_S", "Rolled", "bucket_of", "buckets", "forget", "roll", "watermark"]
+
+BUCKET_S: Final = 10.0
+BATCH_ROWS: Final = 2000
+
+_WATERMARK: Final = "SELECT state_id FROM watermark WHERE name = 'rollup'"
+_SET_WATERMARK: Final = (
+    "INSERT INTO watermark (name, state_id) VALUES ('rollup', ?) "
+    "ON CONFLICT (name) DO UPDATE SET state_id = max(state_id, excluded.state_id)"
+)
+_ROWS: Final = (
+    "SELECT s.id, r.robot_id, s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd "
+    "FROM state s JOIN run r ON r.id = s.run_id WHERE s.id > ? ORDER BY s.id LIMIT ?"
+)
+_BUCKETS: Final = (
+    f"SELECT bucket, {', '.join(Summary._fields)} FROM all_rollup "
+    "WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ? ORDER BY bucket"
+)
+_LAST_CHANGE: Final = (
+    "SELECT value FROM change WHERE run_id = ? AND signal_id = ? ORDER BY state_id DESC LIMIT 1"
+)
+# The rollups were emptied by hand, although rows are there that they once held.
+_EMPTIED: Final = (
+    "SELECT NOT EXISTS (SELECT 1 FROM rollup) "
+    "AND (SELECT sum(rows) FROM signal) > (SELECT total(rows) FROM recent_rollup) "
+    "AND EXISTS (SELECT 1 FROM state WHERE id <= (SELECT state_id FROM watermark))"
+)
+# What a row of foreign origin may hold: numbers, text and nesting that cannot be stored.
+_UNSTORABLE: Final = (OverflowError, ValueError, RecursionError, sqlite3.DataError)
+
+
+class Rolled(NamedTuple):
+    """What a call of `roll` did.
+
+    Attributes:
+        rows: State rows that it took in.
+        done: Whether it reached the newest row.
+    """
+
+    rows: int
+    done: bool
+
+
+def roll(connection: sqlite3.Connection, budget_rows: int = 2000, pause_s: float = 0.0) -> Rolled:
+    """Take in the state rows after the watermark, at most `budget_rows` of them.
+
+    Rows are read, parsed and summed up outside the write lock. What they come to is stored run by
+    run, each in one step of less than a millisecond that first looks whether the run's mark is
+    still where it was: of two callers one stores, the other finds nothing left to do. Rollups
+    emptied by hand begin at the first row again.
+
+    Args:
+        connection: Of a maintainer (the role "writer"), in autocommit mode.
+        budget_rows: Bounds the time of the call: about 50 us per row of 40 leaves.
+        pause_s: Between two steps, for others to write; 0 where nobody else does.
+
+    Raises:
+        sqlite3.Error: The database is locked or damaged; nothing of the step was stored.
+    """
+    if connection.execute(_EMPTIED).fetchone()[0]:
+        forget(connection)
+    taken, done = 0, False
+    while taken < budget_rows and not done:
+        rows = _roll_batch(connection, min(BATCH_ROWS, budget_rows - taken), pause_s)
+        done = rows is None
+        taken += rows or 0
+    move(connection, pause_s)
+    return Rolled(taken, done)
+
+
+def watermark(connection: sqlite3.Connection, run_id: int | None = None) -> int:
+    """The id of the last state row in the rollups, of a run or of all; 0 before the first."""
+    if run_id is not None:
+        return run_mark(connection, run_id) or 0
+    row = connection.execute(_WATERMARK).fetchone()
+    return int(row[0]) if row else 0
+
+
+def buckets(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, first: int, end: int
+) -> Iterator[tuple[int, Summary]]:
+    """The rollups of a signal in buckets [first, end), in order; empty ones are left out."""
+    rows = connection.execute(_BUCKETS, (run_id, signal_id, first, end))
+    return ((row[0], Summary._make(row[1:])) for row in rows)
+
+
+def _roll_batch(connection: sqlite3.Connection, limit: int, pause_s: float) -> int | None:
+    """The rows taken in: None if there are no more, 0 if another caller was faster.
+
+    A row that cannot be summed up costs only itself: it is looked for by halving, and left out.
+    """
+    rows = connection.execute(_ROWS, (watermark(connection), limit)).fetchall()
+    if not rows:
+        return None
+    try:
+        stored = _take_in(connection, rows, pause_s)
+    except _UNSTORABLE:
+        if len(rows) > 1:
+            return _roll_batch(connection, len(rows) // 2, pause_s)
+        stored = _take_in(connection, rows, pause_s, leave_out=True)
+    if stored:
+        connection.execute(_SET_WATERMARK, (rows[-1][0],))
+    return len(rows) if stored else 0
+
+
+def _take_in(
+    connection: sqlite3.Connection, rows: Sequence[Any], pause_s: float, *, leave_out: bool = False
+) -> bool:
+    """Whether all of them are in, run by run; the mark of a run tells which were before."""
+    robots = {row[2]: row[1] for row in rows}
+    for run_id, robot_id in robots.items():
+        mark = run_mark(connection, run_id)
+        if mark is None:
+            return False  # the run was deleted, and its rows with it
+        before = held(connection, run_id, mark)
+        fresh = [row for row in rows if row[2] == run_id and row[0] > mark]
+        addition = _sum_up(connection, before, robot_id, () if leave_out else fresh)
+        if fresh and not store(connection, before, addition, fresh[-1][0]):
+            return False
+        time.sleep(pause_s)
+    return True
+
+
+def _sum_up(
+    connection: sqlite3.Connection, before: Held, robot_id: int, rows: Sequence[Any]
+) -> Addition:
+    """What the rows of a run make of what is held of it; only names that are new are written."""
+    batch = Batch()
+    for row in rows:
+        batch.add(*row)
+    columns = list(batch.columns())
+    known = enter_signals(connection, robot_id, columns)
+    addition = Addition([], [], [])
+    for column in columns:
+        signal = seen_now(known.get(column.name), column)
+        if signal is None or signal.id is None:
+            continue  # beyond the number of signals that a robot may have
+        addition.counts.append(count(signal, column))
+        addition.rollups.extend(_rollups(connection, before, signal, column))
+        if signal.kind not in ("num", "angle"):  # null may yet become text
+            addition.changes.extend(_changes(connection, signal, column))
+    return addition
+
+
+def _rollups(
+    connection: sqlite3.Connection, before: Held, signal: Signal, column: BatchColumn
+) -> Iterator[tuple[Any, ...]]:
+    assert signal.id is not None
+    _, times, values = zip(*column.points, strict=True)
+    if signal.kind == "text":
+        values = cleaned(signal, list(values))
+    end = 0
+    while (start := end) < len(times):
+        bucket = bucket_of(times[start])
+        end = bisect_left(times, (bucket + 1) * BUCKET_S, start)
+        summary = summarise(times[start:end], values[start:end], angle=signal.kind == "angle")
+        known, is_over = before.find(connection, (bucket, signal.id))
+        if known is not None:
+            summary = merge([_of_kind(signal, known), summary])
+        yield (is_over, column.run_id, bucket, signal.id, *summary)
+
+
+def _of_kind(signal: Signal, before: Summary) -> Summary:
+    """What was summed up while it was still a number is text now."""
+    if signal.kind != "text" or before.sum is None:
+        return before
+    kept = ("rows", "present", "first_sim_time_s", "last_sim_time_s")
+    return Summary(**{name: getattr(before, name) for name in kept})
+
+
+def _changes(
+    connection: sqlite3.Connection, signal: Signal, column: BatchColumn
+) -> Iterator[tuple[Any, ...]]:
+    key = (column.run_id, signal.id)
+    last = connection.execute(_LAST_CHANGE, key).fetchone()
+    before: str | tuple[()] | None = last[0] if last else ()
+    for state_id, time_s, value in column.points:
+        if (text := shown(value)) != before:
+            yield (*key, state_id, time_s, text)
+            before = text
+
+
+def bucket_of(sim_time_s: float) -> int:
+    """The number of the bucket that holds that time."""
+    return int(sim_time_s // BUCKET_S)  # exact, which floor of a rounded quotient is not

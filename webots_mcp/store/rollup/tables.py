@@ -1,0 +1,195 @@
+"""The tables that hold rollups, and how they are written: in steps of about a millisecond.
+
+In `rollup` the buckets of a signal stand together, so that its whole history is read fast; one
+bucket of each signal is then a page to write for each. So the newest buckets of a run stand side by
+side in `recent_rollup`, and move when they are over. The view `all_rollup` shows both.
+
+What a step stores was computed before it, outside the write lock, from what stood there then. It
+stores only where nothing of that has changed since, so that two callers do not spoil each other's
+work.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Sequence
+from itertools import groupby
+from typing import Any, Final, NamedTuple
+
+from webots_mcp.connection import LONGEST_WRITE_S, Step, transaction
+from webots_mcp.store.analysis.summary import Summary
+from webots_mcp.store.signals.registry import Count
+
+Key = tuple[int, int]  # bucket, signal id
+
+_FIGURES: Final = ", ".join(Summary._fields)
+_COLUMNS: Final = f"run_id, bucket, signal_id, {_FIGURES}"
+_RUN_MARK: Final = (
+    "SELECT max(rolled_state_id, "
+    "coalesce((SELECT state_id FROM watermark WHERE name = 'rollup'), 0)) FROM run WHERE id = {}"
+)
+_RECENT_ROWS: Final = "SELECT count(*) FROM recent_rollup WHERE run_id = {}"
+_RECENT: Final = f"SELECT bucket, signal_id, {_FIGURES} FROM recent_rollup WHERE run_id = ?"
+_OVER: Final = f"SELECT {_FIGURES} FROM rollup WHERE run_id = ? AND signal_id = ? AND bucket = ?"
+_TEMPORARY: Final = {
+    "new_rollup": f"is_over, {_COLUMNS}",
+    "new_change": "run_id, signal_id, state_id, sim_time_s, value",
+    "new_count": ", ".join(Count._fields),
+}
+_STORE: Final = Step(
+    "store_rollups",
+    ("run_id", "mark", "recent_rows", "state_id"),
+    f"INSERT OR REPLACE INTO recent_rollup ({_COLUMNS}) "
+    f"SELECT {_COLUMNS} FROM new_rollup WHERE NOT is_over",
+    f"INSERT OR REPLACE INTO rollup ({_COLUMNS}) SELECT {_COLUMNS} FROM new_rollup WHERE is_over",
+    f"INSERT OR IGNORE INTO change ({_TEMPORARY['new_change']}) SELECT * FROM new_change",
+    "UPDATE signal SET kind = n.kind, unit = n.unit, rows = signal.rows + n.rows, "
+    "null_rows = signal.null_rows + n.null_rows, odd_rows = signal.odd_rows + n.odd_rows, "
+    "last_seen_wall_time_s = max(signal.last_seen_wall_time_s, n.seen_wall_time_s), "
+    "min = min(coalesce(signal.min, n.min), coalesce(n.min, signal.min)), "
+    "max = max(coalesce(signal.max, n.max), coalesce(n.max, signal.max)) "
+    "FROM new_count n WHERE signal.id = n.signal_id",
+    "UPDATE run SET rolled_state_id = NEW.state_id WHERE id = NEW.run_id",
+    unless=f"({_RUN_MARK.format('NEW.run_id')}) IS NOT NEW.mark "
+    f"OR ({_RECENT_ROWS.format('NEW.run_id')}) <> NEW.recent_rows",
+)
+# A bucket is over when its run has a later one, or has ended.
+_MOVABLE: Final = (
+    "SELECT run_id, bucket, signal_id FROM recent_rollup r WHERE bucket < "
+    "(SELECT max(bucket) FROM recent_rollup WHERE run_id = r.run_id) "
+    "OR (SELECT ended_wall_time_s FROM run WHERE id = r.run_id) IS NOT NULL "
+    "ORDER BY run_id, bucket, signal_id"
+)
+_MOVED: Final = (
+    "FROM recent_rollup WHERE run_id = NEW.run_id AND bucket = NEW.bucket "
+    "AND signal_id BETWEEN NEW.first_id AND NEW.last_id"
+)
+_MOVE: Final = Step(
+    "move_rollups",
+    ("run_id", "bucket", "first_id", "last_id"),
+    f"INSERT OR REPLACE INTO rollup ({_COLUMNS}) SELECT {_COLUMNS} {_MOVED}",
+    f"DELETE {_MOVED}",
+)
+_FIRST_MOVED: Final = 20  # about 10 us each: in `rollup` each has a page of its own
+_FORGET: Final = (
+    "DELETE FROM watermark WHERE name = 'rollup'",
+    "UPDATE run SET rolled_state_id = 0 WHERE rolled_state_id > 0",
+    "DELETE FROM rollup",
+    "DELETE FROM recent_rollup",
+    "DELETE FROM change",
+    "UPDATE signal SET rows = 0, null_rows = 0, odd_rows = 0, min = NULL, max = NULL",
+)
+
+
+def both(columns: str, where: str) -> str:
+    """What to sum up FROM: rows of both tables, or what each of them comes to.
+
+    From `all_rollup` a sum would take three times as long: SQLite copies all of its columns first.
+
+    Args:
+        columns: Those that are needed.
+        where: A condition with named parameters; may go on with GROUP BY.
+    """
+    parts = (
+        f"SELECT {columns} FROM {table} WHERE {where}" for table in ("rollup", "recent_rollup")
+    )
+    return f"({' UNION ALL '.join(parts)})"
+
+
+class Held(NamedTuple):
+    """What the rollups of a run hold before a batch.
+
+    Attributes:
+        mark: Id of the last state row of the run that is in.
+        recent: Its newest buckets.
+    """
+
+    run_id: int
+    mark: int
+    recent: dict[Key, Summary]
+
+    def find(self, connection: sqlite3.Connection, key: Key) -> tuple[Summary | None, bool]:
+        """A bucket of a signal, None where there is none, and whether it is in `rollup`."""
+        if key in self.recent:
+            return self.recent[key], False
+        bucket, signal_id = key
+        row = connection.execute(_OVER, (self.run_id, signal_id, bucket)).fetchone()
+        return (None, False) if row is None else (Summary._make(row), True)
+
+
+class Addition(NamedTuple):
+    """What a batch of state rows of one run makes of its rollups: rows of the tables.
+
+    Attributes:
+        rollups: Whether it is over, run, bucket, signal, and the figures, as they will stand.
+        changes: Run, signal, state row, simulation time, value.
+        counts: What is added to the signals.
+    """
+
+    rollups: list[tuple[Any, ...]]
+    changes: list[tuple[Any, ...]]
+    counts: list[Count]
+
+
+def run_mark(connection: sqlite3.Connection, run_id: int) -> int | None:
+    """The id of the last state row of a run that the rollups hold; None without such a run."""
+    row = connection.execute(_RUN_MARK.format("?"), (run_id,)).fetchone()
+    return int(row[0]) if row else None
+
+
+def held(connection: sqlite3.Connection, run_id: int, mark: int) -> Held:
+    """The newest rollups of a run whose mark is known."""
+    rows = connection.execute(_RECENT, (run_id,))
+    return Held(run_id, mark, {(row[0], row[1]): Summary._make(row[2:]) for row in rows})
+
+
+def store(connection: sqlite3.Connection, before: Held, addition: Addition, state_id: int) -> bool:
+    """Store an addition, which holds the rows up to `state_id`; False where another was faster."""
+    rows = (addition.rollups, addition.changes, addition.counts)
+    _prepare(connection, dict(zip(_TEMPORARY, rows, strict=True)))
+    return _STORE.run(connection, before.run_id, before.mark, len(before.recent), state_id)
+
+
+def _prepare(connection: sqlite3.Connection, rows: dict[str, Sequence[tuple[Any, ...]]]) -> None:
+    """Fill the temporary tables, in a transaction that locks nothing but them."""
+    connection.execute("BEGIN")
+    try:
+        for table, columns in _TEMPORARY.items():
+            connection.execute(f"CREATE TEMP TABLE IF NOT EXISTS {table} ({columns})")
+            connection.execute(f"DELETE FROM temp.{table}")
+            marks = ", ".join("?" * len(columns.split(",")))
+            connection.executemany(f"INSERT INTO temp.{table} VALUES ({marks})", rows[table])
+    finally:
+        connection.execute("COMMIT")
+
+
+def move(connection: sqlite3.Connection, pause_s: float) -> None:
+    """Move the buckets that are over to `rollup`, as many at a time as a millisecond takes."""
+    rows = connection.execute(_MOVABLE).fetchall()
+    for (run_id, bucket), group in groupby(rows, lambda row: (row[0], row[1])):
+        _move_bucket(connection, run_id, bucket, [row[2] for row in group], pause_s)
+
+
+def _move_bucket(
+    connection: sqlite3.Connection, run_id: int, bucket: int, ids: list[int], pause_s: float
+) -> None:
+    most, done = _FIRST_MOVED, 0
+    while done < len(ids):
+        some = ids[done : done + most]
+        started_s = time.perf_counter()
+        _MOVE.run(connection, run_id, bucket, some[0], some[-1])
+        took_s = time.perf_counter() - started_s
+        done += len(some)
+        most = max(1, round(len(some) * min(2.0, LONGEST_WRITE_S / 2 / took_s)))
+        time.sleep(pause_s)
+
+
+def forget(connection: sqlite3.Connection) -> None:
+    """Empty the rollups, so that the next calls of `roll` rebuild them from the state rows.
+
+    What was rolled up from rows that have been deleted since is lost.
+    """
+    with transaction(connection):
+        for statement in _FORGET:
+            connection.execute(statement)

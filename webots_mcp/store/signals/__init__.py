@@ -1,0 +1,1 @@
+"""What was published: names, kinds and units of signals, and the registry of them."""

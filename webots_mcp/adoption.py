@@ -26,6 +26,7 @@ from webots_mcp.entries import (
     read_header,
     waiting_paths,
 )
+from webots_mcp.errors import SessionGoneError
 from webots_mcp.notice import say
 
 _PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
@@ -69,6 +70,13 @@ _NEW_SESSION: Final = (
 # What refuses a row whatever state the database is in: its own content.
 _UNFIT: Final = (sqlite3.IntegrityError, sqlite3.DataError, UnicodeEncodeError, OverflowError)
 
+# What a file that was damaged, or made by others, raises while it is read.
+_OF_THE_FILE: Final = (
+    OSError, ValueError, TypeError, LookupError, RecursionError, SessionGoneError,
+)  # fmt: skip
+
+_strange: set[Path] = set()
+
 
 def is_unfit(error: Exception) -> bool:
     """Whether the row itself is refused; a session that is gone is the database's fault."""
@@ -97,11 +105,15 @@ def take_in(connection: sqlite3.Connection, session_id: int, piece: Sequence[Ent
 
     Raises:
         sqlite3.Error: Nothing was written.
+        SessionGoneError: Somebody deleted the session.
     """
 
     def act() -> Taken:
         until_s = time.monotonic() + _PIECE_S
-        taken = Taken(connection.execute(_ADOPTED, (session_id,)).fetchone()[0], [], [])
+        session = connection.execute(_ADOPTED, (session_id,)).fetchone()
+        if session is None:
+            raise SessionGoneError(f"the session {session_id} was deleted from the database")
+        taken = Taken(session[0], [], [])
         for entry in piece:
             if entry.number > taken.number:
                 taken = taken._replace(number=entry.number)
@@ -118,12 +130,12 @@ def take_in(connection: sqlite3.Connection, session_id: int, piece: Sequence[Ent
 def _write(connection: sqlite3.Connection, session_id: int, entry: Entry) -> str | None:
     """Write an entry; or why the database will never take it, which stops no other."""
     run_id = None
-    if entry.run is not None:
-        row = connection.execute(_RUN_OF, (entry.run,)).fetchone()
-        if row is None:
-            return f"its run {entry.run} is not known"
-        run_id = row[0]
     try:
+        if entry.run is not None:
+            row = connection.execute(_RUN_OF, (entry.run,)).fetchone()
+            if row is None:
+                return f"its run {entry.run} is not known"
+            run_id = row[0]
         connection.execute(STATEMENTS[entry.kind], bind(run_id, session_id, entry.values))
     except Exception as error:
         if not is_unfit(error):
@@ -140,7 +152,8 @@ def adopt(connection: sqlite3.Connection, database: Path) -> int:
         database: Its file.
 
     Returns:
-        How many rows and other writes that was.
+        How many rows and other writes that was. A file that cannot be taken in stays, is said
+        once, and keeps nobody from recording.
 
     Raises:
         sqlite3.Error: The database is locked; what is in is in, the rest waits.
@@ -160,10 +173,21 @@ def _adopt_file(connection: sqlite3.Connection, path: Path) -> int:
             path.unlink()
     except FileNotFoundError:  # another took it in meanwhile
         return 0
-    except (OSError, ValueError) as error:
-        say(f"what waits in {path} cannot be taken in: {error}")
+    except Exception as error:
+        if not (isinstance(error, _OF_THE_FILE) or is_unfit(error)):
+            raise
+        _say_once(path, error)
         return 0
     return count
+
+
+def _say_once(path: Path, error: Exception) -> None:
+    """A file that stays is met again each second."""
+    if path not in _strange:
+        _strange.add(path)
+        speaks = isinstance(error, (OSError, ValueError))
+        why = str(error) if speaks else f"it is damaged ({error!r})"
+        say(f"what waits in {path} cannot be taken in: {why}")
 
 
 def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:

@@ -100,6 +100,7 @@ ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction
 FORMAT: Final = 1  # of the file; whoever knows another one leaves the file alone
 MAX_FILE_BYTES: Final = 1_000_000_000
 _VERSION: Final = "webots_mcp_waiting"
+_NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
 _LOCKED_BYTE: Final = 1 << 40  # far beyond the end: Windows refuses to read what is locked
 
 
@@ -272,7 +273,7 @@ def read_header(file: BinaryIO) -> dict[str, Any] | None:
     file.seek(0)
     try:
         header = json.loads(file.readline())
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     if not isinstance(header, dict):
         return None
@@ -288,13 +289,15 @@ def encoded(value: object) -> bytes:
 
 
 def _decoded(line: bytes) -> Entry | None:
+    """None for what is no entry: cut off by a kill, or damaged since."""
     try:
         number, kind, run, values = json.loads(line)
-    except (ValueError, TypeError):
+        entry = Entry(number, kind, run, values if isinstance(values, dict) else tuple(values))
+        known = kind in STATEMENTS
+    except (ValueError, TypeError, RecursionError):
         return None
-    if kind not in STATEMENTS or not isinstance(number, int):
-        return None
-    return Entry(number, kind, run, values if isinstance(values, dict) else tuple(values))
+    whole = type(number) is int and 0 < number < _NO_NUMBER
+    return entry if known and whole and (run is None or isinstance(run, str)) else None
 
 
 def lock(fd: int) -> bool:

@@ -8,6 +8,7 @@ of its own.
     │   ├── NoDatabaseError         nothing has been recorded there yet
     │   ├── ForeignDatabaseError    the file is not a recording of this package
     │   ├── MalformedRowError       a row holds a value that no bridge has written
+    │   ├── SessionGoneError        somebody deleted the session that is being recorded
     │   ├── SchemaTooNewError       a newer webots-mcp wrote it
     │   └── SchemaTooOldError       an older webots-mcp wrote it: migrate first
     ├── InvalidInputError           the question is the problem; the text says how to ask
@@ -42,6 +43,10 @@ class ForeignDatabaseError(DatabaseError):
 
 class MalformedRowError(DatabaseError):
     """A row holds a value that cannot be read; the file is whole."""
+
+
+class SessionGoneError(DatabaseError):
+    """The row of a session that still records, or whose rows still wait, was deleted."""
 
 
 class SchemaTooNewError(DatabaseError):

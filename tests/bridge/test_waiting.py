@@ -334,6 +334,85 @@ def test_a_file_of_another_version_is_left_alone_and_said(
     assert "another version" in capfd.readouterr().err
 
 
+SESSION = {
+    **dict.fromkeys(("uuid", "host", "instance", "versions", "actions"), "x"),
+    **dict.fromkeys(("pid", "extern", "supervisor", "started_wall_time_s"), 1),
+    **dict.fromkeys(("last_seen_wall_time_s", "last_seen_monotonic_s"), 1.0),
+}
+ROBOT = {"name": "other", "kind": "Robot", "devices": "{}"}
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {},
+        {"session": None, "robot": ROBOT},
+        {"session": {}, "robot": ROBOT},
+        {"session": SESSION | {"uuid": ["x"]}, "robot": ROBOT},
+        {"session": SESSION | {"instance": None}, "robot": ROBOT},
+        {"session": SESSION, "robot": {}},
+        {"session": SESSION, "robot": ROBOT | {"name": "\ud800"}},
+        {"session": SESSION | {"pid": 2**70}, "robot": ROBOT},
+    ],
+)
+def test_a_damaged_file_of_another_session_keeps_nobody_from_recording(
+    told: dict[str, object], file: Path, filed: Recording, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file.parent.mkdir()
+    strange = Path(f"{file}-waiting-x.jsonl")
+    strange.write_text(json.dumps({"webots_mcp_waiting": 1, **told}) + "\n")
+    with MCPBridge(InProcessSupervisor("rover"), file.parent, 1) as bridge:
+        bridge.publish({"n": 0})
+        assert numbers(filed) == [0]
+        assert adopt_into(file) == 0
+    assert strange.exists()
+    assert capfd.readouterr().err.count(f"{strange} cannot be taken in") == 1
+
+
+RUN = {"uuid": "r", "world": None, "step_ms": 8, "reason": "start", "wall_time": 1, "sim_time": 0}
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        '[2, "state", "r", 5]',
+        '[2, ["state"], "r", [1, 1, "{}", null]]',
+        '[1e30, "state", "r", [1, 1, "{}", null]]',
+        '[100000000000000000000, "state", "r", [1, 1, "{}", null]]',
+        '[-2, "state", "r", [1, 1, "{}", null]]',
+        '[2, "state", ["r"], [1, 1, "{}", null]]',
+        '[2, "state", "\\ud800", [1, 1, "{}", null]]',
+        '[2, "state", "r", [100000000000000000000, 1, "{}", null]]',
+        '[2, "state", "r", [[], 1, "{}", null]]',
+        '[2, "state", "r", [1]]',
+        "[" * 100_000,
+    ],
+)
+def test_a_damaged_line_costs_itself_only(line: str, file: Path, filed: Recording) -> None:
+    MCPBridge(InProcessSupervisor("rover"), file.parent).close()
+    first = json.dumps({"webots_mcp_waiting": 1, "session": SESSION, "robot": ROBOT})
+    run = json.dumps([1, "run", None, RUN])
+    last = '[4, "state", "r", [1, 1, "{\\"n\\": 1}", null]]'
+    Path(f"{file}-waiting-x.jsonl").write_text("\n".join((first, run, line, last, "")))
+    assert adopt_into(file) == 1
+    assert numbers(filed) == [1]
+
+
+def test_a_session_that_was_deleted_while_its_rows_waited_is_entered_again(
+    bridge: MCPBridge, robot: InProcessSupervisor, file: Path, filed: Recording
+) -> None:
+    bridge.publish({"n": 0})
+    with closing(connect(file, "writer")) as other:
+        other.execute("BEGIN IMMEDIATE")
+        bridge.publish({"n": 1})
+        for table in ("state", "event", "log", "run", "session"):
+            other.execute(f"DELETE FROM {table}")
+        other.execute("COMMIT")
+    bridge.publish({"n": 2})
+    catch_up(bridge)
+    assert numbers(filed) == [1, 2]
+
+
 def test_a_signals_handler_that_logs_in_the_middle_of_a_row_deadlocks_nothing(
     bridge: MCPBridge, robot: InProcessSupervisor, filed: Recording
 ) -> None:

@@ -54,6 +54,7 @@ from webots_mcp.errors import (
     ForeignDatabaseError,
     SchemaTooNewError,
     SchemaTooOldError,
+    SessionGoneError,
 )
 
 _CATCH_UP_S: Final = 0.002  # a loop that catches up must not stall over it
@@ -399,7 +400,7 @@ class Recorder:
         self._retry_at_s = time.monotonic() + _RETRY_INTERVAL_S
         if is_damage(error):
             self._replace_files(text)
-        elif "no such table" in text or "FOREIGN KEY" in text:
+        elif isinstance(error, SessionGoneError) or _misses_rows(text):
             self._start_over(f"the database lost this session ({text})")
         else:
             self.complain(text, f"not recorded yet, trying again each second: {text}")
@@ -497,6 +498,11 @@ class Recorder:
         self._off = f"not recording into {self._database}: {why}"
         self.complain("off", self._off)
         self._drop_waiting(self._off)
+
+
+def _misses_rows(text: str) -> bool:
+    """Whether SQLite says that what a row refers to, or its table, is not there any more."""
+    return "no such table" in text or "FOREIGN KEY" in text
 
 
 def _patiently(act: Callable[[], Result]) -> Result:

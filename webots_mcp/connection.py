@@ -20,7 +20,13 @@ from webots_mcp.contract import (
     MemoryDatabase,
     make_folder,
 )
-from webots_mcp.errors import DatabaseError, ForeignDatabaseError, NoDatabaseError
+from webots_mcp.errors import (
+    DatabaseError,
+    ForeignDatabaseError,
+    ForkedProcessError,
+    NoDatabaseError,
+)
+from webots_mcp.forked import is_inherited
 
 Role = Literal["loop", "writer", "reader"]
 Result = TypeVar("Result")
@@ -80,12 +86,19 @@ def connect(
         DatabaseError: The folder cannot be made, the file cannot be opened, its log cannot be
             read where nothing can be written, or SQLite is too old.
         ForeignDatabaseError: With `create`, the file belongs to another application.
+        ForkedProcessError: The process that this one was forked from has the file open.
         sqlite3.Error: The file is no database, or is locked for longer than 5 s.
     """
     if sqlite3.sqlite_version_info < OLDEST_SQLITE:
         raise DatabaseError(
             f"SQLite {sqlite3.sqlite_version} of this Python is too old, 3.38 is needed: "
             "use a Python that was built with a newer one"
+        )
+    if isinstance(database, Path) and is_inherited(database):
+        raise ForkedProcessError(
+            f"{database} is open in the process that this one was forked from, and would be "
+            "destroyed if both wrote to it: start this one anew instead, as subprocess does, or "
+            'multiprocessing after set_start_method("spawn")'
         )
     address = database.uri if isinstance(database, MemoryDatabase) else _file_uri(database, create)
     timeout_s = OPENING_TIMEOUT_MS / 1000 if patient else 0

@@ -7,6 +7,7 @@ of its own.
     ├── DatabaseError               the file, not the question, is the problem
     │   ├── NoDatabaseError         nothing has been recorded there yet
     │   ├── ForeignDatabaseError    the file is not a recording of this package
+    │   ├── ForkedProcessError      a parent process has the file open
     │   ├── MalformedRowError       a row holds a value that no bridge has written
     │   ├── SessionGoneError        somebody deleted the session that is being recorded
     │   ├── SchemaTooNewError       a newer webots-mcp wrote it
@@ -39,6 +40,10 @@ class NoDatabaseError(DatabaseError):
 
 class ForeignDatabaseError(DatabaseError):
     """The file is no SQLite database, or belongs to another application."""
+
+
+class ForkedProcessError(DatabaseError):
+    """SQLite cannot open the file in this process, because of the one that forked it."""
 
 
 class MalformedRowError(DatabaseError):

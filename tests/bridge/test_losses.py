@@ -283,3 +283,48 @@ def test_a_database_in_memory_has_no_files_that_could_vanish(
         bridge.publish({"n": 0})
         heartbeat_now(bridge)
         assert bridge.stats().rows_dropped == 0
+
+
+FORKED = """
+import os, sys
+from pathlib import Path
+from webots_mcp import MCPBridge
+from webots_mcp.standin import InProcessSupervisor
+
+def record(bridge, name):
+    for n in range(100):
+        bridge.publish({name: n})
+
+folder = Path(sys.argv[1])
+bridge = MCPBridge(InProcessSupervisor("parent"), folder, 1)
+record(bridge, "n")
+wait, go = os.pipe()
+child = os.fork()
+if child == 0:
+    own = MCPBridge(InProcessSupervisor("child"), folder, 1)
+    record(own, "c")
+    os.read(wait, 1)
+    record(own, "c")
+    print(own.stats().rows_dropped, own.stats().last_error)
+    sys.stdout.flush()
+    os._exit(0)
+record(bridge, "n")
+bridge.close()
+os.write(go, b"x")
+os.waitpid(child, 0)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_bridge_in_a_forked_child_does_not_destroy_the_database_of_its_parent(
+    tmp_path: Path,
+) -> None:
+    line = [sys.executable, "-c", FORKED, str(tmp_path)]
+    told = subprocess.run(line, stdout=subprocess.PIPE, check=True, text=True).stdout
+    recording = Recording(tmp_path / DATABASE_NAME)
+    assert recording.rows("PRAGMA integrity_check") == ["ok"]
+    assert numbers(recording) == [*range(100), *range(100)]
+    dropped, _, why = told.partition(" ")
+    assert int(dropped) >= 200
+    assert "forked from" in why
+    assert "spawn" in why

@@ -52,6 +52,7 @@ from webots_mcp.contract import Database, new_uuid
 from webots_mcp.entries import STATEMENTS, Kind, Values, WaitingFile, bind, waiting_path
 from webots_mcp.errors import (
     ForeignDatabaseError,
+    ForkedProcessError,
     SchemaTooNewError,
     SchemaTooOldError,
     SessionGoneError,
@@ -64,6 +65,11 @@ _RETRY_INTERVAL_S: Final = 1.0
 
 _RUN_ID: Final = "SELECT id FROM run WHERE uuid = ?"
 _GO_ON: Final = "UPDATE run SET end_reason = NULL, ended_wall_time_s = NULL WHERE id = ?"
+
+# What no later try will change.
+_FOR_GOOD: Final = (
+    ForeignDatabaseError, ForkedProcessError, SchemaTooNewError, SchemaTooOldError,
+)  # fmt: skip
 
 Result = TypeVar("Result")
 
@@ -462,7 +468,7 @@ class Recorder:
             return False
         try:
             self._enter(patient)
-        except (ForeignDatabaseError, SchemaTooNewError, SchemaTooOldError) as error:
+        except _FOR_GOOD as error:
             self._give_up(str(error))
         except Exception as error:  # noqa: BLE001  (see `is_busy`)
             self._obstacle = text_of(error)

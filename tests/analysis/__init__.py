@@ -1,0 +1,1 @@
+"""Analysis is true of arrays whose truth is known."""

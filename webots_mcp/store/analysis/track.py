@@ -1,0 +1,90 @@
+"""The way of a robot: its positions without most of their noise, and how long that way is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from webots_mcp.store.analysis.noise import Array, noise_of, smooth
+
+LEG_NOISE: Final = 8.0  # a leg is longer than so many deviations of the smoothed position
+FINEST_LEG_M: Final = 0.02  # smoothing that makes legs so short is enough
+LONGEST_SMOOTHING_S: Final = 2.0  # beyond, it would cut corners
+_PARABOLA_GAIN: Final = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it
+
+
+@dataclass(frozen=True)
+class Track:
+    """Positions in one stretch without recording gaps, in metres.
+
+    Attributes:
+        x: Smoothed; `raw_x` as recorded, and so for y.
+        noise_m: Standard deviation of the noise in each of x and y, estimated from the positions.
+        left_m: What smoothing left of it.
+        smoothed_rows: Over how many rows was smoothed; 1 where there was nothing to smooth.
+    """
+
+    times: Array
+    x: Array
+    y: Array
+    raw_x: Array
+    raw_y: Array
+    noise_m: float
+    left_m: float
+    smoothed_rows: int
+
+    @property
+    def reversed(self) -> Track:
+        """The same way, gone backwards in time."""
+        return replace(
+            self,
+            times=-self.times[::-1],
+            x=self.x[::-1],
+            y=self.y[::-1],
+            raw_x=self.raw_x[::-1],
+            raw_y=self.raw_y[::-1],
+        )
+
+
+def track_of(times: Array, x: Array, y: Array) -> Track:
+    """Estimate the noise of a position and smooth it by no more than that asks for.
+
+    Args:
+        times: Seconds; they do not fall.
+        x: Metres, finite, and so is `y`.
+        y: As many.
+    """
+    noise_m = float(np.hypot(noise_of(x), noise_of(y)) / np.sqrt(2))
+    rows = _smoothing_rows(times, noise_m)
+    (smooth_x, gain), (smooth_y, _) = smooth(x, rows), smooth(y, rows)
+    return Track(times, smooth_x, smooth_y, x, y, noise_m, noise_m * gain, rows)
+
+
+def _smoothing_rows(times: Array, noise_m: float) -> int:
+    interval_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    if noise_m == 0 or interval_s <= 0:
+        return 1
+    wanted = _PARABOLA_GAIN * (LEG_NOISE * noise_m / FINEST_LEG_M) ** 2
+    return 2 * int(min(wanted, LONGEST_SMOOTHING_S / interval_s) / 2) + 1
+
+
+def path_length_m(track: Track) -> float:
+    """Metres travelled: the sum of legs that are longer than noise makes them.
+
+    From row to row a noise of 1 cm would add up to metres while the robot stands still. A leg ends
+    where the smoothed position is 8 standard deviations of what is left of the noise away from
+    where it began; what is shorter at the end is left out.
+    """
+    if len(track.times) == 0:
+        return 0.0
+    shortest_m2 = (LEG_NOISE * track.left_m) ** 2
+    places = zip(track.x.tolist(), track.y.tolist(), strict=True)
+    length_m, (from_x, from_y) = 0.0, (float(track.x[0]), float(track.y[0]))
+    for x, y in places:
+        square_m2 = (x - from_x) ** 2 + (y - from_y) ** 2
+        if square_m2 > shortest_m2:
+            length_m += square_m2**0.5
+            from_x, from_y = x, y
+    return length_m

@@ -9,6 +9,7 @@ import pytest
 
 from tests.store.recorded import Recorded, RecordedRobot
 from webots_mcp.store.queue import CommandQueue
+from webots_mcp.store.recording import look
 from webots_mcp.store.runs import current_run
 from webots_mcp.store.sessions import newest_session
 from webots_mcp.store.status import Status, judge
@@ -183,3 +184,15 @@ def test_a_session_on_another_host_is_judged_by_its_heartbeat(recorded: Recorded
 
 def test_without_a_session_a_robot_was_never_seen(recorded: Recorded) -> None:
     assert judge(recorded.connection, None, None, NOW).text == "never seen"
+
+
+def test_an_answer_tells_one_moment_whatever_is_recorded_while_it_is_put_together(
+    recorded: Recorded,
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, {"x": 1})
+    view = look(recorded.connection, "rover")
+    robot.state(2.0, {"x": 2})
+    robot.event(2.0, "pause", None, {"command_id": 1})
+    header = view.header()
+    assert (header["sim_time_s"], header["status"]) == (1.0, "running")

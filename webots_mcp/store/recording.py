@@ -8,7 +8,6 @@ import time
 from collections.abc import Generator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -60,32 +59,29 @@ _NOT_IN: Final = (
 
 @dataclass(frozen=True)
 class View:
-    """One robot, one run, now: what an answer's header is made of."""
+    """One robot, one run, now: what an answer's header is made of.
+
+    All of it was read in one moment, however long the answer takes to be put together: what comes
+    meanwhile would tell of a robot that stands still and yet has moved on.
+
+    Attributes:
+        is_current: Whether the run is the robot's newest.
+        state: The newest state of the run.
+        status: Whether time is moving in this run.
+    """
 
     connection: sqlite3.Connection
     robot: Robot
     run: Run | None
     is_current: bool
     now_s: float
+    state: State | None
+    status: Status
 
     @property
     def session(self) -> Session | None:
         """The robot's latest session."""
         return self.robot.session
-
-    @cached_property
-    def state(self) -> State | None:
-        """The newest state of the run."""
-        return newest_state(self.connection, self.run.id) if self.run else None
-
-    @cached_property
-    def status(self) -> Status:
-        """Whether time is moving in this run."""
-        if self.is_current or self.run is None:
-            return judge(self.connection, self.session, self.run, self.now_s)
-        ended_s = self.run.ended_wall_time_s or self.run.last_wall_time_s
-        why = f"this is an earlier run; it ended by {self.run.end_reason or 'an unknown cause'}"
-        return Status(stopped_for(self.now_s - ended_s), why)
 
     def header(self) -> dict[str, Any]:
         """The fields that every answer begins with."""
@@ -263,7 +259,18 @@ def view_of(connection: sqlite3.Connection, robot: Robot, run_id: int | None, no
     """A view of a robot that is already known."""
     current = current_run(connection, robot.id)
     run = current if run_id is None else fetch_run(connection, run_id, robot.id)
-    return View(connection, robot, run, run == current, now_s)
+    if run is None or run == current:
+        status = judge(connection, robot.session, run, now_s)
+    else:
+        status = _of_earlier_run(run, now_s)
+    state = newest_state(connection, run.id) if run else None
+    return View(connection, robot, run, run == current, now_s, state, status)
+
+
+def _of_earlier_run(run: Run, now_s: float) -> Status:
+    ended_s = run.ended_wall_time_s or run.last_wall_time_s
+    why = f"this is an earlier run; it ended by {run.end_reason or 'an unknown cause'}"
+    return Status(stopped_for(now_s - ended_s), why)
 
 
 def storage(connection: sqlite3.Connection) -> dict[str, Any]:

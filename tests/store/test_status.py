@@ -141,6 +141,23 @@ def claimed(robot: RecordedRobot, action: str, at: float) -> int:
     return command.id
 
 
+def test_a_row_that_is_further_than_the_heartbeat_shows_that_time_moves_again(
+    recorded: Recorded,
+) -> None:
+    robot = recorded.robot(now=NOW, moved_wall_time_s=NOW - 25, sim_time_s=36.7)
+    robot.state(36.72, {"x": 1}, at=NOW + 0.1)
+    assert status_of(robot, after_s=0.2).text == "running"
+    assert status_of(robot, after_s=9).text == "stopped 8.9 s ago"
+
+
+def test_a_row_that_was_written_while_time_stood_still_does_not_look_like_movement(
+    recorded: Recorded,
+) -> None:
+    robot = recorded.robot(now=NOW, moved_wall_time_s=NOW - 25, sim_time_s=36.72)
+    robot.state(36.72, {"x": 1}, at=NOW + 0.1)
+    assert status_of(robot, after_s=0.2).text == "stopped 25 s ago"
+
+
 def test_a_loop_that_is_inside_a_handler_says_in_which(recorded: Recorded) -> None:
     robot = recorded.robot(now=NOW)
     command_id = claimed(robot, "slow", NOW)

@@ -10,7 +10,7 @@ from webots_mcp.settlement import EXTERN
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.runs import Run
 from webots_mcp.store.sessions import Session, companions, left_holding
-from webots_mcp.store.states import recent_interval_s
+from webots_mcp.store.states import newest_state, recent_interval_s
 
 NEVER_SEEN: Final = "never seen"
 RUNNING: Final = "running"
@@ -85,19 +85,30 @@ def judge(
     """
     if session is None:
         return Status(NEVER_SEEN)
+    moved_s = _moved_wall_time_s(connection, session, run)
     if not session.is_alive(now_s):
-        return _stopped(session, now_s, _why_ended(session))
+        return _stopped(session, moved_s, now_s, _why_ended(session))
     if holder := find_holder(connection, session, now_s):
         return Status(PAUSED, None if holder is session else _held_elsewhere(connection, holder))
     fresh = session.heartbeat_is_fresh(now_s)
     if fresh and _hold_since_beat(connection, session) == "resume":
         return Status(RUNNING)
-    moved_s, still_moving_s = session.moved_wall_time_s, _still_moving_s(connection, run)
+    still_moving_s = _still_moving_s(connection, run)
     if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= still_moving_s:
         return Status(STARTING, _STARTED)
     if moved_s is not None and session.age_s(moved_s, now_s) <= still_moving_s:
         return Status(RUNNING)
-    return _stopped(session, now_s, _why_standing(connection, session, now_s))
+    return _stopped(session, moved_s, now_s, _why_standing(connection, session, moved_s, now_s))
+
+
+def _moved_wall_time_s(
+    connection: sqlite3.Connection, session: Session, run: Run | None
+) -> float | None:
+    """When simulation time last grew: a row that is further than the heartbeat tells it sooner."""
+    row = newest_state(connection, run.id) if run and run.session_id == session.id else None
+    if row is None or row.sim_time_s <= (session.sim_time_s or 0.0):
+        return session.moved_wall_time_s
+    return max(row.wall_time_s, session.moved_wall_time_s or row.wall_time_s)
 
 
 def _why_ended(session: Session) -> str | None:
@@ -106,14 +117,16 @@ def _why_ended(session: Session) -> str | None:
     return _ENDED.get(session.end_reason or "crashed")
 
 
-def _why_standing(connection: sqlite3.Connection, session: Session, now_s: float) -> str:
+def _why_standing(
+    connection: sqlite3.Connection, session: Session, moved_s: float | None, now_s: float
+) -> str:
     """Why the time of a living controller, which its bridge does not hold, stands still."""
     if inside := handler_at_work(connection, session, now_s):
         return inside
-    if session.moved_wall_time_s is None:
+    if moved_s is None:
         return _NOT_STARTED
     # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
-    beaten_since_s = session.last_seen_wall_time_s - session.moved_wall_time_s
+    beaten_since_s = session.last_seen_wall_time_s - moved_s
     if session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S:
         return _STANDING
     left = left_holding(connection, session, now_s)
@@ -137,9 +150,9 @@ def stopped_for(seconds: float) -> str:
     return f"stopped {max(seconds, 0.0):.{1 if seconds < 10 else 0}f} s ago"
 
 
-def _stopped(session: Session, now_s: float, why: str | None) -> Status:
-    moved_s = session.moved_wall_time_s or session.started_wall_time_s
-    return Status(stopped_for(session.age_s(moved_s, now_s)), why)
+def _stopped(session: Session, moved_s: float | None, now_s: float, why: str | None) -> Status:
+    since_s = moved_s or session.started_wall_time_s
+    return Status(stopped_for(session.age_s(since_s, now_s)), why)
 
 
 def find_holder(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from pathlib import Path
 
 import anyio
@@ -13,6 +14,7 @@ from mcp.types import CallToolResult
 from tests.server.conftest import Connect, ask, fail, text_of
 from tests.store.recorded import Recorded
 from webots_mcp.contract import MemoryDatabase
+from webots_mcp.errors import WebotsMCPError
 from webots_mcp.server import create_server
 from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, decode
 
@@ -210,4 +212,12 @@ def test_a_file_of_the_users_folder_is_not_taken_for_a_module(
     monkeypatch.chdir(recording.parent)
     asked = Statement(str(recording), "SELECT 1", 1, 100, 2.0)
     ended = subprocess.run(LINE, input=asked.encoded(), capture_output=True, cwd=FOLDER)
-    assert decode(ended.stdout, asked).rows == ((1,),)
+    assert decode(ended.stdout, ended.returncode, asked).rows == ((1,),)
+
+
+def test_a_process_that_could_not_run_the_statement_is_not_called_a_slow_statement() -> None:
+    asked = Statement("webots.db", "SELECT 1", 1, 100, 2.0)
+    line = (sys.executable, "-m", "webots_mcp.moved_away")
+    ended = subprocess.run(line, input=asked.encoded(), capture_output=True, cwd=FOLDER)
+    with pytest.raises(WebotsMCPError, match=r"exit code 1.*start the server again"):
+        decode(ended.stdout, ended.returncode, asked)

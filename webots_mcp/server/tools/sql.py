@@ -82,7 +82,7 @@ class SqlTools:
                     ended = await anyio.run_process(
                         LINE, input=asked.encoded(), check=False, stderr=None, cwd=FOLDER
                     )
-                    return decode(ended.stdout, asked)
+                    return decode(ended.stdout, ended.returncode, asked)
         raise InvalidInputError(
             f"no process answered within {_PROCESS_TIMEOUT_S:g} s: this machine is overloaded"
         )

@@ -31,6 +31,7 @@ LINE: Final = (sys.executable, "-m", __name__)
 FOLDER: Final = Path(webots_mcp.__file__).parent.parent
 
 _MAX_HEAP_BYTES: Final = 400_000_000
+_TIMED_OUT: Final = 124  # the exit code of timeout(1): no other end of the process has it
 _GRACE_S: Final = 0.3  # SQLite's own deadline comes first: it keeps the rows that were found
 
 
@@ -49,14 +50,21 @@ class Statement:
         return json.dumps(asdict(self)).encode()
 
 
-def decode(answer: bytes, asked: Statement) -> Result:
-    """What the process answered; one that was ended before it could answer took too long.
+def decode(answer: bytes, exit_code: int, asked: Statement) -> Result:
+    """What the process answered; one that ended itself before it could answer took too long.
 
     Raises:
         InvalidInputError: As `query_sql`.
+        WebotsMCPError: The process ended for another reason, which is none of the statement's.
     """
-    if not answer:
+    if exit_code == _TIMED_OUT:
         raise InvalidInputError(too_slow(asked.deadline_s))
+    if exit_code != 0:
+        raise WebotsMCPError(
+            f"the process that runs the statement ended without an answer (exit code {exit_code}); "
+            "the server's stderr may tell why. Was webots-mcp updated or moved since the server "
+            "started? Then start the server again"
+        )
     found = json.loads(answer)
     if "error" in found:
         raise InvalidInputError(found["error"])
@@ -80,7 +88,7 @@ def as_file(database: Database) -> Generator[Path]:
 def main() -> None:
     """Answer the request on stdin."""
     asked = Statement(**json.load(sys.stdin))
-    end = threading.Timer(asked.deadline_s + _GRACE_S, os._exit, [1])
+    end = threading.Timer(asked.deadline_s + _GRACE_S, os._exit, [_TIMED_OUT])
     end.daemon = True
     end.start()
     sys.stdout.write(json.dumps(_answer(asked)))

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from tests.server.conftest import Connect, text_of
+from tests.server.conftest import Connect, fail, text_of
+from tests.store.recorded import Recorded
 
 pytestmark = pytest.mark.anyio
 
@@ -37,6 +38,9 @@ HUGE = 2**63
             "level must be 'debug', 'info', 'warning', 'error' or 'critical', not",
         ),
         ("query_sql", {"sql": "x" * 10**6}, "sql must have at most"),
+        ("get_trends", {"since": [1]}, "since must be a valid number, not [1]"),
+        ("get_logs", {"lines": 1e308}, "lines must be a smaller number, not 1e+308"),
+        ("get_logs", {"x" * 10**5: 1}, "no parameter 'xxx"),
     ],
 )
 async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
@@ -47,6 +51,24 @@ async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
     assert answer.is_error
     assert text_of(answer).startswith(told)
     assert len(text_of(answer)) < 400
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "told"),
+    [
+        ("get_timeline", {"cursor": "x"}, ": 'x' is no cursor: give the `cursor` of the page"),
+        ("get_trends", {"since": "x" * 10**5}, "xxx' is no time: give Unix seconds or ISO 8601"),
+        ("get_trends", {"signals": ["x" * 10**5]}, "no signal 'xxx"),
+    ],
+)
+async def test_what_a_question_refuses_is_told_briefly_in_the_words_of_the_tool(
+    connect: Connect, recorded: Recorded, tool: str, arguments: dict[str, Any], told: str
+) -> None:
+    recorded.robot().state(1.0, {"y": 1})
+    async with connect() as client:
+        answer = await fail(client, f"webots_{tool}", **arguments)
+    assert told in answer
+    assert len(answer) < 4_200
 
 
 async def test_a_parameter_that_may_be_left_out_may_be_null_as_well(connect: Connect) -> None:

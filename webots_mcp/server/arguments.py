@@ -57,7 +57,7 @@ def _slim(schema: dict[str, Any]) -> dict[str, Any]:
 def _require_known(arguments: Iterable[str], known: Iterable[str]) -> None:
     for name in arguments:
         if name not in known:
-            raise ToolError(f"no parameter {name!r}: there is {', '.join(known) or 'none'}")
+            raise ToolError(f"no parameter {_shown(name)}: there is {', '.join(known) or 'none'}")
 
 
 def _explained(error: ValidationError) -> str:
@@ -67,8 +67,15 @@ def _explained(error: ValidationError) -> str:
 
 def _fault(error: ErrorDetails) -> str:
     """One thing that is wrong: the parameter, what is asked of it, and what came."""
-    name = ".".join(map(str, error["loc"]))
+    parameter, *inside = error["loc"]  # a name after it is a type that the value might have had
+    name = ".".join(map(str, (parameter, *(item for item in inside if isinstance(item, int)))))
     if error["type"] == "missing":
         return f"{name} is missing"
     asked = re.sub(r"^(Value error, |\w+ should )", "must ", error["msg"])
-    return f"{name} {asked}, not {repr(error['input'])[:_LONGEST_VALUE]}"
+    if error["type"] == "int_parsing_size":
+        asked = "must be a smaller number"
+    return f"{name} {asked}, not {_shown(error['input'])}"
+
+
+def _shown(value: object) -> str:
+    return repr(value)[:_LONGEST_VALUE]

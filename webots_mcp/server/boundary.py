@@ -27,7 +27,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.server.arguments import CheckedTool
 from webots_mcp.server.results import Answer, CommandAnswer
-from webots_mcp.server.shortening import compact_json
+from webots_mcp.server.shortening import compact_json, cut_text
 from webots_mcp.store.sound import Unsound, past_unsound_rows
 
 READS: Final = ToolAnnotations(read_only_hint=True, open_world_hint=False)
@@ -38,6 +38,7 @@ RESTARTS: Final = ACTS.model_copy(update={"destructive_hint": True})
 
 _BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
 _LONGEST_DEFECT: Final = 200
+_LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
 _DECLARATION: Final = "webots_mcp_declaration"
 
 _log = logging.getLogger(__name__)
@@ -149,7 +150,7 @@ def _answer_error(tool: str, error: Exception, empty: Callable[[str], Any] | Non
     if empty is not None and isinstance(error, (NoDatabaseError, NothingRecordedError)):
         return empty(str(error))
     if isinstance(error, WebotsMCPError):
-        raise ToolError(str(error)) from error
+        raise ToolError(cut_text(str(error), _LONGEST_ERROR)) from error
     if isinstance(error, (MCPError, ToolError)):
         raise error
     _log.exception("%s failed", tool)

@@ -94,5 +94,5 @@ def _read_cursor(text: str) -> Place:
         return float(wall_s), int(run_id), float(start_s), str(kind), str(name), int(number)
     except (ValueError, TypeError) as error:
         raise InvalidInputError(
-            f"after={text!r} is no cursor: give the `cursor` of the page before, as it was"
+            f"{text!r} is no cursor: give the `cursor` of the page before, as it was"
         ) from error

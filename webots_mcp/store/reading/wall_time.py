@@ -26,6 +26,7 @@ _FROM: Final = (  # of the first row at or after a simulation time
     "ORDER BY sim_time_s, id LIMIT 1"
 )
 _BISECTIONS: Final = 60
+_LONGEST_SHOWN: Final = 80
 
 
 def parse_wall_time(value: float | str | None, default_s: float = math.nan) -> float:
@@ -52,7 +53,8 @@ def _iso_seconds(text: str) -> float:
         return datetime.fromisoformat(text.strip().replace("Z", "+00:00")).timestamp()
     except (ValueError, OverflowError, OSError) as error:
         raise InvalidRangeError(
-            f"{text!r} is no time: give Unix seconds or ISO 8601 such as 2026-05-04T13:30:00+02:00"
+            f"{text[:_LONGEST_SHOWN]!r} is no time: give Unix seconds or ISO 8601 such as "
+            "2026-05-04T13:30:00+02:00"
         ) from error
 
 

@@ -1,0 +1,1 @@
+"""How well the past is judged: labelled recordings, and what the questions say of them."""

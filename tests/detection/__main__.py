@@ -1,0 +1,90 @@
+"""Draws labelled recordings, asks what happened in them, and prints how true the answers are."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from tests.detection.drawing import KINDS
+from tests.detection.goals import missed_goals
+from tests.detection.measuring import measure
+from tests.detection.pairs import measure_pairs
+from tests.detection.table import LEGEND, render, render_agreement, render_pairs, render_travelled
+from tests.detection.travelling import measure_travelled
+
+_TRAVELLED: Final = "travelled"
+_PAIRS: Final = "pairs"
+_ALL: Final = (*KINDS, _TRAVELLED, _PAIRS)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Returns 1 with `--check` where a goal is not reached, 2 for a kind that does not exist."""
+    options = _parser().parse_args(arguments)
+    chosen = options.kinds or _ALL
+    started_s = time.monotonic()
+    parts = (_judged(chosen, options), _travelled(chosen, options), _compared(chosen, options))
+    done = [part for part in parts if part is not None]
+    _show("")
+    print("\n\n".join(text for text, _ in done))
+    failed = sum(missed for _, missed in done)
+    took_s = time.monotonic() - started_s
+    print(f"\nseed {options.seed}; {failed} lines are below their goals; {took_s:.0f} s")
+    return int(options.check and failed > 0)
+
+
+def _judged(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:
+    kinds = [kind for kind in chosen if kind in KINDS]
+    if not kinds:
+        return None
+    report = measure(kinds, options.cases, options.seed, options.summaries, _show)
+    shown = "\n".join([*report.wrong, ""]) if options.wrong else ""
+    missed = sum(bool(missed_goals(key, tally)) for key, tally in report.tallies.items())
+    text = "\n".join([f"{shown}{render(report)}", "", *LEGEND])
+    return "\n\n".join([text, render_agreement(report)] if options.summaries else [text]), missed
+
+
+def _travelled(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:
+    if _TRAVELLED not in chosen or options.summaries:
+        return None
+    lines = list(measure_travelled(options.cases, options.seed, _show))
+    return render_travelled(lines), sum(bool(each.missed) for each in lines)
+
+
+def _compared(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:
+    if _PAIRS not in chosen or options.summaries:
+        return None
+    pairs = measure_pairs(options.seed, say=_show)
+    return render_pairs(pairs), len(pairs.missed)
+
+
+def _show(text: str) -> None:
+    """Progress in one line of a terminal; nothing in a pipe."""
+    if sys.stderr.isatty():
+        print(f"\r\033[K{text}", end="", file=sys.stderr, flush=True)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m tests.detection", description=__doc__)
+    parser.add_argument("--seed", type=int, default=1, help="the same draws the same cases (1)")
+    parser.add_argument("--cases", type=int, default=20, help="of each kind (20)")
+    parser.add_argument(
+        "--kinds", nargs="+", choices=_ALL, metavar="KIND", help=f"only these: {', '.join(_ALL)}"
+    )
+    parser.add_argument(
+        "--summaries",
+        nargs="?",
+        const="long",
+        choices=("long", "purged"),
+        help="ask rows and summaries about the same: of runs that are too long to be read row by "
+        "row, or whose rows were purged",
+    )
+    parser.add_argument("--wrong", action="store_true", help="name each thing that was wrong")
+    parser.add_argument("--check", action="store_true", help="fail below the goals")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

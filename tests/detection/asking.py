@@ -1,0 +1,180 @@
+"""The questions whose answers are judged; all that depends on the form of an answer is here."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from tests.detection.labelled import Measure
+from webots_mcp.store.detection.event import KINDS, Event, EventOptions, Kind
+from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading.ranges import resolve_range
+
+# Without a deadline that a busy machine would meet; how long it took is measured beside.
+UNHURRIED_S: Final = 300.0
+LARGE_EFFECT: Final = 0.8  # where an answer gives effects and no verdict, a reader takes it for one
+_ALL: Final = 1_000_000
+
+# The kinds of events that tell each measure; those that do not exist are left out.
+_KINDS: Final[dict[Measure, tuple[str, ...]]] = {
+    "standstill": ("still", "stuck"),
+    "stuck": ("stuck",),
+    "silent": ("silent",),
+    "flat": ("flat",),
+    "dropout": ("jump", "dropout", "spike"),
+    "leap": ("jump", "leap"),
+    "swing": ("oscillation",),
+    "gap": ("gap",),
+}
+# Words of a note that admits that something of a measure may have been missed.
+_WORDS: Final[dict[Measure, tuple[str, ...]]] = {
+    "standstill": ("still", "stuck"),
+    "stuck": ("still", "stuck"),
+    "silent": ("silent", "silence"),
+    "flat": ("flat",),
+    "dropout": ("jump", "dropout", "spike"),
+    "leap": ("jump", "leap"),
+    "swing": ("oscillation", "swing"),
+    "gap": ("gap",),
+}
+_OF_ROBOT: Final = frozenset[Measure]({"standstill", "stuck", "leap", "gap"})
+
+
+@dataclass(frozen=True)
+class Claim:
+    """What an answer says that happened.
+
+    Attributes:
+        name: The published signal; None where it is about the robot.
+        count: How often, where several are told as one.
+        source: The kind of the event and the name that it gives.
+    """
+
+    measure: Measure
+    run_id: int
+    start_s: float
+    end_s: float
+    name: str | None = None
+    period_s: float | None = None
+    amplitude: float | None = None
+    count: int = 1
+    source: tuple[str, str | None] = ("", None)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a question was answered.
+
+    Attributes:
+        took_s: Wall time.
+    """
+
+    claims: tuple[Claim, ...]
+    notes: tuple[str, ...]
+    took_s: float
+
+    def of(self, measure: Measure, run_id: int) -> list[Claim]:
+        """What it claims of one kind in one run."""
+        return [each for each in self.claims if (each.measure, each.run_id) == (measure, run_id)]
+
+    def admits(self, measure: Measure) -> bool:
+        """Whether a note says that something of that kind may have been missed."""
+        words = ("time was over", *_WORDS[measure])
+        return any(word in note.lower() for note in self.notes for word in words)
+
+
+def ask_run(
+    connection: sqlite3.Connection,
+    measures: Sequence[Measure],
+    run_id: int,
+    end_s: float | None = None,
+) -> Answer:
+    """What happened in a run, all of it or up to a time."""
+    return _asked(connection, measures, run_id=run_id, end_s=end_s)
+
+
+def ask_since(
+    connection: sqlite3.Connection, measures: Sequence[Measure], since_wall_s: float
+) -> Answer:
+    """What happened in all runs since a wall time."""
+    return _asked(connection, measures, since=since_wall_s)
+
+
+def _asked(
+    connection: sqlite3.Connection, measures: Sequence[Measure], **bounds: float | None
+) -> Answer:
+    named = {kind for measure in measures for kind in _KINDS[measure]}
+    kinds: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind in named)
+    started_s = time.perf_counter()
+    time_range = resolve_range(connection, **bounds)  # pyright: ignore[reportArgumentType]
+    told = find_events(
+        connection,
+        time_range,
+        EventOptions(kinds=kinds),
+        limit=_ALL,
+        around=(),
+        deadline_s=UNHURRIED_S,
+    )
+    took_s = time.perf_counter() - started_s
+    claims = [each for measure in measures for each in claims_of(told.events, measure)]
+    return Answer(tuple(claims), told.notes, took_s)
+
+
+def claims_of(events: Iterable[Event], measure: Measure) -> list[Claim]:
+    """The events of a measure; what several signals of one array tell at once is one claim."""
+    found: list[Claim] = []
+    for claim in sorted(_claims(events, measure), key=lambda each: each.start_s):
+        same = (at for at, each in enumerate(found) if _is_one(each, claim))
+        if (at := next(same, None)) is None:
+            found.append(claim)
+        else:
+            found[at] = replace(found[at], end_s=max(found[at].end_s, claim.end_s))
+    return found
+
+
+def _claims(events: Iterable[Event], measure: Measure) -> Iterable[Claim]:
+    for event in events:
+        of_position = event.kind == "jump" and event.name == "position"
+        if event.kind in _KINDS[measure] and of_position == (measure == "leap"):
+            named = event.name is not None and measure not in _OF_ROBOT
+            yield Claim(
+                measure,
+                event.run_id,
+                event.start_s,
+                event.end_s,
+                event.name.split(".")[0] if named and event.name else None,
+                event.details.get("period_s"),
+                event.details.get("amplitude"),
+                int(event.details.get("count", 1)),
+                (event.kind, event.name),
+            )
+
+
+def _is_one(one: Claim, other: Claim) -> bool:
+    """Two events that overlap are one where they differ in kind or in the item of an array."""
+    alike = (one.run_id, one.name) == (other.run_id, other.name) and one.source != other.source
+    return alike and other.start_s <= one.end_s and one.start_s <= other.end_s
+
+
+def distances_m(connection: sqlite3.Connection, run_ids: Sequence[int]) -> list[float | None]:
+    """How far the robot travelled in each of the runs, 2 to 10 of them."""
+    comparison = compare_runs(connection, run_ids, deadline_s=UNHURRIED_S)
+    return [group.distance_m for group in comparison.groups]
+
+
+def claimed_differences(connection: sqlite3.Connection) -> list[tuple[str, float]]:
+    """What is claimed to be different since the last edit: names, and how much more it is."""
+    comparison = compare_code(connection, limit=_ALL, deadline_s=UNHURRIED_S)
+    return list(_differences(comparison))
+
+
+def _differences(comparison: Comparison) -> Iterable[tuple[str, float]]:
+    for each in comparison.differences:
+        effect = each.effect[-1]
+        before, after = each.mean[0], each.mean[-1]
+        if effect is None or abs(effect) >= LARGE_EFFECT:
+            yield each.name, (after or 0.0) - (before or 0.0)

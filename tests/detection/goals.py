@@ -1,0 +1,38 @@
+"""What is aimed at, and which figures miss it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from tests.detection.judging import Tally, median, nine_in_ten
+from tests.detection.measuring import Key
+
+LEAST_SHARE: Final = 0.95  # recall and precision
+LEAST_SHARE_NOISY: Final = 0.9  # beyond 10 mm of noise
+MOST_BEGIN_ROWS: Final = 2.0  # the median, of standstills
+MOST_PERIOD_ERROR: Final = 0.05  # nine in ten
+MOST_AMPLITUDE_ERROR: Final = 0.1
+
+
+def missed_goals(key: Key, tally: Tally) -> list[str]:
+    """The names of the figures that do not reach their goals."""
+    return list(_missed(key, tally))
+
+
+def _missed(key: Key, tally: Tally) -> Iterator[str]:
+    _, measure, condition = key
+    least = LEAST_SHARE_NOISY if "to 30 mm" in condition else LEAST_SHARE
+    if "purged" in condition:  # what is gone cannot be found, but it is not passed over
+        if (tally.said_share if tally.said_share is not None else 1.0) < 1:
+            yield "said"
+    elif (tally.recall if tally.recall is not None else 1.0) < least:
+        yield "recall"
+    if (tally.precision if tally.precision is not None else 1.0) < least:
+        yield "precision"
+    if measure == "standstill" and (median(tally.begin_errors) or 0.0) > MOST_BEGIN_ROWS:
+        yield "begin"
+    if (nine_in_ten(tally.period_errors) or 0.0) > MOST_PERIOD_ERROR:
+        yield "period"
+    if (nine_in_ten(tally.amplitude_errors) or 0.0) > MOST_AMPLITUDE_ERROR:
+        yield "amplitude"

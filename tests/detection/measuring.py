@@ -1,0 +1,165 @@
+"""Writes cases, asks about them, and counts what the answers got right."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Final, Literal
+
+from tests.detection.asking import Answer, Claim, ask_run, ask_since
+from tests.detection.drawing import draw_case
+from tests.detection.judging import Tally, Verdict, judge
+from tests.detection.labelled import Case, Incident, LabelledRun, Measure, repeated
+from tests.detection.writing import purge, roll_up, write_all
+from tests.history.recording import WALL_START_S
+from tests.memory import memory_connection
+
+Summaries = Literal["long", "purged"]
+Key = tuple[str, Measure, str]  # kind of recording, what is judged, under which conditions
+
+NOISY_M: Final = 0.01  # more noise than this has goals of its own
+# Longer than what any question reads row by row; what is compared is the first part, shorter than
+# that, which can be asked of rows as well.
+LONG_ROWS: Final = 36_000
+PART_ROWS: Final = 12_000
+_MOST_VALUES: Final = 0  # no further signals in long recordings: their rows cost enough
+
+
+@dataclass
+class Report:
+    """What came of all cases.
+
+    Attributes:
+        agreements: By kind of recording and what is judged: what rows and summaries both tell,
+            and what only the rows or only the summaries do.
+        wrong: A line for each thing that was missed or wrongly told.
+    """
+
+    tallies: dict[Key, Tally] = field(default_factory=dict[Key, Tally])
+    agreements: dict[tuple[str, Measure], tuple[int, int, int]] = field(
+        default_factory=dict[tuple[str, Measure], tuple[int, int, int]]
+    )
+    wrong: list[str] = field(default_factory=list[str])
+
+    def add(self, case: Case, run: LabelledRun, verdict: Verdict, asked: Asked) -> None:
+        """Count one run of a case."""
+        key = (case.kind, asked.measure, ", ".join(filter(None, (_noise(run), asked.how))))
+        tally = self.tallies.setdefault(key, Tally())
+        minutes = run.duration_s / 60
+        admitted = asked.answer.admits(asked.measure)
+        tally.add(verdict, minutes, asked.answer.took_s, admitted=admitted)
+        self.wrong += _lines(case, run, verdict, asked)
+
+    def add_agreement(self, key: tuple[str, Measure], told: Verdict) -> None:
+        """Count what summaries tell, judged by what rows tell."""
+        both, missing, more = self.agreements.get(key, (0, 0, 0))
+        new = (both + len(told.found), missing + len(told.missed), more + told.false)
+        self.agreements[key] = new
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What was asked about a run, and how: of rows, of summaries, or as it came."""
+
+    measure: Measure
+    answer: Answer
+    how: str = ""
+
+
+def measure(
+    kinds: Sequence[str],
+    cases: int,
+    seed: int,
+    summaries: Summaries | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> Report:
+    """Ask about so many cases of each kind."""
+    report = Report()
+    for kind in kinds:
+        for index in range(cases):
+            say(f"{kind} {index + 1}/{cases}")
+            if summaries is None:
+                _measure_whole(draw_case(kind, seed, index), report)
+            else:
+                case = draw_case(kind, seed, index, most_values=_MOST_VALUES)
+                _measure_long(case, summaries, report)
+    return report
+
+
+def _measure_whole(case: Case, report: Report) -> None:
+    """All runs of a case in one question; of every second case the summaries are made before."""
+    with memory_connection() as connection:
+        run_ids = write_all(connection, case.runs)
+        if case.number % 2:
+            roll_up(connection)
+        answer = ask_since(connection, case.asked, WALL_START_S)
+    for run_id, run in zip(run_ids, case.runs, strict=True):
+        for asked in (Asked(each, answer) for each in case.asked):
+            _judge(case, run, run_id, asked, report)
+
+
+def _measure_long(case: Case, summaries: Summaries, report: Report) -> None:
+    """The first part of a long run, asked of its rows and of the summaries of the whole run."""
+    short = repeated(case.runs[-1], min(PART_ROWS, 4 * len(case.runs[-1].times)))
+    end_s = float(short.times[-1])
+    long = repeated(short, LONG_ROWS)
+    with memory_connection() as connection, tempfile.TemporaryDirectory() as folder:
+        (run_id,) = write_all(connection, [long])
+        roll_up(connection)
+        of_rows = ask_run(connection, case.asked, run_id, end_s=end_s + 1e-6)
+        if summaries == "purged":
+            purge(connection, Path(folder), len(long.times) - len(short.times))
+        of_summaries = ask_run(connection, case.asked, run_id)
+    of_part = _until(of_summaries, end_s)
+    for each in case.asked:
+        _judge(case, short, run_id, Asked(each, of_rows, "rows"), report)
+        _judge(case, short, run_id, Asked(each, of_part, summaries), report)
+        told = [_as_incident(claim) for claim in of_rows.of(each, run_id)]
+        agreed = judge(told, of_part.of(each, run_id), short.interval_s)
+        report.add_agreement((case.kind, each), agreed)
+
+
+def _as_incident(claim: Claim) -> Incident:
+    return Incident(claim.measure, claim.start_s, claim.end_s, claim.name)
+
+
+def _until(answer: Answer, end_s: float) -> Answer:
+    """What of it began before that time, and no more of that than lies before it."""
+    claims = [
+        replace(each, end_s=min(each.end_s, end_s))
+        for each in answer.claims
+        if each.start_s <= end_s
+    ]
+    return replace(answer, claims=tuple(claims))
+
+
+def _judge(case: Case, run: LabelledRun, run_id: int, asked: Asked, report: Report) -> None:
+    truth = [each for each in run.incidents if each.measure == asked.measure]
+    claims = asked.answer.of(asked.measure, run_id)
+    report.add(case, run, judge(truth, claims, run.interval_s), asked)
+
+
+def _noise(run: LabelledRun) -> str:
+    if run.distance_m is None:
+        return ""
+    return f"to {'10' if run.noise_m <= NOISY_M else '30'} mm"
+
+
+def _lines(case: Case, run: LabelledRun, verdict: Verdict, asked: Asked) -> Iterator[str]:
+    noise = f", noise {1000 * run.noise_m:g} mm" if run.noise_m else ""
+    where = f"{case.kind} {case.number}, {1000 * run.interval_s:g} ms{noise}"
+    where += f", {asked.how}" if asked.how else ""
+    for incident in verdict.missed:
+        said = ", and said so" if asked.answer.admits(asked.measure) else ""
+        yield f"{where}: {_text(incident)} was missed{said}"
+    for claim in verdict.unfounded:
+        yield f"{where}: {_text(claim)} did not happen"
+
+
+def _text(what: Incident | Claim) -> str:
+    name = f" of {what.name}" if what.name else ""
+    period = f", period {what.period_s:.3g} s" if what.period_s else ""
+    size = f", amplitude {what.amplitude:.3g}" if what.amplitude else ""
+    return f"{what.measure}{name} {what.start_s:.3f} to {what.end_s:.3f} s{period}{size}"

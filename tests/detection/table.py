@@ -1,0 +1,117 @@
+"""The figures as text."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Final
+
+from tests.detection.goals import missed_goals
+from tests.detection.judging import Tally, median, nine_in_ten
+from tests.detection.measuring import Key, Report
+from tests.detection.pairs import Pairs
+from tests.detection.travelling import Travelled
+
+_COLUMNS: Final = (
+    "recording", "judged", "condition", "runs", "truth", "recall", "precision", "begin", "end",
+    "period %", "amplitude %", "false/min", "said", "slowest s", "below the goal",
+)  # fmt: skip
+LEGEND: Final = (
+    "recording: the kind that was drawn; judged: what was looked for; truth: how often it happened",
+    "precision: where it never happened, the share of runs without a false claim",
+    "begin, end: error in rows, of a swing in periods: median/nine in ten",
+    "period, amplitude: error that nine in ten do not exceed",
+    "said: of what was missed, the share whose answer said that it may have missed some",
+)
+
+
+def render(report: Report) -> str:
+    """A line for each kind of recording and each thing that was judged in it."""
+    lines = [_line(key, tally) for key, tally in _told(report)]
+    return _aligned([_COLUMNS, *lines])
+
+
+def render_agreement(report: Report) -> str:
+    """How far rows and summaries tell the same, whether true or not."""
+    head = ("recording", "judged", "both tell", "only rows", "only summaries")
+    counted = (
+        (*key, *map(str, counts)) for key, counts in report.agreements.items() if any(counts)
+    )
+    return _aligned([head, *counted])
+
+
+def _told(report: Report) -> Iterator[tuple[Key, Tally]]:
+    """Not those in which nothing happened and nothing was told, beside some that did."""
+    eventful = {key[0] for key, tally in report.tallies.items() if tally.incidents}
+    for key, tally in report.tallies.items():
+        if tally.incidents or tally.false or key[0] not in eventful:
+            yield key, tally
+
+
+def _line(key: Key, tally: Tally) -> tuple[str, ...]:
+    return (
+        *key,
+        str(tally.runs),
+        str(tally.incidents),
+        _share(tally.recall),
+        _share(tally.precision),
+        _both(tally.begin_errors),
+        _both(tally.end_errors),
+        _percent(tally.period_errors),
+        _percent(tally.amplitude_errors),
+        f"{tally.false / tally.minutes:.2f}",
+        _share(tally.said_share),
+        f"{tally.slowest_s:.2f}",
+        ", ".join(missed_goals(key, tally)),
+    )
+
+
+def render_travelled(lines: Iterable[Travelled]) -> str:
+    """A line for each noise."""
+    head = (
+        "noise mm",
+        "runs",
+        "at rest: worst m",
+        "on the way: ratio",
+        "unknown",
+        "below the goal",
+    )
+    return _aligned([head, *(_travelled(each) for each in lines)])
+
+
+def _travelled(each: Travelled) -> tuple[str, ...]:
+    worst_m = f"{max(each.rest_m):.3f}" if each.rest_m else "-"
+    ratios = f"{min(each.ratios):.3f} to {max(each.ratios):.3f}" if each.ratios else "-"
+    runs = str(len(each.rest_m) + len(each.ratios) + each.unknown)
+    noise = f"{1000 * each.noise_m:g}"
+    return noise, runs, worst_m, ratios, str(each.unknown), ", ".join(each.missed)
+
+
+def render_pairs(pairs: Pairs) -> str:
+    """What was claimed of like runs, and how often +10 % was found."""
+    false = [names for names in pairs.claimed if names]
+    names = Counter(name for names in false for name in names)
+    most = ", ".join(f"{name} {count}" for name, count in names.most_common(6))
+    same = f"A/A: {len(false)} of {len(pairs.claimed)} pairs with a difference that is none"
+    faster = f"+10 % speed: found in {pairs.found} of {pairs.faster} pairs"
+    return "\n".join([f"{same} ({most})" if most else same, faster])
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
+def _both(values: Sequence[float]) -> str:
+    middle, most = median(values), nine_in_ten(values)
+    return "-" if middle is None or most is None else f"{middle:.1f}/{most:.1f}"
+
+
+def _percent(values: Sequence[float]) -> str:
+    most = nine_in_ten(values)
+    return "-" if most is None else f"{100 * most:.1f}"
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    cells = ([c.ljust(w) for c, w in zip(row, widths, strict=True)] for row in rows)
+    return "\n".join("  ".join(row).rstrip() for row in cells)

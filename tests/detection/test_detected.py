@@ -1,0 +1,66 @@
+"""What is said of labelled recordings: the part of them that is tested each time."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.detection.asking import Answer, ask_since
+from tests.detection.drawing import KINDS, draw_case
+from tests.detection.judging import judge
+from tests.detection.labelled import Case, Measure
+from tests.detection.measuring import measure
+from tests.detection.writing import write_all
+from tests.history.recording import WALL_START_S
+from tests.memory import memory_connection
+
+_REPEATABLE = settings.default is not None and settings.default.derandomize
+EXAMPLES = 4 if _REPEATABLE else 100
+MOST_VALUES = 10_000  # that are added to a run: enough to be searched, and read in no time
+LOOKED_FOR: tuple[Measure, ...] = (
+    "standstill", "silent", "flat", "dropout", "leap", "swing", "gap",
+)  # fmt: skip
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def asked(case: Case, measures: tuple[Measure, ...]) -> tuple[list[int], Answer]:
+    with memory_connection() as connection:
+        run_ids = write_all(connection, case.runs)
+        return run_ids, ask_since(connection, measures, WALL_START_S)
+
+
+@given(kind=st.sampled_from(list(KINDS)), seed=SEEDS)
+@settings(max_examples=2 * EXAMPLES, deadline=None)
+def test_an_answer_keeps_to_the_recording_and_tells_nothing_twice(kind: str, seed: int) -> None:
+    case = draw_case(kind, seed, 0, most_values=MOST_VALUES)
+    run_ids, answer = asked(case, LOOKED_FOR)
+    runs = dict(zip(run_ids, case.runs, strict=True))
+    told = sorted(answer.claims, key=lambda each: (str(each.source), each.run_id, each.start_s))
+    for claim in told:
+        times = runs[claim.run_id].times
+        assert times[0] <= claim.start_s <= claim.end_s <= times[-1]
+    for before, after in pairwise(told):
+        if (before.source, before.run_id) == (after.source, after.run_id):
+            assert before.end_s <= after.start_s
+
+
+@given(kind=st.sampled_from(["gaps", "swing_gap"]), seed=SEEDS)
+@settings(max_examples=EXAMPLES, deadline=None)
+def test_every_gap_is_told_and_nothing_else_is_a_gap(kind: str, seed: int) -> None:
+    case = draw_case(kind, seed, 0, most_values=MOST_VALUES)
+    run_ids, answer = asked(case, ("gap",))
+    for run_id, run in zip(run_ids, case.runs, strict=True):
+        truth = [each for each in run.incidents if each.measure == "gap"]
+        verdict = judge(truth, answer.of("gap", run_id), run.interval_s)
+        assert not verdict.missed and not verdict.false
+
+
+@pytest.mark.parametrize("kind", ["silent", "late", "wide"])
+def test_silence_that_lasts_less_than_half_of_a_run_is_told_exactly(kind: str) -> None:
+    report = measure([kind], 1, 1)
+    tally = report.tallies[kind, "silent", ""]
+    assert (tally.recall or 1.0, tally.false, report.wrong) == (1.0, 0, [])

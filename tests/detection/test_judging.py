@@ -1,0 +1,117 @@
+"""Answers whose worth is known get the figures that they deserve."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from tests.detection.asking import Answer, Claim, claims_of
+from tests.detection.goals import missed_goals
+from tests.detection.judging import Tally, judge
+from tests.detection.labelled import Incident
+from webots_mcp.store.detection.event import Event
+
+STOPS = (Incident("standstill", 10.0, 20.0), Incident("standstill", 40.0, 50.0))
+
+
+def stand(start_s: float, end_s: float) -> Claim:
+    return Claim("standstill", 1, start_s, end_s)
+
+
+def tally(*verdicts: object, admitted: bool = False) -> Tally:
+    found = Tally()
+    for verdict in verdicts:
+        found.add(verdict, 2.0, 0.1, admitted=admitted)  # pyright: ignore[reportArgumentType]
+    return found
+
+
+def test_who_tells_all_and_nothing_else_is_right() -> None:
+    found = tally(judge(STOPS, [stand(10, 20), stand(40.1, 49.8)], 0.1))
+    assert (found.recall, found.precision, found.said_share) == (1.0, 1.0, None)
+    assert found.begin_errors == pytest.approx([0.0, 1.0])
+    assert found.end_errors == pytest.approx([0.0, 2.0])
+    assert missed_goals(("drive", "standstill", ""), found) == []
+
+
+def test_what_is_not_told_costs_recall_and_what_did_not_happen_precision() -> None:
+    found = tally(judge(STOPS, [stand(10, 20), stand(70, 80)], 0.1))
+    assert (found.recall, found.precision, found.said_share) == (0.5, 0.5, 0.0)
+    assert missed_goals(("drive", "standstill", ""), found) == ["recall", "precision"]
+
+
+def test_one_standstill_told_as_four_is_found_once_and_thrice_wrong() -> None:
+    parts = [stand(10, 14), stand(14.2, 16), stand(16.2, 18), stand(18.2, 20)]
+    verdict = judge(STOPS[:1], parts, 0.1)
+    assert len(verdict.found) == 1 and verdict.false == 3
+
+
+def test_two_standstills_told_as_one_are_found_at_most_once() -> None:
+    verdict = judge(STOPS, [stand(10, 50)], 0.1)
+    assert len(verdict.found) + len(verdict.missed) == 2 and len(verdict.missed) >= 1
+
+
+def test_an_answer_that_covers_the_whole_run_has_found_nothing_in_it() -> None:
+    verdict = judge(STOPS, [stand(0, 600)], 0.1)
+    assert not verdict.found and verdict.false == 1
+
+
+def test_what_lies_at_a_limit_is_right_whether_it_is_told_or_not() -> None:
+    short = replace(STOPS[0], optional=True)
+    for claims in ([], [stand(10, 20)], [stand(10, 13), stand(15, 20)]):
+        found = tally(judge([short], claims, 0.1))
+        assert (found.incidents, found.false, found.precision) == (0, 0, 1.0)
+
+
+def test_where_nothing_happened_each_run_is_clean_or_not() -> None:
+    found = tally(judge([], [], 0.1), judge([], [stand(1, 5), stand(6, 9)], 0.1))
+    assert (found.recall, found.precision, found.false, found.minutes) == (None, 0.5, 2, 4.0)
+
+
+def test_a_miss_is_told_apart_from_one_that_the_answer_admits() -> None:
+    silent_miss, admitted_miss = judge(STOPS, [], 0.1), judge(STOPS, [], 0.1)
+    assert tally(silent_miss).said_share == 0.0
+    assert tally(admitted_miss, admitted=True).said_share == 1.0
+
+
+def test_ten_dropouts_told_as_one_count_as_the_ten_that_they_are() -> None:
+    drops = [Incident("dropout", at, at, "ir") for at in range(10)]
+    told = Claim("dropout", 1, 0.0, 9.0, "ir", count=10)
+    assert len(judge(drops, [told], 0.1).found) == 10
+    assert judge(drops, [replace(told, count=12)], 0.1).false == 2
+    assert len(judge(drops, [replace(told, count=8)], 0.1).missed) == 2
+    assert not judge(drops, [replace(told, name="front")], 0.1).found
+
+
+def test_a_swing_that_a_gap_cuts_in_two_may_be_told_twice() -> None:
+    swing = Incident("swing", 10, 40, "heading", 2.0, 0.2, split=True)
+    claim = Claim("swing", 1, 10, 20, "heading", 2.1, 0.18)
+    verdict = judge([swing], [claim, replace(claim, start_s=26, end_s=40)], 0.1)
+    assert len(verdict.found) == 1 and verdict.false == 0
+    found = tally(verdict)
+    assert found.period_errors == pytest.approx([0.05])
+    assert found.amplitude_errors == pytest.approx([0.1])
+    assert judge([replace(swing, split=False)], [claim, replace(claim)], 0.1).false == 1
+
+
+def test_what_several_items_of_an_array_tell_at_once_is_one_claim() -> None:
+    events = [
+        Event("silent", 1, 3.0, 9.0, 0.0, name) for name in ("lidar.min", "lidar.max", "front")
+    ]
+    events.append(Event("silent", 1, 20.0, 22.0, 0.0, "lidar.min"))
+    claims = claims_of(events, "silent")
+    assert [(each.name, each.start_s) for each in claims] == [
+        ("lidar", 3.0), ("front", 3.0), ("lidar", 20.0),
+    ]  # fmt: skip
+
+
+def test_a_leap_of_the_robot_and_a_jump_of_a_sensor_are_two_things() -> None:
+    events = [Event("jump", 1, 3.0, 3.0, 0.0, name) for name in ("position", "front")]
+    assert [each.name for each in claims_of(events, "leap")] == [None]
+    assert [each.name for each in claims_of(events, "dropout")] == ["front"]
+
+
+def test_a_note_admits_what_it_names() -> None:
+    answer = Answer((), ("stuck was not searched: no position is published",), 0.0)
+    assert answer.admits("stuck") and answer.admits("standstill") and not answer.admits("swing")
+    assert Answer((), ("the time was over: searched up to 3 s only",), 0.0).admits("swing")

@@ -65,7 +65,7 @@ def find_log_level(level: object) -> LogLevel | None:
         return _LEVEL_ALIASES.get(level.strip().lower())
     if isinstance(level, bool) or not isinstance(level, (int, float)) or level != level:
         return None
-    return LOG_LEVELS[int(min(max(level // 10 - 1, 0), len(LOG_LEVELS) - 1))]
+    return LOG_LEVELS[int(min(max(level, 10), 50)) // 10 - 1]
 
 
 def host_name() -> str:

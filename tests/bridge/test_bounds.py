@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import collections
 import ctypes
+import itertools
 import json
 import math
 import sqlite3
 import sys
+import tracemalloc
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -18,7 +21,8 @@ from hypothesis import strategies as st
 
 from tests.bridge.conftest import Recording
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import encoding
+from webots_mcp.bridge import cleaning, encoding
+from webots_mcp.bridge.changes import Changes
 from webots_mcp.bridge.cleaning import MAX_NAMED
 from webots_mcp.bridge.encoding import MAX_ROW_BYTES, Encoded
 
@@ -440,3 +444,92 @@ def test_whatever_is_published_sqlite_can_read_it_and_it_is_bounded_and_what_is_
     if not any(kind.startswith(("array[", "dict", "too deep")) for kind in encoded.odd.values()):
         assert json.loads(again.text) == stored
         assert again.odd == {}
+
+
+class Unending(Mapping[str, object]):
+    """Says that it is small, and never comes to its end."""
+
+    def __len__(self) -> int:
+        return 3
+
+    def __getitem__(self, key: str) -> object:
+        return True
+
+    def __iter__(self) -> Iterator[str]:
+        return (f"key {n}" for n in itertools.count())
+
+
+def test_a_state_that_never_comes_to_its_end_is_recorded_as_far_as_it_says(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.publish(Unending())
+    assert recording.states() == [{"key 0": True, "key 1": True, "key 2": True}]
+
+
+def test_keys_that_are_new_in_every_state_do_not_fill_the_memory() -> None:
+    changes = Changes()
+    tracemalloc.start()
+    try:
+        for n in range(20_000):
+            assert not list(changes.look({f"seen at {n}": "yes"}))
+        held_bytes, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert held_bytes < 500_000
+
+
+@pytest.mark.usefixtures("encoder")
+def test_objects_that_take_too_long_cost_themselves_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    for module in (encoding, cleaning):
+        monkeypatch.setattr(module, "LONGEST_S", -1.0)
+    encoded = encoding.encode({"a": [Decimal(1), Decimal(2)], "b": {"c": 2.5}, "d": math.nan})
+    assert json.loads(encoded.text)["b"] == {"c": 2.5}
+    assert encoded.odd["a.1"] == "type Decimal: no time left"
+    assert encoded.odd["d"] == "nan"
+
+
+class Counted:
+    """An array of numbers that counts how often it is read."""
+
+    read = 0
+
+    def __init__(self, size: int, nbytes: int) -> None:
+        self._size = size
+        self.nbytes = nbytes
+
+    def __len__(self) -> int:
+        return self._size
+
+    def tolist(self) -> list[float]:
+        Counted.read += 1
+        return [1.0] * self._size
+
+
+@pytest.mark.usefixtures("encoder")
+def test_arrays_that_there_is_no_room_for_are_not_read() -> None:
+    Counted.read = 0
+    encoded = encoding.encode({"a": [Counted(15_000, 120_000) for _ in range(500)]})
+    assert Counted.read <= 4
+    assert encoded.odd["a.499"] == "array[15000]"
+
+
+@pytest.mark.usefixtures("encoder")
+def test_an_array_of_few_but_long_items_is_not_read() -> None:
+    Counted.read = 0
+    assert encoding.encode({"a": Counted(10, 40_000_000)}).odd == {"a": "array of 40000000 bytes"}
+    assert Counted.read == 0
+
+
+@pytest.mark.usefixtures("encoder")
+@pytest.mark.parametrize(
+    "key", [10**4000, tuple(range(100_000)), frozenset(range(1000))], ids=["int", "tuple", "set"]
+)
+def test_a_key_whose_text_takes_long_to_make_is_named_by_its_kind(key: Any) -> None:
+    name = f"<{type(key).__name__}>"
+    assert encoding.encode({key: 1}) == (f'{{"{name}":1}}', {name: "key"}, 0)
+
+
+@pytest.mark.usefixtures("encoder")
+def test_numpys_long_doubles_are_numbers() -> None:
+    state = {"a": np.longdouble(0.5), "b": np.array([0.25], np.longdouble)}
+    assert encoding.encode(state) == ('{"a":0.5,"b":[0.25]}', {}, 0)

@@ -40,6 +40,8 @@ def logger(bridge: MCPBridge) -> logging.Logger:
         (0, "debug"),
         (25, "info"),
         (1000, "critical"),
+        (float("inf"), "critical"),
+        (float("-inf"), "debug"),
         (-1, "debug"),
     ],
 )

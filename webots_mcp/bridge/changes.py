@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from itertools import islice
 from typing import Any, Final
 
 from webots_mcp.bridge.cleaning import MAX_KEY_CHARACTERS, key_text
@@ -36,12 +37,14 @@ class Changes:
         last = self._last
         if len(state) > _MOST_KEYS:
             return changed
-        for key, value in state.items():
+        for key, value in islice(state.items(), _MOST_KEYS):  # not all mappings come to their end
             if type(value) is not bool and not (type(value) is str and len(value) <= _LONGEST):
                 continue
             before = last.get(key, _UNSEEN)
             if before is value or before == value:
                 continue
+            if before is _UNSEEN and len(last) >= _MOST_KEYS:
+                continue  # keys that are never the same would fill the memory
             last[key] = value
             if before is not _UNSEEN and self._count < MOST_CHANGES:
                 self._count += 1

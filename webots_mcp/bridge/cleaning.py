@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import enum
 import math
+import time
 from collections import deque
 from collections.abc import Iterable, Mapping
 from itertools import compress, islice
@@ -37,6 +38,10 @@ _TOP_KEYS: Final = 1000  # of a state that has more keys than there is room for
 _MOST_PATHS_CHARACTERS: Final = 50_000  # of all together
 _MOST_REASON_CHARACTERS: Final = 200
 _LONGEST_ESCAPE: Final = 6
+_MOST_KEY_BITS: Final = 1000  # the text of a longer integer takes long to make
+# For the objects of a row, which take their own time. The processor's, because by the wall clock
+# another process that runs in between would cost values.
+LONGEST_S: Final = 0.01
 
 
 # Where a value stands: its path is put together only where it has to be named.
@@ -69,6 +74,7 @@ class Cleaner:
         self._keys_bytes = MAX_KEYS_BYTES
         self._paths = _MOST_PATHS_CHARACTERS
         self._unfilled: deque[_Unfilled] = deque()
+        self._until_s = time.thread_time() + LONGEST_S
 
     def clean(self, state: object) -> object:
         """The plain counterpart of any value; one that fails costs itself and no other."""
@@ -227,6 +233,10 @@ class Cleaner:
     def _object(self, value: Any, place: Place, depth: int) -> object:
         if isinstance(value, (bytes, bytearray, memoryview)):
             return self._bytes(memoryview(cast("bytes", value)), place)
+        if time.thread_time() > self._until_s:
+            return self._replaced(place, f"type {kind_name(value)}: no time left")
+        if (count := item_count(value)) > self._room:
+            return self._replaced(place, f"array[{count}]")
         return self._plain(convert(value), place, depth + 1)
 
     def _take(self, room: int) -> bool:
@@ -260,9 +270,19 @@ def key_text(key: object) -> str:
     """Object keys as the JSON encoder writes them; any other key as its text."""
     if key is None or isinstance(key, bool):
         return {None: "null", True: "true", False: "false"}[key]
-    if isinstance(key, (str, int)):  # also enums of them, whose own text is another
-        return str.__str__(key) if isinstance(key, str) else int.__repr__(key)
+    if isinstance(key, str):  # also enums of it, whose own text is another
+        return str.__str__(key)
+    if isinstance(key, int):
+        _require_short(key.bit_length(), _MOST_KEY_BITS)
+        return int.__repr__(key)
+    if issubclass(type(key), (tuple, frozenset)):
+        _require_short(len(cast("tuple[object, ...]", key)), MAX_KEY_CHARACTERS)
     return str(key)
+
+
+def _require_short(length: int, limit: int) -> None:
+    if length > limit:
+        raise NoCounterpartError(f"its text is too long: {length}")
 
 
 def _size_bytes(text: str) -> int:

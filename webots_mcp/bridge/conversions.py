@@ -9,6 +9,7 @@ from itertools import islice
 from typing import Any, Final, cast
 
 MOST_ITEMS: Final = 20_000  # of one array or container; a row has no room for more
+MOST_ARRAY_BYTES: Final = 1_000_000  # of one array, whose items may be long texts
 _MOST_KIND_CHARACTERS: Final = 100
 
 # Classes of Webots' `controller` package whose instances are nothing but their attributes.
@@ -43,6 +44,7 @@ def convert(value: Any) -> object:
         attributes: dict[str, object] = value.__dict__
         return {name: item for name, item in attributes.items() if not name.startswith("_")}
     _require_few(item_count(value))
+    _require_short(value)
     for name, conversion in _CONVERSIONS:
         if hasattr(value, name):
             return conversion(value)
@@ -64,6 +66,12 @@ def item_count(value: Any) -> int:
 def _require_few(count: int) -> None:
     if count > MOST_ITEMS:
         raise NoCounterpartError(f"array[{count}]")
+
+
+def _require_short(array: Any) -> None:
+    size_bytes = getattr(array, "nbytes", 0)
+    if isinstance(size_bytes, int) and size_bytes > MOST_ARRAY_BYTES:
+        raise NoCounterpartError(f"array of {size_bytes} bytes")
 
 
 def is_number_array(value: Any) -> bool:
@@ -126,7 +134,7 @@ def _is_followed(kind: Any) -> bool:
 # By what the object can do, not by its type: numpy, dataclasses, datetime and pathlib would cost
 # the controller their import.
 _CONVERSIONS: Final[tuple[tuple[str, Callable[[Any], object]], ...]] = (
-    ("tolist", lambda array: array.tolist()),  # numpy scalars and arrays, array.array
+    ("tolist", lambda array: _listed(array)),  # numpy scalars and arrays, array.array
     ("__dataclass_fields__", lambda data: {name: getattr(data, name) for name in _fields(data)}),
     ("_value_", lambda member: member.value),  # enum
     ("isoformat", lambda moment: moment.isoformat()),
@@ -138,6 +146,12 @@ _CONVERSIONS: Final[tuple[tuple[str, Callable[[Any], object]], ...]] = (
     ("isdisjoint", lambda items: list(_as_many_as_said(items))),  # set, frozenset
     ("__reversed__", lambda items: list(_as_many_as_said(items))),  # deque, range, sequences
 )
+
+
+def _listed(array: Any) -> object:
+    """Numpy has no plain number for its long doubles."""
+    plain = array.tolist()
+    return float(plain) if type(plain) is type(array) else plain
 
 
 def _fields(data: Any) -> Iterable[str]:

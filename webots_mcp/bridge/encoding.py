@@ -17,6 +17,7 @@ replaced, what is too much is cut, and `odd` names the path and what stood there
     is room for                        1,000
     dict whose keys are more text      its beginning   "dict cut after 900"
     than there is room for
+    array of over 1,000,000 bytes      null            "array of 40000000 bytes"
     nested over 20 levels              null            "too deep"
     text over 100,000 bytes            its beginning   "text[50000000]"
     key over 200 characters            its beginning   "key[5000]"
@@ -24,6 +25,8 @@ replaced, what is too much is cut, and `odd` names the path and what stood there
     key that has no text               "<Handle>"      "key"
     C pointer                          null            "null pointer", "pointer of unknown length"
     any other object                   null            "type Socket"
+    object after those before it took  null            "type Socket: no time left"
+    10 ms of processor time
     object that fails while it is read null            "type Socket: why"
     row that fails as a whole          {}              "": why
 
@@ -42,11 +45,19 @@ beyond 64 bits: they become the nearest float, as which SQLite reads them.
 from __future__ import annotations
 
 import json
+import time
 from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable, Iterable
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.bridge.cleaning import MAX_DEPTH, MAX_ROOM, ROOM_OF_A_VALUE, Cleaner, failure
+from webots_mcp.bridge.cleaning import (
+    LONGEST_S,
+    MAX_DEPTH,
+    MAX_ROOM,
+    ROOM_OF_A_VALUE,
+    Cleaner,
+    failure,
+)
 from webots_mcp.bridge.conversions import convert, is_number_array, item_count
 
 orjson: Any
@@ -91,9 +102,22 @@ class _NotPlainError(Exception):
     """The value is too large, or of a kind that has to be looked at more closely."""
 
 
+class _Converted(dict[int, object]):
+    """The plain counterpart of each object, by its id, and when the first one was asked for."""
+
+    began_s: float | None = None
+
+    def require_time(self) -> None:
+        """Raise _NotPlainError where the objects have taken too long already."""
+        if self.began_s is None:
+            self.began_s = time.thread_time()
+        elif time.thread_time() > self.began_s + LONGEST_S:
+            raise _NotPlainError
+
+
 def encode(state: object) -> Encoded:
     """Encode a state, as fast as its content allows; the state itself is never changed."""
-    converted: dict[int, object] = {}
+    converted = _Converted()
     try:
         _look((state,), MAX_PLAIN_VALUES, 0, converted)
         text = _encode_looked_at(state, converted)
@@ -107,7 +131,7 @@ def encode(state: object) -> Encoded:
 def is_small(value: object) -> bool:
     """Whether a look at all of it, as `str` takes, ends soon."""
     try:
-        _look((value,), MAX_PLAIN_VALUES, 0, {})
+        _look((value,), MAX_PLAIN_VALUES, 0, _Converted())
     except Exception:  # noqa: BLE001  (whatever an object of the user's does)
         return False
     return True
@@ -124,7 +148,7 @@ def text_of(value: object) -> str:
 # -- the ordinary way --------------------------------------------------------------------------
 
 
-def _look(values: Iterable[Any], left: int, depth: int, converted: dict[int, object]) -> int:
+def _look(values: Iterable[Any], left: int, depth: int, converted: _Converted) -> int:
     """Count what is to be encoded before the encoder, which knows no bounds, begins with it.
 
     Args:
@@ -196,7 +220,7 @@ def _is_plain_key(key: object) -> bool:
     return key is None or type(key) in (bool, float)
 
 
-def _look_at_object(value: Any, left: int, depth: int, converted: dict[int, object]) -> int:
+def _look_at_object(value: Any, left: int, depth: int, converted: _Converted) -> int:
     if isinstance(value, float):
         return left
     if isinstance(value, int):
@@ -208,11 +232,12 @@ def _look_at_object(value: Any, left: int, depth: int, converted: dict[int, obje
     if is_number_array(value):
         converted[id(value)] = value
         return _look((), left - item_count(value), depth, converted)
+    converted.require_time()
     converted[id(value)] = plain = convert(value)
     return _look((plain,), left - 1, depth + 1, converted)
 
 
-def _look_at_container(value: Any, left: int, depth: int, converted: dict[int, object]) -> int:
+def _look_at_container(value: Any, left: int, depth: int, converted: _Converted) -> int:
     """A subclass counts as what it derives from if it does not give out its items in its own way.
 
     The encoders ask some subclasses for their items, and not others.

@@ -1,0 +1,89 @@
+"""Swings are found where they are, whatever else the value does before, after or meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from webots_mcp.store.analysis.noise import Array
+from webots_mcp.store.analysis.swings import Swing, find_swings
+
+START_S, PERIODS, HEIGHT = 60.0, 8, 0.2
+COURSES: dict[str, Callable[[Array], Array]] = {
+    "constant": np.zeros_like,
+    "ramp": lambda times: 0.15 * times,
+    "turns": lambda times: np.interp(times, [0, 30, 65, 70, 90, 200], [0, 9, 9, 12, 12, -20]),
+    "far away": lambda times: np.where(times < 30, 40.0, 0.0),
+}
+
+
+def swinging(times: Array, course: str, period_s: float, noise: float = 0.003) -> Array:
+    """Eight periods from 60 s on."""
+    inside = (times >= START_S) & (times < START_S + PERIODS * period_s)
+    swing = np.where(inside, HEIGHT * np.sin(2 * np.pi * (times - START_S) / period_s), 0)
+    dither = np.random.default_rng(len(times)).normal(0, noise, len(times))
+    return COURSES[course](times) + swing + dither
+
+
+def swings_of(times: Array, values: Array) -> list[Swing]:
+    return find_swings(times, values, least_half_swings=6, longest_period_s=5.0)
+
+
+@pytest.mark.parametrize("course", COURSES)
+@pytest.mark.parametrize(("interval_s", "period_s"), [(0.008, 1.0), (0.032, 2.0), (0.1, 3.0)])
+def test_eight_periods_within_two_minutes_are_found(
+    course: str, interval_s: float, period_s: float
+) -> None:
+    times = np.arange(0, 120, interval_s)
+    (swing,) = swings_of(times, swinging(times, course, period_s))
+    assert swing.period_s == pytest.approx(period_s, rel=0.05)
+    assert swing.amplitude == pytest.approx(HEIGHT, rel=0.1)
+    assert swing.start_s == pytest.approx(START_S, abs=period_s)
+    assert swing.end_s == pytest.approx(START_S + PERIODS * period_s, abs=period_s)
+
+
+@pytest.mark.parametrize("course", ["constant", "ramp", "turns"])
+def test_more_time_never_finds_less(course: str) -> None:
+    times = np.arange(0, 600, 0.032)
+    values = swinging(times, course, 2.0)
+    for start_s, end_s in ((55, 80), (30, 120), (0, 300), (0, 600)):
+        part = (times >= start_s) & (times < end_s)
+        assert len(swings_of(times[part], values[part])) == 1, (start_s, end_s)
+
+
+def test_a_swing_goes_on_across_a_gap() -> None:
+    times = np.arange(0, 120, 0.032)
+    values = 0.1 * times + HEIGHT * np.sin(np.pi * times)
+    recorded = (times < 50) | (times > 56.3)
+    (swing,) = swings_of(times[recorded], values[recorded])
+    assert (swing.start_s, swing.end_s) == (pytest.approx(0, abs=1), pytest.approx(120, abs=1))
+    assert swing.period_s == pytest.approx(2.0, rel=0.02)
+    assert swing.amplitude == pytest.approx(HEIGHT, rel=0.05)
+
+
+def test_two_different_swings_beside_a_gap_are_two() -> None:
+    times = np.arange(0, 120, 0.032)
+    values = np.where(times < 50, np.sin(np.pi * times), 0.2 * np.sin(4 * np.pi * times))
+    recorded = (times < 50) | (times > 56)
+    before, after = swings_of(times[recorded], values[recorded])
+    assert (before.period_s, after.period_s) == (
+        pytest.approx(2.0, rel=0.02), pytest.approx(0.5, rel=0.02),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_and_what_goes_to_and_fro_once_do_not_swing(seed: int) -> None:
+    times = np.arange(0, 120, 0.032)
+    assert swings_of(times, np.random.default_rng(seed).normal(0, 1, len(times))) == []
+    assert swings_of(times, np.where(times % 60 < 30, 1.0, 0.05)) == []
+    assert swings_of(times, np.ones_like(times)) == []
+    assert swings_of(times[:5], times[:5]) == []
+
+
+def test_rows_of_a_paused_simulation_count_once() -> None:
+    times = np.arange(0, 60, 0.032)
+    paused = np.insert(times, 900, np.full(5000, times[900]))
+    (swing,) = swings_of(paused, np.sin(np.pi * paused))
+    assert swing.period_s == pytest.approx(2.0, rel=0.02)

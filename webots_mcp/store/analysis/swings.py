@@ -1,0 +1,345 @@
+"""Regular swings: where a value goes to and fro, how fast and how far.
+
+The search is local: each stretch without recording gaps is looked at by itself, and in it each
+period has a band of its own, in which a swing shows as crossings of zero that come
+regularly and reach equally far. What happens elsewhere in the stretch changes nothing, so that
+asking for more time never finds less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from webots_mcp.store.analysis.noise import Array, noise_of
+
+SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
+SCALE_RATIO: Final = 2**0.5  # from one band to the next
+FINEST_SHARE: Final = 8  # of a band's period: what is shorter is smoothed away
+ROWS_PER_PERIOD: Final = 16  # of a band: of more, means are taken
+FITTED_PER_PERIOD: Final = 32  # the same where a sine is fitted; it loses 0.2 % of its height
+GAP_INTERVALS: Final = 3.0  # a gap is longer than so many usual intervals
+JOINED_PERIODS: Final = 1.5  # so near a gap a swing ends or begins that may go on across it
+ALIKE: Final = (1.15, 1.5)  # ratio of periods and of amplitudes on both sides of a gap
+HALF_PERIODS: Final = (0.5 / 1.7, 0.5 * 1.5)  # of the band's period, that a half swing may last
+MOST_UNEVEN: Final = 1.8  # times as far as those before it may a half swing reach
+MOST_IRREGULAR: Final = 0.25  # coefficient of variation of the half periods
+MOST_VARIED: Final = 0.4  # and of how far the half swings reach
+LEAST_EXPLAINED: Final = (0.85, 0.70)  # of the variance by a sine, for 6 half swings and for 10
+STRAIGHTENED_EXPLAINED: Final = 0.9  # where a course of slopes was taken out before
+PERIODS_FITTED: Final = 2.5  # at once: over more, a swing may change a little
+TRIED_PERIODS: Final = np.linspace(0.92, 1.08, 9)  # times the period of the crossings
+NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
+MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
+MOST_OVERLAP: Final = 0.2  # of the shorter one
+
+
+@dataclass(frozen=True)
+class Swing:
+    """A stretch in which a value went to and fro regularly.
+
+    Attributes:
+        half_swings: How many there are between the first and the last crossing of its mean course.
+        amplitude: Half of the way from one turning point to the next.
+        explained: Share of the variance about a slow course that a sine explains, 0 to 1.
+    """
+
+    start_s: float
+    end_s: float
+    half_swings: int
+    period_s: float
+    amplitude: float
+    explained: float
+
+
+@dataclass(frozen=True)
+class _Crossings:
+    """Where a band crosses zero, and how long and how far it goes between two crossings."""
+
+    moments: Array
+    halves: Array
+    reaches: Array
+
+
+def find_swings(
+    times: Array, values: Array, *, least_half_swings: int, longest_period_s: float
+) -> list[Swing]:
+    """Swings of one signal, in order; angles have to be unwrapped.
+
+    A swing counts when at least so many half swings follow each other, alike in length and reach,
+    when a sine explains most of their variance about a parabola, and when it rises above the noise
+    of its own stretch. Period and amplitude are those of the best sine. Each stretch between
+    recording gaps is looked at by itself; a swing that reaches a gap and is the same after it is
+    one swing.
+    """
+    moving = np.diff(times, prepend=-np.inf) > 0
+    times, values = times[moving], values[moving]
+    if len(times) <= SHORTEST_PERIOD_ROWS:
+        return []
+    interval_s = float(np.median(np.diff(times)))
+    borders = np.flatnonzero(np.diff(times) > GAP_INTERVALS * interval_s * (1 + 1e-6)) + 1
+    found: list[Swing] = []
+    for moments, stretch in zip(np.split(times, borders), np.split(values, borders), strict=True):
+        swings = _in_stretch(moments, stretch, least_half_swings, longest_period_s)
+        if found and swings and _goes_on(found[-1], swings[0], times):
+            swings[0] = _as_one(found.pop(), swings[0])
+        found += swings
+    return found
+
+
+def _goes_on(before: Swing, after: Swing, times: Array) -> bool:
+    """Whether the next swing begins right after the gap that the one before reached."""
+    ended, began = np.searchsorted(times, [before.end_s, after.start_s])
+    between = times[max(0, ended - 1) : began + 1]
+    gap_s = float(np.max(np.diff(between)))
+    recorded_s = after.start_s - before.end_s - gap_s
+    if recorded_s > 2 * JOINED_PERIODS * before.period_s:
+        return False
+    periods = _ratio(before.period_s, after.period_s)
+    return periods <= ALIKE[0] and _ratio(before.amplitude, after.amplitude) <= ALIKE[1]
+
+
+def _ratio(one: float, other: float) -> float:
+    return max(one, other) / min(one, other)
+
+
+def _as_one(before: Swing, after: Swing) -> Swing:
+    """Half swings are those that were seen; period, amplitude and share are weighted by them."""
+    count = before.half_swings + after.half_swings
+    share = before.half_swings / count
+    return replace(
+        before,
+        end_s=after.end_s,
+        half_swings=count,
+        period_s=share * before.period_s + (1 - share) * after.period_s,
+        amplitude=share * before.amplitude + (1 - share) * after.amplitude,
+        explained=share * before.explained + (1 - share) * after.explained,
+    )
+
+
+def _in_stretch(
+    times: Array, values: Array, least_half_swings: int, longest_period_s: float
+) -> list[Swing]:
+    """Swings in a stretch in which rows come evenly."""
+    if len(times) <= SHORTEST_PERIOD_ROWS or not np.ptp(values):
+        return []
+    interval_s = float(np.median(np.diff(times)))
+    found: list[Swing] = []
+    rows = SHORTEST_PERIOD_ROWS
+    while rows * interval_s <= longest_period_s * SCALE_RATIO and rows < len(values):
+        step = max(1, int(rows / ROWS_PER_PERIOD))
+        moments, means = _means(times, step), _means(values, step)
+        for band in _bands(moments, means, round(rows / step)):
+            for crossings in _regular(
+                _crossings(moments, band), rows * interval_s, least_half_swings
+            ):
+                found += _fitted(times, values, crossings, interval_s)
+        rows *= SCALE_RATIO
+    return _best([each for each in found if each.period_s <= longest_period_s])
+
+
+def _means(values: Array, step: int) -> Array:
+    """Of so many values each; a rest at the end that is less is left out."""
+    whole = len(values) // step * step
+    return np.add.reduceat(values[:whole], np.arange(0, whole, step)) / step if step > 1 else values
+
+
+def _bands(times: Array, values: Array, rows: int) -> Iterator[Array]:
+    """What swings with about that period: as it is, and without a course of slopes."""
+    for course in (values, _straightened(times, values, rows)):
+        if course is not None:
+            fine = _moving_mean(course, rows // FINEST_SHARE)
+            yield fine - _moving_mean(course, rows)
+
+
+def _moving_mean(values: Array, rows: int) -> Array:
+    """Twice the mean over about so many rows; beyond the ends the values go on point-mirrored."""
+    reach = min(rows // 2, len(values) - 1)
+    if reach < 1:
+        return values
+    for _ in range(2):
+        before = 2 * values[0] - values[reach:0:-1]
+        after = 2 * values[-1] - values[-2 : -reach - 2 : -1]
+        sums = np.concatenate(([0.0], np.cumsum(np.concatenate((before, values, after)))))
+        values = (sums[2 * reach + 1 :] - sums[: -2 * reach - 1]) / (2 * reach + 1)
+    return values
+
+
+def _straightened(times: Array, values: Array, rows: int) -> Array | None:
+    """Values without a course of slopes that change now and then, as of a robot that turns.
+
+    The slope at each moment is the median over one period: a swing about it has the median 0, and
+    a change of slope stays a sharp bend. None where the stretch is too short.
+    """
+    step = max(1, rows // ROWS_PER_PERIOD)
+    half = rows // step // 2
+    means, moments = _means(values, step), _means(times, step)
+    if len(means) < 2 * half + 3:
+        return None
+    steps = np.pad(np.diff(means), half, mode="edge")
+    windows = np.lib.stride_tricks.sliding_window_view(steps, 2 * half + 1)
+    slopes = np.partition(windows, half, axis=1)[:, half]
+    return values - np.interp(times, moments, np.concatenate(([0.0], np.cumsum(slopes))))
+
+
+def _crossings(times: Array, band: Array) -> _Crossings:
+    """Between two rows the band is taken to be straight."""
+    before = np.flatnonzero(np.diff(band >= 0))
+    if len(before) < 2:
+        return _Crossings(np.empty(0), np.empty(0), np.empty(0))
+    share = band[before] / (band[before] - band[before + 1])
+    moments = times[before] + share * (times[before + 1] - times[before])
+    reaches = np.maximum.reduceat(np.abs(band), before + 1)[:-1]
+    return _Crossings(moments, np.diff(moments), reaches)
+
+
+def _regular(crossings: _Crossings, period_s: float, least: int) -> Iterator[_Crossings]:
+    """Stretches of at least so many half swings of about that period that reach equally far."""
+    low, high = (share * period_s for share in HALF_PERIODS)
+    fitting = (crossings.halves > low) & (crossings.halves < high)
+    edges = np.flatnonzero(np.diff(fitting, prepend=False, append=False)).tolist()
+    for first, last in zip(edges[::2], edges[1::2], strict=True):
+        if last - first < least:
+            continue
+        for start, end in pairwise(_uneven(crossings.reaches[first:last].tolist())):
+            if end - start >= least:
+                part = slice(first + start, first + end)
+                moments = crossings.moments[part.start : part.stop + 1]
+                yield _Crossings(moments, crossings.halves[part], crossings.reaches[part])
+
+
+def _uneven(reaches: list[float]) -> list[int]:
+    """Where a half swing reaches much less or much farther than the few before it; and both ends.
+
+    Compared is with the (upper) median of up to five since the last such place.
+    """
+    places = [0]
+    for index in range(1, len(reaches)):
+        usual = sorted(reaches[max(places[-1], index - 5) : index])
+        middle = usual[len(usual) // 2]
+        if not middle / MOST_UNEVEN < reaches[index] < middle * MOST_UNEVEN:
+            places.append(index)
+    return [*places, len(reaches)]
+
+
+def _fitted(
+    times: Array, values: Array, crossings: _Crossings, interval_s: float
+) -> Iterator[Swing]:
+    """The swing of such a stretch, if a sine explains it."""
+    count = len(crossings.halves)
+    if _varies(crossings.halves) > MOST_IRREGULAR or _varies(crossings.reaches) > MOST_VARIED:
+        return
+    start_s, end_s = float(crossings.moments[0]), float(crossings.moments[-1])
+    period_s = 2 * (end_s - start_s) / count
+    start, end = np.searchsorted(times, [start_s, end_s])
+    rows = slice(max(0, int(start) - 1), min(len(times), int(end) + 1))
+    best = _best_sine(times[rows], values[rows], period_s, interval_s)
+    if best[0] < _least_explained(count):
+        best = _best_sine_of_straightened(times, values, rows, period_s, interval_s)
+        if best[0] < STRAIGHTENED_EXPLAINED:
+            return
+    explained, period_s, amplitude = best
+    noise = noise_of(values[rows])
+    of_means = noise / np.sqrt(period_s / interval_s * count / 2)
+    if amplitude >= min(NOISE_AMPLITUDES * noise, MEAN_AMPLITUDES * of_means):
+        yield Swing(start_s, end_s, count, period_s, amplitude, explained)
+
+
+def _varies(sizes: Array) -> float:
+    """The coefficient of variation."""
+    return float(sizes.std() / sizes.mean())
+
+
+def _least_explained(half_swings: int) -> float:
+    """The fewer there are, the more has to be explained: chance makes a few now and then."""
+    return float(np.interp(half_swings, (6, 10), LEAST_EXPLAINED))
+
+
+def _best_sine_of_straightened(
+    times: Array, values: Array, rows: slice, period_s: float, interval_s: float
+) -> tuple[float, float, float]:
+    around = round(2 * period_s / interval_s)
+    start = max(0, rows.start - around)
+    wide = slice(start, rows.stop + around)
+    course = _straightened(times[wide], values[wide], around)
+    if course is None:
+        return 0.0, period_s, 0.0
+    inner = course[rows.start - start : rows.stop - start]
+    return _best_sine(times[rows], inner, period_s, interval_s)
+
+
+def _best_sine(
+    times: Array, values: Array, period_s: float, interval_s: float
+) -> tuple[float, float, float]:
+    """Share of the variance, period and amplitude of the best sine of about that period.
+
+    Sines and parabolas of least squares, in pieces of two to three periods.
+    """
+    step = max(1, int(period_s / interval_s / FITTED_PER_PERIOD))
+    times, values = _means(times, step), _means(values, step)
+    pieces = max(1, round((times[-1] - times[0]) / (PERIODS_FITTED * period_s)))
+    ends: Array = np.linspace(float(times[0]), float(times[-1]), pieces + 1)
+    borders = np.searchsorted(times, ends[1:-1])
+    periods = period_s * TRIED_PERIODS
+    fits = [
+        _fit(moments - moments.mean(), piece, periods)
+        for moments, piece in zip(np.split(times, borders), np.split(values, borders), strict=True)
+        if len(piece) >= SHORTEST_PERIOD_ROWS
+    ]
+    course = sum(fit.of_course for fit in fits)
+    if not course > 0:
+        return 0.0, period_s, 0.0
+    explained = 1 - np.sum([fit.of_sines for fit in fits], axis=0) / course
+    best = int(np.argmax(explained))
+    amplitude = float(np.median([fit.amplitudes[best] for fit in fits]))
+    return float(explained[best]), float(periods[best]), amplitude
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """What a parabola leaves of the squares; what it leaves with a sine of each period."""
+
+    of_course: float
+    of_sines: Array
+    amplitudes: Array
+
+
+def _fit(times: Array, values: Array, periods: Array) -> _Fit:
+    """Sines are fitted to what a parabola leaves of the values and of the sines themselves."""
+    place = times / max(float(np.ptp(times)), 1e-9)
+    basis: Array = np.linalg.qr(np.vander(place, 3))[0]
+    rest = _without(basis, values)
+    angles: Array = 2 * np.pi * times / periods[:, None]
+    sines, cosines = (_without(basis, waves) for waves in (np.sin(angles), np.cos(angles)))
+    ss, cc, sc = (_products(*pair) for pair in ((sines,) * 2, (cosines,) * 2, (sines, cosines)))
+    sy, cy = _products(sines, rest), _products(cosines, rest)
+    determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
+    of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant
+    of_course = float(rest @ rest)
+    return _Fit(of_course, of_course - of_sine * sy - of_cosine * cy, np.hypot(of_sine, of_cosine))
+
+
+def _without(basis: Array, waves: Array) -> Array:
+    return waves - (waves @ basis) @ np.transpose(basis)
+
+
+def _products(one: Array, other: Array) -> Array:
+    return np.asarray(np.sum(one * other, axis=1), np.float64)
+
+
+def _best(found: list[Swing]) -> list[Swing]:
+    """Of swings that overlap, the one with most half swings that are best explained."""
+    kept: list[Swing] = []
+    for swing in sorted(found, key=lambda each: -each.explained * each.half_swings):
+        if all(_overlap(swing, other) < MOST_OVERLAP for other in kept):
+            kept.append(swing)
+    return sorted(kept, key=lambda each: each.start_s)
+
+
+def _overlap(one: Swing, other: Swing) -> float:
+    common_s = min(one.end_s, other.end_s) - max(one.start_s, other.start_s)
+    return common_s / min(one.end_s - one.start_s, other.end_s - other.start_s)

@@ -466,6 +466,14 @@ def test_a_state_that_never_comes_to_its_end_is_recorded_as_far_as_it_says(
     assert recording.states() == [{"key 0": True, "key 1": True, "key 2": True}]
 
 
+def test_what_is_added_to_the_devices_may_never_come_to_its_end_either(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.auto_publish(Unending())
+    (state,) = recording.states()
+    assert {key for key in state if key.startswith("key")} == {"key 0", "key 1", "key 2"}
+
+
 def test_keys_that_are_new_in_every_state_do_not_fill_the_memory() -> None:
     changes = Changes()
     tracemalloc.start()

@@ -7,6 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Mapping
+from itertools import islice
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
@@ -158,7 +159,8 @@ class MCPBridge:
             if self._clock.look():
                 self._begin_run()
             if self._throttle.admits(self._heart.hold is not None):
-                self._record_state({**self._read_devices(include_time), **(extra or {})})
+                more = dict(islice(extra.items(), len(extra))) if extra else {}
+                self._record_state({**self._read_devices(include_time), **more})
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("auto_publish", error)
 

@@ -10,14 +10,22 @@ from typing import Final
 
 from tests.detection.drawing import KINDS
 from tests.detection.goals import missed_goals
-from tests.detection.measuring import measure
+from tests.detection.measuring import measure, measure_widened
 from tests.detection.pairs import measure_pairs
-from tests.detection.table import LEGEND, render, render_agreement, render_pairs, render_travelled
+from tests.detection.table import (
+    LEGEND,
+    render,
+    render_agreement,
+    render_pairs,
+    render_travelled,
+    render_widened,
+)
 from tests.detection.travelling import measure_travelled
 
 _TRAVELLED: Final = "travelled"
 _PAIRS: Final = "pairs"
-_ALL: Final = (*KINDS, _TRAVELLED, _PAIRS)
+_WIDENED: Final = "widened"  # of the kinds that are named beside it, else of all
+_ALL: Final = (*KINDS, _WIDENED, _TRAVELLED, _PAIRS)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -25,8 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     chosen = options.kinds or _ALL
     started_s = time.monotonic()
-    parts = (_judged(chosen, options), _travelled(chosen, options), _compared(chosen, options))
-    done = [part for part in parts if part is not None]
+    parts = (_judged, _widened, _travelled, _compared)
+    done = [told for part in parts if (told := part(chosen, options)) is not None]
     _show("")
     print("\n\n".join(text for text, _ in done))
     failed = sum(missed for _, missed in done)
@@ -44,6 +52,16 @@ def _judged(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, in
     missed = sum(bool(missed_goals(key, tally)) for key, tally in report.tallies.items())
     text = "\n".join([f"{shown}{render(report)}", "", *LEGEND])
     return "\n\n".join([text, render_agreement(report)] if options.summaries else [text]), missed
+
+
+def _widened(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:
+    if _WIDENED not in chosen or options.summaries:
+        return None
+    kinds = [kind for kind in chosen if kind in KINDS] or list(KINDS)
+    report = measure_widened(kinds, options.cases, options.seed, _show)
+    shown = "\n".join([*report.wrong, ""]) if options.wrong else ""
+    lost = sum(alone > both for alone, both in report.widened.values())
+    return f"{shown}{render_widened(report)}", lost
 
 
 def _travelled(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, int] | None:

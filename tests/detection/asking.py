@@ -91,10 +91,11 @@ def ask_run(
     connection: sqlite3.Connection,
     measures: Sequence[Measure],
     run_id: int,
+    start_s: float | None = None,
     end_s: float | None = None,
 ) -> Answer:
-    """What happened in a run, all of it or up to a time."""
-    return _asked(connection, measures, run_id=run_id, end_s=end_s)
+    """What happened in a run, all of it or from and up to a time."""
+    return _asked(connection, measures, run_id=run_id, start_s=start_s, end_s=end_s)
 
 
 def ask_since(

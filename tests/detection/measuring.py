@@ -24,6 +24,8 @@ NOISY_M: Final = 0.01  # more noise than this has goals of its own
 # that, which can be asked of rows as well.
 LONG_ROWS: Final = 36_000
 PART_ROWS: Final = 12_000
+MOST_ALONE: Final = 4  # incidents of a run that are asked about one by one
+AROUND_S: Final = 10.0  # before and after each
 _MOST_VALUES: Final = 0  # no further signals in long recordings: their rows cost enough
 
 
@@ -34,12 +36,17 @@ class Report:
     Attributes:
         agreements: By kind of recording and what is judged: what rows and summaries both tell,
             and what only the rows or only the summaries do.
+        widened: By kind of recording and what is judged: what was told where only the time about
+            it was asked for, and how much of that was told of the whole run too.
         wrong: A line for each thing that was missed or wrongly told.
     """
 
     tallies: dict[Key, Tally] = field(default_factory=dict[Key, Tally])
     agreements: dict[tuple[str, Measure], tuple[int, int, int]] = field(
         default_factory=dict[tuple[str, Measure], tuple[int, int, int]]
+    )
+    widened: dict[tuple[str, Measure], tuple[int, int]] = field(
+        default_factory=dict[tuple[str, Measure], tuple[int, int]]
     )
     wrong: list[str] = field(default_factory=list[str])
 
@@ -57,6 +64,11 @@ class Report:
         both, missing, more = self.agreements.get(key, (0, 0, 0))
         new = (both + len(told.found), missing + len(told.missed), more + told.false)
         self.agreements[key] = new
+
+    def add_widened(self, key: tuple[str, Measure], *, of_whole: bool) -> None:
+        """Count what was told when asked about alone."""
+        alone, both = self.widened.get(key, (0, 0))
+        self.widened[key] = (alone + 1, both + of_whole)
 
 
 @dataclass(frozen=True)
@@ -123,6 +135,42 @@ def _measure_long(case: Case, summaries: Summaries, report: Report) -> None:
 
 def _as_incident(claim: Claim) -> Incident:
     return Incident(claim.measure, claim.start_s, claim.end_s, claim.name)
+
+
+def measure_widened(
+    kinds: Sequence[str], cases: int, seed: int, say: Callable[[str], None] = lambda text: None
+) -> Report:
+    """Ask about the time of each incident alone, and about the whole run: more time, not less."""
+    report = Report()
+    for kind in kinds:
+        for index in range(cases):
+            say(f"{kind} {index + 1}/{cases}, alone")
+            _measure_widened(draw_case(kind, seed, index, most_values=0), report)
+    return report
+
+
+def _measure_widened(case: Case, report: Report) -> None:
+    run = case.runs[-1]
+    with memory_connection() as connection:
+        (run_id,) = write_all(connection, [run])
+        whole = ask_run(connection, case.asked, run_id)
+        for incident in [each for each in run.incidents if not each.optional][:MOST_ALONE]:
+            about = (incident.start_s - AROUND_S, incident.end_s + AROUND_S)
+            alone = ask_run(connection, [incident.measure], run_id, *about)
+            if _tells(alone, incident, run_id, run):
+                of_whole = _tells(whole, incident, run_id, run)
+                report.add_widened((case.kind, incident.measure), of_whole=of_whole)
+                report.wrong += [] if of_whole else [_lost(case, run, incident)]
+
+
+def _tells(answer: Answer, incident: Incident, run_id: int, run: LabelledRun) -> bool:
+    claims = answer.of(incident.measure, run_id)
+    return bool(judge([incident], claims, run.interval_s).found)
+
+
+def _lost(case: Case, run: LabelledRun, incident: Incident) -> str:
+    where = f"{case.kind} {case.number}, {1000 * run.interval_s:g} ms"
+    return f"{where}: {_text(incident)} is told of that time and not of the whole run"
 
 
 def _until(answer: Answer, end_s: float) -> Answer:

@@ -40,6 +40,16 @@ def render_agreement(report: Report) -> str:
     return _aligned([head, *counted])
 
 
+def render_widened(report: Report) -> str:
+    """What is told of a stretch, and how much of that of the whole run."""
+    head = ("recording", "judged", "told of its time", "also of the whole run", "below the goal")
+    counted = (
+        (*key, str(alone), str(both), "" if alone == both else "lost")
+        for key, (alone, both) in report.widened.items()
+    )
+    return _aligned([head, *counted])
+
+
 def _told(report: Report) -> Iterator[tuple[Key, Tally]]:
     """Not those in which nothing happened and nothing was told, beside some that did."""
     eventful = {key[0] for key, tally in report.tallies.items() if tally.incidents}

@@ -60,6 +60,15 @@ def test_rows_and_summaries_are_asked_about_the_same(
     assert gaps["rows"][5] == "1.00"
 
 
+def test_what_is_told_of_a_stretch_is_looked_for_in_the_whole_run(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["--kinds", "gaps", "widened", "--cases", "1", "--check"]) == 0
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    alone, both = next(line[2:] for line in lines if line[:2] == ["gaps", "gap"] and len(line) == 4)
+    assert alone == both != "0"
+
+
 def test_a_robot_that_drives_without_noise_has_travelled_as_far_as_it_did() -> None:
     exact = next(iter(measure_travelled(1, 1)))
     assert exact.noise_m == 0.0 and exact.missed == []

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.server.conftest import Connect, ask
+from tests.server.conftest import Connect, ask, fail, text_of
 from tests.server.malformed import Damage, damages, record, unusable_answers
 from tests.store.recorded import Recorded
 
@@ -60,3 +60,15 @@ async def test_a_row_that_is_left_out_is_named_and_the_others_are_told(
         assert answer["state"] == {"x": 2 if damage.column == "odd" else 1}
         recorded.connection.execute("DELETE FROM state WHERE id = 2")
         assert "left_out" not in await ask(client, "webots_get_full_state")
+
+
+async def test_where_nothing_is_left_the_answer_names_what_was_left_out(
+    recorded: Recorded, connect: Connect
+) -> None:
+    robot = recorded.robot()
+    Damage("run", "last_wall_time_s", "x").apply(recorded.connection)
+    said = f"run {robot.run_id}: last_wall_time_s is no sound number"
+    async with connect() as client:
+        assert said in (await ask(client, "webots_get_world_info"))["left_out"]
+        assert said in text_of(await client.call_tool("webots_get_camera", {}))
+        assert said in await fail(client, "webots_annotate_run", run_id=robot.run_id, label="x")

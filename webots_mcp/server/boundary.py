@@ -105,6 +105,7 @@ def _declared(family: object) -> Iterator[tuple[Callable[..., Any], Declaration]
 def _wrap(method: Callable[..., Any], empty: Callable[[str], Any] | None) -> Callable[..., Any]:
     @functools.wraps(method)
     def wrapper(*args: Any, **kwargs: Any) -> Any:
+        unsound: Unsound | None = None
         try:
             if empty is not None:
                 try:
@@ -114,7 +115,7 @@ def _wrap(method: Callable[..., Any], empty: Callable[[str], Any] | None) -> Cal
             with past_unsound_rows() as unsound:
                 return _as_result(method(*args, **kwargs), unsound)
         except Exception as error:  # noqa: BLE001  (each becomes an answer)
-            return _as_result(_answer_error(method.__name__, error, empty))
+            return _as_result(_answer_error(method.__name__, error, empty, unsound), unsound)
 
     return wrapper
 
@@ -124,6 +125,7 @@ def _wrap_async(
 ) -> Callable[..., Any]:
     @functools.wraps(method)
     async def wrapper(*args: Any, **kwargs: Any) -> Any:
+        unsound: Unsound | None = None
         try:
             if empty is not None:
                 try:
@@ -133,7 +135,7 @@ def _wrap_async(
             with past_unsound_rows() as unsound:
                 return _as_result(await method(*args, **kwargs), unsound)
         except Exception as error:  # noqa: BLE001  (each becomes an answer)
-            return _as_result(_answer_error(method.__name__, error, empty))
+            return _as_result(_answer_error(method.__name__, error, empty, unsound), unsound)
 
     return wrapper
 
@@ -145,12 +147,19 @@ def _require_over_a_value(error: Exception) -> None:
         raise error
 
 
-def _answer_error(tool: str, error: Exception, empty: Callable[[str], Any] | None) -> Any:
-    """Our errors tell the model what to do; of a defect the server's log has the rest."""
+def _answer_error(
+    tool: str, error: Exception, empty: Callable[[str], Any] | None, unsound: Unsound | None
+) -> Any:
+    """Our errors tell the model what to do; of a defect the server's log has the rest.
+
+    What is missing may be so for rows that were left out: they are named beside each of our errors.
+    """
     if empty is not None and isinstance(error, (NoDatabaseError, NothingRecordedError)):
         return empty(str(error))
     if isinstance(error, WebotsMCPError):
-        raise ToolError(cut_text(str(error), _LONGEST_ERROR)) from error
+        left_out = unsound.described() if unsound else []
+        rows = f" (left out: {'; '.join(left_out)})" if left_out else ""
+        raise ToolError(f"{cut_text(str(error), _LONGEST_ERROR)}{rows}") from error
     if isinstance(error, (MCPError, ToolError)):
         raise error
     _log.exception("%s failed", tool)

@@ -98,6 +98,17 @@ def test_the_newest_rows_of_all_runs_together_do_not_go_because_of_their_age(
     assert (again.rows, [each.rows for each in again.spared]) == (0, [30])
 
 
+@pytest.mark.parametrize("column", ["started_wall_time_s", "last_wall_time_s"])
+def test_a_run_whose_times_are_no_numbers_stays_and_holds_up_nothing(
+    recorded: Recorded, column: str
+) -> None:
+    for _ in range(3):
+        recorded.add_run(50)
+    recorded.connection.execute(f"UPDATE run SET {column} = 'x' WHERE id = 2")
+    recorded.prune(states(rows=60, spared_rows=0))
+    assert recorded.rows() == {1: 10, 2: 50, 3: 50}
+
+
 def test_what_stays_beyond_a_limit_is_told_with_the_reason(recorded: Recorded) -> None:
     for _ in range(2):
         recorded.add_run(20)

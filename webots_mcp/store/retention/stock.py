@@ -16,7 +16,8 @@ TABLES: Final = ("state", "log", "event", "image")
 _RUNS: Final = (
     f"SELECT id, robot_id, rows, started_wall_time_s, last_wall_time_s, {KEPT}, "
     "ended_wall_time_s IS NULL OR id = (SELECT max(id) FROM run n WHERE n.robot_id = run.robot_id)"
-    " AS is_current FROM run ORDER BY started_wall_time_s, id"
+    " AS is_current FROM run WHERE typeof(started_wall_time_s) IN ('real', 'integer') "
+    "AND typeof(last_wall_time_s) IN ('real', 'integer') ORDER BY started_wall_time_s, id"
 )
 _ROWS_BY_RUN: Final = "SELECT run_id, count(*) FROM {table} GROUP BY run_id"
 _ROWS: Final = "SELECT count(*) FROM {table} WHERE run_id = ?"
@@ -87,7 +88,10 @@ class Oldest(NamedTuple):
 
 
 def read_runs(connection: sqlite3.Connection) -> list[Run]:
-    """All runs in the order in which they began."""
+    """All runs in the order in which they began.
+
+    A run whose times are no numbers, which no bridge writes, has no place in it: it stays.
+    """
     return [Run(*row) for row in connection.execute(_RUNS).fetchall()]
 
 

@@ -108,6 +108,22 @@ def test_serving_ends_at_sigterm_with_a_word(folder: Path) -> None:
         assert process.stderr.read() == "webots-mcp: ended by SIGTERM\n"
 
 
+def test_serving_ends_without_a_word_when_its_client_is_gone(folder: Path) -> None:
+    ask = {"name": "webots_monitor", "arguments": {"duration_s": 90}}
+    call = {"jsonrpc": "2.0", "id": 2, "method": "tools/call", "params": ask}
+    with run("serve", "--data-dir", str(folder)) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdin.write(f"{json.dumps(HELLO)}\n")
+        process.stdin.flush()
+        assert "serverInfo" in process.stdout.readline()
+        process.stdout.close()
+        process.stdin.write(f"{json.dumps(call)}\n")
+        process.stdin.close()
+        assert (process.wait(timeout=20), process.stderr.read()) == (0, "")
+
+
 @pytest.mark.parametrize(
     ("number", "code", "word"),
     [(signal.SIGINT, 130, "ended by Ctrl-C"), (signal.SIGTERM, 143, "ended by SIGTERM")],

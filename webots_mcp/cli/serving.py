@@ -62,8 +62,25 @@ def serve(arguments: argparse.Namespace) -> None:
         from webots_mcp.server import create_server
 
         server = create_server(database, data_dir, read_only=arguments.read_only, limits=limits)
-    with ending_in_time():
+    with ending_in_time(), _ending_with_the_client():
         server.run()
+
+
+@contextmanager
+def _ending_with_the_client() -> Generator[None]:
+    """A client that has gone does not read the last answer: that is an end and no defect."""
+    try:
+        yield
+    except Exception as error:
+        if not _is_broken_pipe(error):
+            raise
+        raise BrokenPipeError from error
+
+
+def _is_broken_pipe(error: object) -> bool:
+    """Whether it is nothing else, also where the server's tasks have grouped it."""
+    parts: tuple[object, ...] = getattr(error, "exceptions", ())
+    return all(map(_is_broken_pipe, parts)) if parts else isinstance(error, BrokenPipeError)
 
 
 @contextmanager

@@ -159,8 +159,7 @@ class MCPBridge:
             if self._clock.look():
                 self._begin_run()
             if self._throttle.admits(self._heart.hold is not None):
-                more = dict(islice(extra.items(), len(extra))) if extra else {}
-                self._record_state({**self._read_devices(include_time), **more})
+                self._record_state({**self._read_devices(include_time), **_finite(extra or {})})
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("auto_publish", error)
 
@@ -440,3 +439,10 @@ class MCPBridge:
             raise error
         kind = f"{method} {type(error).__name__}"
         self._recorder.complain(kind, f"{method} failed: {describe(error)}")
+
+
+def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
+    """As many items as it says; a mapping of the user's own may never come to its end."""
+    if not isinstance(extra, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise TypeError(f"extra is a dict, got {type(extra).__name__}")
+    return dict(islice(extra.items(), len(extra)))

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.server.conftest import Connect, fail, text_of
+from tests.server.conftest import Connect, ask, fail, text_of
 from tests.store.recorded import Recorded
 
 pytestmark = pytest.mark.anyio
@@ -41,6 +41,11 @@ HUGE = 2**63
         ("get_trends", {"since": [1]}, "since must be a valid number, not [1]"),
         ("get_logs", {"lines": 1e308}, "lines must be a smaller number, not 1e+308"),
         ("get_logs", {"x" * 10**5: 1}, "no parameter 'xxx"),
+        ("get_trends", {"signal": ["x"]}, "no parameter 'signal': there is signals, "),
+        ("find_events", {"strt_s": 1}, "no parameter 'strt_s': there is start_s, "),
+        ("find_events", {"for_s": 2.0}, "for_s=2 needs above or below"),
+        ("query_history", {"signals": ["x"], "cursor": 3}, "cursor goes on with rows"),
+        ("get_timeline", {"kinds": ["threshold"]}, "a threshold has no place here"),
     ],
 )
 async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
@@ -49,7 +54,7 @@ async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
     async with connect() as client:
         answer = await client.call_tool(f"webots_{tool}", arguments)
     assert answer.is_error
-    assert text_of(answer).startswith(told)
+    assert text_of(answer).removeprefix(f"Error executing tool webots_{tool}: ").startswith(told)
     assert len(text_of(answer)) < 400
 
 
@@ -90,3 +95,44 @@ async def test_every_schema_says_that_there_are_no_other_parameters(connect: Con
         tools = (await client.list_tools()).tools
     assert tools
     assert all(tool.input_schema["additionalProperties"] is False for tool in tools)
+
+
+async def test_bounds_stand_in_the_schemas_in_the_words_of_json_schema(connect: Connect) -> None:
+    async with connect() as client:
+        tools = (await client.list_tools()).tools
+    schemas = {
+        (tool.name.removeprefix("webots_"), name): schema
+        for tool in tools
+        for name, schema in tool.input_schema["properties"].items()
+    }
+    assert not [where for where, each in schemas.items() if {"ge", "gt", "le", "lt"} & set(each)]
+    assert schemas["get_trends", "run_id"]["minimum"] == 1
+    assert schemas["get_trends", "last_s"]["exclusiveMinimum"] == 0
+    assert schemas["query_history", "cursor"]["minimum"] == 0
+
+
+async def test_one_name_is_taken_for_a_list_of_one(connect: Connect, recorded: Recorded) -> None:
+    recorded.robot().state(1.0, {"pose": {"x": 1, "y": 2}})
+    arguments: dict[str, Any] = {"raw": True, "run_id": 1}
+    async with connect() as client:
+        for names in ("pose.x", ["pose.x"], '["pose.x"]'):
+            answer = await ask(client, "webots_query_history", signals=names, **arguments)
+            assert answer["raw"]["signals"] == {"pose.x": [1]}
+        assert "not [1]" in await fail(client, "webots_compare_runs", run_ids=1)
+        answer = await ask(client, "webots_find_events", kinds="run")
+        assert answer["totals"] == {"run": 1}
+
+
+async def test_a_misspelt_signal_is_answered_with_the_nearest_names(
+    connect: Connect, recorded: Recorded
+) -> None:
+    names = ["aa", "battery_v", "sensors.front", "sensors.rear", "zz.pose_x"]
+    recorded.robot().state(1.0, dict.fromkeys(names, 1))
+    async with connect() as client:
+        for wrong, near in (
+            ("nope", "zz.pose_x"),
+            ("FRONT", "sensors.front"),
+            ("batery", names[1]),
+        ):
+            told = await fail(client, "webots_get_trends", signals=[wrong])
+            assert f"no signal {wrong!r} is recorded; the nearest of 5 names: {near}" in told

@@ -15,6 +15,8 @@ from mcp.server.mcpserver.tools import Tool
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from webots_mcp.store.nearest import nearest_first
+
 _MOST_FAULTS: Final = 3
 _LONGEST_VALUE: Final = 80
 
@@ -36,9 +38,11 @@ class CheckedTool(Tool):
         Raises:
             ToolError: An argument is unknown, missing or out of bounds, or the tool refused.
         """
-        _require_known(arguments, self.parameters["properties"])
+        properties = self.parameters["properties"]
+        _require_known(arguments, properties)
+        meant = {name: _as_meant(value, properties[name]) for name, value in arguments.items()}
         try:
-            return await super().run(arguments, context, convert_result)
+            return await super().run(meant, context, convert_result)
         except ToolError as error:
             if isinstance(error.__cause__, ValidationError):
                 raise ToolError(_explained(error.__cause__)) from error
@@ -57,7 +61,15 @@ def _slim(schema: dict[str, Any]) -> dict[str, Any]:
 def _require_known(arguments: Iterable[str], known: Iterable[str]) -> None:
     for name in arguments:
         if name not in known:
-            raise ToolError(f"no parameter {_shown(name)}: there is {', '.join(known) or 'none'}")
+            there = ", ".join(nearest_first(name, known)) or "none"
+            raise ToolError(f"no parameter {_shown(name)}: there is {there}")
+
+
+def _as_meant(value: Any, schema: dict[str, Any]) -> Any:
+    """One item, where a list is asked for, is a list of one; a JSON list stays as it is."""
+    in_text = isinstance(value, str) and value.lstrip().startswith("[")
+    is_one = not (value is None or in_text or isinstance(value, list))
+    return [value] if is_one and schema.get("type") == "array" else value
 
 
 def _explained(error: ValidationError) -> str:

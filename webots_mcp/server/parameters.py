@@ -26,8 +26,11 @@ def _as_seconds(value: float) -> float:
 
 
 # Bounds that only an absurd value meets stay out of the schemas, which every client carries along.
-_Id = Annotated[int, AfterValidator(_as_id)]
+# The others stand before a validator of ours: behind it pydantic does not know JSON Schema's words.
+_RowId = Annotated[int, Field(ge=1), AfterValidator(_as_id)]
+_Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]
 _Seconds = Annotated[float, AfterValidator(_as_seconds)]
+_Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
 RobotName = Annotated[
     str | None,
     Field(
@@ -35,12 +38,10 @@ RobotName = Annotated[
         description="Robot name (webots_list_robots); may be left out while only one is live.",
     ),
 ]
-RunId = Annotated[
-    _Id | None, Field(ge=1, description="That run instead of the robot's current one.")
-]
+RunId = Annotated[_RowId | None, Field(description="That run instead of the robot's current one.")]
 LastS = Annotated[
-    _Seconds | None,
-    Field(gt=0, description="Only the last so many seconds of simulation time."),
+    _Duration | None,
+    Field(description="Only the last so many seconds of simulation time."),
 ]
 StartS = Annotated[_Seconds | None, Field(description="From this simulation time on, s.")]
 EndS = Annotated[
@@ -51,7 +52,7 @@ TimeoutS = Annotated[
     Field(ge=0.1, le=MAX_WAIT_S, description="How long to wait for the outcome, wall seconds."),
 ]
 _CURSOR: Final = "From the previous answer, to go on where it ended."
-Cursor = Annotated[_Id | None, Field(ge=0, description=_CURSOR)]
+Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=500, description=_CURSOR)]
 Since = Annotated[
     float | str | None,
@@ -94,6 +95,6 @@ ShownLimit = Annotated[
 LogLevel = Annotated[contract.LogLevel, Field(description="Log lines of this level and above.")]
 Limit = Annotated[int, Field(ge=1, le=500, description="At most so many.")]
 RunIds = Annotated[
-    list[_Id] | None,
+    list[_RowId] | None,
     Field(max_length=10, description="Several runs by their ids (webots_list_runs)."),
 ]

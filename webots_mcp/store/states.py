@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final, cast
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.nearest import nearest_first
 from webots_mcp.store.rows import columns_of
 
 
@@ -50,6 +51,7 @@ PACE_ROWS: Final = 6
 PACE_WINDOW_S: Final = 5.0
 _PACE_WINDOW_ROWS: Final = 500
 _SHOWN_KEYS: Final = 20
+_SEARCHED_KEYS: Final = 1000  # for those like the one that is not there
 _SHOWN_KEY_CHARACTERS: Final = 40
 
 
@@ -109,7 +111,8 @@ def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
         for taken in range(len(parts), 0, -1):
             if (key := ".".join(parts[:taken])) in members:
                 return key, taken
-        known = [key[:_SHOWN_KEY_CHARACTERS] for key in list(members)[:_SHOWN_KEYS]]
+        near = nearest_first(parts[0], itertools.islice(members, _SEARCHED_KEYS))[:_SHOWN_KEYS]
+        known = [key[:_SHOWN_KEY_CHARACTERS] for key in near]
         raise InvalidInputError(f"path {path!r}: there is no {parts[0]!r}; there are {known}")
     if isinstance(value, list):
         items = cast("list[Any]", value)

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.bounds import Bounds
 from webots_mcp.server.fitting import (
@@ -87,6 +88,8 @@ class HistoryTools:
         No extreme is averaged away; empty buckets are null, gaps are listed. Text and flags come as
         the points at which they changed. For "what happened" webots_get_trends is shorter.
         """
+        if cursor is not None and not raw:
+            raise InvalidInputError("cursor goes on with rows: give it together with raw=true")
         bounds = Bounds(last_s, start_s, end_s, since, until)
         with self._recording.view(robot, run_id) as view:
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.bounds import Bounds
 from webots_mcp.server.fitting import BUDGET, LARGE_BUDGET, answer_about, notes_of, size_of
@@ -55,6 +56,8 @@ class TimelineTools:
 
         By default from the start of the run on; webots_find_events also finds what nobody noted.
         """
+        if "threshold" in (kinds or ()):
+            raise InvalidInputError("a threshold has no place here: ask webots_find_events(above)")
         bounds = Bounds(last_s, start_s, end_s, since, until)
         options = EventOptions(kinds=tuple(kinds or STORED), log_level=log_level)
         with self._recording.view(robot, run_id) as view:

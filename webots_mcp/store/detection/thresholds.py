@@ -20,8 +20,10 @@ def thresholds_on(
         for_s: At least so many simulated seconds.
 
     Raises:
-        InvalidInputError: A limit without a signal.
+        InvalidInputError: A limit without a signal, or a duration without a limit.
     """
+    if for_s and above is None and below is None:
+        raise InvalidInputError(f"for_s={for_s:g} needs above or below: of what it is the duration")
     limits = [{"above": above}] * (above is not None) + [{"below": below}] * (below is not None)
     if limits and not names:
         raise InvalidInputError("above and below need signals: name those that are compared")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import fnmatch
 import sqlite3
 from collections.abc import Iterable, Sequence
@@ -11,6 +10,7 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.analysis.summary import Summary, summarise
+from webots_mcp.store.nearest import nearest_first
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.rows import cleaned
@@ -23,6 +23,7 @@ from webots_mcp.store.signals.flatten import Kind, Value, flatten, parse
 from webots_mcp.store.signals.registry import MAX_SIGNALS, Signal, by_name, registered, seen_now
 
 SAMPLED_ROWS: Final = 200  # rows not yet rolled up that are searched for new names and kinds
+_MOST_OFFERED: Final = 5
 
 _NEWEST_ROWS: Final = (
     "SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE run_id = ? "
@@ -177,11 +178,8 @@ def _meant(known: dict[str, Signal], name: str) -> Iterable[Signal]:
 def _unknown(known: dict[str, Signal], name: str) -> str:
     if not known:
         return f"no signal {name!r}: no state row with values has been recorded yet"
-    near = difflib.get_close_matches(name.replace("*", ""), known, 5, 0.5)
-    parts = name.replace("*", "").lower().split(".")
-    near += [each for each in known if parts[-1] and parts[-1] in each.lower()]
-    offer = list(dict.fromkeys(near))[:5] or list(known)[:10]
-    return f"no signal {name!r} is recorded; there is {', '.join(offer)} ({len(known)} in all)"
+    offer = ", ".join(nearest_first(name.replace("*", ""), known)[:_MOST_OFFERED])
+    return f"no signal {name!r} is recorded; the nearest of {len(known)} names: {offer}"
 
 
 @in_one_snapshot

@@ -66,10 +66,14 @@ def _require_known(arguments: Iterable[str], known: Iterable[str]) -> None:
 
 
 def _as_meant(value: Any, schema: dict[str, Any]) -> Any:
-    """One item, where a list is asked for, is a list of one; a JSON list stays as it is."""
-    in_text = isinstance(value, str) and value.lstrip().startswith("[")
-    is_one = not (value is None or in_text or isinstance(value, list))
-    return [value] if is_one and schema.get("type") == "array" else value
+    """One item, where a list is asked for, is a list of one."""
+    is_one = schema.get("type") == "array" and value is not None and not _is_list(value)
+    return [value] if is_one else value
+
+
+def _is_list(value: object) -> bool:
+    """Whether it is a list, or the JSON text of one, which the SDK reads."""
+    return isinstance(value, list) or (isinstance(value, str) and value.lstrip().startswith("["))
 
 
 def _explained(error: ValidationError) -> str:

@@ -16,12 +16,12 @@ from webots_mcp.server.shortening import (
     round_number,
     shorten,
 )
+from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.recording import View, look, storage
 
 BUDGET: Final = 6_600  # characters of JSON, of the 8,000 that are 2,000 tokens; the header has 600
 LARGE_BUDGET: Final = 40_000  # where the asker said how much: clients put longer answers aside
 LONGEST_NAME: Final = 80
-_DECIMALS: Final = 3
 _LONGEST_NOTE: Final = 300
 _MOST_NOTES: Final = 5
 
@@ -57,7 +57,7 @@ def figure(value: float | None) -> float | None:
 
 def seconds(time_s: float | None) -> float | None:
     """A simulation time as it is shown: to the millisecond."""
-    return None if time_s is None or not math.isfinite(time_s) else round(time_s, _DECIMALS)
+    return None if time_s is None or not math.isfinite(time_s) else shown_time(time_s)
 
 
 def figures(values: Sequence[float | None]) -> list[float | None]:

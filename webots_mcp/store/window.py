@@ -1,7 +1,8 @@
 """The stretch of a run that a question about its log is about, in simulation seconds.
 
-Other than the ranges of `store.reading.ranges` it is not bounded by the state rows: the last lines
-of a controller often come after its last state, and some controllers only log.
+Its bounds are compared as those of the ranges of `store.reading.ranges`, but other than they it is
+not bounded by the state rows: the last lines of a controller often come after its last state, and
+some controllers only log.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import math
 from typing import NamedTuple
 
 from webots_mcp.errors import InvalidRangeError
+from webots_mcp.store.reading.moments import moment_of
 
 
 class Window(NamedTuple):
@@ -42,8 +44,9 @@ def resolve_window(
             raise InvalidRangeError("give either last_s or start_s and end_s, not both")
         if last_s <= 0:
             raise InvalidRangeError(f"last_s={last_s} must be greater than 0")
-        return Window(newest_s - last_s, math.inf)
-    window = Window(-math.inf if start_s is None else start_s, math.inf if end_s is None else end_s)
+        return Window(moment_of(newest_s - last_s), math.inf)
+    start = -math.inf if start_s is None else moment_of(start_s)
+    window = Window(start, math.inf if end_s is None else moment_of(end_s))
     if window.start_s >= window.end_s:
         raise InvalidRangeError(
             f"start_s={start_s} must be less than end_s={end_s} (the end is not included)"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sqlite3
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
@@ -101,7 +102,9 @@ def change_events(
 ) -> Iterator[Event]:
     """Changes of text and flags, each as long as the new value lasted, up to the newest row."""
     states = [signal for signal in signals if not signal.is_number]
-    whole = Segment(segment.run_id, segment.start_s, just_after(newest_s))
+    # From just before on: what changed exactly at the start had another value until then.
+    before_s = math.nextafter(segment.start_s, -math.inf)
+    whole = Segment(segment.run_id, before_s, just_after(newest_s))
     for name, points in change_points(connection, whole, states, deadline).items():
         ends_s = [*(point.sim_time_s for point in points[2:]), None]
         changes = [

@@ -7,6 +7,8 @@ import sqlite3
 from collections.abc import Iterator
 from typing import Final
 
+from webots_mcp.store.reading.moments import moment_of
+
 _ROWS_LEFT: Final = (
     "SELECT (SELECT min(sim_time_s) FROM state WHERE run_id = run.id) FROM run "
     "WHERE id = ? AND purged_rows > 0"
@@ -32,7 +34,7 @@ def coverage_notes(
     elif start_s > newest_s:
         yield f"no row: the range begins after the newest row of {run} at {newest_s:g} s"
     else:
-        if start_s < first_s:
+        if start_s < moment_of(first_s):
             yield f"the recording of {run} begins at {first_s:g} s, within the range"
         if end_s > math.nextafter(newest_s, math.inf):
             yield f"the recording of {run} ends at {newest_s:g} s, within the range"

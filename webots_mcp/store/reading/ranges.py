@@ -7,6 +7,10 @@ A range is half-open, [start, end), and given in one of three ways:
 - in seconds back from a run's newest row (`last_s`; that row is in),
 - in wall time (`since`, `until`: ISO 8601 or Unix seconds), across the runs of a robot.
 
+Simulation times are compared to the millisecond, as they are shown (`reading.moments`): a
+time from an answer, given back as `start_s`, finds its row, and as `end_s` leaves it to the next
+range, whatever a clock that adds up steps has stored (47.519999 is shown as 47.52).
+
 Without `run_id` the run is the robot's newest. Simulation time begins again in each run, so a
 range over several runs is one segment per run.
 """
@@ -20,6 +24,7 @@ from typing import Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
 from webots_mcp.store.reading.coverage import coverage_notes, purge_notes
+from webots_mcp.store.reading.moments import moment_of, shown_time
 from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.reading.wall_time import parse_wall_time, simulation_times
 
@@ -33,6 +38,20 @@ _RUNS_IN: Final = (
     "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s < ? "
     "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) "
     "AND (? IS NULL OR id = ?) ORDER BY id DESC LIMIT ?"
+)
+# What was stored just before a bound and is shown as of it; commands know no run but their robot's.
+_SHOWN_ALIKE: Final = "SELECT min(time_s) FROM ({})".format(
+    " UNION ALL ".join(
+        f"SELECT min({time}) AS time_s FROM {table} WHERE {subject} "
+        f"AND {time} >= :moment AND {time} < :bound"
+        for table, time, subject in (
+            ("state", "sim_time_s", "run_id = :run"),
+            ("log", "sim_time_s", "run_id = :run"),
+            ("event", "sim_time_s", "run_id = :run"),
+            ("image", "sim_time_s", "run_id = :run"),
+            ("command", "claimed_sim_time_s", "robot_id = :robot"),
+        )
+    )
 )
 MOST_RUNS: Final = 50  # that one range in wall time may hold
 
@@ -138,9 +157,13 @@ def _require_order(start_s: float, end_s: float, start_name: str, end_name: str)
     if start_s >= end_s:
         what = "empty" if start_s == end_s else "reversed"
         raise InvalidRangeError(
-            f"the range is {what}: {start_name}={start_s:.13g} must be less than "
-            f"{end_name}={end_s:.13g}"
+            f"the range is {what}: {start_name}={_told(start_s)} must be less than "
+            f"{end_name}={_told(end_s)}"
         )
+
+
+def _told(time_s: float) -> str:
+    return f"{shown_time(time_s):.13g}"
 
 
 def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
@@ -191,13 +214,21 @@ def _in_simulation_time(
     first_s, newest_s = bounds
     if last_s is not None:
         start_s = newest_s - last_s
-    start = first_s if start_s is None else start_s
+    start = first_s if start_s is None else _bound(connection, subject, start_s)
     # An end that is left out holds the newest row, also where the start lies beyond it.
-    end = just_after(max(newest_s, start)) if end_s is None else end_s
+    end = just_after(max(newest_s, start)) if end_s is None else _bound(connection, subject, end_s)
     _require_order(start, end, "start_s", "end_s")
     segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
     notes = tuple(coverage_notes(connection, run_id, (start, end), bounds))
     return TimeRange(subject.robot_id, subject.robot, (segment,), "simulation", notes)
+
+
+def _bound(connection: sqlite3.Connection, subject: Subject, time_s: float) -> float:
+    """Where a bound lies: at the first thing that is shown as of this time, or of a later one."""
+    names = {"run": subject.run_id, "robot": subject.robot_id}
+    times = {"moment": moment_of(time_s), "bound": shown_time(time_s)}
+    (before_s,) = connection.execute(_SHOWN_ALIKE, names | times).fetchone()
+    return times["bound"] if before_s is None else before_s
 
 
 def _in_wall_time(

@@ -17,6 +17,7 @@ from typing import Final
 from webots_mcp.store.analysis.summary import Summary, merge, summarise
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rows_by_bucket
+from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.rollup.rolling import BUCKET_S, bucket_of, buckets, watermark
@@ -32,6 +33,9 @@ _STOOD_BEFORE: Final = (
 )
 # Without any, the last bucket of the run was purged: of it the rollup is all there is.
 _ROWS_FROM: Final = "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ?)"
+_ROW_IN: Final = (
+    "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?)"
+)
 
 
 class Pieces:
@@ -108,7 +112,7 @@ def read_pieces(
         return pieces
     start_s, end_s = span.start * BUCKET_S, span.stop * BUCKET_S
     head, foot = replace(segment, end_s=start_s), replace(segment, start_s=end_s)
-    middle = replace(segment, start_s=start_s, end_s=end_s)
+    middle = replace(segment, start_s=start_s, end_s=min(end_s, segment.end_s))
     mark = watermark(connection, segment.run_id)
     pieces.add_rows(read_columns(connection, head, signals, deadline))
     pieces.add_rollups(connection, segment.run_id, span, deadline)
@@ -126,13 +130,21 @@ def rows_after(connection: sqlite3.Connection, segment: Segment, mark: int) -> S
     return replace(segment, start_s=max(segment.start_s, first[0]))
 
 
+def _has_rows(connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float) -> bool:
+    return bool(connection.execute(_ROW_IN, (run_id, start_s, end_s)).fetchone()[0])
+
+
 def _whole_buckets(connection: sqlite3.Connection, segment: Segment) -> range:
     """The buckets that lie wholly inside."""
     first = math.ceil(segment.start_s / BUCKET_S)
     if first == bucket_of(segment.start_s):
         start = (segment.run_id, segment.start_s, segment.wall_start_s)
         first += connection.execute(_STOOD_BEFORE, start).fetchone()[0]
-    end = bucket_of(segment.end_s)
+    # The end of a bucket that is given as the end of a range lies half a millisecond before it.
+    end_s = segment.end_s
+    end = bucket_of(max(end_s, shown_time(end_s)))
+    if end != bucket_of(end_s) and _has_rows(connection, segment.run_id, end_s, end * BUCKET_S):
+        end -= 1
     if segment.open_end:
         rows_left = connection.execute(_ROWS_FROM, (segment.run_id, end * BUCKET_S)).fetchone()[0]
         end += not rows_left

@@ -77,7 +77,8 @@ def test_events_tell_since_when_it_was_stuck(say: Say) -> None:
 
 
 def test_compare_says_what_differs(say: Say) -> None:
-    assert "0.2         0.3" in line_with(say("compare"), "commanded_m_s")
+    assert line_with(say("compare"), "commanded_m_s", "0.2", "0.3")
+    assert line_with(say("compare"), "mean_speed_m_s", "0.2", "0.3")
     assert line_with(say("compare", "1", "3"), "mean run 1", "mean run 3", "effect run 3")
 
 

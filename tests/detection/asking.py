@@ -16,7 +16,6 @@ from webots_mcp.store.reading.ranges import resolve_range
 
 # Without a deadline that a busy machine would meet; how long it took is measured beside.
 UNHURRIED_S: Final = 300.0
-LARGE_EFFECT: Final = 0.8  # where an answer gives effects and no verdict, a reader takes it for one
 _ALL: Final = 1_000_000
 
 # The kinds of events that tell each measure; those that do not exist are left out.
@@ -162,9 +161,10 @@ def _is_one(one: Claim, other: Claim) -> bool:
 
 
 def distances_m(connection: sqlite3.Connection, run_ids: Sequence[int]) -> list[float | None]:
-    """How far the robot travelled in each of the runs, 2 to 10 of them."""
+    """How far the robot travelled in each of the runs, 2 to 10 of them, over the same stretch."""
     comparison = compare_runs(connection, run_ids, deadline_s=UNHURRIED_S)
-    return [group.distance_m for group in comparison.groups]
+    way = next((each for each in comparison.measures if each.name == "distance_m"), None)
+    return [spread and spread.median for spread in way.spread] if way else [None] * len(run_ids)
 
 
 def claimed_differences(connection: sqlite3.Connection) -> list[tuple[str, float]]:
@@ -174,8 +174,9 @@ def claimed_differences(connection: sqlite3.Connection) -> list[tuple[str, float
 
 
 def _differences(comparison: Comparison) -> Iterable[tuple[str, float]]:
-    for each in comparison.differences:
-        effect = each.effect[-1]
-        before, after = each.mean[0], each.mean[-1]
-        if effect is None or abs(effect) >= LARGE_EFFECT:
-            yield each.name, (after or 0.0) - (before or 0.0)
+    figures = [(each.name, each.spread, each.different) for each in comparison.measures]
+    figures += [(each.name, each.mean, each.different) for each in comparison.differences]
+    for name, spread, different in figures:
+        before, after = spread[0], spread[-1]
+        if different[-1] and before is not None and after is not None:
+            yield name, after.median - before.median

@@ -17,7 +17,9 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
-from webots_mcp.store.questions.compare import Comparison, Difference, compare_code, compare_runs
+from webots_mcp.store.analysis.spread import Spread
+from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.differences import Difference
 from webots_mcp.store.questions.runs import annotate_run, list_runs, run_info
 
 
@@ -85,30 +87,117 @@ def difference(comparison: Comparison, name: str) -> Difference:
     return next(each for each in comparison.differences if each.name == name)
 
 
+def measures(comparison: Comparison) -> dict[str, list[float | None]]:
+    """The medians of each group, by what is measured."""
+    return {
+        each.name: [None if one is None else one.median for one in each.spread]
+        for each in comparison.measures
+    }
+
+
+def medians(spreads: list[Spread | None]) -> list[float | None]:
+    return [None if each is None else each.median for each in spreads]
+
+
 def test_two_runs_differ_in_what_was_changed(rover: sqlite3.Connection, tier: str) -> None:
     comparison = compare_runs(rover, [2, 3])
     assert comparison.compared_s == pytest.approx(29.9, abs=0.01)
     x = difference(comparison, "pose.0")
     slow = [0.2 * 0.1 * step for step in range(300)]
     fast = [0.3 * 0.1 * step for step in range(300)]
-    assert x.mean == [pytest.approx(statistics.fmean(slow)), pytest.approx(statistics.fmean(fast))]
+    assert medians(x.mean) == [pytest.approx(statistics.fmean(each)) for each in (slow, fast)]
     pooled = math.sqrt((statistics.variance(slow) + statistics.variance(fast)) / 2)
     d = (statistics.fmean(fast) - statistics.fmean(slow)) / pooled
     assert x.effect == [0.0, pytest.approx(d)]
+    assert x.deviation_ratio == [1.0, pytest.approx(1.5)]
     assert x.count == [300, 300]
     assert difference(comparison, "battery_v").effect == [0.0, pytest.approx(0.0, abs=1e-9)]
     assert comparison.differences[0].name == "commanded_m_s"  # constant at 0.2, constant at 0.3
     assert comparison.differences[0].effect == [0.0, None]
 
 
-def test_distance_time_and_events_are_told_per_run(rover: sqlite3.Connection) -> None:
-    first, third = compare_runs(rover, [1, 3]).groups
-    assert first.distance_m == pytest.approx(8.0 + 0.8 + 0.6 + 5.0 + 1.0, abs=0.3)
-    assert third.distance_m == pytest.approx(0.3 * 59.9)
-    assert third.duration_s == pytest.approx(59.9)
-    assert first.time_by_mode_s == pytest.approx({"cruise": 76.9, "avoid": 35.0, "back_up": 8.0})
-    assert first.events["stuck"] == 1 and first.events["gap"] == 1
-    assert third.events == {}
+def test_runs_are_measured_over_the_same_stretch(rover: sqlite3.Connection) -> None:
+    comparison = compare_runs(rover, [1, 3])
+    assert comparison.compared_s == pytest.approx(59.9, abs=0.01)
+    found = measures(comparison)
+    assert found["distance_m"] == [pytest.approx(8.7, abs=0.3), pytest.approx(0.3 * 59.9)]
+    assert found["mean_speed_m_s"][1] == pytest.approx(0.3, abs=0.001)
+    assert found["share of back_up"] == [pytest.approx(8.0 / 59.9, abs=0.005), 0.0]
+    assert found["stuck per min"] == [pytest.approx(1.0, abs=0.01), 0.0]
+
+
+def test_of_one_run_each_no_difference_is_claimed(rover: sqlite3.Connection) -> None:
+    comparison = compare_runs(rover, [2, 3])
+    verdicts = [each.different for each in (*comparison.measures, *comparison.differences)]
+    assert all(verdict == [False, None] for verdict in verdicts)
+    assert "one run each" in comparison.notes[0]
+
+
+def record_group(
+    recorder: Recorder, robot_id: int, code: str, runs: int, speed_m_s: float, dice: random.Random
+) -> None:
+    """Runs of 30 s that drive about as fast, with some bumps by chance and a noisy sensor."""
+    for _ in range(runs):
+        recorder.run(recorder.session(robot_id, code * 64), robot_id)
+        speed = speed_m_s * (1 + dice.gauss(0, 0.01))
+        swing = dice.gauss(0.2, 0.01)
+        for step in range(150):
+            time_s = 0.2 * step
+            bumped = dice.random() < 0.005
+            recorder.publish(
+                time_s,
+                {
+                    "pose": [speed * time_s, 0.0],
+                    "mode": "back_up" if bumped else "cruise",
+                    "error": swing * math.sin(time_s),
+                    "noise": dice.gauss(0, 1),
+                },
+            )
+
+
+def claimed(comparison: Comparison) -> set[str]:
+    found = (*comparison.measures, *comparison.differences)
+    return {each.name for each in found if each.different[1]}
+
+
+def test_between_like_runs_no_difference_is_claimed(empty: sqlite3.Connection) -> None:
+    dice = random.Random(4)
+    recorder = Recorder(empty)
+    for pair in range(20):
+        robot_id = recorder.robot(f"r{pair}")
+        empty.execute("BEGIN")
+        for code in "ab":
+            record_group(recorder, robot_id, code, 3, 0.2, dice)
+        empty.execute("COMMIT")
+        assert claimed(compare_code(empty, robot=f"r{pair}")) == set()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_tenth_more_speed_is_found(empty: sqlite3.Connection, seed: int) -> None:
+    dice = random.Random(seed)
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    empty.execute("BEGIN")
+    record_group(recorder, robot_id, "a", 5, 0.2, dice)
+    record_group(recorder, robot_id, "b", 5, 0.22, dice)
+    empty.execute("COMMIT")
+    comparison = compare_code(empty)
+    assert {"distance_m", "mean_speed_m_s"} <= claimed(comparison)
+    assert "noise" not in claimed(comparison)
+    assert difference(comparison, "pose.0").different == [False, True]
+
+
+def test_a_swing_that_was_cut_comes_first(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    for swing in (0.4, 0.02):
+        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        for step in range(200):
+            state = {f"other_{i}": i * 0.1 + swing * 0.5 + step * 0.01 for i in range(6)}
+            recorder.publish(step * 0.1, {**state, "heading_error": swing * math.sin(step * 0.3)})
+    first, *_ = compare_runs(empty, [1, 2]).differences
+    assert first.name == "heading_error"
+    assert first.deviation_ratio[1] == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize(("noise_m", "speed_m_s", "way_m"), [(0.01, 0, 0), (0.0005, 0.1, 14)])
@@ -126,15 +215,17 @@ def test_the_noise_of_a_position_is_no_way(
             x, y = (noise.gauss(speed_m_s * step * 0.032, noise_m), noise.gauss(1, noise_m))
             recorder.publish(step * 0.032, {"pose": [x, y]})
     empty.execute("COMMIT")
-    for group in compare_runs(empty, [1, 2]).groups:
-        assert group.distance_m == pytest.approx(way_m, abs=0.03 * way_m + 0.6)
+    for distance_m in measures(compare_runs(empty, [1, 2]))["distance_m"]:
+        assert distance_m == pytest.approx(way_m, abs=0.03 * way_m + 0.6)
 
 
 def test_runs_before_and_after_the_last_edit_are_compared(rover: sqlite3.Connection) -> None:
-    before, after = compare_code(rover).groups
+    comparison = compare_code(rover)
+    before, after = comparison.groups
     assert [run.run_id for run in before.runs] == [1, 2]
     assert [run.run_id for run in after.runs] == [3]
-    assert before.events["stuck"] == 1 and "stuck" not in after.events
+    assert comparison.compared_s == pytest.approx(29.9, abs=0.01)
+    assert measures(comparison)["mean_speed_m_s"] == pytest.approx([0.2, 0.3], abs=0.001)
 
 
 def test_a_signal_that_only_one_run_has_is_named(empty: sqlite3.Connection) -> None:
@@ -161,8 +252,8 @@ def test_runs_of_two_robots_can_be_compared(empty: sqlite3.Connection) -> None:
             recorder.publish(float(step), {"filler_" + name: 0, "x": x + step % 2, "scan": None})
     comparison = compare_runs(empty, [1, 2], names=["x", "scan"])
     (x, *_) = comparison.differences
-    assert x.mean == [1.5, 3.5]
-    assert comparison.notes == ("these are runs of different robots: a, b",)
+    assert medians(x.mean) == [1.5, 3.5]
+    assert "these are runs of different robots: a, b" in comparison.notes
     assert comparison.only_in == {}
 
 

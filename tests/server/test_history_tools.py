@@ -238,7 +238,9 @@ async def test_before_and_after_the_last_edit_are_compared(story: Path) -> None:
     answer = await tell(story, "webots_compare_runs")
     before, after = rows_of(answer["groups"])
     assert (before["runs"], after["runs"]) == ([1, 2], [3])
-    assert after["distance_m"] == pytest.approx(17.97, abs=0.01)
+    measures = {row["name"]: row for row in rows_of(answer["measures"])}
+    assert answer["compared_s"] == pytest.approx(29.9, abs=0.01)
+    assert measures["distance_m"]["median"][1] == pytest.approx(0.3 * 29.9, abs=0.01)
     differences = {row["signal"]: row for row in rows_of(answer["differences"])}
     assert differences["commanded_m_s"]["mean"] == [0.2, 0.3]
     assert "target" not in differences and "are equal" in answer["hint"]

@@ -26,6 +26,7 @@ from webots_mcp.cli.tables import print_notes, print_table
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from webots_mcp.store.analysis.spread import Spread
     from webots_mcp.store.detection.event import EventOptions
     from webots_mcp.store.questions.compare import Comparison
     from webots_mcp.store.questions.series import RunHistory
@@ -298,22 +299,49 @@ def _spelled(value: object) -> object:
 
 def _print_comparison(found: Comparison) -> None:
     groups = [
-        [
-            group.name,
-            ", ".join(str(run.run_id) for run in group.runs),
-            group.duration_s,
-            group.distance_m,
-            {value: round(time_s, 1) for value, time_s in group.time_by_mode_s.items()} or None,
-            group.events or None,
-        ]
+        [group.name, ", ".join(str(run.run_id) for run in group.runs), group.duration_s]
         for group in found.groups
     ]
-    columns = ("", "runs", "duration_s", "distance_m", "seconds per mode", "events")
-    print_table(columns, groups)
-    print(f"\nSignals over the first {found.compared_s:.3f} s, what differs most first:")
+    print_table(("", "runs", "duration_s"), groups)
     names: Sequence[str] = [group.name for group in found.groups]
+    print(f"\nThe first {found.compared_s:.3f} s of each run:")
+    verdicts = [f"{name} differs" for name in names[1:]]
     print_table(
-        ["signal", *(f"mean {name}" for name in names), *(f"effect {name}" for name in names[1:])],
-        [[each.name, *each.mean, *each.effect[1:]] for each in found.differences],
+        ["", *names, *verdicts],
+        [
+            [each.name, *map(_spelled_spread, each.spread), *map(_verdict, each.different[1:])]
+            for each in found.measures
+        ],
+    )
+    print("\nSignals, what differs most first:")
+    columns = [f"mean {name}" for name in names] + [f"effect {name}" for name in names[1:]]
+    columns += [f"deviation {name}" for name in names[1:]]
+    print_table(
+        ["signal", *columns, *verdicts],
+        [
+            [
+                each.name,
+                *map(_spelled_spread, each.mean),
+                *each.effect[1:],
+                *(
+                    None if ratio is None else f"x {ratio:.3g}"
+                    for ratio in each.deviation_ratio[1:]
+                ),
+                *map(_verdict, each.different[1:]),
+            ]
+            for each in found.differences
+        ],
     )
     print_notes(found.notes)
+
+
+def _spelled_spread(spread: Spread | None) -> str | None:
+    """The median, and the range of several runs."""
+    if spread is None:
+        return None
+    several = "" if spread.low == spread.high else f" ({spread.low:.4g} to {spread.high:.4g})"
+    return f"{spread.median:.4g}{several}"
+
+
+def _verdict(different: bool | None) -> str:
+    return {True: "yes", False: "no", None: "not known"}[different]

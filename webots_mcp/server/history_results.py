@@ -190,13 +190,18 @@ class ComparisonAnswer(NotedAnswer):
 
     groups: Table | None = None
     compared_s: float | None = Field(
-        default=None, description="Differences are about the first so many seconds of each run."
+        default=None, description="All figures are about the first so many seconds of each run."
+    )
+    measures: Table | None = Field(
+        default=None,
+        description="Each run as a whole: median over the runs of each group, and their range. "
+        "different: of each group but the first.",
     )
     differences: Table | None = Field(
         default=None,
-        description="Most different first; lists are in the order of the groups. effect: how far "
-        "the mean is from the first group's, in pooled standard deviations (0.8 is large, null: "
-        "unequal constants).",
+        description="Signals, most different first; lists are in the order of the groups. Of each "
+        "group but the first: effect, how far the mean is from the first group's, in standard "
+        "deviations (0.8 is large, null: unequal constants), deviation_ratio, different.",
     )
     total: int | None = Field(default=None, description="Numeric signals that all groups have.")
     only_in: dict[str, list[str]] | None = Field(

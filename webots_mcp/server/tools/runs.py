@@ -35,6 +35,7 @@ from webots_mcp.server.parameters import (
     ShownLimit,
 )
 from webots_mcp.server.results import Table
+from webots_mcp.store.analysis.spread import Spread
 from webots_mcp.store.questions.compare import (
     Comparison,
     Difference,
@@ -59,10 +60,11 @@ RUN_COLUMNS: Final = (
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
     "name", "robot", "runs", "labels", "sha256", "ended_by", "duration_s", "real_time_factor",
-    "distance_m", "time_by_mode_s", "events",
 )  # fmt: skip
+MEASURE_COLUMNS: Final = ("name", "median", "range", "different")
 DIFFERENCE_COLUMNS: Final = (
-    "signal", "unit", "mean", "deviation", "min", "max", "effect",
+    "signal", "unit", "mean", "mean_range", "deviation", "deviation_ratio", "min", "max",
+    "effect", "different",
 )  # fmt: skip
 DEFAULT_DIFFERENCES: Final = 15
 _SHOWN_HASH: Final = 10
@@ -108,11 +110,12 @@ class RunTools:
         limit: ShownLimit = None,
         robot: RobotName = None,
     ) -> ComparisonAnswer:
-        """Two or more runs beside each other; the first is the reference. What differs most first.
+        """Did my edit help? Runs beside each other; the first group is the reference.
 
-        Without run_ids: the runs before and after the last edit of the controller's file. Duration,
-        distance, time per mode, events of each kind, and each signal's effect: how far its mean is
-        from the reference's, in standard deviations (0.8 is large).
+        Without run_ids: the runs before and after the last edit of the controller's file. Over the
+        same stretch of each run: distance, mean speed, share of time per mode, events per minute,
+        and the signals that differ most. `different` is true only beyond the spread of like runs,
+        which takes several runs of each: null says that it cannot be told.
         """
         with self._recording.view(robot, run_ids[0] if run_ids else None) as view:
             return answer_about(
@@ -198,20 +201,52 @@ def _compared(
         found = compare_runs(view.connection, run_ids, names=wanted, limit=most)
     else:
         found = compare_code(view.connection, robot=view.robot.name, names=wanted, limit=most)
-    differing = [each for each in found.differences if any(e != 0 for e in each.effect[1:])]
-    groups = _groups(found)
-    room = (BUDGET if limit is None else LARGE_BUDGET) - len(str(groups.rows if groups else ""))
+    differing = [each for each in found.differences if _differs(each)]
+    groups, measures = _groups(found), _measures(found)
+    told = "".join(str(table.rows) for table in (groups, measures) if table)
+    room = (BUDGET if limit is None else LARGE_BUDGET) - len(told)
     rows = fitting([_difference_row(difference) for difference in differing], room)
     only_in = list(found.only_in.items())
     return {
         "groups": groups,
         "compared_s": seconds(found.compared_s),
+        "measures": measures,
         "differences": without_empty(DIFFERENCE_COLUMNS, rows),
         "total": found.total,
         "only_in": {name: list(groups) for name, groups in only_in[:_MOST_ONLY_IN]} or None,
         "notes": notes_of(found.notes),
         "hint": _hint(found, len(rows), len(differing), len(only_in)),
     }
+
+
+def _differs(difference: Difference) -> bool:
+    """Whether mean or deviation of any group is another one than in the first."""
+    ratios = [each for each in difference.deviation_ratio[1:] if each is not None]
+    return any(each != 0 for each in difference.effect[1:]) or any(each != 1 for each in ratios)
+
+
+def _measures(found: Comparison) -> Table | None:
+    rows = [
+        [
+            short_name(each.name),
+            _medians(each.spread),
+            _ranges(each.spread),
+            _told(each.different),
+        ]
+        for each in found.measures
+    ]
+    return without_empty(MEASURE_COLUMNS, rows)
+
+
+def _medians(spreads: Sequence[Spread | None]) -> list[float | None]:
+    return figures([None if each is None else each.median for each in spreads])
+
+
+def _ranges(spreads: Sequence[Spread | None]) -> list[list[float | None] | None] | None:
+    """The least and the greatest of each group; None where each group is one run."""
+    if all(each is None or each.low == each.high for each in spreads):
+        return None
+    return [None if each is None else figures([each.low, each.high]) for each in spreads]
 
 
 def _groups(found: Comparison) -> Table | None:
@@ -233,9 +268,6 @@ def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
         ", ".join(dict.fromkeys(run.end_reason or _GOING_ON for run in group.runs)),
         seconds(group.duration_s),
         figure(pace(group.duration_s, driven_s)),
-        figure(group.distance_m),
-        shown({value: round(time_s, 3) for value, time_s in group.time_by_mode_s.items()}) or None,
-        group.events or None,
     ]
 
 
@@ -243,12 +275,21 @@ def _difference_row(difference: Difference) -> list[Any]:
     return [
         short_name(difference.name),
         difference.unit,
-        figures(difference.mean),
-        figures(difference.deviation),
+        _medians(difference.mean),
+        _ranges(difference.mean),
+        _medians(difference.deviation),
+        figures(difference.deviation_ratio[1:]),
         figures(difference.min),
         figures(difference.max),
-        figures(difference.effect),
+        figures(difference.effect[1:]),
+        _told(difference.different),
     ]
+
+
+def _told(different: Sequence[bool | None]) -> list[bool | None] | None:
+    """The verdict on each group but the first; None where there is none on any."""
+    verdicts = list(different[1:])
+    return verdicts if any(each is not None for each in verdicts) else None
 
 
 def _hint(found: Comparison, told: int, differing: int, only_in: int) -> str | None:
@@ -256,6 +297,6 @@ def _hint(found: Comparison, told: int, differing: int, only_in: int) -> str | N
     hints = [f"the {told} that differ most of {found.total}: limit or signals for others"] * more
     hints += ["no numeric signal differs"] * (differing == 0)
     equal = 0 if more else found.total - differing
-    hints += [f"the means of the other {equal} are equal"] * (equal > 0 and differing > 0)
+    hints += [f"mean and deviation of the other {equal} are equal"] * (equal > 0 and differing > 0)
     hints += [f"{only_in} signals are in some groups only"] * (only_in > _MOST_ONLY_IN)
     return "; ".join(hints) or None

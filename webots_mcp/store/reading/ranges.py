@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
@@ -75,6 +75,10 @@ class Segment:
     wall_end_s: float = math.inf
     open_start: bool = False
     open_end: bool = False
+
+    def until(self, end_s: float) -> Segment:
+        """Its part before that time."""
+        return replace(self, end_s=end_s, open_end=False)
 
     @property
     def holds_from_s(self) -> float:

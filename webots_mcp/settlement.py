@@ -40,7 +40,7 @@ END_RUNS: Final = (
 )
 EXTERN: Final = "nobody starts an extern controller again: start it by hand"
 _OPEN_SESSIONS: Final = (
-    "SELECT id, pid, process, last_seen_wall_time_s, EXISTS (SELECT 1 FROM command "
+    "SELECT id, pid, CAST(process AS BLOB), last_seen_wall_time_s, EXISTS (SELECT 1 FROM command "
     "WHERE session_id = session.id AND action = 'reload' AND issued_wall_time_s IS NOT NULL) "
     "FROM session WHERE ended_wall_time_s IS NULL AND host = ?"
 )
@@ -88,7 +88,7 @@ def gone_sessions(connection: sqlite3.Connection) -> list[tuple[int, str]]:
     return [
         (session_id, "reload" if reloading else "crashed")
         for session_id, pid, process, seen_s, reloading in sessions
-        if not process_alive(pid, process, seen_s)
+        if not process_alive(pid, process and process.decode("utf-8", "replace"), seen_s)
     ]
 
 

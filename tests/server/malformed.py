@@ -31,11 +31,11 @@ JSON_COLUMNS: Final = {
     ("state", "odd"), ("event", "data"), ("command", "params"), ("command", "result"),
 }  # fmt: skip
 _BLOB: Final = b"\x00\xff\x01"
-_NOT_UTF8: Final = "CAST(x'7b22ff41227d' AS TEXT)"
+NOT_UTF8: Final = "CAST(x'7b22ff41227d' AS TEXT)"
 _WRONG_BY_TYPE: Final[dict[str, tuple[Any, ...]]] = {
     "INTEGER": ("yesterday", _BLOB, 2**63 - 1, -(2**63), 1e300, float("inf")),
     "FLOAT": ("yesterday", _BLOB, 2**63 - 1, 1e300, float("inf"), float("-inf"), -1e18),
-    "TEXT": (_BLOB, _NOT_UTF8, "", "x" * 100_000, "a\0b"),
+    "TEXT": (_BLOB, NOT_UTF8, "", "x" * 100_000, "a\0b"),
 }
 _WRONG_JSON: Final = (
     '{"x": ', "nonsense", "[1, 2]", "7", "null", '"text"', '{"x": NaN}', '{"x": 1e999}',
@@ -91,7 +91,7 @@ class Damage(NamedTuple):
         where = f"rowid = (SELECT max(rowid) FROM {self.table})"
         if self.table in KEYED:  # they have no rowid
             where = f"(run_id, signal_id) = (SELECT max(run_id), max(signal_id) FROM {self.table})"
-        new, values = ("?", (self.value,)) if self.value is not _NOT_UTF8 else (_NOT_UTF8, ())
+        new, values = ("?", (self.value,)) if self.value is not NOT_UTF8 else (NOT_UTF8, ())
         connection.execute("PRAGMA foreign_keys=OFF")
         connection.execute(f"UPDATE {self.table} SET {self.column} = {new} WHERE {where}", values)
 

@@ -68,6 +68,19 @@ def past_unsound_rows() -> Generator[Unsound]:
         _reading.reset(token)
 
 
+@contextmanager
+def sound_rows(connection: sqlite3.Connection) -> Generator[Unsound]:
+    """Inside, a writer has the view `sound_NAME` of each table, and reads any text."""
+    unsound, text_factory = Unsound(), connection.text_factory
+    _show_sound(connection, unsound, prefix="sound_")
+    try:
+        yield unsound
+    finally:
+        connection.text_factory = text_factory
+        for table in _TABLES:
+            connection.execute(f"DROP VIEW temp.sound_{table}")
+
+
 def shadow_if_asked(connection: sqlite3.Connection) -> None:
     """Inside `past_unsound_rows` give a reader views of the sound rows under the tables' names."""
     if (unsound := _reading.get()) is not None:
@@ -75,20 +88,24 @@ def shadow_if_asked(connection: sqlite3.Connection) -> None:
 
 
 def _shadow(connection: sqlite3.Connection, unsound: Unsound) -> None:
+    connection.execute("PRAGMA query_only=OFF")  # a view of this connection alone
+    _show_sound(connection, unsound)
+    connection.execute("PRAGMA query_only=ON")
+
+
+def _show_sound(connection: sqlite3.Connection, unsound: Unsound, prefix: str = "") -> None:
     connection.text_factory = _as_text
     connection.create_function("unsound", 4, unsound.note)
     connection.create_function("sound_json", 2, _is_sound_json, deterministic=True)
-    connection.execute("PRAGMA query_only=OFF")  # a view of this connection alone
     for table in _TABLES:
-        connection.execute(_view(connection, table))
-    connection.execute("PRAGMA query_only=ON")
+        connection.execute(_view(connection, table, prefix))
 
 
 def _as_text(stored: bytes) -> str:
     return stored.decode("utf-8", "replace")
 
 
-def _view(connection: sqlite3.Connection, table: str) -> str:
+def _view(connection: sqlite3.Connection, table: str, prefix: str) -> str:
     columns = connection.execute(_COLUMNS, (table,)).fetchall()
     keys = [name for name, _, _, _, key in columns if key]
     row = " || '/' || ".join(keys)
@@ -109,11 +126,14 @@ def _view(connection: sqlite3.Connection, table: str) -> str:
                 f"ELSE coalesce({left_out}, {default or 'NULL'}) END AS {name}"
             )
     for name, other in _REFERENCES.get(table, ()):
-        there = f"EXISTS (SELECT 1 FROM temp.{other} AS other WHERE other.id = {table}.{name})"
+        there = (
+            f"EXISTS (SELECT 1 FROM temp.{prefix}{other} AS other WHERE other.id = {table}.{name})"
+        )
         left_out = f"unsound('{table}', {row}, '{name}', 'reference')"
         needed.append(f"CASE WHEN {there} THEN 1 ELSE {left_out} END")
     where = " AND ".join(needed) or "1"
-    return f"CREATE TEMP VIEW {table} AS SELECT {', '.join(shown)} FROM main.{table} WHERE {where}"
+    rows = f"SELECT {', '.join(shown)} FROM main.{table} WHERE {where}"
+    return f"CREATE TEMP VIEW {prefix}{table} AS {rows}"
 
 
 def _check(table: str, name: str, kind: str) -> tuple[str, str]:

@@ -26,10 +26,11 @@ _NTH_ID: Final = (
     "SELECT id FROM {table} WHERE run_id = ? ORDER BY sim_time_s, id LIMIT 1 OFFSET ? - 1"
 )
 _FIRST_TIME: Final = "SELECT min(sim_time_s) FROM {table} WHERE run_id = ?"
-_LAST_TIME: Final = "SELECT max(sim_time_s) FROM {table} WHERE run_id = ?"
+# Any text and any blob is greater than any number.
+_LAST_TIME: Final = "SELECT max(sim_time_s) FROM {table} WHERE run_id = ? AND sim_time_s <= 9e999"
 _WALL_AT: Final = (
     "SELECT wall_time_s FROM {table} WHERE run_id = ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+    "AND wall_time_s <= 9e999 ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
 _ROWS_UP_TO: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s <= ?"
 _ROWS_BELOW: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND id < ?"
@@ -47,7 +48,9 @@ _ID_RANGE: Final = "SELECT coalesce(min(id), 0), coalesce(max(id), -1) FROM {tab
 _WINDOW: Final = (
     "SELECT run_id, {payload} FROM {table} NOT INDEXED WHERE id >= ? ORDER BY id LIMIT ?"
 )
-_PICTURES: Final = "SELECT run_id, avg(bytes) FROM image GROUP BY run_id"
+_PICTURES: Final = (
+    "SELECT run_id, avg(iif(bytes BETWEEN 0 AND 1e12, bytes, 0)) FROM image GROUP BY run_id"
+)
 _COLUMNS: Final = "SELECT name, type, pk FROM pragma_table_info(?)"
 _WINDOWS: Final = 32
 _WINDOW_ROWS: Final = 40
@@ -166,9 +169,12 @@ def rows_before(connection: sqlite3.Connection, holding: Holding, wall_time_s: f
 
     def is_older(time_s: float) -> bool:
         query = _WALL_AT.format(table=table)
-        return float(connection.execute(query, (run_id, time_s)).fetchone()[0]) < wall_time_s
+        row = connection.execute(query, (run_id, time_s)).fetchone()
+        return row is not None and row[0] < wall_time_s
 
     older_s, younger_s = _bounds(connection, table, run_id)
+    if younger_s is None:
+        return 0  # no row of it has a time
     if is_older(younger_s):
         return holding.rows
     if not is_older(older_s):

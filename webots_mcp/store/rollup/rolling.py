@@ -14,6 +14,8 @@ from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.connection import is_about_a_value, is_damage
+from webots_mcp.notice import say
 from webots_mcp.store.analysis.summary import Summary, merge, summarise
 from webots_mcp.store.reading.rows import cleaned
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
@@ -28,6 +30,7 @@ from webots_mcp.store.rollup.tables import (
 )
 from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal, count, enter_signals, seen_now
+from webots_mcp.store.sound import Unsound, sound_rows
 
 __all__ = ["BUCKET_S", "Rolled", "bucket_of", "buckets", "forget", "roll", "watermark"]
 
@@ -39,9 +42,15 @@ _SET_WATERMARK: Final = (
     "INSERT INTO watermark (name, state_id) VALUES ('rollup', ?) "
     "ON CONFLICT (name) DO UPDATE SET state_id = max(state_id, excluded.state_id)"
 )
+_COLUMNS: Final = "s.id, r.robot_id, s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd"
 _ROWS: Final = (
-    "SELECT s.id, r.robot_id, s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd "
-    "FROM state s JOIN run r ON r.id = s.run_id WHERE s.id > ? ORDER BY s.id LIMIT ?"
+    f"SELECT {_COLUMNS} FROM state s JOIN run r ON r.id = s.run_id "
+    "WHERE s.id > ? ORDER BY s.id LIMIT ?"
+)
+_IDS: Final = "SELECT id FROM state WHERE id > ? ORDER BY id LIMIT ?"
+_SOUND_ROWS: Final = (
+    f"SELECT {_COLUMNS} FROM sound_state s JOIN sound_run r ON r.id = s.run_id "
+    "WHERE s.id > ? AND s.id <= ? ORDER BY s.id"
 )
 _BUCKETS: Final = (
     f"SELECT bucket, {', '.join(Summary._fields)} FROM all_rollup "
@@ -53,11 +62,14 @@ _LAST_CHANGE: Final = (
 # The rollups were emptied by hand, although rows are there that they once held.
 _EMPTIED: Final = (
     "SELECT NOT EXISTS (SELECT 1 FROM rollup) "
-    "AND (SELECT sum(rows) FROM signal) > (SELECT total(rows) FROM recent_rollup) "
+    "AND (SELECT total(rows) FROM signal) > (SELECT total(rows) FROM recent_rollup) "
     "AND EXISTS (SELECT 1 FROM state WHERE id <= (SELECT state_id FROM watermark))"
 )
-# What a row of foreign origin may hold: numbers, text and nesting that cannot be stored.
-_UNSTORABLE: Final = (OverflowError, ValueError, RecursionError, sqlite3.DataError)
+# What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
+# be stored, a run that is not there.
+_UNSTORABLE: Final = (
+    TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
+)  # fmt: skip
 
 
 class Rolled(NamedTuple):
@@ -77,8 +89,9 @@ def roll(connection: sqlite3.Connection, budget_rows: int = 2000, pause_s: float
 
     Rows are read, parsed and summed up outside the write lock. What they come to is stored run by
     run, each in one step of less than a millisecond that first looks whether the run's mark is
-    still where it was: of two callers one stores, the other finds nothing left to do. Rollups
-    emptied by hand begin at the first row again.
+    still where it was: of two callers one stores, the other finds nothing left to do. Rows that
+    hold what no bridge writes are left out, and said on stderr. Rollups emptied by hand begin at
+    the first row again.
 
     Args:
         connection: Of a maintainer (the role "writer"), in autocommit mode.
@@ -116,27 +129,58 @@ def buckets(
 
 
 def _roll_batch(connection: sqlite3.Connection, limit: int, pause_s: float) -> int | None:
-    """The rows taken in: None if there are no more, 0 if another caller was faster.
-
-    A row that cannot be summed up costs only itself: it is looked for by halving, and left out.
-    """
-    rows = connection.execute(_ROWS, (watermark(connection), limit)).fetchall()
-    if not rows:
-        return None
+    """The rows taken in: None if there are no more, 0 if another caller was faster."""
+    after = watermark(connection)
     try:
+        rows = connection.execute(_ROWS, (after, limit)).fetchall()
+        ids = [row[0] for row in rows]
         stored = _take_in(connection, rows, pause_s)
-    except _UNSTORABLE:
-        if len(rows) > 1:
-            return _roll_batch(connection, len(rows) // 2, pause_s)
-        stored = _take_in(connection, rows, pause_s, leave_out=True)
+    except Exception as error:
+        if not _is_over_a_value(error):
+            raise
+        ids = [row[0] for row in connection.execute(_IDS, (after, limit))]
+        stored = _take_in_sound(connection, after, ids[-1], pause_s)
+    if stored and ids:
+        connection.execute(_SET_WATERMARK, (ids[-1],))
+    return (len(ids) if stored else 0) if ids else None
+
+
+def _is_over_a_value(error: Exception) -> bool:
+    if is_damage(error):
+        return False
+    return isinstance(error, _UNSTORABLE) or is_about_a_value(error)
+
+
+def _take_in_sound(connection: sqlite3.Connection, after: int, last: int, pause_s: float) -> bool:
+    """As `_take_in`, of rows among which are some that no bridge has written: they are left out."""
+    with sound_rows(connection) as unsound:
+        rows = connection.execute(_SOUND_ROWS, (after, last)).fetchall()
+        stored = _take_in_halves(connection, rows, pause_s, unsound)
     if stored:
-        connection.execute(_SET_WATERMARK, (rows[-1][0],))
-    return len(rows) if stored else 0
+        say(f"left out of the rollups: {'; '.join(unsound.described())}")
+    return stored
 
 
-def _take_in(
-    connection: sqlite3.Connection, rows: Sequence[Any], pause_s: float, *, leave_out: bool = False
+def _take_in_halves(
+    connection: sqlite3.Connection, rows: Sequence[Any], pause_s: float, unsound: Unsound
 ) -> bool:
+    """A row that cannot be summed up costs only itself: it is looked for by halving."""
+    try:
+        return _take_in(connection, rows, pause_s)
+    except Exception as error:
+        if not _is_over_a_value(error):
+            raise
+        if len(rows) == 1:
+            unsound.note("state", rows[0][0], "data", "state")
+            return True
+    middle = len(rows) // 2
+    return all(
+        _take_in_halves(connection, half, pause_s, unsound)
+        for half in (rows[:middle], rows[middle:])
+    )
+
+
+def _take_in(connection: sqlite3.Connection, rows: Sequence[Any], pause_s: float) -> bool:
     """Whether all of them are in, run by run; the mark of a run tells which were before."""
     robots = {row[2]: row[1] for row in rows}
     for run_id, robot_id in robots.items():
@@ -145,7 +189,7 @@ def _take_in(
             return False  # the run was deleted, and its rows with it
         before = held(connection, run_id, mark)
         fresh = [row for row in rows if row[2] == run_id and row[0] > mark]
-        addition = _sum_up(connection, before, robot_id, () if leave_out else fresh)
+        addition = _sum_up(connection, before, robot_id, fresh)
         if fresh and not store(connection, before, addition, fresh[-1][0]):
             return False
         time.sleep(pause_s)

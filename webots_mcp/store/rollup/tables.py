@@ -26,7 +26,7 @@ Key = tuple[int, int]  # bucket, signal id
 _FIGURES: Final = ", ".join(Summary._fields)
 _COLUMNS: Final = f"run_id, bucket, signal_id, {_FIGURES}"
 _RUN_MARK: Final = (
-    "SELECT max(rolled_state_id, "
+    "SELECT max(iif(typeof(rolled_state_id) = 'integer', rolled_state_id, 0), "
     "coalesce((SELECT state_id FROM watermark WHERE name = 'rollup'), 0)) FROM run WHERE id = {}"
 )
 _RECENT_ROWS: Final = "SELECT count(*) FROM recent_rollup WHERE run_id = {}"

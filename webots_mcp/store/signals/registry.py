@@ -25,7 +25,8 @@ from webots_mcp.store.signals.flatten import (
 MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
 
 _OF_ROBOT: Final = (
-    "SELECT id, robot_id, name, kind, unit, path, reduce FROM signal WHERE robot_id = ? ORDER BY id"
+    "SELECT id, robot_id, name, kind, unit, path, reduce FROM signal WHERE robot_id = ? "
+    "AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
 )
 _ADD: Final = (
     "INSERT OR IGNORE INTO signal (robot_id, name, kind, unit, path, reduce, "

@@ -1,0 +1,146 @@
+"""What no bridge has written costs maintenance that row, and never the rows after it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.server.malformed import NOT_UTF8, Damage
+from tests.store.recorded import Recorded
+from webots_mcp.adoption import adopt
+from webots_mcp.entries import FORMAT
+from webots_mcp.settlement import gone_sessions
+from webots_mcp.store.retention import Limit, Retention, plan
+from webots_mcp.store.retention.purge import prune
+from webots_mcp.store.rollup.rolling import roll
+
+BLOB = b"\x00\xff\x01"
+ROLLED = (
+    "SELECT name, sum(r.rows) FROM all_rollup r JOIN signal s ON s.id = r.signal_id "
+    "GROUP BY name ORDER BY name"
+)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        Damage("state", "sim_time_s", "late"),
+        Damage("state", "sim_time_s", BLOB),
+        Damage("state", "sim_time_s", 1e300),
+        Damage("state", "data", NOT_UTF8),
+    ],
+    ids=str,
+)
+def test_a_row_that_cannot_be_summed_up_costs_only_itself_and_is_named(
+    recorded: Recorded, damage: Damage, capsys: pytest.CaptureFixture[str]
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, {"x": 1})
+    robot.state(2.0, {"x": 2, "y": 0})
+    damage.apply(recorded.connection)
+    robot.state(3.0, {"x": 3})
+    assert roll(recorded.connection).rows == 3
+    rolled = dict(recorded.connection.execute(ROLLED).fetchall())
+    assert rolled == {"x": 2}
+    assert f"state 2: {damage.column} is no sound" in capsys.readouterr().err
+    assert roll(recorded.connection) == (0, True)
+
+
+@pytest.mark.parametrize(
+    ("damage", "rolled"),
+    [
+        (Damage("run", "rolled_state_id", "yesterday"), {"x": 2}),
+        (Damage("signal", "rows", 2**63 - 1), {"x": 2}),
+        (Damage("signal", "name", BLOB), {"x": 1}),
+        (Damage("signal", "path", BLOB), {"x": 1}),
+    ],
+    ids=str,
+)
+def test_a_wrong_value_in_what_rollups_are_kept_by_does_not_keep_new_rows_out(
+    recorded: Recorded, damage: Damage, rolled: dict[str, int]
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, {"x": 1})
+    roll(recorded.connection)
+    damage.apply(recorded.connection)
+    robot.state(2.0, {"x": 1, "fresh": 1})
+    roll(recorded.connection)
+    found = dict(recorded.connection.execute(ROLLED).fetchall())
+    assert found.pop("fresh") == 1
+    assert damage.column in ("name", "path") or found == rolled
+
+
+@pytest.mark.parametrize("table", ["state", "log", "event", "image"])
+@pytest.mark.parametrize("value", ["yesterday", BLOB, 1e300])
+@pytest.mark.parametrize("column", ["sim_time_s", "wall_time_s"])
+def test_a_row_without_a_time_does_not_keep_others_from_being_purged(
+    recorded: Recorded, tmp_path: Path, table: str, value: Any, column: str
+) -> None:
+    robot = recorded.robot(now=1000.0)
+    for step in range(5):
+        robot.state(step, {"x": 1})
+        robot.log(step, "hello")
+        robot.event(step, "change", "x", {})
+        robot.image(step, f"{step}.png")
+    Damage(table, column, value).apply(recorded.connection)
+    limit = Limit(age_s=10, spared_rows=0)
+    prune(recorded.connection, tmp_path, Retention(*[limit] * 5, outlive=0), now_s=2000, rest=False)
+    assert recorded.connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0] <= 1
+
+
+@pytest.mark.parametrize("column", ["started_wall_time_s", "last_wall_time_s"])
+def test_a_run_without_a_time_does_not_keep_others_from_being_purged(
+    recorded: Recorded, column: str
+) -> None:
+    robot = recorded.robot()
+    for _ in range(2):
+        robot.state(1.0, {"x": 1})
+        robot.begin_run("reset")
+    Damage("run", column, "yesterday").apply(recorded.connection)
+    limits = Retention(*[Limit(rows=1, age_s=1, spared_rows=0)] * 5)
+    assert plan(recorded.connection, limits).rows_by_table()["state"] >= 1
+
+
+def test_the_process_of_a_session_need_not_be_text(recorded: Recorded) -> None:
+    recorded.robot(process="x")
+    recorded.connection.execute("UPDATE session SET process = CAST(x'7bff' AS TEXT)")
+    assert gone_sessions(recorded.connection) == [(1, "crashed")]
+
+
+HEADER = {"webots_mcp_waiting": FORMAT, "robot": {}, "session": {"uuid": "u"}}
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [{"webots_mcp_waiting": FORMAT}],
+        [HEADER],
+        [{**HEADER, "session": {"uuid": ["u"], "started_wall_time_s": 1}}],
+    ],
+)
+def test_a_waiting_file_that_no_controller_has_written_is_passed_over(
+    recorded: Recorded, lines: list[Any]
+) -> None:
+    assert isinstance(recorded.database, Path)
+    path = Path(f"{recorded.database}-waiting-u.jsonl")
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert adopt(recorded.connection, recorded.database) == 0
+
+
+def test_an_entry_that_no_controller_has_written_costs_only_itself(recorded: Recorded) -> None:
+    assert isinstance(recorded.database, Path)
+    robot = recorded.robot(uuid="u")
+    recorded.connection.execute("UPDATE run SET uuid = 'r'")
+    state = [1.0, 1.0, "{}", None]
+    lines: list[Any] = [
+        HEADER, [1, ["state"], "r", state], [2**70, "state", "r", state],
+        [2, "state", ["r"], state], [3, "state", "r", 7],
+        [4, "state", "r", [{}]], [5, "state", "r", state],
+    ]  # fmt: skip
+    path = Path(f"{recorded.database}-waiting-u.jsonl")
+    path.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert adopt(recorded.connection, recorded.database) == 1
+    assert recorded.connection.execute("SELECT run_id FROM state").fetchall() == [(robot.run_id,)]

@@ -6,7 +6,6 @@ import sqlite3
 import sys
 import time
 from pathlib import Path
-from typing import Final
 
 from webots_mcp.adoption import adopt
 from webots_mcp.bridge.identity import Identity
@@ -14,8 +13,6 @@ from webots_mcp.bridge.registration import Registration, register
 from webots_mcp.connection import connect, journal_mode, never_wait
 from webots_mcp.contract import DATABASE_NAME, SCHEMA_VERSION, Database, MemoryDatabase
 from webots_mcp.schema import create_schema, require_current, schema_version
-
-_SQLITE_HEADER: Final = b"SQLite format 3\0"
 
 
 def open_session(
@@ -92,9 +89,13 @@ def move_aside(database: Path) -> None:
             damaged.rename(f"{database}.damaged-{stamp}{suffix}")
 
 
-def is_ours(database: Database) -> bool:
-    """Whether a broken file may be moved aside: it was a database, or has our name."""
+def is_ours(database: Database, why: str) -> bool:
+    """Whether a broken file may be moved aside: it has our name, or a database's head.
+
+    SQLite's own words tell of the head. Reading it here would drop the locks of this process on
+    the file, on which a maintainer's or another bridge's connection may depend (SQLite, How To
+    Corrupt, 2.2).
+    """
     if isinstance(database, MemoryDatabase):
         return False
-    with database.open("rb") as file:
-        return database.name == DATABASE_NAME or file.read(16) == _SQLITE_HEADER
+    return database.name == DATABASE_NAME or "not a database" not in why

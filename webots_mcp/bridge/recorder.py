@@ -494,7 +494,7 @@ class Recorder:
 
     def _replace_damaged(self, why: str) -> bool:
         """A damaged database, or a file of our name, is moved aside; any other file is not ours."""
-        if is_ours(self._database):
+        if is_ours(self._database, why):
             self._replace_files(why)
             return self.connection is None and self._retry_at_s == 0 and self._open(patient=False)
         self._give_up(f"{why}; choose another file")

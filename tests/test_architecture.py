@@ -23,7 +23,7 @@ ALLOWED = {
     "schema": {"connection", "contract", "errors"},
     "liveness": set[str](),
     "notice": set[str](),
-    "settlement": {"contract", "liveness"},
+    "settlement": {"contract", "entries", "liveness"},
     "entries": set[str](),
     "adoption": {"connection", "entries", "errors", "notice"},
     "maintenance": {"adoption", "connection", "errors", "notice", "schema"},

@@ -36,9 +36,10 @@ _ADOPTED: Final = "SELECT adopted_rows FROM session WHERE id = ?"
 _SET_ADOPTED: Final = "UPDATE session SET adopted_rows = ? WHERE id = ?"
 _RUN_OF: Final = "SELECT id FROM run WHERE uuid = ?"
 _RECOUNT: Final = (
-    "UPDATE run SET rows = purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id) "
+    "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "
     "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
 )
+_SET_ROWS: Final = "UPDATE run SET rows = ? WHERE id = ?"
 _KNOWN_ROBOT: Final = (
     "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
     "VALUES (:name, :kind, :devices, :now, :now) ON CONFLICT (name) DO UPDATE SET "
@@ -202,7 +203,8 @@ def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:
         count += sum(entry.kind != "run" for entry in taken.written)
         unfit += taken.unfit
     if count:
-        connection.execute(_RECOUNT, (session_id,))
+        for counted in connection.execute(_RECOUNT, (session_id,)).fetchall():
+            connection.execute(_SET_ROWS, counted)
     if unfit:
         say(f"{len(unfit)} rows that waited in {file.name} were refused: {unfit[0]}")
     return count

@@ -348,6 +348,7 @@ CREATE TABLE retention_limit (
 );
 CREATE UNIQUE INDEX ix_session_uuid ON session (uuid);
 CREATE UNIQUE INDEX ix_run_uuid ON run (uuid);
+CREATE INDEX ix_command_session_id ON command (session_id);
 CREATE TABLE recent_rollup (
 	run_id INTEGER NOT NULL, 
 	bucket INTEGER NOT NULL /* floor(sim_time_s / 10) */, 

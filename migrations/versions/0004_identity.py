@@ -124,6 +124,7 @@ def upgrade() -> None:
     for table in NAMED:
         op.execute(f"UPDATE {table} SET uuid = {NEW_UUID[dialect]}")
         op.create_index(op.f(f"ix_{table}_uuid"), table, ["uuid"], unique=True)
+    op.create_index(op.f("ix_command_session_id"), "command", ["session_id"])
     create_recent_rollup()
     op.execute(ALL_ROLLUP)
     if dialect == "sqlite":
@@ -156,6 +157,7 @@ def downgrade() -> None:
     op.execute("DROP VIEW all_rollup")
     op.execute(f"INSERT INTO rollup ({ROLLUP}) SELECT {ROLLUP} FROM recent_rollup")
     op.drop_table("recent_rollup")
+    op.drop_index(op.f("ix_command_session_id"), "command")
     for table in NAMED:
         op.drop_index(op.f(f"ix_{table}_uuid"), table)
     for table, columns in COLUMNS.items():

@@ -55,11 +55,12 @@ def register(
 ) -> Registration:
     """Enter a session; several starters at once each get their own, with names of their own.
 
-    Everything stands in one transaction that takes the write lock first: what the dead left open
-    is settled, an unfinished session of the same robot is ended as `replaced`, and where a live
-    process already has the name, `#2` (and so on) is appended.
+    What has to agree stands in one transaction that takes the write lock first: what the dead left
+    open is settled, an unfinished session of the same robot is ended as `replaced`, and where a
+    live process already has the name, `#2` (and so on) is appended.
     """
     now_s = time.time()
+    settlement.settle(connection, now_s)  # what takes long, outside of the transaction
     with transaction(connection):
         settlement.settle(connection, now_s)
         name = _free_name(connection, identity, now_s)

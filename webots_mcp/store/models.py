@@ -300,6 +300,7 @@ class Command(SQLModel, table=True):
     __table_args__ = (
         _partial("ix_command_pending", "status = 'pending'"),
         _partial("ix_command_claimed", "status = 'claimed'"),
+        Index(None, "session_id"),
         _KEEP_IDS,
     )
     id: int | None = _id()

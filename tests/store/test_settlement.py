@@ -1,0 +1,67 @@
+"""What became of commands and runs of a process that is gone: never more than is known."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+
+from tests.store.recorded import Recorded, RecordedRobot, insert
+from webots_mcp.adoption import adopt
+from webots_mcp.entries import FORMAT
+from webots_mcp.settlement import settle
+
+STATUS = "SELECT status FROM command"
+NOBODY = 2**31  # no system gives that pid
+
+
+def claimed(robot: RecordedRobot) -> None:
+    insert(robot.connection, "command", {
+        "robot_id": robot.id, "action": "dance", "params": "{}", "status": "claimed",
+        "created_wall_time_s": robot.now, "expires_wall_time_s": robot.now + 10,
+        "session_id": robot.session_id,
+    })  # fmt: skip
+
+
+def test_a_command_is_not_lost_while_its_result_waits_beside_the_database(
+    recorded: Recorded,
+) -> None:
+    assert isinstance(recorded.database, Path)
+    claimed(recorded.robot(uuid="u", pid=NOBODY))
+    done = {"now": 1.0, "sim_time": 1.0, "command": 1, "status": "done", "result": "7"}
+    lines = [
+        {"webots_mcp_waiting": FORMAT, "robot": {}, "session": {"uuid": "u"}},
+        [1, "command finished", None, done | {"error": None}],
+    ]
+    file = Path(f"{recorded.database}-waiting-u.jsonl")
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    settle(recorded.connection, time.time())
+    assert recorded.connection.execute(STATUS).fetchone() == ("claimed",)
+    adopt(recorded.connection, recorded.database)
+    settle(recorded.connection, time.time())
+    assert recorded.connection.execute(STATUS).fetchone() == ("done",)
+
+
+def test_a_command_of_a_dead_process_is_lost_where_nothing_waits(recorded: Recorded) -> None:
+    claimed(recorded.robot(uuid="u", pid=NOBODY))
+    settle(recorded.connection, time.time())
+    assert recorded.connection.execute(STATUS).fetchone() == ("lost",)
+
+
+def test_rows_of_a_crashed_run_are_counted_by_no_statement_that_writes(recorded: Recorded) -> None:
+    robot = recorded.robot(pid=NOBODY)
+    robot.state(1.0, {"x": 1})
+    robot.state(2.0, {"x": 1})
+    recorded.connection.execute("UPDATE run SET rows = 0, purged_rows = 3")
+    writes: list[str] = []
+    recorded.connection.set_trace_callback(writes.append)
+    settle(recorded.connection, time.time())
+    recorded.connection.set_trace_callback(None)
+    assert recorded.connection.execute("SELECT rows, last_sim_time_s FROM run").fetchone() == (5, 2)
+    assert not [sql for sql in writes if sql.startswith("UPDATE") and "FROM state" in sql]
+
+
+def test_forgetting_a_session_reads_no_command_of_another(recorded: Recorded) -> None:
+    sql = "EXPLAIN QUERY PLAN UPDATE command SET session_id = NULL WHERE session_id = 1"
+    (plan,) = recorded.connection.execute(sql).fetchall()
+    assert "USING" in plan[3] and "INDEX ix_command_session_id" in plan[3]

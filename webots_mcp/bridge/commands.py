@@ -15,6 +15,7 @@ from typing import Any, Final, cast
 
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.text import cut, storable
 from webots_mcp.errors import WebotsMCPError
 
@@ -33,8 +34,19 @@ CLAIM: Final = (
     "UPDATE command SET status = 'claimed', session_id = :session, claimed_wall_time_s = :now, "
     "claimed_sim_time_s = :sim_time WHERE status = 'pending' AND id = (SELECT id FROM command "
     "WHERE robot_id = :robot AND status = 'pending' AND expires_wall_time_s > :now "
-    "ORDER BY id LIMIT 1) RETURNING id, CAST(action AS BLOB), CAST(params AS BLOB)"
+    "ORDER BY id LIMIT 1) AND NOT EXISTS (SELECT 1 FROM session s WHERE s.robot_id = :robot "
+    "AND s.id > :session AND s.ended_wall_time_s IS NULL) "
+    "RETURNING id, CAST(action AS BLOB), CAST(params AS BLOB)"
 )
+# A session that was judged dead although it lives may have a successor: commands are for that one.
+_SUCCESSOR: Final = (
+    "SELECT pid FROM session WHERE robot_id = ? AND id > ? AND ended_wall_time_s IS NULL LIMIT 1"
+)
+# Commands are claimed in the order of their ids. One row always: none means that it failed.
+_CLAIMED_SINCE: Final = (
+    "SELECT (SELECT max(id) FROM command WHERE session_id = ? AND status = 'claimed' AND id > ?)"
+)
+_INTERRUPTED: Final = "the controller was interrupted before it began; it did not run"
 
 
 class Command:
@@ -58,9 +70,13 @@ class CommandQueue:
 
     def __init__(self, recorder: Recorder) -> None:
         self._recorder = recorder
+        self._last_begun = 0
+        self._claiming = False
 
     def claim(self, sim_time_s: float) -> Command | None:
         """The oldest command that waits for this robot, now ours; None costs no lock.
+
+        Call `begin` with it. One that an interrupt kept from that fails with the next call.
 
         Raises:
             sqlite3.Error: Another writer holds the lock (try again with the next call), or the
@@ -68,12 +84,40 @@ class CommandQueue:
         """
         recorder, now = self._recorder, time.time()
         registration = recorder.registration
+        if registration is not None and self._claiming:
+            self._fail_interrupted(registration.session_id, sim_time_s)
         if registration is None or not recorder.fetch(PEEK, (registration.robot_id, now)):
             return None
         ids = {"session": registration.session_id, "robot": registration.robot_id}
         times = {"now": now, "sim_time": sim_time_s}
+        self._claiming = True
         rows = recorder.fetch(CLAIM, {**ids, **times})
-        return self._read(rows[0], registration.session_id, sim_time_s) if rows else None
+        command = self._read(rows[0], registration.session_id, sim_time_s) if rows else None
+        if command is None:
+            self._claiming = False
+            self._look_for_successor(registration)
+        return command
+
+    def begin(self, command: Command) -> None:
+        """It is in the hands of who runs it: whatever happens now, its fate will be written."""
+        self._last_begun = command.id
+        self._claiming = False
+
+    def _fail_interrupted(self, session_id: int, sim_time_s: float) -> None:
+        found = self._recorder.fetch(_CLAIMED_SINCE, (session_id, self._last_begun))
+        for (command_id,) in found:
+            if command_id is not None:
+                self.fail(Command(command_id, "", {}, session_id), _INTERRUPTED, sim_time_s)
+            self._claiming = False
+
+    def _look_for_successor(self, registration: Registration) -> None:
+        ids = (registration.robot_id, registration.session_id)
+        for (pid,) in self._recorder.fetch(_SUCCESSOR, ids):
+            self._recorder.complain(
+                "successor",
+                f"commands for robot {registration.robot_name!r} go to process {pid}, which began "
+                "later under the same name: end one of the two",
+            )
 
     def _read(
         self, row: tuple[int, bytes, bytes | None], session_id: int, sim_time_s: float

@@ -134,9 +134,10 @@ class Control:
         return command
 
     def _start(self, command: Command) -> None:
-        if command.action in _ENDS_STEPPING:
-            self._interrupt_steps(command)
         try:
+            self._queue.begin(command)
+            if command.action in _ENDS_STEPPING:
+                self._interrupt_steps(command)
             if command.action in BUILT_IN_ACTIONS:
                 self._under_way[command] = self.actions.begin(command)
             else:

@@ -100,7 +100,7 @@ def test_a_run_without_a_time_does_not_keep_others_from_being_purged(
         robot.state(1.0, {"x": 1})
         robot.begin_run("reset")
     Damage("run", column, "yesterday").apply(recorded.connection)
-    limits = Retention(*[Limit(rows=1, age_s=1, spared_rows=0)] * 5)
+    limits = Retention(*[Limit(rows=1, age_s=1, spared_rows=0)] * 5, outlive=0)
     assert plan(recorded.connection, limits).rows_by_table()["state"] >= 1
 
 

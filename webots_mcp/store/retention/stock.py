@@ -173,8 +173,8 @@ def rows_before(connection: sqlite3.Connection, holding: Holding, wall_time_s: f
         return row is not None and row[0] < wall_time_s
 
     older_s, younger_s = _bounds(connection, table, run_id)
-    if younger_s is None:
-        return 0  # no row of it has a time
+    if older_s is None or younger_s is None:
+        return 0
     if is_older(younger_s):
         return holding.rows
     if not is_older(older_s):
@@ -229,8 +229,10 @@ def _payload(connection: sqlite3.Connection, table: str) -> str:
     return " + ".join(parts)
 
 
-def _bounds(connection: sqlite3.Connection, table: str, run_id: int) -> tuple[float, float]:
-    """Simulation times of the run's first and last row in a table."""
+def _bounds(
+    connection: sqlite3.Connection, table: str, run_id: int
+) -> tuple[float, float] | tuple[None, None]:
+    """Simulation times of the run's first and last row in a table; None where no row has one."""
     first = connection.execute(_FIRST_TIME.format(table=table), (run_id,)).fetchone()[0]
     last = connection.execute(_LAST_TIME.format(table=table), (run_id,)).fetchone()[0]
-    return first, last
+    return (None, None) if last is None else (first, last)

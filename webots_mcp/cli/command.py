@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import sys
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from webots_mcp.errors import MalformedRowError, WebotsMCPError
 
 if TYPE_CHECKING:
     import sqlite3
@@ -30,6 +33,7 @@ class Command(NamedTuple):
 
 
 COMMANDS: Final[list[Command]] = []
+_OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
 
 
 def argument(*flags: str, **options: Any) -> Argument:
@@ -58,6 +62,43 @@ def command(
         return run
 
     return register
+
+
+def question(
+    name: str, *arguments: Argument
+) -> Callable[[Callable[[argparse.Namespace], None]], Callable[[argparse.Namespace], None]]:
+    """Make a function that only reads a subcommand.
+
+    One that fails over a value that no bridge has written is asked again past such rows, which are
+    named on stderr.
+    """
+
+    def register(run: Callable[[argparse.Namespace], None]) -> Callable[..., None]:
+        @functools.wraps(run)
+        def ask(arguments: argparse.Namespace) -> None:
+            try:
+                run(arguments)
+            except Exception as error:
+                if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
+                    raise
+            else:
+                return
+            _ask_past_unsound_rows(run, arguments)
+
+        return command(name, *arguments)(ask)
+
+    return register
+
+
+def _ask_past_unsound_rows(
+    run: Callable[[argparse.Namespace], None], arguments: argparse.Namespace
+) -> None:
+    from webots_mcp.store.sound import past_unsound_rows
+
+    with past_unsound_rows() as unsound:
+        run(arguments)
+    for said in unsound.described():
+        print(f"webots-mcp: left out: {said}", file=sys.stderr)
 
 
 DATA_DIR: Final = argument(

@@ -18,8 +18,8 @@ from webots_mcp.cli.command import (
     ROBOT,
     Argument,
     argument,
-    command,
     count,
+    question,
     reading,
 )
 from webots_mcp.cli.tables import print_notes, print_table
@@ -47,7 +47,7 @@ RANGE: Final = (ROBOT, RUN, *TIMES)
 SIGNALS: Final = argument("signals", nargs="*", metavar="SIGNAL", help="names, with '*' (all)")
 
 
-@command(
+@question(
     "runs", DATA_DIR, DATABASE, ROBOT, JSON,
     count("-n", "the newest N runs", default=20),
 )  # fmt: skip
@@ -73,7 +73,7 @@ def runs(arguments: argparse.Namespace) -> None:
     print_notes([f"{found.total} runs in all: -n shows more"] if found.cursor else [])
 
 
-@command(
+@question(
     "history", DATA_DIR, DATABASE, *RANGE, JSON,
     argument("signals", nargs="+", metavar="SIGNAL", help="names, with '*'"),
     count("--points", "at most N buckets", default=20),
@@ -97,7 +97,7 @@ def history(arguments: argparse.Namespace) -> None:
     print_notes(found.notes)
 
 
-@command(
+@question(
     "trends", DATA_DIR, DATABASE, *RANGE, JSON, SIGNALS,
     count("-n", "the N that changed most", default=20),
 )  # fmt: skip
@@ -117,7 +117,7 @@ def trends(arguments: argparse.Namespace) -> None:
     print_notes(found.notes)
 
 
-@command(
+@question(
     "events", DATA_DIR, DATABASE, *RANGE, JSON,
     argument("--kind", action="append", metavar="KIND", help="only this kind; may be repeated"),
     argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
@@ -149,7 +149,7 @@ def events(arguments: argparse.Namespace) -> None:
     print_notes([*found.notes, *([] if rows else ["nothing of these kinds in that range"])])
 
 
-@command(
+@question(
     "plot", DATA_DIR, DATABASE, *RANGE, SIGNALS,
     argument("-o", "--output", required=True, metavar="FILE", help="a .png or .svg file"),
     argument("--trajectory", action="store_true", help="the way of the robot, seen from above"),
@@ -184,7 +184,7 @@ def plot(arguments: argparse.Namespace) -> None:
     print_notes(picture.notes)
 
 
-@command(
+@question(
     "compare", DATA_DIR, DATABASE, ROBOT, JSON,
     argument("run_ids", type=int, nargs="*", metavar="RUN",
              help="two or more runs; none: before and after the last edit of the controller"),

@@ -14,9 +14,9 @@ from webots_mcp.cli.command import (
     JSON,
     ROBOT,
     argument,
-    command,
     count,
     open_recording,
+    question,
     reading,
 )
 from webots_mcp.errors import InvalidInputError
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.recording import View
 
 
-@command("status", DATA_DIR, DATABASE, JSON)
+@question("status", DATA_DIR, DATABASE, JSON)
 def status(arguments: argparse.Namespace) -> None:
     """Show the robots: whether they run, how old their data is, what could not be recorded."""
     import webots_mcp.store.recording as recordings
@@ -51,7 +51,7 @@ def status(arguments: argparse.Namespace) -> None:
     print(json.dumps(facts, indent=2) if arguments.json else _as_text(facts))
 
 
-@command(
+@question(
     "tail",
     DATA_DIR,
     DATABASE,

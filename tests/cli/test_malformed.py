@@ -1,0 +1,47 @@
+"""A value that no bridge has written costs its row, named on stderr, and no command."""
+
+from __future__ import annotations
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.server.malformed import NOT_UTF8, Damage, record
+from webots_mcp.cli import main
+
+DAMAGES = (
+    Damage("state", "sim_time_s", "late"),
+    Damage("state", "data", NOT_UTF8),
+    Damage("event", "data", "[1]"),
+    Damage("session", "actions", "nonsense"),
+    Damage("log", "wall_time_s", b"\x00"),
+)
+ASKED = (
+    ("status",), ("status", "--json"), ("runs",), ("events",), ("trends",), ("history", "pose.0"),
+    ("compare", "1", "2"), ("tail", "--no-follow"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES, ids=str)
+def test_every_question_is_answered_past_a_wrong_value(tmp_path: Path, damage: Damage) -> None:
+    file = tmp_path / "webots.db"
+    record(file)
+    with closing(sqlite3.connect(file)) as connection, connection:
+        damage.apply(connection)
+    ended = {asked: main([*asked, "--database", str(file)]) for asked in ASKED}
+    assert [asked for asked, code in ended.items() if code] == []
+
+
+def test_what_was_left_out_is_said_on_stderr(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "webots.db"
+    record(file)
+    with closing(sqlite3.connect(file)) as connection, connection:
+        Damage("session", "actions", "nonsense").apply(connection)
+    assert main(["status", "--database", str(file)]) == 0
+    answer = capsys.readouterr()
+    assert "rover" in answer.out
+    assert answer.err == "webots-mcp: left out: session 1: actions is no sound JSON\n"

@@ -24,7 +24,7 @@ def event_lanes(
 ) -> tuple[list[Lane], list[str]]:
     """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole."""
     options = EventOptions(kinds=_KINDS, signals=tuple(names))
-    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=())
+    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=(), group=False)
     kinds: list[str] = [
         kind for kind in _KINDS if any(event.kind == kind for event in found.events)
     ]

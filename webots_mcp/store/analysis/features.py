@@ -22,7 +22,7 @@ LEAST_CROSSINGS: Final = 6  # four are made by a value that fell, rested, and ro
 SLOW_SHARE: Final = 0.5  # of the variance must be left in means for their course to be the values'
 AVERAGED: Final = 8  # values in one mean, where noise hides the crossings
 SPIKE_SCORE: Final = 8.0  # 3.5 is the usual; here thousands of values are looked at at once
-MOST_SPIKES_SHARE: Final = 0.001  # more than that are noise
+MOST_SPIKES_SHARE: Final = 0.05  # of the values: more of them are how the signal is
 FLAT_BAND: Final = 0.005  # of the range: what moves less is at rest
 
 
@@ -146,8 +146,9 @@ def find_spikes(times: Sequence[float], values: Sequence[float]) -> list[Spike]:
 
     s = value - mean of both neighbours, judged by the modified z-score 0.6745 * s / MAD(s), and
     where that MAD is 0 by s / (1.2533 * mean |s|): B. Iglewicz, D. C. Hoaglin, How to Detect and
-    Handle Outliers (1993). A step is no spike, because its neighbours differ. Where more than one
-    in a thousand values (and more than three) stand out, none is told: that is how the signal is.
+    Handle Outliers (1993). A step is no spike, because its neighbours differ, and no
+    turning point, because those differ from the ones beyond them. Where more than one
+    in twenty values (and more than three) stand out, none is told: that is how the signal is.
     """
     if len(values) < 5:
         return []
@@ -160,9 +161,15 @@ def find_spikes(times: Sequence[float], values: Sequence[float]) -> list[Spike]:
     found = [
         Spike(times[index + 1], values[index + 1])
         for index, size in enumerate(middle)
-        if abs(size) > limit and abs(values[index + 2] - values[index]) < abs(size) / 2
+        if abs(size) > limit and _stands_alone(values, index + 1, abs(size) / 2)
     ]
     return found if len(found) <= max(3, MOST_SPIKES_SHARE * len(values)) else []
+
+
+def _stands_alone(values: Sequence[float], index: int, limit: float) -> bool:
+    """Whether the neighbours agree with each other, and each with the one beyond it."""
+    near = [*values[max(0, index - 2) : index], *values[index + 1 : index + 3]]
+    return all(abs(after - before) < limit for before, after in pairwise(near))
 
 
 def flat_since(times: Sequence[float], values: Sequence[float]) -> float | None:
@@ -199,16 +206,12 @@ def time_effect(
     return min(1.0, between / squares)
 
 
-def unwrap(angles: Sequence[float]) -> list[float]:
-    """Angles without the jumps of a full turn, as if turns were counted.
+def unwrap(angles: Sequence[float], turn: float = math.tau) -> list[float]:
+    """Angles without the jumps of a full turn, as if turns were counted: as numpy does it.
 
     Each step is taken as the shorter way round (K. Itoh, Analysis of the phase unwrapping
     algorithm, Applied Optics 21, 1982).
     """
-    turned: list[float] = []
-    offset = 0.0
-    for index, angle in enumerate(angles):
-        if index and abs(step := angle - angles[index - 1]) > math.pi:
-            offset -= math.copysign(2 * math.pi, step)
-        turned.append(angle + offset)
-    return turned
+    import numpy as np
+
+    return np.unwrap(angles, period=turn).tolist()

@@ -1,22 +1,21 @@
-"""Sudden jumps, and stretches of to and fro."""
+"""Sudden jumps: dropouts and spikes that come back, and steps that stay."""
 
 from __future__ import annotations
 
 import math
-import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.store.analysis.features import MOST_IRREGULAR
 from webots_mcp.store.reading.gaps import rhythm_of
 
-MOST_JUMPS_SHARE: Final = 0.001  # more of them are how the signal is
+MOST_JUMPS_SHARE: Final = 0.05  # of the rows: more of them are how the signal is
 LEAST_STEPS: Final = 10
+LONGEST_EXCURSION: Final = 5  # rows that a value which otherwise rests may be elsewhere
+BACK_SHARE: Final = 0.2  # of a step: who comes back to so near where it began is back
 POSITION_STEPS: Final = 5.0  # a position jumps by so many times its 99th percentile step
 WHOLE_TURNS: Final = (math.tau, 360.0)
-TURN_SHARE: Final = 0.2  # of the range (5th to 95th percentile): what turns by less is noise
 
 
 @dataclass(frozen=True)
@@ -33,27 +32,16 @@ class Jump:
     back_s: float | None = None
 
 
-@dataclass(frozen=True)
-class ToAndFro:
-    """A stretch of regular turning points."""
-
-    start_s: float
-    end_s: float
-    turns: int
-    period_s: float
-    amplitude: float
-
-
 def find_jumps(
     times: Sequence[float], values: Sequence[float], score: float, usual: Sequence[float] = ()
 ) -> list[Jump]:
-    """Steps whose modified z-score (see `shapes.find_spikes`) is above the score.
+    """Steps whose modified z-score (see `features.find_spikes`) is above the score.
 
-    Compared is with the steps that are not zero, of which there have to be ten: for counters and
-    commanded values a step is what they do. Where more than one in a thousand steps (and more
-    than three) stand out, none is told. After a gap a step may be larger by as many times as the
-    gap is longer than the usual interval; and the step of an angle over the end of its scale (pi,
-    180 degrees, 360 degrees) is as large as what is left of a whole turn.
+    Compared is with the steps that are not zero and do not come back at once, of which there have
+    to be ten: for counters and commanded values a step is what they do. Of a value that otherwise
+    rests only what comes back at once counts. After a gap a step may be larger by as many times as
+    the gap is longer than the usual interval; and the step of an angle over the end of its scale
+    (pi, 180 degrees, 360 degrees) is as large as what is left of a whole turn.
 
     Args:
         times: Of the values.
@@ -62,9 +50,18 @@ def find_jumps(
         usual: The sizes of steps to compare with; empty for those of the values themselves.
     """
     steps = [abs(after - before) for before, after in pairwise(values)]
-    sizes = sorted(size for size in usual or steps if size > 0)
+    backs = _come_back(values, steps)
+    there_and_back = {row for left, back in backs.items() for row in range(left, back)}
+    sizes = sorted(
+        size
+        for size in usual or (s for place, s in enumerate(steps) if place not in there_and_back)
+        if size > 0
+    )
     if len(sizes) < LEAST_STEPS:
-        return []
+        return [
+            Jump(times[row + 1], values[row], values[row + 1], times[back])
+            for row, back in backs.items()
+        ]
     median = sizes[len(sizes) // 2]
     limit = median + score * median / 0.6745
     wide = [index for index, step in enumerate(steps) if step > limit]
@@ -73,8 +70,24 @@ def find_jumps(
         for index, intervals in zip(wide, _intervals(times, wide), strict=True)
         if _step(values[index], values[index + 1]) > limit * intervals
     ]
-    jumps = list(_with_return(found))
-    return jumps if len(jumps) <= max(3, MOST_JUMPS_SHARE * len(steps)) else []
+    return list(_with_return(found))
+
+
+def are_usual(jumps: Sequence[Jump], rows: int) -> bool:
+    """Whether there are so many of them that they are how the signal is."""
+    return len(jumps) > max(3, MOST_JUMPS_SHARE * rows)
+
+
+def _come_back(values: Sequence[float], steps: Sequence[float]) -> dict[int, int]:
+    """Rows after which a value that had rested left, and rows in which it was back soon after."""
+    backs: dict[int, int] = {}
+    for row in range(1, len(steps)):
+        if steps[row] > 0 and steps[row - 1] == 0 and _step(values[row], values[row + 1]) > 0:
+            soon = range(row + 2, min(row + 2 + LONGEST_EXCURSION, len(values)))
+            back = next((later for later in soon if values[later] == values[row]), None)
+            if back is not None:
+                backs[row] = back
+    return backs
 
 
 def _intervals(times: Sequence[float], indexes: Sequence[int]) -> list[float]:
@@ -97,7 +110,7 @@ def _with_return(jumps: Sequence[Jump]) -> Iterator[Jump]:
         jump = jumps[index]
         following = jumps[index + 1] if index + 1 < len(jumps) else None
         size = abs(jump.after - jump.before)
-        if following is not None and abs(following.after - jump.before) < 0.2 * size:
+        if following is not None and abs(following.after - jump.before) < BACK_SHARE * size:
             yield Jump(jump.sim_time_s, jump.before, jump.after, following.sim_time_s)
             index += 2
         else:
@@ -124,55 +137,3 @@ def find_leaps(
         for index, intervals in zip(long, _intervals(times, long), strict=True)
         if steps[index] > limit_m * intervals
     ]
-
-
-def find_to_and_fro(
-    times: Sequence[float], values: Sequence[float], turns: int, longest_period_s: float
-) -> Iterator[ToAndFro]:
-    """Stretches of at least `turns` turning points, each soon after the last, at regular times.
-
-    A turning point counts when the value has come back by a fifth of its range (zigzag filter).
-    Regular means that the half periods' standard deviation is at most 0.4 of their mean.
-    """
-    points = _turning_points(times, values)
-    start = 0
-    for end in range(1, len(points) + 1):
-        soon = end < len(points) and points[end][0] - points[end - 1][0] <= longest_period_s / 2
-        if soon:
-            continue
-        if end - start >= turns and (found := _regular(points[start:end])) is not None:
-            yield found
-        start = end
-
-
-def _turning_points(times: Sequence[float], values: Sequence[float]) -> list[tuple[float, float]]:
-    if len(values) < 3:
-        return []
-    ordered = sorted(values)
-    size = ordered[int(0.95 * (len(ordered) - 1))] - ordered[int(0.05 * (len(ordered) - 1))]
-    least = TURN_SHARE * size
-    if least <= 0:
-        return []
-    points: list[tuple[float, float]] = []
-    extreme, direction = (times[0], values[0]), 0
-    for time, value in zip(times, values, strict=True):
-        change = value - extreme[1]
-        if direction == 0:
-            direction = (change > least) - (change < -least)
-            extreme = (time, value) if direction else extreme
-        elif change * direction > 0:
-            extreme = (time, value)
-        elif -change * direction > least:
-            points.append(extreme)
-            extreme, direction = (time, value), -direction
-    return points
-
-
-def _regular(points: Sequence[tuple[float, float]]) -> ToAndFro | None:
-    halves = [after[0] - before[0] for before, after in pairwise(points)]
-    half_s = statistics.fmean(halves)
-    if half_s <= 0 or statistics.pstdev(halves) > MOST_IRREGULAR * half_s:
-        return None
-    swings = [abs(after[1] - before[1]) for before, after in pairwise(points)]
-    amplitude = statistics.median(swings) / 2
-    return ToAndFro(points[0][0], points[-1][0], len(points), 2 * half_s, amplitude)

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import re
 import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
 from webots_mcp.store.analysis.features import unwrap
-from webots_mcp.store.analysis.jumps import find_jumps, find_leaps, find_to_and_fro
+from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
 from webots_mcp.store.analysis.motion import Motion, find_stays
 from webots_mcp.store.analysis.summary import Summary, usable_numbers
 from webots_mcp.store.detection.event import Event, EventOptions, Kind
 from webots_mcp.store.detection.stored import wall_time_at
-from webots_mcp.store.reading.intervals import MOSTLY, Beyond, Flat, Silent, Span
-from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.intervals import MOSTLY, Beyond, Flat, Silent, Span, common
+from webots_mcp.store.reading.ranges import Segment, recorded_bounds
+from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.reading.views import View
-from webots_mcp.store.rollup.tables import both
-from webots_mcp.store.signals.catalogue import resolve_signals
+from webots_mcp.store.rollup.rolling import watermark
+from webots_mcp.store.signals.catalogue import other_form, resolve_signals
 from webots_mcp.store.signals.registry import Signal
 
 DETECTED: Final[tuple[Kind, ...]] = (
@@ -27,11 +30,19 @@ DETECTED: Final[tuple[Kind, ...]] = (
 
 OF_NUMBERS: Final = frozenset[Kind]({"silent", "flat", "jump", "oscillation"})
 
-_OF_SIGNAL: Final = both("rows, present, changes", "run_id = :run AND signal_id = :signal")
-_OF_RUN: Final = (  # also the rows that do not hold the signal
-    "SELECT max(sum(rows), (SELECT rows FROM run WHERE id = :run)), sum(present), sum(changes) "
-    f"FROM {_OF_SIGNAL}"
+# Whether it changed in most rows of a stretch of 10 s that the run has rollups of.
+_LIVELY: Final = (
+    "SELECT EXISTS (SELECT 1 FROM all_rollup WHERE run_id = ? AND signal_id = ? "
+    "AND present >= 10 AND changes >= ? * present)"
 )
+# Whether it had a value before, in the rollups or in rows that are not rolled up yet.
+_HAD_VALUE: Final = (
+    "SELECT EXISTS (SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = :signal "
+    "AND first_sim_time_s < :before) OR EXISTS (SELECT 1 FROM state WHERE id > :mark "
+    "AND +run_id = :run AND sim_time_s < :before AND json_extract(data, :path) IS NOT NULL)"
+)
+LEAST_CHANGES: Final = 10  # of who mostly changes
+MANY_SILENCES: Final = 10  # of a signal that mostly has no value: it comes so by nature
 # What a robot swings with; sensors swing by nature while it drives.
 _SWINGING: Final = re.compile(
     r"(^|[._])(heading|yaw|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"
@@ -57,6 +68,7 @@ class Search:
     options: EventOptions
     view: View
     ended_s: float
+    deadline: Deadline
 
     def event(self, kind: Kind, start_s: float, end_s: float, name: str | None, **details: Any):
         """An event of this run; what has a duration and reaches the newest row goes on."""
@@ -65,13 +77,34 @@ class Search:
         ongoing = end_s >= self.ended_s > start_s
         return Event(kind, run_id, start_s, end_s, wall_s, name, details, ongoing)
 
-    def any_of(self, signal: Signal, here: Summary, holds: Callable[[Summary], bool]) -> bool:
-        """Whether it holds of a signal in the segment, or else in the run as far as rolled up."""
-        if holds(here):
-            return True
-        values = {"run": self.segment.run_id, "signal": signal.id}
-        of_run = self.connection.execute(_OF_RUN, values).fetchone()
-        return of_run[0] is not None and holds(Summary(*of_run))
+    @cached_property
+    def began_s(self) -> float:
+        """The run's first row."""
+        bounds = recorded_bounds(self.connection, self.segment.run_id)
+        return bounds[0] if bounds else self.segment.start_s
+
+    def has_begun(self, signal: Signal, at_s: float) -> bool:
+        """Whether it had a value before."""
+        run_id = self.segment.run_id
+        asked = {"run": run_id, "signal": signal.id, "before": at_s, "path": signal.path}
+        asked["mark"] = watermark(self.connection, run_id)
+        return bool(self.connection.execute(_HAD_VALUE, asked).fetchone()[0])
+
+    def is_lively(self, signal: Signal) -> bool:
+        """Whether it mostly changed for 10 s somewhere in the run, as far as rolled up."""
+        asked = (self.segment.run_id, signal.id, MOSTLY)
+        return bool(self.connection.execute(_LIVELY, asked).fetchone()[0])
+
+    def is_over(self, kind: Kind, left: Sequence[Signal]) -> bool:
+        """Whether the time is over; then a note says of which signals it was not searched."""
+        if not self.deadline.passed:
+            return False
+        names = ", ".join(signal.name for signal in left[:3]) + (", ..." if left[3:] else "")
+        self.view.notes.append(
+            f"the time was over: {kind} was not searched in {len(left)} signals ({names}): "
+            "name them, or ask for less time"
+        )
+        return True
 
 
 def stuck_events(search: Search) -> Iterator[Event]:
@@ -104,52 +137,108 @@ def threshold_events(search: Search) -> Iterator[Event]:
 
 
 def silent_events(search: Search) -> Iterator[Event]:
-    """A signal that mostly has a value had none."""
-    for signal in search.numbers:
+    """A signal that had a value has none: it has begun, and lasts to its next one, if any."""
+    for index, signal in enumerate(search.numbers):
         here = search.view.summary(signal)
-        if here.present < here.rows and search.any_of(signal, here, _mostly_present):
-            for span in search.view.spans(signal, Silent()):
-                if span.end_s - span.start_s >= search.options.silent_s:
-                    yield search.event("silent", span.start_s, span.end_s, signal.name)
+        if here.present == here.rows:
+            continue
+        if search.is_over("silent", search.numbers[index:]):
+            return
+        spans = [
+            span for span in _without_value(search, signal) if _has_begun(search, signal, span)
+        ]
+        least_s = _least_silence_s(search, signal, here, spans)
+        for span in spans:
+            if span.end_s - span.start_s >= least_s:
+                yield search.event("silent", span.start_s, span.end_s, signal.name)
+
+
+def _without_value(search: Search, signal: Signal) -> list[Span]:
+    """Where neither the signal has a value nor its array in its other form, long or short."""
+    spans = search.view.spans(signal, Silent())
+    other = other_form(search.known, signal)
+    if other is None or not spans:
+        return spans
+    return list(common(spans, search.view.spans(other, Silent())))
+
+
+def _has_begun(search: Search, signal: Signal, span: Span) -> bool:
+    """What had no value before its first one was not there yet; that is no silence."""
+    if span.start_s <= search.began_s:
+        return False
+    if not span.from_first:
+        return True
+    other = other_form(search.known, signal)
+    return any(search.has_begun(each, span.start_s) for each in (signal, other) if each)
+
+
+def _least_silence_s(search: Search, signal: Signal, here: Summary, spans: Sequence[Span]) -> float:
+    """Longer, where a signal comes now and then: it is silent who stays away longer than usual."""
+    least_s = search.options.silent_s
+    lengths = sorted(span.end_s - span.start_s for span in spans)
+    if here.present >= MOSTLY * here.rows or len(lengths) < MANY_SILENCES:
+        return least_s
+    usual_s = lengths[len(lengths) // 2]
+    if 3 * usual_s <= least_s:
+        return least_s
+    search.view.notes.append(
+        f"{signal.name} has a value about every {usual_s:.3g} s: it counts as silent from "
+        f"{3 * usual_s:.3g} s on"
+    )
+    return 3 * usual_s
 
 
 def flat_events(search: Search) -> Iterator[Event]:
-    """A signal that mostly changes had exactly the same value."""
+    """A signal that otherwise mostly changes had exactly the same value."""
     least_s = max(search.options.flat_s, search.view.shortest_rest_s)
-    for signal in search.numbers:
+    for index, signal in enumerate(search.numbers):
         here = search.view.summary(signal)
-        if here.changes < here.present - 1 and search.any_of(signal, here, _mostly_changing):
-            spans = search.view.spans(signal, Flat())
-            yield from _flat(search, signal, spans, least_s)
+        if here.changes >= here.present - 1:
+            continue
+        if search.is_over("flat", search.numbers[index:]):
+            return
+        spans = search.view.spans(signal, Flat())
+        flat = [span for span in spans if span.end_s - span.start_s >= least_s]
+        if flat and (_changes_otherwise(search, here, flat) or search.is_lively(signal)):
+            for span in flat:
+                yield search.event("flat", span.start_s, span.end_s, signal.name, value=span.key)
 
 
-def _mostly_present(summary: Summary) -> bool:
-    return summary.present >= MOSTLY * summary.rows > 0
-
-
-def _mostly_changing(summary: Summary) -> bool:
-    return summary.changes >= MOSTLY * summary.present > 0
-
-
-def _flat(search: Search, signal: Signal, spans: list[Span], least_s: float) -> Iterator[Event]:
-    for span in spans:
-        if span.end_s - span.start_s >= least_s:
-            yield search.event("flat", span.start_s, span.end_s, signal.name, value=span.key)
+def _changes_otherwise(search: Search, here: Summary, flat: Sequence[Span]) -> bool:
+    """Whether it changed in most of the rows outside of those spans, and in ten at least."""
+    whole_s = min(search.segment.end_s, search.ended_s) - search.segment.start_s
+    flat_s = sum(span.end_s - span.start_s for span in flat)
+    rows = here.present * max(0.0, 1 - flat_s / whole_s) if whole_s > 0 else 0.0
+    return here.changes >= max(LEAST_CHANGES, MOSTLY * rows)
 
 
 def jump_events(search: Search) -> Iterator[Event]:
     """A value changed from one row to the next by much more than it usually does."""
     position = search.motion.position or ()
-    for signal in search.numbers:
-        if signal.kind == "angle" or signal in position:
+    signals = [s for s in search.numbers if s.kind != "angle" and s not in position]
+    for index, signal in enumerate(signals):
+        if search.is_over("jump", signals[index:]):
+            break
+        jumps = [
+            jump
+            for course in search.view.courses(signal)
+            for jump in find_jumps(
+                course.times, course.numbers, search.options.jump_score, course.usual_steps
+            )
+        ]
+        if are_usual(jumps, search.view.summary(signal).present):
+            search.view.notes.append(
+                f"jumps of {signal.name} were not judged: {len(jumps)} large steps are how it is"
+            )
             continue
-        for course in search.view.courses(signal):
-            score = search.options.jump_score
-            for jump in find_jumps(course.times, course.numbers, score, course.usual_steps):
-                details = {"before": jump.before, "after": jump.after}
-                end_s = jump.sim_time_s if jump.back_s is None else jump.back_s
-                yield search.event("jump", jump.sim_time_s, end_s, signal.name, **details)
+        yield from (_jump(search, signal, jump) for jump in jumps)
     yield from _leaps(search)
+
+
+def _jump(search: Search, signal: Signal, jump: Jump) -> Event:
+    end_s = jump.sim_time_s if jump.back_s is None else jump.back_s
+    details = {"before": jump.before, "after": jump.after}
+    return search.event("jump", jump.sim_time_s, end_s, signal.name, **details)
 
 
 def _leaps(search: Search) -> Iterator[Event]:
@@ -173,16 +262,27 @@ def oscillation_events(search: Search) -> Iterator[Event]:
     asked = search.options.signals != EventOptions.signals
     signals = [each for each in search.numbers if asked or _SWINGING.search(each.name)]
     columns = search.view.newest(signals)
-    for signal in signals:
-        times, numbers = usable_numbers(columns.times, columns.values[signal.name])
-        course = unwrap(numbers) if signal.kind == "angle" else numbers
-        options = search.options
-        for swing in find_to_and_fro(
-            times, course, options.oscillation_turns, options.oscillation_period_s
-        ):
-            details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
-            ends = (swing.start_s, swing.end_s)
-            yield search.event("oscillation", *ends, signal.name, turns=swing.turns, **details)
+    for index, signal in enumerate(signals):
+        if search.is_over("oscillation", signals[index:]):
+            return
+        yield from _swings(search, signal, columns)
+
+
+def _swings(search: Search, signal: Signal, columns: Columns) -> Iterator[Event]:
+    import numpy as np  # at the first question, not at the start of the server
+
+    from webots_mcp.store.analysis.swings import find_swings
+
+    times, numbers = usable_numbers(columns.times, columns.values[signal.name])
+    for swing in find_swings(
+        np.asarray(times, np.float64),
+        np.asarray(unwrap(numbers, signal.turn) if signal.turn else numbers, np.float64),
+        least_half_swings=search.options.oscillation_turns,
+        longest_period_s=search.options.oscillation_period_s,
+    ):
+        details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
+        ends = (swing.start_s, swing.end_s)
+        yield search.event("oscillation", *ends, signal.name, turns=swing.half_swings, **details)
 
 
 DETECTORS: Final = {

@@ -19,6 +19,7 @@ from webots_mcp.store.signals.registry import Signal
 
 LASTING: Final = frozenset[Kind]({"stuck", "threshold", "silent", "flat"})
 FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
+JUMP_REACH_S: Final = 2.0  # before and after a segment: whether a value comes back shows there
 
 _ROWS_BEFORE_AND_AFTER: Final = (
     "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?), "
@@ -78,6 +79,7 @@ class Detection:
             "stuck": options.stuck_s,
             "silent": options.silent_s,
             "flat": options.flat_s,
+            "jump": JUMP_REACH_S,
             "threshold": for_s,
         }
         return max((least_s.get(kind, 0.0) for kind in kinds), default=0.0)
@@ -104,7 +106,7 @@ class Detection:
         ]
         needed = {signal.name: signal for signal in (*numbers, *motion.signals, *limits)}
         view = view_of(self.connection, segment, list(needed.values()), self.deadline)
-        common = (self.known, numbers, motion, self.options, view, self.newest_s)
+        common = (self.known, numbers, motion, self.options, view, self.newest_s, self.deadline)
         search = Search(self.connection, segment, *common)
         found = [event for kind in kinds for event in DETECTORS[kind](search)]
         notes += view.notes

@@ -6,11 +6,13 @@ import sqlite3
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from importlib import import_module
 from typing import Final, NamedTuple
 
 from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import Event, EventOptions, Kind
+from webots_mcp.store.detection.grouping import grouped
 from webots_mcp.store.detection.search import Detection
 from webots_mcp.store.detection.stored import (
     change_events,
@@ -61,6 +63,7 @@ def find_events(
     *,
     limit: int = 50,
     around: Sequence[str] | None = None,
+    group: bool = True,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> Events:
     """What happened in a range: with its true begin and end, also where it reaches out of it.
@@ -76,14 +79,18 @@ def find_events(
             others the newest.
         around: Signals whose values are told with each event; None for mode, position and
             commanded speed.
+        group: Many dropouts, steps or silences of one signal are told as one event, which counts
+            them; else each is one.
         deadline_s: After it, what was found so far is the answer, and the notes say so.
 
     Raises:
         UnknownSignalError: A name in the options or in `around` meets nothing.
     """
     options = options or EventOptions()
-    context = _context(known_signals(connection, time_range), options, around)
+    known = known_signals(connection, time_range)
+    context = _context(known, options, around)
     found, notes = collect(connection, time_range, options, deadline_s)
+    found = grouped(found, known) if group else found
     chosen = choose(found, limit)
     if len(chosen) < len(found):
         notes.append(f"{len(found) - len(chosen)} of {len(found)} events are left out: ask by kind")
@@ -108,6 +115,7 @@ def collect(
         UnknownSignalError: A name in the options meets nothing.
     """
     known = known_signals(connection, time_range)
+    import_module("numpy")  # once per process, before the time counts
     deadline = Deadline(deadline_s)
     notes = list(time_range.notes)
     found: list[Event] = []

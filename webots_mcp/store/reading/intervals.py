@@ -22,7 +22,7 @@ from webots_mcp.store.rollup.rolling import BUCKET_S
 from webots_mcp.store.signals.flatten import Value
 from webots_mcp.store.signals.registry import Signal
 
-MOSTLY: Final = 0.5  # who is silent or flat for longer than this share is so by nature
+MOSTLY: Final = 0.5  # of the rows
 
 
 @dataclass(frozen=True)
@@ -191,3 +191,21 @@ def _as_one(before: Span, after: Span) -> Span:
     highs = [each for each in (before.high, after.high) if each is not None]
     low, high = min(lows, default=None), max(highs, default=None)
     return replace(before, end_s=after.end_s, low=low, high=high, to_last=after.to_last)
+
+
+def common(spans: Sequence[Span], others: Sequence[Span]) -> Iterator[Span]:
+    """Where both hold."""
+    for span in spans:
+        for other in others:
+            start, end = max(span, other, key=_start_of), min(span, other, key=_end_of)
+            if start.start_s <= end.end_s:
+                ends = (start.from_first, end.to_last)
+                yield Span(start.start_s, end.end_s, span.key, span.low, span.high, *ends)
+
+
+def _start_of(span: Span) -> float:
+    return span.start_s
+
+
+def _end_of(span: Span) -> float:
+    return span.end_s

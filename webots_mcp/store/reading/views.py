@@ -8,6 +8,7 @@ from __future__ import annotations
 import functools
 import math
 import sqlite3
+import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -31,7 +32,7 @@ from webots_mcp.store.rollup.rolling import BUCKET_S, bucket_of, watermark
 from webots_mcp.store.rollup.tables import both
 from webots_mcp.store.signals.registry import Signal
 
-JUMP_BUCKETS: Final = 3  # of each signal of a long segment that are read
+JUMP_BUCKETS: Final = 20  # of each signal of a long segment that are read
 JUMP_RANGE: Final = 3.0  # times the usual range of a bucket: there may be a jump in it
 SAMPLES_PER_STAY: Final = 5
 SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
@@ -48,10 +49,9 @@ _COUNTS: Final = (
     "SELECT signal_id, sum(rows), sum(present), sum(changes) "
     f"FROM {_COUNTS_OF_EACH} GROUP BY signal_id"
 )
-_USUAL_RANGE: Final = f"SELECT avg(max - min) {_OF_SIGNAL}"
-_WIDEST: Final = (  # also at its border with the bucket before
+_WIDTHS: Final = (  # also at its border with the bucket before
     "SELECT bucket, max(max - min, abs(first - lag(last, 1, first) OVER (ORDER BY bucket))) "
-    f"{_OF_SIGNAL} AND first IS NOT NULL ORDER BY 2 DESC LIMIT ?"
+    f"{_OF_SIGNAL} AND first IS NOT NULL"
 )
 _RESTS: Final = f"SELECT EXISTS (SELECT 1 {_OF_SIGNAL} AND min = max AND present = rows)"
 
@@ -181,7 +181,8 @@ class LongView:
 
     def summary(self, signal: Signal) -> Summary:
         """Counts from the rollups."""
-        return self._totals.get(signal.id or 0, Summary())
+        rows = max((each.rows for each in self._totals.values()), default=0)
+        return self._totals.get(signal.id or 0, Summary(rows))
 
     def spans(self, signal: Signal, condition: Condition) -> list[Span]:
         """From rollups, and rows where they leave it open."""
@@ -202,12 +203,19 @@ class LongView:
     def courses(self, signal: Signal) -> Iterator[Course]:
         """The few buckets whose range is unusual, each with the rows just before and after it."""
         values = (self._span[0], signal.id, *self._span[1:])
-        usual = self._connection.execute(_USUAL_RANGE, values).fetchone()[0] or 0.0
-        for bucket, size in self._connection.execute(_WIDEST, (*values, JUMP_BUCKETS)).fetchall():
+        widths = self._connection.execute(_WIDTHS, values).fetchall()
+        usual = statistics.median(size for _, size in widths) if widths else 0.0
+        wide = [(size, bucket) for bucket, size in widths if size > JUMP_RANGE * usual]
+        if len(wide) > JUMP_BUCKETS:
+            self.notes.append(
+                f"jumps of {signal.name} were searched in the {JUMP_BUCKETS} widest of {len(wide)} "
+                "stretches of 10 s: ask for less time to see the others"
+            )
+        for _, bucket in sorted(sorted(wide, reverse=True)[:JUMP_BUCKETS], key=_bucket):
             if self._deadline.passed:
                 self._cut()
-            elif size > JUMP_RANGE * usual > 0:
-                yield Course(*self._numbers(signal, bucket), self._usual_steps(signal))
+                return
+            yield Course(*self._numbers(signal, bucket), self._usual_steps(signal))
 
     def newest(self, signals: Sequence[Signal]) -> Columns:
         """The newest rows."""
@@ -267,6 +275,10 @@ class LongView:
     def _usual_steps(self, signal: Signal) -> list[float]:
         _, numbers = usable_numbers(self._sample.times, self._sample.values[signal.name])
         return [abs(after - before) for before, after in pairwise(numbers)]
+
+
+def _bucket(wide: tuple[float, int]) -> int:
+    return wide[1]
 
 
 def _join_s(times: Sequence[float]) -> float:

@@ -19,7 +19,7 @@ from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
 from webots_mcp.store.rollup.rolling import watermark
 from webots_mcp.store.rollup.tables import both
-from webots_mcp.store.signals.flatten import Kind, Value, flatten, parse
+from webots_mcp.store.signals.flatten import REDUCTIONS, Kind, Value, flatten, parse
 from webots_mcp.store.signals.registry import MAX_SIGNALS, Signal, by_name, registered, seen_now
 
 SAMPLED_ROWS: Final = 200  # rows not yet rolled up that are searched for new names and kinds
@@ -104,7 +104,33 @@ def _signals_in(
             signal = seen_now(found.get(column.name), column)
             if signal is not None:
                 found[column.name] = signal
-    return found if len(found) == len(known) else by_name(list(found.values()))
+    named = without_placeholders(found)
+    return named if len(found) == len(known) else by_name(list(named.values()))
+
+
+def without_placeholders(known: dict[str, Signal]) -> dict[str, Signal]:
+    """Without names that only ever held null and have others below them.
+
+    `lidar: null` before the first scan is the missing value of `lidar.min` and the others.
+    """
+    branches = {name[:place] for name in known for place, sign in enumerate(name) if sign == "."}
+    return {
+        name: signal
+        for name, signal in known.items()
+        if signal.kind != "null" or name not in branches
+    }
+
+
+def other_form(known: dict[str, Signal], signal: Signal) -> Signal | None:
+    """A signal that has a value where the same array is longer, or shorter; None without any.
+
+    Of more than 16 items an array is `lidar.min` and others, of fewer `lidar.0` and so on.
+    """
+    branch, _, last = signal.name.rpartition(".")
+    if signal.reduce is not None:
+        return known.get(f"{branch}.0")
+    other = known.get(f"{branch}.{REDUCTIONS[0]}")
+    return other if last.isdigit() and other is not None and other.reduce is not None else None
 
 
 def _unrolled_sample(connection: sqlite3.Connection, robot_id: int, run_id: int) -> Batch:
@@ -213,6 +239,7 @@ def list_signals(
     known = registered(connection, subject.robot_id)
     now = (seen_now(known.get(name), column) for name, column in late.items())
     known |= {signal.name: signal for signal in now if signal}
+    known = without_placeholders(known)
     there = {name: signal for name, signal in known.items() if signal.id in stored or name in late}
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
     matching.sort(key=lambda signal: signal.name)

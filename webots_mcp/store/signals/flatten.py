@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Iterable
 from typing import Any, Final, Literal, NamedTuple, cast
@@ -19,6 +20,9 @@ MAX_YAW_RAD: Final = 3.2  # the third item of a pose that goes beyond is no yaw
 _INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
 _ANGLE_NAME: Final = re.compile(
     r"(^|[._])(yaw|heading|theta|bearing|roll|pitch)(_rad)?(\.\d+)?$", re.IGNORECASE
+)
+_DEGREES_NAME: Final = re.compile(
+    r"(^|[._])(yaw|heading|theta|bearing|course|roll|pitch)_deg(\.\d+)?$", re.IGNORECASE
 )
 _THIRD_OF_POSE: Final = re.compile(r"(^|\.)pose\.2$", re.IGNORECASE)
 _UNIT_SUFFIXES: Final = {
@@ -160,6 +164,13 @@ def kind_of(name: str, value: Value, *, planar: bool = False) -> Kind:
         return "text"
     limit = MAX_YAW_RAD if planar else MAX_ANGLE_RAD if _ANGLE_NAME.search(name) else -1.0
     return "angle" if abs(value) <= limit else "num"
+
+
+def turn_of(name: str, kind: Kind) -> float | None:
+    """A whole turn of an angle: 2 pi, or 360 where the name says degrees; else None."""
+    if kind == "angle":
+        return math.tau
+    return 360.0 if kind == "num" and _DEGREES_NAME.search(name) else None
 
 
 def may_be_yaw(name: str) -> bool:

@@ -18,6 +18,7 @@ from webots_mcp.store.signals.flatten import (
     may_be_yaw,
     parse,
     places,
+    turn_of,
     unit_of,
     widen,
 )
@@ -60,6 +61,11 @@ class Signal:
     def is_plain(self) -> bool:
         """Whether `json_extract` alone gives the same as `flatten`."""
         return self.reduce is None and not self.decoded
+
+    @property
+    def turn(self) -> float | None:
+        """A whole turn of an angle, in its unit; None of what is no angle."""
+        return turn_of(self.name, self.kind)
 
     @property
     def is_number(self) -> bool:

@@ -38,6 +38,7 @@ CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wai
 _UNWRITABLE: Final = ("readonly database", "unable to open database file")
 _CALLED_OFF: Final = "called off"
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
+_SAYS_NOTHING: Final = "malformed database, which SQLite names in bytes that are no text"
 _ABOUT_A_VALUE: Final = (
     "malformed JSON", "JSON cannot hold", "JSON path", "to UTF-8 column", "integer overflow",
     "user-defined function",
@@ -310,7 +311,8 @@ def text_of(error: Exception) -> str:
     """What went wrong, also where SQLite's own message is no text."""
     if isinstance(error, UnicodeDecodeError):
         return error.object.decode("utf-8", "replace")
-    return str(error)
+    # Python 3.10 leaves such a message out; of this class itself, it was about the file.
+    return str(error) or (_SAYS_NOTHING if type(error) is sqlite3.DatabaseError else "")
 
 
 def is_unwritable(error: Exception) -> bool:

@@ -31,6 +31,7 @@ from webots_mcp.connection import (
     identify_files,
     is_busy,
     never_wait,
+    text_of,
 )
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.notice import say
@@ -221,5 +222,5 @@ class Maintainer(threading.Thread):
 def _described(error: Exception) -> str:
     """An error of the database or of ours speaks for itself; any other needs its kind."""
     if isinstance(error, (sqlite3.Error, WebotsMCPError, OSError)):
-        return str(error)
+        return text_of(error)
     return repr(error)

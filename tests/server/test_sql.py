@@ -22,6 +22,7 @@ pytestmark = pytest.mark.anyio
 
 LONG = "printf('%.*c', 9000000, 'a')"
 NEEDLE = "printf('%.*c', 4000000, 'a') || 'b'"
+OTHERS_FIRST = "printf('%.*c', 4000000, 'b') || 'a'"  # all are compared before the one that fits
 ENDLESS = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)"
 DOUBLING = (
     "WITH RECURSIVE d(n, x) AS (SELECT 1, 'x' UNION ALL SELECT n + 1, x || x FROM d WHERE n < 60)"
@@ -31,8 +32,8 @@ LONG_STEPS = (
     f"SELECT length(replace({LONG}, {NEEDLE}, ''))",
     f"SELECT instr({LONG}, {NEEDLE})",
     f"SELECT {LONG} GLOB '*' || {NEEDLE} || '*a*b*'",
-    f"SELECT trim({LONG}, {LONG})",
-    f"SELECT rtrim({LONG}, {NEEDLE})",
+    f"SELECT trim({LONG}, {OTHERS_FIRST})",
+    f"SELECT rtrim({LONG}, {OTHERS_FIRST})",
 )
 WRITES = (
     "DELETE FROM state",

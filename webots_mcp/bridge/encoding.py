@@ -71,7 +71,8 @@ MAX_PLAIN_VALUES: Final = MAX_ROOM // ROOM_OF_A_VALUE
 _CHARACTERS_OF_A_VALUE: Final = 16  # a text takes another value's room for each so many
 _SHORT_KEY_CHARACTERS: Final = 60
 _MOST_SHORT_KEYS: Final = 10_000
-_FLOATS: Final = frozenset((float,))
+# They take the room of one value, whatever they are, and are encoded as they are.
+_LEAVES: Final = frozenset((float, bool, type(None)))
 _SHORT_ARRAY: Final = 16
 _CONTAINERS: Final[tuple[Any, ...]] = (dict, list, tuple)
 _MANY: Final = (dict, list, tuple, set, frozenset, deque)
@@ -170,19 +171,20 @@ def _look(values: Iterable[Any], left: int, depth: int, converted: _Converted) -
         kind = type(value)  # pyright: ignore[reportUnknownVariableType]
         if kind is float:
             continue
-        if kind is dict or kind is list or kind is tuple:
+        if kind is dict:
+            left -= len(value)
+            if left < 0 or not (_short_keys.issuperset(value) or _has_short_keys(value)):
+                raise _NotPlainError
+            if not _LEAVES.issuperset(map(type, items := value.values())):
+                left = _look(items, left, depth + 1, converted)
+        elif kind is list or kind is tuple:
             left -= len(value)
             if left < 0:
                 raise _NotPlainError
-            items = value
-            if kind is dict:
-                if not (_short_keys.issuperset(value) or _has_short_keys(value)):
-                    raise _NotPlainError
-                items = value.values()
-            elif len(value) > _SHORT_ARRAY and type(value[0]) is float and _adds_up(value):
+            if len(value) > _SHORT_ARRAY and type(value[0]) is float and _adds_up(value):
                 continue
-            if not _FLOATS.issuperset(map(type, items)):
-                left = _look(items, left, depth + 1, converted)
+            if not _LEAVES.issuperset(map(type, value)):
+                left = _look(value, left, depth + 1, converted)
         elif kind is str:
             if len(value) >= _CHARACTERS_OF_A_VALUE:
                 left -= len(value) // _CHARACTERS_OF_A_VALUE

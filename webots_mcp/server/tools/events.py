@@ -84,6 +84,7 @@ class EventTools:
 
         Changed modes and flags, stuck, oscillation, jumps, thresholds, silent or flat sensors,
         recording gaps, runs, commands, log lines, pictures: "since when, how often, in which mode".
+        Many jumps, silences or flat times of one signal are one event with count and says.
         """
         bounds = Bounds(last_s, start_s, end_s, since, until)
         thresholds = thresholds_on(signals or (), above, below, for_s)

@@ -37,11 +37,16 @@ class Trend:
     """A numeric signal over a range.
 
     Attributes:
-        summary: Count, first, last, extremes with their times, mean, deviation.
+        summary: Count, first, last, extremes with their times, mean, deviation. Where the turns of
+            an angle are counted, its extremes are those of the unwrapped angle too (from rollups
+            those of their means).
         mean: Of an angle the circular mean. What is less than a few millionths of the range is
             rounded away: it comes from adding.
-        deviation: Standard deviation; of an angle that of the unwrapped angle.
-        turned_rad: How far an angle turned, positive as it grows, turns counted; else None.
+        deviation: Standard deviation; of an angle that of the unwrapped angle, or the circular one
+            where turns cannot be counted.
+        turned: How far an angle turned, positive as it grows, turns counted; else None.
+        leaps: An angle that changed by more than a quarter turn from row to row, as the bearing to
+            the nearest of several things does: its turns cannot be counted.
         monotonic: "rising", "falling" (never the other way, and not constant), or None.
         crossings: Of the mean, by more than noise.
         fast: It varies so fast that the means of 10 s do not show its course.
@@ -59,7 +64,8 @@ class Trend:
     summary: Summary
     mean: float | None
     deviation: float | None
-    turned_rad: float | None
+    turned: float | None
+    leaps: bool
     slope_per_s: float | None
     r2: float | None
     shape: Shape
@@ -93,27 +99,32 @@ def judge(
         inner_variance: That of the values within the buckets. Where more of it lies there than
             between them, a course of their means is not that of the values (it may be an alias).
     """
-    angle = signal.kind == "angle"
-    course = unwrap(numbers) if angle else numbers
-    inner = summary if len(course) == summary.present and not angle else summarise(times, course)
-    mean = inner.mean or 0.0
-    slow = _slow_share(inner, inner_variance, angle=angle)
-    fast = slow < SLOW_SHARE
-    line = _of_all(fit_line(times, course, mean), slow)
+    of_rows = spikes is not None
+    turn = signal.turn if of_rows or signal.kind == "angle" else None
+    leaps = turn is not None and of_rows and _leaps(numbers, turn)
+    course = unwrap(numbers, turn) if turn and not leaps else numbers
+    inner = summary if len(course) == summary.present and not turn else summarise(times, course)
+    slow = _slow_share(inner, inner_variance, angle=signal.kind == "angle")
+    fast = slow < SLOW_SHARE or leaps
+    line = None if leaps else _of_all(fit_line(times, course, inner.mean or 0.0), slow)
     crossings, swing = 0, None
     if not fast:
-        crossings, swing = find_oscillation(times, course, mean, inner.deviation or 0.0)
+        crossings, swing = find_oscillation(
+            times, course, inner.mean or 0.0, inner.deviation or 0.0
+        )
     monotonic = None if fast else _monotonic(course)
     rest_s = None if fast else flat_since(times, course)
+    summary = _unwrapped(summary, inner) if course is not numbers else summary
     shape = _shape(summary, line, monotonic, swing, rest_s, times[-1] - times[0])
     trend = Trend(
         name=signal.name,
         kind=signal.kind,
         unit=signal.unit,
         summary=summary,
-        mean=_rounded(summary.direction if angle else summary.mean, inner),
-        deviation=inner.deviation if angle else summary.deviation,
-        turned_rad=_turned_rad(summary, numbers) if angle and not fast else None,
+        mean=_rounded(_mean(signal, summary, inner, numbers), inner),
+        deviation=_deviation(signal, summary, inner, leaps=leaps),
+        turned=_turned(summary, numbers, turn) if turn and not fast else None,
+        leaps=leaps,
         slope_per_s=line.slope_per_s if line else None,
         r2=line.r2 if line else None,
         shape=shape,
@@ -143,9 +154,44 @@ def _of_all(line: Line | None, slow: float) -> Line | None:
     return line and replace(line, r2=line.r2 * slow)
 
 
-def _turned_rad(summary: Summary, numbers: Sequence[float]) -> float:
+def _leaps(numbers: Sequence[float], turn: float) -> bool:
+    """Whether it changed, the short way round, by more than a quarter turn from row to row."""
+    steps = (abs(math.remainder(after - before, turn)) for before, after in pairwise(numbers))
+    return any(step > turn / 4 for step in steps)
+
+
+def _unwrapped(summary: Summary, course: Summary) -> Summary:
+    """With the extremes of the course in which turns are counted."""
+    return summary._replace(
+        min=course.min,
+        min_sim_time_s=course.min_sim_time_s,
+        max=course.max,
+        max_sim_time_s=course.max_sim_time_s,
+    )
+
+
+def _mean(
+    signal: Signal, summary: Summary, course: Summary, numbers: Sequence[float]
+) -> float | None:
+    """Of an angle in degrees that of the unwrapped one, written as its values are."""
+    if signal.kind == "angle":
+        return summary.direction
+    if signal.turn is None or course is summary or course.mean is None:
+        return summary.mean
+    return (
+        course.mean % signal.turn if min(numbers) >= 0 else math.remainder(course.mean, signal.turn)
+    )
+
+
+def _deviation(signal: Signal, summary: Summary, course: Summary, *, leaps: bool) -> float | None:
+    if leaps and signal.kind == "angle":
+        return summary.circular_deviation
+    return course.deviation if signal.turn else summary.deviation
+
+
+def _turned(summary: Summary, numbers: Sequence[float], turn: float) -> float:
     ends = (summary.first or 0.0, summary.last or 0.0)
-    turned = unwrap([ends[0], *numbers, ends[1]])
+    turned = unwrap([ends[0], *numbers, ends[1]], turn)
     return turned[-1] - turned[0]
 
 
@@ -198,7 +244,9 @@ def _relative_range(summary: Summary) -> float:
 def _remarks(trend: Trend) -> Iterator[str]:
     summary, unit = trend.summary, f" {trend.unit}" if trend.unit else ""
     yield _course(trend, unit)
-    if trend.fast:
+    if trend.leaps:
+        yield "changes by more than a quarter turn at once: turns are not counted"
+    elif trend.fast:
         yield f"varies faster than {BUCKET_S:g} s: ask for a shorter range"
     if trend.flat_since_s is not None and trend.shape != "constant":
         yield f"flat at {summary.last:.4g} since {trend.flat_since_s:.6g} s"
@@ -224,8 +272,8 @@ def _course(trend: Trend, unit: str) -> str:
         return f"swung {how} {swing.period_s:.3g} s {stretch}"
     if trend.shape in ("rising", "falling"):
         slope = f" ({trend.slope_per_s:.3g}{unit}/s)" if trend.slope_per_s is not None else ""
-        if trend.turned_rad is not None:
-            return f"turns by {trend.turned_rad:.3g}{unit}{slope}"
+        if trend.turned is not None:
+            return f"turns by {trend.turned:.3g}{unit}{slope}"
         verb = "rises" if trend.shape == "rising" else "falls"
         return f"{verb} from {summary.first:.4g} to {summary.last:.4g}{unit}{slope}"
     low, high = f"{summary.min:.4g}", f"{summary.max:.4g}"

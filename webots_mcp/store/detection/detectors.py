@@ -13,7 +13,7 @@ from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
 from webots_mcp.store.analysis.motion import Motion, find_stays
 from webots_mcp.store.analysis.summary import Summary, usable_numbers
-from webots_mcp.store.detection.event import Event, EventOptions, Kind
+from webots_mcp.store.detection.event import KINDS, Event, EventOptions, Kind
 from webots_mcp.store.detection.stored import wall_time_at
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.intervals import MOSTLY, Beyond, Flat, Silent, Span, common
@@ -261,6 +261,12 @@ def oscillation_events(search: Search) -> Iterator[Event]:
     """It went to and fro: heading, wheels, speed, position and the like, and what is asked for."""
     asked = search.options.signals != EventOptions.signals
     signals = [each for each in search.numbers if asked or _SWINGING.search(each.name)]
+    left = len(search.numbers) - len(signals)
+    if left and len(search.options.kinds) < len(KINDS):  # who asks about it is told
+        search.view.notes.append(
+            f"oscillation was not searched in {left} of {len(search.numbers)} signals, whose names "
+            "are not of what a robot swings with: name them in signals"
+        )
     columns = search.view.newest(signals)
     for index, signal in enumerate(signals):
         if search.is_over("oscillation", signals[index:]):

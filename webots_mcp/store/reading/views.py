@@ -119,6 +119,7 @@ class RowView:
             reached_s = columns.times[-1] if columns.times else 0.0
             self.notes.append(f"the time was over: searched up to {reached_s:g} s only")
         self._columns = columns
+        self._summaries: dict[str, Summary] = {}
 
     def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
         """All rows."""
@@ -126,7 +127,10 @@ class RowView:
 
     def summary(self, signal: Signal) -> Summary:
         """Of all rows."""
-        return summarise(self._columns.times, self._columns.values[signal.name])
+        if signal.name not in self._summaries:
+            values = self._columns.values[signal.name]
+            self._summaries[signal.name] = summarise(self._columns.times, values)
+        return self._summaries[signal.name]
 
     def spans(self, signal: Signal, condition: Condition) -> list[Span]:
         """From all rows."""

@@ -82,6 +82,17 @@ def test_an_array_that_crosses_16_items_is_not_silent(empty: sqlite3.Connection,
     assert told(ask(empty, "silent")) == []
 
 
+def test_a_list_that_is_shorter_at_times_is_not_silent_and_a_dead_item_is(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    def state(time_s: float) -> dict[str, Any]:
+        seen = [range_m(time_s)] * (3 if time_s % 40 < 20 else 14)
+        return {"seen": seen, "near": [1.0, None if time_s > 60 else range_m(time_s)]}
+
+    record(empty, state)
+    assert told(ask(empty, "silent")) == [("near.1", 60.1, 119.9)]
+
+
 def test_a_sensor_that_is_dead_for_most_of_the_run_is_silent(
     empty: sqlite3.Connection, tier: str
 ) -> None:

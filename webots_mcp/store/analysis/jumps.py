@@ -10,7 +10,7 @@ from typing import Final
 
 from webots_mcp.store.reading.gaps import rhythm_of
 
-MOST_JUMPS_SHARE: Final = 0.05  # of the rows: more of them are how the signal is
+MOST_JUMPS_SHARE: Final = 0.1  # of the rows: more of them are how the signal is
 LEAST_STEPS: Final = 10
 LONGEST_EXCURSION: Final = 5  # rows that a value which otherwise rests may be elsewhere
 BACK_SHARE: Final = 0.2  # of a step: who comes back to so near where it began is back

@@ -41,6 +41,10 @@ _HAD_VALUE: Final = (
     "AND first_sim_time_s < :before) OR EXISTS (SELECT 1 FROM state WHERE id > :mark "
     "AND +run_id = :run AND sim_time_s < :before AND json_extract(data, :path) IS NOT NULL)"
 )
+_TYPES_AT: Final = (  # of the array, and of the item in it
+    "SELECT json_type(data, ?), json_type(data, ?) FROM state WHERE run_id = ? "
+    "AND sim_time_s >= ? ORDER BY sim_time_s, id LIMIT 1"
+)
 LEAST_CHANGES: Final = 10  # of who mostly changes
 MANY_SILENCES: Final = 10  # of a signal that mostly has no value: it comes so by nature
 # What a robot swings with; sensors swing by nature while it drives.
@@ -145,7 +149,9 @@ def silent_events(search: Search) -> Iterator[Event]:
         if search.is_over("silent", search.numbers[index:]):
             return
         spans = [
-            span for span in _without_value(search, signal) if _has_begun(search, signal, span)
+            span
+            for span in _without_value(search, signal)
+            if _has_begun(search, signal, span) and not _is_shorter(search, signal, span)
         ]
         least_s = _least_silence_s(search, signal, here, spans)
         for span in spans:
@@ -170,6 +176,16 @@ def _has_begun(search: Search, signal: Signal, span: Span) -> bool:
         return True
     other = other_form(search.known, signal)
     return any(search.has_begun(each, span.start_s) for each in (signal, other) if each)
+
+
+def _is_shorter(search: Search, signal: Signal, span: Span) -> bool:
+    """Whether the array was there when it began, but so short or long that it has no such item."""
+    array = signal.path if signal.reduce else signal.path.rpartition("[")[0]
+    if not array:
+        return False
+    asked = (array, signal.path, search.segment.run_id, span.start_s)
+    types = search.connection.execute(_TYPES_AT, asked).fetchone()
+    return types is not None and types[0] == "array" and types[1] != "null"
 
 
 def _least_silence_s(search: Search, signal: Signal, here: Summary, spans: Sequence[Span]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from webots_mcp.store.analysis.noise import Array, noise_of, smooth
 
 LEG_NOISE: Final = 8.0  # a leg is longer than so many deviations of the smoothed position
+GAP_INTERVALS: Final = 3.0
 FINEST_LEG_M: Final = 0.02  # smoothing that makes legs so short is enough
 LONGEST_SMOOTHING_S: Final = 2.0  # beyond, it would cut corners
 _PARABOLA_GAIN: Final = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it
@@ -48,18 +50,41 @@ class Track:
         )
 
 
-def track_of(times: Array, x: Array, y: Array) -> Track:
+def track_of(times: Array, x: Array, y: Array, noise_m: float | None = None) -> Track:
     """Estimate the noise of a position and smooth it by no more than that asks for.
 
     Args:
         times: Seconds; they do not fall.
         x: Metres, finite, and so is `y`.
         y: As many.
+        noise_m: Where it is known from other rows: between samples far apart, turns look like it.
     """
-    noise_m = float(np.hypot(noise_of(x), noise_of(y)) / np.sqrt(2))
+    noise_m = position_noise_m(x, y) if noise_m is None else noise_m
     rows = _smoothing_rows(times, noise_m)
     (smooth_x, gain), (smooth_y, _) = smooth(x, rows), smooth(y, rows)
     return Track(times, smooth_x, smooth_y, x, y, noise_m, noise_m * gain, rows)
+
+
+def position_noise_m(x: Array, y: Array) -> float:
+    """Standard deviation of the noise in each coordinate."""
+    return float(np.hypot(noise_of(x), noise_of(y)) / np.sqrt(2))
+
+
+def tracks_of(times: Array, x: Array, y: Array, noise_m: float | None = None) -> list[Track]:
+    """One track per stretch without a gap.
+
+    A gap is an interval of more than three median ones: nobody knows what happened in it. The
+    noise is that of the longest stretch, unless it is given.
+    """
+    steps = np.diff(times)
+    usual_s = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    cuts = np.flatnonzero(steps > GAP_INTERVALS * usual_s * (1 + 1e-6)) + 1
+    edges = [0, *cuts.tolist(), len(times)]
+    parts = [slice(start, end) for start, end in pairwise(edges) if end > start]
+    if noise_m is None and parts:
+        longest = max(parts, key=lambda part: part.stop - part.start)
+        noise_m = position_noise_m(x[longest], y[longest])
+    return [track_of(times[part], x[part], y[part], noise_m) for part in parts]
 
 
 def _smoothing_rows(times: Array, noise_m: float) -> int:
@@ -88,3 +113,16 @@ def path_length_m(track: Track) -> float:
             length_m += square_m2**0.5
             from_x, from_y = x, y
     return length_m
+
+
+def travelled_m(tracks: list[Track]) -> float:
+    """Metres travelled along stretches one after the other, with the straight ways between them.
+
+    How far it went in a recording gap is not known; it is at least the straight way.
+    """
+    across_m = [
+        float(np.hypot(after.x[0] - before.x[-1], after.y[0] - before.y[-1]))
+        for before, after in pairwise(tracks)
+    ]
+    least_m = LEG_NOISE * max((track.noise_m for track in tracks), default=0.0)
+    return sum(map(path_length_m, tracks)) + sum(way_m for way_m in across_m if way_m > least_m)

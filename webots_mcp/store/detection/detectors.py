@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
-from webots_mcp.store.analysis.motion import Motion, find_stays
+from webots_mcp.store.analysis.motion import Motion
 from webots_mcp.store.analysis.summary import Summary, usable_numbers
 from webots_mcp.store.detection.event import KINDS, Event, EventOptions, Kind
 from webots_mcp.store.detection.stored import wall_time_at
@@ -25,7 +25,7 @@ from webots_mcp.store.signals.catalogue import other_form, resolve_signals
 from webots_mcp.store.signals.registry import Signal
 
 DETECTED: Final[tuple[Kind, ...]] = (
-    "stuck", "threshold", "silent", "flat", "jump", "oscillation",
+    "still", "stuck", "threshold", "silent", "flat", "jump", "oscillation",
 )  # fmt: skip
 
 OF_NUMBERS: Final = frozenset[Kind]({"silent", "flat", "jump", "oscillation"})
@@ -74,6 +74,13 @@ class Search:
     ended_s: float
     deadline: Deadline
 
+    @cached_property
+    def standing(self) -> list[Event]:
+        """The standstills, found once for both of their kinds; numpy is imported at the first."""
+        from webots_mcp.store.detection.standing import standing_events
+
+        return standing_events(self)
+
     def event(self, kind: Kind, start_s: float, end_s: float, name: str | None, **details: Any):
         """An event of this run; what has a duration and reaches the newest row goes on."""
         run_id = self.segment.run_id
@@ -113,18 +120,12 @@ class Search:
 
 def stuck_events(search: Search) -> Iterator[Event]:
     """It should have moved and stayed where it was."""
-    if search.motion.position is None:
-        search.view.notes.append("stuck was not searched: no position is published (pose.0, ...)")
-        return
-    columns = search.view.places(search.motion.signals, search.options.stuck_s)
-    if missing := [each.name for each in search.motion.signals if each.name not in columns.values]:
-        search.view.notes.append(f"stuck was not searched: {missing[0]} is not in every row")
-        return
-    for stay in find_stays(columns, search.motion, search.options):
-        details = {"x_m": stay.x_m, "y_m": stay.y_m}
-        details |= {"mode": stay.mode} if search.motion.mode else {}
-        details |= {"commanded": stay.commanded} if search.motion.commanded else {}
-        yield search.event("stuck", stay.start_s, stay.end_s, None, **details)
+    return (event for event in search.standing if event.kind == "stuck")
+
+
+def still_events(search: Search) -> Iterator[Event]:
+    """It stayed where it was."""
+    return (event for event in search.standing if event.kind == "still")
 
 
 def threshold_events(search: Search) -> Iterator[Event]:
@@ -308,6 +309,7 @@ def _swings(search: Search, signal: Signal, columns: Columns) -> Iterator[Event]
 
 
 DETECTORS: Final = {
+    "still": still_events,
     "stuck": stuck_events,
     "threshold": threshold_events,
     "silent": silent_events,

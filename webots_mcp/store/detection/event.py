@@ -11,7 +11,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.signals.flatten import Value
 
 Kind = Literal[
-    "run", "gap", "change", "stuck", "threshold", "silent", "flat", "jump", "oscillation",
+    "run", "gap", "change", "still", "stuck", "threshold", "silent", "flat", "jump", "oscillation",
     "command", "log", "noticed", "image",
 ]  # fmt: skip
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
@@ -23,9 +23,9 @@ class Event:
     """Something that happened in a run.
 
     Attributes:
-        kind: run (it began or ended), gap (no rows), change (of a text or flag), stuck,
-            threshold, silent (no value), flat, jump, oscillation; command, log, noticed (by the
-            bridge), image.
+        kind: run (it began or ended), gap (no rows), change (of a text or flag), still (it stood),
+            stuck (it stood and should have moved), threshold, silent (no value), flat, jump,
+            oscillation; command, log, noticed (by the bridge), image.
         end_s: Equal to the start for what has no duration; of a change when the value ended.
         ongoing: It lasts up to the newest row of a run that goes on; of a command, it is not
             finished.
@@ -78,12 +78,13 @@ class EventOptions:
         position: The two signals of the position in metres; None finds them by name (`pose.0`
             and `pose.1`, `position.x` and `position.y`, `gps.0` and so on).
         mode: The text signal of the mode; None finds it by name (`mode`, `state`, ...).
-        moving_modes: Modes in which the robot should move; None for all but those whose name says
-            that they do not (idle, stop, wait, turn, ...).
+        moving_modes: Modes in which the robot should move; None for those in which it has been
+            seen moving, in this run or an earlier one.
         commanded: The signal of the commanded speed; None finds it by name (`commanded`, `cmd`,
-            `target_speed`, else `speed`, `velocity`), and without any the mode alone tells.
+            `target_speed`). Of `speed` and `velocity` it is open whether they are commanded.
         min_commanded: A commanded speed of at least this should move the robot.
-        stuck_m: Stuck is who should move and stays within this distance ...
+        stuck_m: Still is who stays within this distance (more where the noise of the position is
+            more), stuck who should move besides, ...
         stuck_s: ... for so long.
         thresholds: For the kind "threshold".
         silent_s: Without a value for so long, though it mostly has one.

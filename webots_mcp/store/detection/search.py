@@ -17,7 +17,7 @@ from webots_mcp.store.reading.views import view_of
 from webots_mcp.store.signals.catalogue import resolve_signals
 from webots_mcp.store.signals.registry import Signal
 
-LASTING: Final = frozenset[Kind]({"stuck", "threshold", "silent", "flat"})
+LASTING: Final = frozenset[Kind]({"still", "stuck", "threshold", "silent", "flat"})
 FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
 JUMP_REACH_S: Final = 2.0  # before and after a segment: whether a value comes back shows there
 
@@ -76,6 +76,7 @@ class Detection:
         options = self.options
         for_s = max((threshold.for_s for threshold in options.thresholds), default=0.0)
         least_s: dict[Kind, float] = {
+            "still": options.stuck_s,
             "stuck": options.stuck_s,
             "silent": options.silent_s,
             "flat": options.flat_s,
@@ -104,7 +105,7 @@ class Detection:
             for threshold in self.options.thresholds
             for signal in resolve_signals(self.known, [threshold.signal])
         ]
-        needed = {signal.name: signal for signal in (*numbers, *motion.signals, *limits)}
+        needed = {signal.name: signal for signal in (*numbers, *motion.evidence, *limits)}
         view = view_of(self.connection, segment, list(needed.values()), self.deadline)
         common = (self.known, numbers, motion, self.options, view, self.newest_s, self.deadline)
         search = Search(self.connection, segment, *common)

@@ -74,9 +74,18 @@ class View(Protocol):
 
     notes: list[str]
     shortest_rest_s: float  # a shorter one may be missed
+    sampled_s: float  # between the rows of `places`; 0 where these are all
 
     def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
         """Rows close enough to see a stay of that length."""
+        ...
+
+    def sample(self, signals: Sequence[Signal]) -> Columns:
+        """Enough rows one after the other to tell the noise of signals."""
+        ...
+
+    def rows_between(self, start_s: float, end_s: float, signals: Sequence[Signal]) -> Columns:
+        """All rows of the segment in [start_s, end_s)."""
         ...
 
     def summary(self, signal: Signal) -> Summary:
@@ -112,6 +121,7 @@ class RowView:
     """All rows of a segment."""
 
     shortest_rest_s = 0.0
+    sampled_s = 0.0
 
     def __init__(self, columns: Columns) -> None:
         self.notes: list[str] = []
@@ -123,6 +133,14 @@ class RowView:
 
     def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
         """All rows."""
+        return self._columns
+
+    def sample(self, signals: Sequence[Signal]) -> Columns:
+        """All rows."""
+        return self._columns
+
+    def rows_between(self, start_s: float, end_s: float, signals: Sequence[Signal]) -> Columns:
+        """All rows, also those outside."""
         return self._columns
 
     def summary(self, signal: Signal) -> Summary:
@@ -162,6 +180,7 @@ class LongView:
         self._connection = connection
         self._segment = segment
         self._deadline = deadline
+        self.sampled_s = 0.0
         self._signals = [signal for signal in signals if signal.is_number]
         self._span = (segment.run_id, bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
         late = rows_after(connection, segment, watermark(connection, segment.run_id))
@@ -173,15 +192,29 @@ class LongView:
         """A row every fifth of the stay; fewer where that would be too many."""
         span_s = self._segment.end_s - self._segment.start_s
         every_s = max(stay_s / SAMPLES_PER_STAY, span_s / MOST_SAMPLES)
+        self.sampled_s = every_s
         if every_s > stay_s / 2:
-            self.notes.append(f"stuck for less than {2 * every_s:.3g} s may be missed")
+            self.notes.append(f"still or stuck for less than {2 * every_s:.3g} s may be missed")
         plain = [signal for signal in signals if signal.is_plain]
         found = read_sampled(self._connection, self._segment, plain, every_s, self._deadline)
         self._add_newest(found, plain, every_s)
         if found.cut:
             reached_s = found.times[-1] if found.times else self._segment.start_s
-            self.notes.append(f"the time was over: stuck was searched up to {reached_s:g} s only")
+            self.notes.append(
+                f"the time was over: still and stuck looked for up to {reached_s:g} s only"
+            )
         return found
+
+    def sample(self, signals: Sequence[Signal]) -> Columns:
+        """The newest rows."""
+        part = newest_part(self._connection, self._segment, SAMPLE_ROWS)
+        return read_columns(self._connection, part, signals, self._deadline)
+
+    def rows_between(self, start_s: float, end_s: float, signals: Sequence[Signal]) -> Columns:
+        """Read from the segment."""
+        start_s, end_s = max(start_s, self._segment.start_s), min(end_s, self._segment.end_s)
+        part = replace(self._segment, start_s=start_s, end_s=end_s)
+        return read_columns(self._connection, part, signals, self._deadline)
 
     def summary(self, signal: Signal) -> Summary:
         """Counts from the rollups."""

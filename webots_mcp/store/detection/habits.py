@@ -1,0 +1,122 @@
+"""In which modes a robot has been seen moving, in this run and in earlier ones."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+
+from webots_mcp.store.analysis.motion import Motion, tracks_in
+from webots_mcp.store.analysis.track import Track, path_length_m
+from webots_mcp.store.reading.changes import Point, change_points
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
+from webots_mcp.store.reading.rows import read_columns
+from webots_mcp.store.signals.flatten import Value
+
+ROLLS_OUT_S: Final = 1.5  # after a mode began, the motion of the mode before may go on
+WINDOW_S: Final = 20.0  # at once is read
+MOST_WINDOWS: Final = 12  # of each mode are read
+LEAST_MOVED_M: Final = 0.1
+LEAST_NOISE: Final = 4.0  # deviations of the position
+EARLIER_RUNS: Final = 3
+
+_EARLIER: Final = (
+    "SELECT id FROM run WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) AND id < ? "
+    "ORDER BY id DESC LIMIT ?"
+)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """How fast it moved in a mode, and in which run that was seen."""
+
+    speed_m_s: float
+    run_id: int
+
+
+class MovedIn:
+    """Looks for a mode's visits until one of them shows that the robot moved in it."""
+
+    def __init__(
+        self, connection: sqlite3.Connection, run_id: int, motion: Motion, deadline: Deadline
+    ) -> None:
+        self._connection = connection
+        self.run_id = run_id
+        self._motion = motion
+        self._deadline = deadline
+        self._points: dict[int, list[Point]] = {}
+        self._seen: dict[Value, Seen | None] = {}
+
+    def seen(self, mode: Value) -> Seen | None:
+        """None where none of the looked at visits shows that it moved."""
+        if mode not in self._seen:
+            self._seen[mode] = self._look(mode) if isinstance(mode, str) else None
+        return self._seen[mode]
+
+    def _look(self, mode: str) -> Seen | None:
+        runs = self._connection.execute(_EARLIER, (self.run_id, self.run_id, EARLIER_RUNS))
+        for run_id in (self.run_id, *(run_id for (run_id,) in runs.fetchall())):
+            for window in self._windows(run_id, mode):
+                if self._deadline.passed:
+                    return None
+                if speed_m_s := self._speed_in(window):
+                    return Seen(speed_m_s, run_id)
+        return None
+
+    def _windows(self, run_id: int, mode: str) -> list[Segment]:
+        """Stretches of the mode's visits, spread over the run."""
+        windows = [
+            Segment(run_id, start_s, min(start_s + WINDOW_S, end_s))
+            for begin_s, end_s in self._visits(run_id, mode)
+            for start_s in _steps(begin_s, end_s)
+        ]
+        every = max(1, -(-len(windows) // MOST_WINDOWS))
+        return windows[::every]
+
+    def _visits(self, run_id: int, mode: str) -> Iterator[tuple[float, float]]:
+        """When the mode was in force, without the moment in which the one before rolls out."""
+        bounds = recorded_bounds(self._connection, run_id)
+        signal = self._motion.mode
+        if bounds is None or signal is None:
+            return
+        whole = Segment(run_id, bounds[0], just_after(bounds[1]))
+        if run_id not in self._points:
+            found = change_points(self._connection, whole, [signal], self._deadline)
+            self._points[run_id] = found[signal.name]
+        for at, (point, after) in enumerate(
+            pairwise([*self._points[run_id], Point(whole.end_s, None)])
+        ):
+            if point.value == mode:
+                yield point.sim_time_s + (ROLLS_OUT_S if at else 0.0), after.sim_time_s
+
+    def _speed_in(self, window: Segment) -> float | None:
+        """How fast it usually was while it moved; None where it did not."""
+        position = self._motion.position
+        if position is None:
+            return None
+        columns = read_columns(self._connection, window, position, self._deadline)
+        tracks = tracks_in(columns, position)
+        way_m = sum(map(path_length_m, tracks))
+        if way_m < max([LEAST_MOVED_M, *(LEAST_NOISE * track.noise_m for track in tracks)]):
+            return None
+        return max(map(_usual_m_s, tracks)) or None
+
+
+def _steps(begin_s: float, end_s: float) -> Iterator[float]:
+    while begin_s < end_s:
+        yield begin_s
+        begin_s += WINDOW_S
+
+
+def _usual_m_s(track: Track) -> float:
+    """The median speed over a second, where it is at least half of the highest."""
+    later = np.minimum(np.searchsorted(track.times, track.times + 1.0), len(track.times) - 1)
+    way_m = np.hypot(track.x[later] - track.x, track.y[later] - track.y)
+    took_s = np.maximum(track.times[later] - track.times, 0.5)
+    speeds = way_m / took_s
+    return float(np.median(speeds[speeds >= speeds.max() / 2]))

@@ -1,0 +1,202 @@
+"""Standstills: always told as a fact, and as stuck where something shows that it should move."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+
+from webots_mcp.store.analysis.motion import tracks_in
+from webots_mcp.store.analysis.standstill import find_standstills
+from webots_mcp.store.analysis.track import Track
+from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.evidence import Evidence, Flags, turned_rad, usual, weigh
+from webots_mcp.store.detection.habits import MovedIn
+from webots_mcp.store.reading.rows import Columns
+from webots_mcp.store.signals.registry import Signal
+
+if TYPE_CHECKING:
+    from webots_mcp.store.detection.detectors import Search
+
+BRIDGED_S: Final = 0.5  # evidence that is missing for less goes on
+NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
+READ_WHOLE_S: Final = 60.0  # of a longer standstill in a long range both ends are read
+MARGIN_S: Final = 8.0  # before and after it that are read
+
+
+@dataclass(frozen=True)
+class Standing:
+    """The robot stayed about one place.
+
+    Attributes:
+        columns: Rows in which it stood: all, or samples.
+        within_s: How exactly begin and end are known; 0 for to the row.
+    """
+
+    start_s: float
+    end_s: float
+    x_m: float
+    y_m: float
+    columns: Columns
+    within_s: float = 0.0
+
+
+def standing_events(search: Search) -> list[Event]:
+    """All standstills of a segment, as `still` and as `stuck`."""
+    position = search.motion.position
+    if position is None:
+        search.view.notes.append(
+            "still and stuck were not looked for: no position is published (pose.0, ...)"
+        )
+        return []
+    moved_in = MovedIn(search.connection, search.segment.run_id, search.motion, search.deadline)
+    events: list[Event] = []
+    for standing in _standings(search, position):
+        evidence = weigh(standing.columns, search.motion, search.options, moved_in)
+        events += _told(search, standing, evidence)
+    return events
+
+
+def _told(search: Search, standing: Standing, evidence: Evidence) -> Iterator[Event]:
+    """What it was stuck for; and the standstill, unless that is the same."""
+    spans = _spans(standing, evidence.should_move, NEARLY * search.options.stuck_s)
+    for start, end in spans:
+        yield _stuck(search, standing, evidence, slice(start, end))
+    least_s = search.options.stuck_s
+    covered = any(
+        standing.columns.times[start] - standing.start_s < least_s
+        and standing.end_s - standing.columns.times[end - 1] < least_s
+        for start, end in spans
+    )
+    if not covered or "stuck" not in search.options.kinds:
+        details = _details(search, standing, standing.columns)
+        details["not_stuck"] = "; ".join(evidence.against) or "only for moments should it move"
+        ends = (standing.start_s, standing.end_s)
+        if covered or spans:
+            details.pop("not_stuck")
+        yield search.event("still", *ends, None, **details)
+
+
+def _stuck(search: Search, standing: Standing, evidence: Evidence, rows: slice) -> Event:
+    part = _rows(standing.columns, rows)
+    all_of_it = len(part.times) >= NEARLY * len(standing.columns.times)
+    start_s = standing.start_s if all_of_it else part.times[0]
+    end_s = standing.end_s if all_of_it else part.times[-1]
+    details = _details(search, standing, part)
+    commanded = search.motion.commanded
+    if commanded is not None and commanded.name in part.values:
+        details["commanded"] = usual(part.values[commanded.name])
+    details["evidence"] = "; ".join(evidence.shown_by)
+    return search.event("stuck", start_s, end_s, None, **details)
+
+
+def _details(search: Search, standing: Standing, rows: Columns) -> dict[str, Any]:
+    """What is told of a standstill, whether it was stuck or not."""
+    details: dict[str, Any] = {"x_m": standing.x_m, "y_m": standing.y_m}
+    mode = search.motion.mode
+    if mode is not None and mode.name in rows.values:
+        details["mode"] = usual(rows.values[mode.name])
+    if (turned := turned_rad(rows, search.motion.heading)) is not None:
+        details["turned_rad"] = round(turned, 3)
+    return details | ({"within_s": standing.within_s} if standing.within_s else {})
+
+
+def _standings(search: Search, position: tuple[Signal, Signal]) -> Iterator[Standing]:
+    """From all rows; of a long segment first from samples, then from the rows about each."""
+    view, options = search.view, search.options
+    columns = view.places(search.motion.evidence, options.stuck_s)
+    if missing := [each.name for each in position if each.name not in columns.values]:
+        view.notes.append(f"still and stuck were not looked for: {missing[0]} is not in every row")
+        return
+    noise_m = _noise_m(view.sample(position), position) if view.sampled_s else None
+    tracks = tracks_in(columns, position, noise_m)
+    least_s = max(options.stuck_s - 2 * view.sampled_s, options.stuck_s / 2)
+    found = [each for track in tracks for each in _in_track(search, track, columns, least_s)]
+    if view.sampled_s:
+        found = [fine for each in found for fine in _from_rows(search, each)]
+    if not found and (nearest := _went_least(tracks, options.stuck_s)):
+        view.notes.append(f"no standstill of {options.stuck_s:g} s: {nearest}")
+    yield from found
+
+
+def _in_track(search: Search, track: Track, columns: Columns, least_s: float) -> Iterator[Standing]:
+    for each in find_standstills(track, search.options.stuck_m, least_s):
+        start_s, end_s = float(track.times[each.start]), float(track.times[each.last])
+        rows = slice(bisect_left(columns.times, start_s), bisect_right(columns.times, end_s))
+        yield Standing(start_s, end_s, each.x_m, each.y_m, _rows(columns, rows))
+
+
+def _from_rows(search: Search, rough: Standing) -> list[Standing]:
+    """What the rows about a standstill that samples show tell of it."""
+    if search.deadline.passed:
+        search.view.notes.append("the time was over: begin and end of standstills are not exact")
+        return [replace(rough, within_s=search.view.sampled_s)]
+    start_s, end_s = rough.start_s - MARGIN_S, rough.end_s + MARGIN_S
+    if rough.end_s - rough.start_s <= READ_WHOLE_S:
+        return _about(search, rough, start_s, end_s)
+    head = _about(search, rough, start_s, rough.start_s + READ_WHOLE_S / 2)
+    foot = _about(search, rough, rough.end_s - READ_WHOLE_S / 2, end_s)
+    first_s = head[-1].start_s if head else rough.start_s
+    last_s = foot[0].end_s if foot else rough.end_s
+    return [replace(rough, start_s=first_s, end_s=last_s)]
+
+
+def _about(search: Search, rough: Standing, start_s: float, end_s: float) -> list[Standing]:
+    """The standstills in the rows from one time to another that touch a rough one."""
+    position = search.motion.position
+    assert position is not None
+    columns = search.view.rows_between(start_s, end_s, search.motion.evidence)
+    tracks = tracks_in(columns, position)
+    found = (
+        each
+        for track in tracks
+        for each in _in_track(search, track, columns, search.options.stuck_s)
+    )
+    return [each for each in found if each.start_s <= rough.end_s and each.end_s >= rough.start_s]
+
+
+def _noise_m(columns: Columns, position: tuple[Signal, Signal]) -> float | None:
+    tracks = tracks_in(columns, position)
+    return tracks[0].noise_m if tracks else None
+
+
+def _rows(columns: Columns, rows: slice) -> Columns:
+    return Columns(
+        columns.run_id,
+        columns.ids[rows],
+        columns.times[rows],
+        columns.walls[rows],
+        {name: values[rows] for name, values in columns.values.items()},
+    )
+
+
+def _spans(standing: Standing, flags: Flags, least_s: float) -> list[tuple[int, int]]:
+    """Row ranges [start, end) of at least that duration in which the flags hold."""
+    times = standing.columns.times
+    edges = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))).tolist()
+    spans: list[tuple[int, int]] = []
+    for start, end in zip(edges[::2], edges[1::2], strict=True):
+        if spans and times[start] - times[spans[-1][1] - 1] <= BRIDGED_S:
+            start = spans.pop()[0]
+        spans.append((start, end))
+    return [(start, end) for start, end in spans if times[end - 1] - times[start] >= least_s]
+
+
+def _went_least(tracks: Sequence[Track], least_s: float) -> str | None:
+    """What came nearest to a standstill."""
+    ways: list[tuple[float, float]] = []
+    for track in tracks:
+        later = np.searchsorted(track.times, track.times + least_s)
+        starts = np.flatnonzero(later < len(track.times))
+        if len(starts):
+            ends = later[starts]
+            way_m = np.hypot(track.x[ends] - track.x[starts], track.y[ends] - track.y[starts])
+            least = int(way_m.argmin())
+            ways.append((float(way_m[least]), float(track.times[starts[least]])))
+    if not ways:
+        return None
+    way_m, start_s = min(ways)
+    return f"where it went least, from {start_s:.1f} s on, it came {way_m:.2g} m far"

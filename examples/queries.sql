@@ -88,6 +88,8 @@ FROM (
 ) JOIN robot_run USING (run_id) WHERE sim_time_s - before_s > 10 / rows_per_s;
 
 -- 10. How far did it drive? (sqrt is there where SQLite was built with its math functions.)
+-- From row to row, without smoothing: noise of the position adds to it, also while it stands.
+-- The server's tools and `webots-mcp compare` tell the distance without that noise.
 -- Example:
 --     run_id  distance_m
 --     2       18.701

@@ -128,7 +128,7 @@ def trends(arguments: argparse.Namespace) -> None:
     count("-n", "at most N events", default=50),
 )  # fmt: skip
 def events(arguments: argparse.Namespace) -> None:
-    """Find what happened: changes, stuck, gaps, jumps, silent sensors, commands, warnings."""
+    """Find what happened: changes, stuck, standstills, gaps, jumps, silent sensors, warnings."""
     from webots_mcp.store.questions.events import find_events
 
     with reading(arguments) as connection:

@@ -15,7 +15,7 @@ MOST_EVENTS: Final = 500
 MOST_LANES: Final = 5
 # What a person would look for first. Changes and gaps are drawn otherwise.
 _KINDS: Final[tuple[Kind, ...]] = (
-    "stuck", "jump", "silent", "oscillation", "log", "command", "noticed", "flat",
+    "stuck", "jump", "silent", "oscillation", "log", "command", "noticed", "flat", "still",
 )  # fmt: skip
 
 

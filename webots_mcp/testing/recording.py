@@ -114,7 +114,7 @@ class Recording:
         """What the values of the run show: when it was stuck, where a signal jumped, and the like.
 
         Args:
-            kinds: `stuck`, `jump`, `oscillation`, `silent`, `flat`, `gap`, ...; none for all.
+            kinds: `still`, `stuck`, `jump`, `oscillation`, `silent`, `gap`, ...; none for all.
             options: More fields of `webots_mcp.store.detection.event.EventOptions`.
 
         Raises:

@@ -65,10 +65,14 @@ class EventTools:
             float, Field(ge=0, description="... for at least so many simulated seconds.")
         ] = 0,
         stuck_s: Annotated[
-            float, Field(gt=0, description="Stuck is who should move, but for so long ...")
+            float, Field(gt=0, description="Still, or stuck, is who for so long ...")
         ] = EventOptions.stuck_s,
         stuck_m: Annotated[
-            float, Field(gt=0, description="... stays within so many metres.")
+            float,
+            Field(
+                gt=0,
+                description="... stays within so many metres (more where the position is noisy).",
+            ),
         ] = EventOptions.stuck_m,
         log_level: LogLevel = "warning",
         last_s: LastS = None,
@@ -82,8 +86,9 @@ class EventTools:
     ) -> EventsAnswer:
         """What happened in a stretch of time, by default the whole run, with begin and duration.
 
-        Changed modes and flags, stuck, oscillation, jumps, thresholds, silent or flat sensors,
-        recording gaps, runs, commands, log lines, pictures: "since when, how often, in which mode".
+        Changed modes and flags, still (it stood), stuck (it stood and should have moved; evidence
+        says why), oscillation, jumps, thresholds, silent or flat sensors, recording gaps, runs,
+        commands, log lines, pictures: "since when, how often, in which mode".
         Many jumps, silences or flat times of one signal are one event with count and says.
         """
         bounds = Bounds(last_s, start_s, end_s, since, until)

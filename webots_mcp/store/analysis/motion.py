@@ -183,3 +183,9 @@ def path_length(
     from webots_mcp.store.analysis.track import travelled_m
 
     return travelled_m(tracks_in(columns, position, noise_m))
+
+
+def position_noise(columns: Columns, position: tuple[Signal, Signal]) -> float | None:
+    """Standard deviation of the noise in each coordinate, in metres; None without a position."""
+    tracks = tracks_in(columns, position)
+    return tracks[0].noise_m if tracks else None

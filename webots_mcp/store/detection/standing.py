@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from webots_mcp.store.analysis.motion import tracks_in
+from webots_mcp.store.analysis.motion import position_noise, tracks_in
 from webots_mcp.store.analysis.standstill import find_standstills
 from webots_mcp.store.analysis.track import Track
 from webots_mcp.store.detection.event import Event
@@ -111,7 +111,7 @@ def _standings(search: Search, position: tuple[Signal, Signal]) -> Iterator[Stan
     if missing := [each.name for each in position if each.name not in columns.values]:
         view.notes.append(f"still and stuck were not looked for: {missing[0]} is not in every row")
         return
-    noise_m = _noise_m(view.sample(position), position) if view.sampled_s else None
+    noise_m = position_noise(view.sample(position), position) if view.sampled_s else None
     tracks = tracks_in(columns, position, noise_m)
     least_s = max(options.stuck_s - 2 * view.sampled_s, options.stuck_s / 2)
     found = [each for track in tracks for each in _in_track(search, track, columns, least_s)]
@@ -156,11 +156,6 @@ def _about(search: Search, rough: Standing, start_s: float, end_s: float) -> lis
         for each in _in_track(search, track, columns, search.options.stuck_s)
     )
     return [each for each in found if each.start_s <= rough.end_s and each.end_s >= rough.start_s]
-
-
-def _noise_m(columns: Columns, position: tuple[Signal, Signal]) -> float | None:
-    tracks = tracks_in(columns, position)
-    return tracks[0].noise_m if tracks else None
 
 
 def _rows(columns: Columns, rows: slice) -> Columns:

@@ -13,7 +13,7 @@ from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.differences import Difference, difference_of, only_in, size_of
-from webots_mcp.store.questions.outcomes import Measure, RunPart, measures_of
+from webots_mcp.store.questions.outcomes import Measure, RunPart, measures_of, sampling_notes
 from webots_mcp.store.questions.runs import RunInfo, run_info
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import whole_run
@@ -167,7 +167,8 @@ def _compare(
     shared = sorted((each for each in differences if all(each.count)), key=size_of, reverse=True)
     told = tuple(_group(connection, name, found) for name, found in parts.items())
     measures = measures_of(connection, list(parts.values()), options, deadline)
-    notes = _notes(told)
+    cut = [part for found in parts.values() for part in found]
+    notes = _notes(told) + sampling_notes(connection, cut)
     if deadline.passed:
         notes.append(f"the time of {deadline_s:g} s was over: not all rows were looked at")
     return Comparison(

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
-from webots_mcp.store.analysis.motion import Motion, path_length
+from webots_mcp.store.analysis.motion import Motion, path_length, position_noise
 from webots_mcp.store.analysis.spread import Spread, spread_of, verdicts_on
 from webots_mcp.store.detection.event import Event, EventOptions, Kind
 from webots_mcp.store.questions.events import collect
@@ -18,12 +18,14 @@ from webots_mcp.store.reading.changes import change_points, longest_values
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.rows import exceeds, read_columns
-from webots_mcp.store.reading.sampling import MOST_SAMPLES, read_sampled
+from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.signals.registry import Signal
 
+NOISE_ROWS: Final = 2000  # of a long run, that tell the noise of its position
 SAMPLE_S: Final = 0.5  # between the positions from which a long run's distance is summed
 COUNTED: Final[tuple[Kind, ...]] = (
-    "gap", "change", "stuck", "silent", "flat", "jump", "oscillation", "command", "log", "noticed",
+    "gap", "change", "still", "stuck", "silent", "flat", "jump", "oscillation", "command", "log",
+    "noticed",
 )  # fmt: skip
 _SHARE: Final = "share of "
 
@@ -142,16 +144,32 @@ def _outcome(
 
 
 def _distance(connection: sqlite3.Connection, part: RunPart, deadline: Deadline) -> float | None:
-    """Of a long run from samples, of which each cuts corners a little."""
+    """Of a long run from samples, which cut corners a little; its newest rows tell its noise."""
     position = part.motion.position
     if position is None:
         return None
     if not exceeds(connection, part.segment) or not all(each.is_plain for each in position):
         columns = read_columns(connection, part.segment, position, deadline)
-    else:
-        every_s = max(SAMPLE_S, (part.segment.end_s - part.segment.start_s) / MOST_SAMPLES)
-        columns = read_sampled(connection, part.segment, position, every_s, deadline)
-    return path_length(columns, position)
+        return path_length(columns, position)
+    columns = read_sampled(connection, part.segment, position, _every_s(part.segment), deadline)
+    newest = newest_part(connection, part.segment, NOISE_ROWS)
+    noise_m = position_noise(read_columns(connection, newest, position, deadline), position)
+    return path_length(columns, position, noise_m)
+
+
+def _every_s(segment: Segment) -> float:
+    """Simulated seconds between the samples of a long run."""
+    return max(SAMPLE_S, (segment.end_s - segment.start_s) / MOST_SAMPLES)
+
+
+def sampling_notes(connection: sqlite3.Connection, parts: Sequence[RunPart]) -> list[str]:
+    """Says of which runs the distance comes from samples."""
+    return [
+        f"the distance of run {part.segment.run_id} is that of a position each "
+        f"{_every_s(part.segment):.2g} s"
+        for part in parts
+        if part.motion.position and exceeds(connection, part.segment)
+    ]
 
 
 def _mode_times(

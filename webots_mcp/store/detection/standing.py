@@ -113,6 +113,13 @@ def _standings(search: Search, position: tuple[Signal, Signal]) -> Iterator[Stan
         return
     noise_m = position_noise(view.sample(position), position) if view.sampled_s else None
     tracks = tracks_in(columns, position, noise_m)
+    if not tracks:
+        names = " and ".join(signal.name for signal in position)
+        view.notes.append(
+            f"still and stuck were not looked for: {names} have no value in run "
+            f"{search.segment.run_id} there"
+        )
+        return
     least_s = max(options.stuck_s - 2 * view.sampled_s, options.stuck_s / 2)
     found = [each for track in tracks for each in _in_track(search, track, columns, least_s)]
     if view.sampled_s:

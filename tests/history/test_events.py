@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import math
 import random
+import re
 import sqlite3
+from collections import Counter
+from itertools import count
 from typing import Any
 
 import pytest
@@ -13,8 +16,11 @@ from tests.history.recording import WALL_START_S, Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.analysis.jumps import find_jumps
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
+from webots_mcp.store.detection.search import Detection
 from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.signals.catalogue import known_signals
 
 
 def ask(connection: sqlite3.Connection, kind: Any, *, bounds: Any = None, **options: Any) -> Events:
@@ -150,7 +156,103 @@ def test_a_limit_keeps_rare_kinds_and_says_what_is_left_out(rover: sqlite3.Conne
     assert len(events.events) <= 12
     kinds = {event.kind for event in events.events}
     assert {"stuck", "gap", "command", "run"} <= kinds
-    assert "left out" in events.notes[-1]
+    told = Counter(event.kind for event in events.events)
+    left_out = {kind: each.count for kind, each in events.left_out.items()}
+    assert left_out and told + Counter(left_out) == events.totals
+
+
+def record_a_busy_run(connection: sqlite3.Connection) -> Recorder:
+    """100 s in which a flag changes each second, with 3 warnings, and 2 pictures a second."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    picture = {"kind": "camera", "width": 1, "height": 1, "bytes": 1}
+    for step in range(1000):
+        recorder.publish(step * 0.1, {"lit": step // 10 % 2 == 0, "mode": "ab"[step // 20 % 2]})
+        if step % 5 == 0:
+            recorder.insert("image", **recorder.at(step * 0.1), path=f"{step}.png", **picture)
+        if step in (100, 101, 700):
+            line = {"level": "warning", "source": "controller", "message": str(step)}
+            recorder.insert("log", **recorder.at(step * 0.1), **line)
+    return recorder
+
+
+@pytest.mark.parametrize("limit", [1, 7, 60])
+def test_cursors_lead_through_all_that_was_left_out_while_more_is_recorded(
+    empty: sqlite3.Connection, limit: int
+) -> None:
+    recorder = record_a_busy_run(empty)
+    whole = find_events(empty, resolve_range(empty), limit=1000).events
+    found: list[Event] = []
+    page = find_events(empty, resolve_range(empty), limit=limit)
+    while True:
+        assert 0 < len(page.events) <= limit
+        found += page.events
+        if page.cursor is None:
+            break
+        time_s = 100.0 + len(found)
+        recorder.publish(time_s, {"lit": None, "mode": "c"})
+        line = {"level": "error", "source": "controller", "message": "later"}
+        recorder.insert("log", **recorder.at(time_s), **line)
+        page = find_events(empty, resolve_range(empty), limit=limit, after=page.cursor)
+
+    def subject(event: Event) -> tuple[object, ...]:
+        return event.kind, event.name, event.start_s
+
+    early = [subject(event) for event in found if event.start_s < 100.0]
+    assert sorted(early, key=str) == sorted(map(subject, whole), key=str)
+
+
+def test_what_happens_all_the_time_crowds_nothing_out_and_is_named_by_time(
+    empty: sqlite3.Connection,
+) -> None:
+    record_a_busy_run(empty)
+    events = find_events(empty, resolve_range(empty), limit=6)
+    told = [(event.kind, event.name) for event in events.events]
+    assert told.count(("log", "warning")) == 3 and told.count(("run", None)) == 1
+    changes = events.left_out["change"]
+    assert changes.count == events.totals["change"] - 2
+    assert (changes.first_s, changes.last_s) == pytest.approx((1.0, 98.0), abs=0.01)
+
+
+def test_pictures_are_told_only_where_they_are_asked_for(empty: sqlite3.Connection) -> None:
+    record_a_busy_run(empty)
+    assert "image" not in find_events(empty, resolve_range(empty)).totals
+    assert ask(empty, "image").totals == {"image": 200}
+
+
+def test_a_cursor_of_find_events_that_is_none_is_refused(rover: sqlite3.Connection) -> None:
+    for wrong in ("x", "[]", "5", '{"log": 3}', '{"log": [1, 2]}', "null"):
+        with pytest.raises(InvalidInputError, match="no cursor"):
+            find_events(rover, resolve_range(rover), after=wrong)
+
+
+def test_what_there_was_no_time_for_is_named(rover: sqlite3.Connection, tier: str) -> None:
+    found = resolve_range(rover, run_id=1)
+    events = find_events(rover, found, deadline_s=0.0)
+    (note,) = (note for note in events.notes if "not looked for: stuck" in note)
+    for kind in ("stuck", "silent", "flat", "jump", "oscillation"):
+        assert kind in note and kind not in events.totals
+    (note,) = (note for note in events.notes if "not looked for: run" in note)
+    assert "log" in note and "change" in note and not events.events
+
+
+def test_between_two_signals_the_time_is_looked_at(
+    rover: sqlite3.Connection,
+) -> None:
+    ticks = count()
+    time_range = resolve_range(rover, run_id=1)
+    detection = Detection(
+        rover,
+        known_signals(rover, time_range),
+        EventOptions(kinds=("jump",)),
+        Deadline(12.0, lambda: next(ticks)),
+        *(0.0, 119.9),
+    )
+    notes: list[str] = []
+    detection.events_touching(time_range.segments[0], notes)
+    told = " ".join(notes)
+    assert re.search(r"jump was not searched in \d+ signals", told), told
 
 
 def test_a_run_that_is_only_cruising_has_no_trouble(rover: sqlite3.Connection) -> None:

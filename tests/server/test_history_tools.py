@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -392,3 +393,21 @@ async def test_answers_are_the_same_before_and_after_rolling_up(
         assert {k: v for k, v in before.items() if k not in changing} == {
             k: v for k, v in after.items() if k not in changing
         }, tool
+
+
+async def test_what_find_events_does_not_show_is_named_by_time_and_a_cursor_shows_it(
+    story: Path,
+) -> None:
+    async with client_on(story) as client:
+        told: Counter[str] = Counter()
+        asked: dict[str, Any] = {"run_id": STORY, "limit": 4}
+        while True:
+            answer = await ask(client, "webots_find_events", **asked)
+            rows = answer["events"]["rows"]
+            assert 0 < len(rows) <= 4
+            told.update(row[0] for row in rows)
+            if "cursor" not in answer:
+                break
+            assert all(" from " in each for each in answer["not_shown"].values())
+            asked["cursor"] = answer["cursor"]
+    assert told == Counter(answer["totals"]) and "image" not in told

@@ -126,6 +126,7 @@ def trends(arguments: argparse.Namespace) -> None:
     argument("--for", type=float, default=0.0, dest="for_s", metavar="S",
              help="for at least S simulated seconds"),
     count("-n", "at most N events", default=50),
+    argument("--after", metavar="CURSOR", help="what an answer with that cursor left out"),
 )  # fmt: skip
 def events(arguments: argparse.Namespace) -> None:
     """Find what happened: changes, stuck, standstills, gaps, jumps, silent sensors, warnings."""
@@ -133,8 +134,9 @@ def events(arguments: argparse.Namespace) -> None:
 
     with reading(arguments) as connection:
         found = find_events(
-            connection, range_of(connection, arguments), _options(arguments), limit=arguments.n
-        )
+            connection, range_of(connection, arguments), _options(arguments), limit=arguments.n,
+            after=arguments.after,
+        )  # fmt: skip
     if arguments.json:
         return _print_json(found)
     several = len({event.run_id for event in found.events}) > 1
@@ -146,7 +148,13 @@ def events(arguments: argparse.Namespace) -> None:
         for event in found.events
     ]  # fmt: skip
     print_table(("run", "start_s", "duration_s", "kind", "name", "details"), rows)
-    print_notes([*found.notes, *([] if rows else ["nothing of these kinds in that range"])])
+    left_out = [
+        f"left out: {each.count} of kind {kind} from {each.first_s:.3f} to {each.last_s:.3f} s"
+        for kind, each in found.left_out.items()
+    ]
+    left_out += [f"--after '{found.cursor}' shows them, -n more at once"] if found.cursor else []
+    none = [] if rows else ["nothing of these kinds in that range"]
+    print_notes([*found.notes, *left_out, *none])
 
 
 @question(
@@ -223,13 +231,13 @@ def range_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> T
 
 
 def _options(arguments: argparse.Namespace) -> EventOptions:
-    from webots_mcp.store.detection.event import KINDS, EventOptions
+    from webots_mcp.store.detection.event import USUAL_KINDS, EventOptions
     from webots_mcp.store.detection.thresholds import thresholds_on
 
     limits = thresholds_on(
         arguments.signal or (), arguments.above, arguments.below, arguments.for_s
     )
-    kinds = tuple(arguments.kind or (("threshold",) if limits else KINDS))
+    kinds = tuple(arguments.kind or (("threshold",) if limits else USUAL_KINDS))
     return EventOptions(kinds=kinds, signals=tuple(arguments.signal or "*"), thresholds=limits)
 
 

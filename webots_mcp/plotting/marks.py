@@ -30,6 +30,9 @@ def event_lanes(
     ]
     lanes = [_lane(kind, found, part) for kind in kinds[:MOST_LANES]]
     notes = [note for note in found.notes if note not in part.notes]
+    if found.left_out:
+        kind, rest = max(found.left_out.items(), key=lambda item: item[1].count)
+        notes.append(f"{rest.count} events of kind {kind} up to {rest.last_s:.3f} s are not drawn")
     if left_out := kinds[MOST_LANES:]:
         notes.append(f"events left out: {', '.join(left_out)}")
     return lanes, notes

@@ -136,6 +136,13 @@ class EventsAnswer(NotedAnswer):
     totals: dict[str, int] | None = Field(
         default=None, description="How many there are of each kind, shown or not."
     )
+    not_shown: dict[str, str] | None = Field(
+        default=None,
+        description="How many of each kind there are beside these, and when they began.",
+    )
+    cursor: str | None = Field(
+        default=None, description="Ask again with this cursor for those that are not shown."
+    )
 
 
 class TimelineAnswer(NotedAnswer):
@@ -164,6 +171,10 @@ class MonitorAnswer(NotedAnswer):
     )
     totals: dict[str, int] | None = Field(
         default=None, description="How many events there are of each kind, shown or not."
+    )
+    not_shown: dict[str, str] | None = Field(
+        default=None,
+        description="How many of each kind there are beside these, and when they began.",
     )
 
 

@@ -53,7 +53,7 @@ TimeoutS = Annotated[
 ]
 _CURSOR: Final = "From the previous answer, to go on where it ended."
 Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
-TextCursor = Annotated[str, Field(max_length=500, description=_CURSOR)]
+TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
 Since = Annotated[
     float | str | None,
     Field(

@@ -13,7 +13,7 @@ from webots_mcp.connection import Role, connect
 from webots_mcp.contract import LOG_LEVELS, Database
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.schema import schema_version
-from webots_mcp.store.detection.event import KINDS, EventOptions, Kind
+from webots_mcp.store.detection.event import USUAL_KINDS, EventOptions, Kind
 from webots_mcp.store.detection.event import Event as FoundEvent
 from webots_mcp.store.events import Event, newest_events
 from webots_mcp.store.logs import LogFilter, LogLine, newest_lines
@@ -114,14 +114,15 @@ class Recording:
         """What the values of the run show: when it was stuck, where a signal jumped, and the like.
 
         Args:
-            kinds: `still`, `stuck`, `jump`, `oscillation`, `silent`, `gap`, ...; none for all.
+            kinds: `still`, `stuck`, `jump`, `oscillation`, `silent`, `gap`, ...; none for all but
+                pictures.
             options: More fields of `webots_mcp.store.detection.event.EventOptions`.
 
         Raises:
             InvalidInputError: There is no such kind.
         """
         self._roll_up()
-        wanted = EventOptions(kinds=kinds or KINDS, **options)
+        wanted = EventOptions(kinds=kinds or USUAL_KINDS, **options)
         with self._subject() as (connection, subject):
             whole = resolve_range(connection, robot=subject.robot, run_id=subject.run_id)
             found = find_events(connection, whole, wanted, limit=sys.maxsize, deadline_s=math.inf)

@@ -33,12 +33,13 @@ from webots_mcp.server.parameters import (
     ShownLimit,
     Since,
     StartS,
+    TextCursor,
     Until,
 )
 from webots_mcp.server.results import Table
-from webots_mcp.store.detection.event import KINDS, Event, EventOptions, Kind, Threshold
+from webots_mcp.store.detection.event import USUAL_KINDS, Event, EventOptions, Kind, Threshold
 from webots_mcp.store.detection.thresholds import thresholds_on
-from webots_mcp.store.questions.events import choose, find_events
+from webots_mcp.store.questions.events import Events, Found, search_events
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.recording import Recording, View
 
@@ -81,6 +82,7 @@ class EventTools:
         since: Since = None,
         until: Until = None,
         limit: ShownLimit = None,
+        cursor: TextCursor = "",
         robot: RobotName = None,
         run_id: RunId = None,
     ) -> EventsAnswer:
@@ -88,8 +90,9 @@ class EventTools:
 
         Changed modes and flags, still (it stood), stuck (it stood and should have moved; evidence
         says why), oscillation, jumps, thresholds, silent or flat sensors, recording gaps, runs,
-        commands, log lines, pictures: "since when, how often, in which mode".
-        Many jumps, silences or flat times of one signal are one event with count and says.
+        commands, log lines: "since when, how often, in which mode". Many jumps, silences or flat
+        times of one signal are one event with count and says. Pictures only with kinds=["image"].
+        What is not shown is counted; cursor shows it.
         """
         bounds = Bounds(last_s, start_s, end_s, since, until)
         thresholds = thresholds_on(signals or (), above, below, for_s)
@@ -105,7 +108,7 @@ class EventTools:
             return answer_about(
                 view,
                 EventsAnswer,
-                lambda: _found(view, bounds.resolve(view, run_id), options, limit),
+                lambda: _found(view, bounds.resolve(view, run_id), options, limit, cursor),
             )
 
 
@@ -113,33 +116,47 @@ def _kinds(kinds: Sequence[Kind] | None, thresholds: Sequence[Threshold]) -> tup
     """Who gives a threshold asks about that, unless other kinds are named."""
     if kinds and "threshold" in kinds and not thresholds:
         raise InvalidInputError("kinds=['threshold'] needs signals, and above or below")
-    return tuple(kinds) if kinds else ("threshold",) if thresholds else KINDS
+    return tuple(kinds) if kinds else ("threshold",) if thresholds else USUAL_KINDS
 
 
 def _found(
-    view: View, asked: TimeRange, options: EventOptions, limit: int | None
+    view: View, asked: TimeRange, options: EventOptions, limit: int | None, cursor: str
 ) -> dict[str, Any]:
-    found = find_events(view.connection, asked, options, limit=limit or DEFAULT_LIMIT)
-    events, left_out = fitting_events(found.events, BUDGET if limit is None else LARGE_BUDGET, view)
-    hints = [f"{left_out} more left out to keep it short: ask by kinds or time"] if left_out else []
-    hints += [] if found.totals else [_why_none(options)]
+    found = search_events(view.connection, asked, options, after=cursor or None)
+    budget = BUDGET if limit is None else LARGE_BUDGET
+    told, events = fitting_events(found, limit or DEFAULT_LIMIT, budget, view)
+    hints = ["ask again with this cursor for what is not shown"] if told.cursor else []
+    hints += [] if events else [_why_none(options, cursor, bool(found.totals))]
     return {
         "events": events,
         "totals": found.totals or None,
+        "not_shown": not_shown_of(told),
+        "cursor": told.cursor,
         "notes": notes_of(found.notes),
         "hint": "; ".join(hints) or None,
     }
 
 
-def fitting_events(found: Sequence[Event], budget: int, view: View) -> tuple[Table | None, int]:
-    """As many of the events as fit the budget, rare kinds whole; and how many were left out."""
-    events = list(found)
+def fitting_events(
+    found: Found, limit: int, budget: int, view: View
+) -> tuple[Events, Table | None]:
+    """At most `limit` of what was found, and as much of it as fits the budget."""
     while True:
-        made = events_table(events, view)
-        size = size_of(made.rows) if made else 0
-        if size <= budget or len(events) == 1:
-            return made, len(found) - len(events)
-        events = choose(events, max(1, min(len(events) - 1, int(len(events) * budget / size))))
+        told = found.told(view.connection, limit)
+        made = events_table(told.events, view)
+        size = size_of([made.rows if made else [], not_shown_of(told), told.cursor])
+        if size <= budget or limit <= 1:
+            return told, made
+        shown_now = len(told.events)
+        limit = max(1, min(shown_now - 1, int(shown_now * budget / size)))
+
+
+def not_shown_of(told: Events) -> dict[str, str] | None:
+    """How many of each kind are not shown, and from when to when they are."""
+    return {
+        kind: f"{each.count} from {seconds(each.first_s)} to {seconds(each.last_s)} s"
+        for kind, each in told.left_out.items()
+    } or None
 
 
 def events_table(events: Sequence[Event], view: View) -> Table | None:
@@ -164,7 +181,9 @@ def events_table(events: Sequence[Event], view: View) -> Table | None:
     return without_empty(columns, rows)
 
 
-def _why_none(options: EventOptions) -> str:
+def _why_none(options: EventOptions, cursor: str, any_before: bool) -> str:
+    if cursor and any_before:
+        return "nothing was left out before that cursor"
     if options.thresholds:
         return "never beyond the threshold that long: webots_get_trends tells the extremes"
     return "nothing of these kinds in that range: widen the range, or leave kinds and signals out"

@@ -16,19 +16,17 @@ from webots_mcp.server.boundary import READS, reporter, tool
 from webots_mcp.server.fitting import BUDGET, answer_about, notes_of
 from webots_mcp.server.history_results import MonitorAnswer
 from webots_mcp.server.parameters import MAX_WAIT_S, RobotName
-from webots_mcp.server.tools.events import fitting_events
+from webots_mcp.server.tools.events import fitting_events, not_shown_of
 from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
 from webots_mcp.server.watching import Window, movement, window_from
-from webots_mcp.store.detection.event import KINDS, Event, EventOptions, Kind
-from webots_mcp.store.questions.events import choose, find_events
+from webots_mcp.store.detection.event import Event
+from webots_mcp.store.questions.events import search_events
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.recording import Recording, View
 
 _REPORT_INTERVAL_S: Final = 1.0
 _SHOWN_SIGNALS: Final = 12
 _SHOWN_EVENTS: Final = 30
-_MOST_EVENTS: Final = 500
-_WATCHED_KINDS: Final[tuple[Kind, ...]] = tuple(kind for kind in KINDS if kind != "image")
 
 
 class MonitorTools:
@@ -102,11 +100,9 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     recorded = bool(window.rows.segments)
     told = trends(view.connection, window.rows, limit=MOST_SIGNALS).runs if recorded else ()
     budget = BUDGET // 2 // max(len(told), 1)
-    options = EventOptions(kinds=_WATCHED_KINDS)
-    found = find_events(view.connection, window.around, options, limit=_MOST_EVENTS)
+    found = search_events(view.connection, window.around)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
-    shown = choose(happened, _SHOWN_EVENTS)
-    events, left_out = fitting_events(shown, BUDGET // 2, view)
+    shown, events = fitting_events(found.only(happened), _SHOWN_EVENTS, BUDGET // 2, view)
     rows = sum(run.rows for run in told)
     return {
         "rows": rows,
@@ -114,8 +110,9 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
         "trends": [trend_tables(run, _SHOWN_SIGNALS, budget) for run in told] or None,
         "events": events,
         "totals": dict(Counter(event.kind for event in happened)) or None,
-        "notes": notes_of(window.rows.notes),
-        "hint": _hint(rows, len(happened) - len(shown) + left_out, view),
+        "not_shown": not_shown_of(shown),
+        "notes": notes_of(tuple(dict.fromkeys((*window.rows.notes, *found.notes)))),
+        "hint": _hint(rows, bool(shown.left_out), wall_start_s, view),
     }
 
 
@@ -126,10 +123,12 @@ def _in_window(event: Event, window: Window, wall_start_s: float) -> bool:
     return event.wall_time_s >= wall_start_s or lasted
 
 
-def _hint(rows: int, left_out: int, view: View) -> str | None:
+def _hint(rows: int, left_out: bool, wall_start_s: float, view: View) -> str | None:
     if rows == 0:
         return _why_nothing(view)
-    return "more events: ask webots_find_events with last_s" if left_out else None
+    if not left_out:
+        return None
+    return f"more events: webots_find_events(since={wall_start_s:.3f}) shows what is left out"
 
 
 def _why_nothing(view: View) -> str:

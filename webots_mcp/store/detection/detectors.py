@@ -13,7 +13,7 @@ from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
 from webots_mcp.store.analysis.motion import Motion
 from webots_mcp.store.analysis.summary import Summary, usable_numbers
-from webots_mcp.store.detection.event import KINDS, Event, EventOptions, Kind
+from webots_mcp.store.detection.event import USUAL_KINDS, Event, EventOptions, Kind
 from webots_mcp.store.detection.stored import wall_time_at
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.intervals import MOSTLY, Beyond, Flat, Silent, Span, common
@@ -279,7 +279,7 @@ def oscillation_events(search: Search) -> Iterator[Event]:
     asked = search.options.signals != EventOptions.signals
     signals = [each for each in search.numbers if asked or _SWINGING.search(each.name)]
     left = len(search.numbers) - len(signals)
-    if left and len(search.options.kinds) < len(KINDS):  # who asks about it is told
+    if left and len(search.options.kinds) < len(USUAL_KINDS):  # who asks about it is told
         search.view.notes.append(
             f"oscillation was not searched in {left} of {len(search.numbers)} signals, whose names "
             "are not of what a robot swings with: name them in signals"

@@ -15,6 +15,8 @@ Kind = Literal[
     "command", "log", "noticed", "image",
 ]  # fmt: skip
 KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
+# What is looked for unless kinds are named: a picture is no news, and there may be thousands.
+USUAL_KINDS: Final[tuple[Kind, ...]] = tuple(kind for kind in KINDS if kind != "image")
 LEVELS: Final = LOG_LEVELS
 
 
@@ -73,7 +75,7 @@ class EventOptions:
     """What counts as an event.
 
     Attributes:
-        kinds: Which kinds are looked for.
+        kinds: Which kinds are looked for; pictures only where they are named.
         signals: Names, with `*`, of the signals that are looked at.
         position: The two signals of the position in metres; None finds them by name (`pose.0`
             and `pose.1`, `position.x` and `position.y`, `gps.0` and so on).
@@ -96,7 +98,7 @@ class EventOptions:
         log_level: Log lines of this level and above.
     """
 
-    kinds: tuple[Kind, ...] = KINDS
+    kinds: tuple[Kind, ...] = USUAL_KINDS
     signals: tuple[str, ...] = ("*",)
     position: tuple[str, str] | None = None
     mode: str | None = None

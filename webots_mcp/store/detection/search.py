@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from operator import attrgetter
 from typing import Final
@@ -109,8 +109,15 @@ class Detection:
         view = view_of(self.connection, segment, list(needed.values()), self.deadline)
         common = (self.known, numbers, motion, self.options, view, self.newest_s, self.deadline)
         search = Search(self.connection, segment, *common)
-        found = [event for kind in kinds for event in DETECTORS[kind](search)]
+        found: list[Event] = []
+        missed: list[Kind] = []
+        for kind in kinds:
+            if self.deadline.passed:
+                missed.append(kind)
+            else:
+                found += DETECTORS[kind](search)
         notes += view.notes
+        notes += [not_looked_for(missed)] if missed else []
         return found
 
     def _is_cut(self, event: Event, looked_at: Segment) -> bool:
@@ -125,6 +132,12 @@ class Detection:
         began_before = looked_at.start_s > self.first_s and not has_begin
         goes_on = looked_at.end_s <= self.newest_s and not has_end
         return began_before or goes_on
+
+
+def not_looked_for(what: Iterable[str]) -> str:
+    """The note on what there was no time for."""
+    asked = "ask for fewer kinds, signals or seconds"
+    return f"the time was over, not looked for: {', '.join(what)}; {asked}"
 
 
 def _reaches_into(event: Event, segment: Segment) -> bool:

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from importlib import import_module
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import Event, EventOptions, Kind
 from webots_mcp.store.detection.grouping import grouped
-from webots_mcp.store.detection.search import Detection
+from webots_mcp.store.detection.search import Detection, not_looked_for
 from webots_mcp.store.detection.stored import (
+    MOST_CHANGES,
+    MOST_OF_A_KIND,
     change_events,
     command_events,
     gap_events,
@@ -23,6 +27,7 @@ from webots_mcp.store.detection.stored import (
     noticed_events,
     run_events,
 )
+from webots_mcp.store.questions.places import Place, placed, read_place
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, just_after, recorded_bounds
 from webots_mcp.store.reading.snapshot import in_one_snapshot
@@ -31,6 +36,8 @@ from webots_mcp.store.signals.flatten import Value, flatten, parse
 from webots_mcp.store.signals.registry import Signal
 
 MOST_AROUND: Final = 6  # values that are told with an event
+# What happens all the time: shown in the room that all other kinds leave.
+ROUTINE: Final = frozenset[Kind]({"change", "image"})
 
 _IS_OPEN: Final = "SELECT id, session_id, ended_wall_time_s IS NULL FROM run WHERE id = ?"
 _ROW_AT: Final = (
@@ -40,22 +47,77 @@ _ROW_AT: Final = (
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """Events of one kind that were found and are not told: how many, and when they began."""
+
+    count: int
+    first_s: float
+    last_s: float
+
+
+@dataclass(frozen=True)
 class Events:
     """The answer of `find_events`.
 
     Attributes:
         events: In the order of wall time; at most `limit` of all that were found.
         totals: How many of each kind were found.
-        notes: What was not searched, or left out, and where the range leaves the recording.
+        left_out: Those that are told neither here nor on the pages before.
+        cursor: Give it as `after` for those that are left out; None where none are.
+        notes: What was not searched, and where the range leaves the recording.
     """
 
     robot: str
     events: tuple[Event, ...]
     totals: dict[Kind, int]
+    left_out: dict[Kind, LeftOut]
+    cursor: str | None
     notes: tuple[str, ...]
 
 
-@in_one_snapshot
+@dataclass(frozen=True)
+class Found:
+    """All that happened in a range, of which an answer tells a part.
+
+    Attributes:
+        entries: In order, without what the pages before have told.
+        context: The signals whose values are told with each event.
+        borders: By kind, the place before which nothing has been told yet; None: nowhere.
+    """
+
+    robot: str
+    entries: tuple[tuple[Place, Event], ...]
+    totals: dict[Kind, int]
+    notes: tuple[str, ...]
+    context: tuple[Signal, ...]
+    borders: dict[str, Place | None] = field(default_factory=dict[str, "Place | None"])
+
+    @property
+    def events(self) -> list[Event]:
+        """Without their places."""
+        return [event for _, event in self.entries]
+
+    def only(self, events: Sequence[Event]) -> Found:
+        """The same of these events alone."""
+        wanted = {id(event) for event in events}
+        entries = tuple(entry for entry in self.entries if id(entry[1]) in wanted)
+        return replace(self, entries=entries, totals=dict(Counter(e.kind for e in events)))
+
+    def told(self, connection: sqlite3.Connection, limit: int) -> Events:
+        """An answer of at most `limit` events: see `choose`."""
+        chosen = {id(event) for event in choose(self.events, limit)}
+        told = [entry for entry in self.entries if id(entry[1]) in chosen]
+        rest = [entry for entry in self.entries if id(entry[1]) not in chosen]
+        return Events(
+            self.robot,
+            tuple(_with_values(connection, event, self.context) for _, event in told),
+            self.totals,
+            _left_out([event for _, event in rest]),
+            _cursor(told, rest, self.borders),
+            self.notes,
+        )
+
+
 def find_events(
     connection: sqlite3.Connection,
     time_range: TimeRange,
@@ -64,6 +126,7 @@ def find_events(
     limit: int = 50,
     around: Sequence[str] | None = None,
     group: bool = True,
+    after: str | None = None,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> Events:
     """What happened in a range: with its true begin and end, also where it reaches out of it.
@@ -75,31 +138,60 @@ def find_events(
         connection: Any.
         time_range: From `resolve_range`.
         options: What counts as an event; None for the defaults.
-        limit: At most so many events. Where there are more, rare kinds are kept whole, and of the
-            others the newest.
+        limit: At most so many events: see `choose`.
         around: Signals whose values are told with each event; None for mode, position and
             commanded speed.
         group: Many dropouts, steps or silences of one signal are told as one event, which counts
             them; else each is one.
-        deadline_s: After it, what was found so far is the answer, and the notes say so.
+        after: The `cursor` of an answer, for the events that it left out.
+        deadline_s: After it, what was found so far is the answer, and the notes say what was not
+            looked at.
 
     Raises:
         UnknownSignalError: A name in the options or in `around` meets nothing.
+        InvalidInputError: `after` is no cursor.
     """
+    found = search_events(
+        connection, time_range, options, around=around, group=group, after=after,
+        deadline_s=deadline_s,
+    )  # fmt: skip
+    return found.told(connection, limit)
+
+
+@in_one_snapshot
+def search_events(
+    connection: sqlite3.Connection,
+    time_range: TimeRange,
+    options: EventOptions | None = None,
+    *,
+    around: Sequence[str] | None = None,
+    group: bool = True,
+    after: str | None = None,
+    deadline_s: float = QUESTION_DEADLINE_S,
+) -> Found:
+    """All that happened in a range; see `find_events` for the arguments."""
     options = options or EventOptions()
+    borders = _read_cursor(after) if after else None
     known = known_signals(connection, time_range)
     context = _context(known, options, around)
     found, notes = collect(connection, time_range, options, deadline_s)
     found = grouped(found, known) if group else found
-    chosen = choose(found, limit)
-    if len(chosen) < len(found):
-        notes.append(f"{len(found) - len(chosen)} of {len(found)} events are left out: ask by kind")
-    return Events(
+    return Found(
         time_range.robot,
-        tuple(_with_values(connection, event, context) for event in chosen),
+        tuple(entry for entry in placed(found) if _is_left(entry[0], borders)),
         dict(Counter(event.kind for event in found)),
         tuple(dict.fromkeys(notes)),
+        tuple(context),
+        borders or {},
     )
+
+
+def _is_left(place: Place, borders: dict[str, Place | None] | None) -> bool:
+    """Whether no page before has told of the event at that place."""
+    if borders is None:
+        return True
+    border = borders.get(place[3])
+    return place[3] in borders and (border is None or place < border)
 
 
 @in_one_snapshot
@@ -120,7 +212,7 @@ def collect(
     notes = list(time_range.notes)
     found: list[Event] = []
     for segment in time_range.segments:
-        found += _stored(connection, segment, known, options, deadline)
+        found += _stored(connection, segment, known, options, deadline, notes)
         recorded = _recorded(connection, segment)
         if recorded is not None:
             detection = Detection(connection, known, options, deadline, *recorded.bounds)
@@ -151,25 +243,44 @@ def _stored(
     known: dict[str, Signal],
     options: EventOptions,
     deadline: Deadline,
-) -> Iterator[Event]:
-    """Events of the kinds that tables tell."""
+    notes: list[str],
+) -> list[Event]:
+    """Events of the kinds that tables tell; the notes name what there was no time for."""
     recorded = _recorded(connection, segment)
     signals = resolve_signals(known, options.signals) if known else []
-    if "run" in options.kinds:
-        yield from run_events(connection, segment)
-    if "command" in options.kinds:
-        yield from command_events(connection, segment)
-    if "log" in options.kinds:
-        yield from log_events(connection, segment, options)
-    if "noticed" in options.kinds:
-        yield from noticed_events(connection, segment)
-    if "image" in options.kinds:
-        yield from image_events(connection, segment)
-    if "gap" in options.kinds and recorded is not None:
-        yield from gap_events(connection, recorded.segment, deadline)
-    if "change" in options.kinds and recorded is not None:
-        newest_s = recorded.bounds[1]
-        yield from change_events(connection, recorded.segment, newest_s, signals, deadline)
+    finders: dict[Kind, Callable[[], Iterable[Event]]] = {
+        "run": lambda: run_events(connection, segment),
+        "command": lambda: command_events(connection, segment),
+        "log": lambda: log_events(connection, segment, options),
+        "noticed": lambda: noticed_events(connection, segment),
+        "image": lambda: image_events(connection, segment),
+    }
+    if recorded is not None:
+        part, newest_s = recorded.segment, recorded.bounds[1]
+        finders["gap"] = lambda: gap_events(connection, part, deadline)
+        finders["change"] = lambda: change_events(connection, part, newest_s, signals, deadline)
+    found: list[Event] = []
+    missed: list[str] = []
+    for kind, find in finders.items():
+        if kind in options.kinds and deadline.passed:
+            missed.append(kind)
+        elif kind in options.kinds:
+            found += find()
+    notes += [not_looked_for(missed)] if missed else []
+    notes += _bounded(found)
+    return found
+
+
+def _bounded(events: Sequence[Event]) -> Iterable[str]:
+    """Notes on kinds of which only the newest were read."""
+    names = Counter(event.name for event in events if event.kind == "change")
+    kinds = Counter(event.kind for event in events if event.kind != "change")
+    for name, count in names.items():
+        if count >= MOST_CHANGES:
+            yield f"only the newest {count} changes of {name} are counted: ask an earlier end_s"
+    for kind, count in kinds.items():
+        if count >= MOST_OF_A_KIND:
+            yield f"only the newest {count} of kind {kind} are counted: ask for an earlier end_s"
 
 
 class _Recorded(NamedTuple):
@@ -188,23 +299,64 @@ def _recorded(connection: sqlite3.Connection, segment: Segment) -> _Recorded | N
     return _Recorded(replace(segment, start_s=start_s, end_s=end_s), bounds)
 
 
-def in_order(event: Event) -> tuple[float, int, float]:
-    """The one clock of all events: wall time, and where that is equal simulation time."""
-    return event.wall_time_s, event.run_id, event.start_s
-
-
 def choose(events: Sequence[Event], limit: int) -> list[Event]:
-    """At most `limit` events in order of time: rare kinds whole, of the others the newest."""
-    ordered = sorted(events, key=in_order)
+    """At most `limit` of the events, in their order: rare kinds whole, of the others the newest.
+
+    What happens all the time (changes, pictures) gets the room that the other kinds leave.
+    """
+    matter = [event for event in events if event.kind not in ROUTINE]
+    kept = _shared_out(matter, limit)
+    kept |= _shared_out([event for event in events if event.kind in ROUTINE], limit - len(kept))
+    return [event for event in events if id(event) in kept]
+
+
+def _shared_out(events: Sequence[Event], limit: int) -> set[int]:
+    """The ids of at most `limit` events; each kind gets what the rarer ones leave it."""
     left = limit
     kept: set[int] = set()
-    counts = Counter(event.kind for event in ordered)
+    counts = Counter(event.kind for event in events)
     for rank, (kind, _) in enumerate(reversed(counts.most_common())):
         share = left // (len(counts) - rank)
-        newest = [event for event in ordered if event.kind == kind][-share:] if share else []
+        newest = [event for event in events if event.kind == kind][-share:] if share else []
         kept.update(id(event) for event in newest)
         left -= len(newest)
-    return [event for event in ordered if id(event) in kept]
+    return kept
+
+
+def _left_out(events: Sequence[Event]) -> dict[Kind, LeftOut]:
+    """By kind; the events are in order."""
+    by_kind: dict[Kind, list[Event]] = {}
+    for event in events:
+        by_kind.setdefault(event.kind, []).append(event)
+    return {
+        kind: LeftOut(len(each), each[0].start_s, each[-1].start_s)
+        for kind, each in by_kind.items()
+    }
+
+
+def _cursor(
+    told: Sequence[tuple[Place, Event]],
+    rest: Sequence[tuple[Place, Event]],
+    borders: dict[str, Place | None],
+) -> str | None:
+    """Of each kind with events left out, before which place they are; null: anywhere.
+
+    Of a kind the newest are told first, so that what is recorded meanwhile moves nothing.
+    """
+    firsts = borders | {place[3]: place for place, _ in reversed(told)}
+    kinds = dict.fromkeys(place[3] for place, _ in rest)
+    return json.dumps({kind: firsts.get(kind) for kind in kinds}) if kinds else None
+
+
+def _read_cursor(text: str) -> dict[str, Place | None]:
+    """By kind, before which place the events are that the cursor's answer left out."""
+    try:
+        read: dict[str, Any] = json.loads(text)
+        return {kind: place and read_place(place) for kind, place in read.items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise InvalidInputError(
+            f"after={text[:80]!r} is no cursor: give the `cursor` of an answer, as it was"
+        ) from error
 
 
 def _with_values(connection: sqlite3.Connection, event: Event, context: Sequence[Signal]) -> Event:

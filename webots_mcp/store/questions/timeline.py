@@ -10,15 +10,14 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.detection.event import Event, EventOptions, Kind
-from webots_mcp.store.questions.events import collect, in_order
+from webots_mcp.store.questions.events import collect
+from webots_mcp.store.questions.places import Place, placed, read_place
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 
 STORED: Final[tuple[Kind, ...]] = ("run", "gap", "change", "command", "log", "noticed", "image")
 MOST_ENTRIES: Final = 500
-
-Place = tuple[float, int, float, str, str, int]
 
 
 @dataclass(frozen=True)
@@ -65,7 +64,7 @@ def timeline(
         raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ENTRIES}")
     options = options or EventOptions(kinds=STORED, log_level="info")
     found, notes = collect(connection, time_range, options, deadline_s)
-    entries = _entries(found)
+    entries = placed(found)
     left = [entry for entry in entries if entry[0] > _read_cursor(after)] if after else entries
     page = left[:limit]
     return Timeline(
@@ -77,21 +76,9 @@ def timeline(
     )
 
 
-def _entries(events: list[Event]) -> list[tuple[Place, Event]]:
-    """The events in order, each with its place; events that are equal in all else are counted."""
-    seen: Counter[Place] = Counter()
-    entries: list[tuple[Place, Event]] = []
-    for event in events:
-        place = (*in_order(event), event.kind, event.name or "", 0)
-        entries.append(((*place[:-1], seen[place]), event))
-        seen[place] += 1
-    return sorted(entries, key=lambda entry: entry[0])
-
-
 def _read_cursor(text: str) -> Place:
     try:
-        wall_s, run_id, start_s, kind, name, number = json.loads(text)
-        return float(wall_s), int(run_id), float(start_s), str(kind), str(name), int(number)
+        return read_place(json.loads(text))
     except (ValueError, TypeError) as error:
         raise InvalidInputError(
             f"{text!r} is no cursor: give the `cursor` of the page before, as it was"

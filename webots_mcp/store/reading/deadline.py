@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import sqlite3
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import Final
 
 QUESTION_DEADLINE_S: Final = 2.0
@@ -15,18 +15,25 @@ _STEPS_PER_LOOK: Final = 20_000  # of SQLite's virtual machine: about 0.5 ms
 class Deadline:
     """When a question has to be answered with what is known by then."""
 
-    def __init__(self, limit_s: float = QUESTION_DEADLINE_S) -> None:
-        self._until_s = time.monotonic() + limit_s
+    def __init__(
+        self, limit_s: float = QUESTION_DEADLINE_S, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._clock = clock
+        self._until_s = clock() + limit_s
+
+    def part(self, share: float) -> Deadline:
+        """One for a part of the work: after that share of the time that is left."""
+        return Deadline(share * self.left_s, self._clock)
 
     @property
     def passed(self) -> bool:
         """Whether the time is over."""
-        return time.monotonic() >= self._until_s
+        return self._clock() >= self._until_s
 
     @property
     def left_s(self) -> float:
         """Seconds that are left; 0 once it has passed."""
-        return max(0.0, self._until_s - time.monotonic())
+        return max(0.0, self._until_s - self._clock())
 
     @contextlib.contextmanager
     def interrupting(self, connection: sqlite3.Connection) -> Generator[None]:

@@ -32,6 +32,7 @@ from webots_mcp.store.rollup.rolling import BUCKET_S, bucket_of, watermark
 from webots_mcp.store.rollup.tables import both
 from webots_mcp.store.signals.registry import Signal
 
+READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
 JUMP_BUCKETS: Final = 20  # of each signal of a long segment that are read
 JUMP_RANGE: Final = 3.0  # times the usual range of a bucket: there may be a jump in it
 SAMPLES_PER_STAY: Final = 5
@@ -114,7 +115,7 @@ def view_of(
     """The view that suits the length of the segment."""
     if exceeds(connection, segment):
         return LongView(connection, segment, signals, deadline)
-    return RowView(read_columns(connection, segment, signals, deadline))
+    return RowView(read_columns(connection, segment, signals, deadline.part(READING_SHARE)))
 
 
 class RowView:

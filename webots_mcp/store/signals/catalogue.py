@@ -205,7 +205,7 @@ def _unknown(known: dict[str, Signal], name: str) -> str:
     if not known:
         return f"no signal {name!r}: no state row with values has been recorded yet"
     offer = ", ".join(nearest_first(name.replace("*", ""), known)[:_MOST_OFFERED])
-    return f"no signal {name!r} is recorded; the nearest of {len(known)} names: {offer}"
+    return f"no signal {name!r} is recorded; there is {offer} (the nearest of {len(known)})"
 
 
 @in_one_snapshot

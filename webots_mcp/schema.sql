@@ -310,27 +310,6 @@ SELECT (
   l.run_id, l.id AS log_id, l.sim_time_s,
   strftime('%Y-%m-%d %H:%M:%f', l.wall_time_s, 'unixepoch') AS utc, l.level, l.source, l.message
 FROM log l;
-CREATE VIEW robot_period AS
-/* How long a text or flag of the state kept a value. Signals that never changed have none. */
-SELECT (
-  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = p.run_id) AS robot,
-  p.run_id, p.name AS signal, p.value, p.start_s,
-  coalesce(p.next_s, u.last_sim_time_s) AS end_s,
-  round(coalesce(p.next_s, u.last_sim_time_s) - p.start_s, 3) AS duration_s
-FROM (
-  SELECT run_id, name, value, start_s,
-    lead(start_s) OVER (PARTITION BY run_id, name ORDER BY start_s, id, side) AS next_s
-  FROM (
-    SELECT e.run_id, e.name, e.id, k.value AS side,
-      CASE k.value WHEN 0 THEN v.started_sim_time_s ELSE e.sim_time_s END AS start_s,
-      CASE WHEN json_valid(e.data)
-        THEN json_extract(e.data, CASE k.value WHEN 0 THEN '$.from' ELSE '$.to' END) END AS value
-    FROM event e JOIN run v ON v.id = e.run_id CROSS JOIN json_each('[0, 1]') k
-    WHERE e.kind = 'change' AND (k.value = 1 OR NOT EXISTS (
-      SELECT 1 FROM event b
-      WHERE b.run_id = e.run_id AND b.kind = 'change' AND b.name = e.name AND b.id < e.id))
-  ) c
-) p JOIN run u ON u.id = p.run_id;
 CREATE TABLE recording (
 	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
 	created_wall_time_s FLOAT NOT NULL, 
@@ -376,4 +355,25 @@ CREATE VIEW all_rollup AS
 /* Rollups, those of buckets that are over and the newest. */
 SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines FROM rollup
 UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines FROM recent_rollup;
+CREATE VIEW robot_period AS
+/* How long a text or flag of the state kept a value. Signals that never changed have none. */
+SELECT (
+  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = p.run_id) AS robot,
+  p.run_id, p.name AS signal, p.value, p.start_s,
+  coalesce(p.next_s, u.last_sim_time_s) AS end_s,
+  round(coalesce(p.next_s, u.last_sim_time_s) - p.start_s, 3) AS duration_s
+FROM (
+  SELECT run_id, name, value, start_s,
+    lead(start_s) OVER (PARTITION BY run_id, name ORDER BY start_s, id, side) AS next_s
+  FROM (
+    SELECT e.run_id, e.name, e.id, k.value AS side,
+      CASE k.value WHEN 0 THEN coalesce((SELECT min(f.sim_time_s) FROM state f WHERE f.run_id = v.id AND f.sim_time_s <= e.sim_time_s AND v.purged_rows = 0), v.started_sim_time_s /* purged */) ELSE e.sim_time_s END AS start_s,
+      CASE WHEN json_valid(e.data)
+        THEN json_extract(e.data, CASE k.value WHEN 0 THEN '$.from' ELSE '$.to' END) END AS value
+    FROM event e JOIN run v ON v.id = e.run_id CROSS JOIN json_each('[0, 1]') k
+    WHERE e.kind = 'change' AND (k.value = 1 OR NOT EXISTS (
+      SELECT 1 FROM event b
+      WHERE b.run_id = e.run_id AND b.kind = 'change' AND b.name = e.name AND b.id < e.id))
+  ) c
+) p JOIN run u ON u.id = p.run_id;
 INSERT INTO alembic_version (version_num) VALUES ('0004');

@@ -83,6 +83,12 @@ CREATE VIEW all_rollup AS
 /* Rollups, those of buckets that are over and the newest. */
 SELECT {ROLLUP} FROM rollup
 UNION ALL SELECT {ROLLUP} FROM recent_rollup"""
+# A value held from the run's first row on: the run itself begins earlier, with its controller.
+RUN_START = "v.started_sim_time_s"
+FIRST_ROW = (
+    "coalesce((SELECT min(f.sim_time_s) FROM state f WHERE f.run_id = v.id "
+    "AND f.sim_time_s <= e.sim_time_s AND v.purged_rows = 0), v.started_sim_time_s /* purged */)"
+)
 NEW_UUID = {
     "sqlite": "lower(hex(randomblob(4)) || '-' || hex(randomblob(2)) || '-4' || "
     "substr(hex(randomblob(2)), 2) || '-' || substr('89ab', 1 + (random() & 3), 1) || "
@@ -128,7 +134,17 @@ def upgrade() -> None:
     create_recent_rollup()
     op.execute(ALL_ROLLUP)
     if dialect == "sqlite":
+        replace_in_robot_period(RUN_START, FIRST_ROW)
         op.execute("PRAGMA user_version = 4")
+
+
+def replace_in_robot_period(old: str, new: str) -> None:
+    """Make the view again with another expression for the start of a signal's first period."""
+    connection = op.get_bind()
+    found = "SELECT sql FROM sqlite_master WHERE type = 'view' AND name = 'robot_period'"
+    sql: str = connection.exec_driver_sql(found).scalar_one()
+    connection.exec_driver_sql("DROP VIEW robot_period")
+    connection.exec_driver_sql(sql.replace(old, new))
 
 
 def create_recent_rollup() -> None:
@@ -154,6 +170,8 @@ def create_recent_rollup() -> None:
 
 
 def downgrade() -> None:
+    if op.get_context().dialect.name == "sqlite":
+        replace_in_robot_period(FIRST_ROW, RUN_START)
     op.execute("DROP VIEW all_rollup")
     op.execute(f"INSERT INTO rollup ({ROLLUP}) SELECT {ROLLUP} FROM recent_rollup")
     op.drop_table("recent_rollup")

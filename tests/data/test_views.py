@@ -90,10 +90,23 @@ def test_periods_cover_each_run_without_gap_or_overlap(reader: sqlite3.Connectio
         "WHERE run_id = 1 AND signal = 'mode' ORDER BY start_s",
     )
     assert [period[0] for period in periods] == ["cruise", "back_up", "turn", "cruise"]
-    ends = rows(reader, "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = 1")[0]
+    first = "SELECT min(sim_time_s) FROM state WHERE run_id = run.id"
+    ends = rows(reader, f"SELECT ({first}), last_sim_time_s FROM run WHERE id = 1")[0]
     assert (periods[0][1], periods[-1][2]) == ends
     assert [period[1] for period in periods[1:]] == [period[2] for period in periods[:-1]]
     assert sum(period[3] for period in periods) == pytest.approx(ends[1] - ends[0], abs=0.01)
+
+
+def test_the_first_period_begins_with_the_first_row_not_with_the_controller(
+    recorder: Recorder,
+) -> None:
+    for time_s, mode in ((5.0, "a"), (8.0, "b"), (9.0, "b")):
+        recorder.publish(time_s, {"mode": mode})
+    change = {"kind": "change", "name": "mode", "data": '{"from": "a", "to": "b"}'}
+    recorder.insert("event", **recorder.at(8.0), **change)
+    recorder.end_run("finished")
+    sql = "SELECT value, start_s, end_s FROM robot_period ORDER BY start_s"
+    assert rows(recorder.connection, sql) == [("a", 5.0, 8.0), ("b", 8.0, 9.0)]
 
 
 def test_runs_tell_durations_speed_and_rows(reader: sqlite3.Connection) -> None:

@@ -71,6 +71,14 @@ def test_a_range_that_leaves_the_recording_says_so(
     assert words in resolve_range(rover, run_id=1, **bounds).notes[0]
 
 
+def test_more_seconds_back_than_a_run_has_lasted_name_the_run_before(
+    rover: sqlite3.Connection,
+) -> None:
+    told = resolve_range(rover, run_id=2, last_s=60.0).notes[-1]
+    assert "run 2 (begun by reset) has lasted for 29.9 s only" in told and "run 1" in told
+    assert "run 1" not in " ".join(resolve_range(rover, run_id=2, last_s=29.9).notes)
+
+
 @pytest.mark.parametrize(
     ("bounds", "words"),
     [

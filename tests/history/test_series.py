@@ -174,3 +174,13 @@ def test_rows_after_the_watermark_are_in_the_answer(empty: sqlite3.Connection, t
     assert column(run, "x").whole[:2] == (599, 599)
     assert column(run, "x").whole.last == 599.0
     assert [point.value for point in run.changes[0].points] == ["m0", "m1", "m2"]
+
+
+def test_integers_beyond_64_bits_stay_what_they_are_in_rows(empty: sqlite3.Connection) -> None:
+    numbers = [2**63 - 1, 2**63, -(2**63) - 1, 10**30 + 1]
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step, number in enumerate(numbers):
+        recorder.publish(float(step), {"ticks": number})
+    assert list(query_rows(empty, resolve_range(empty), ["ticks"]).values["ticks"]) == numbers

@@ -76,7 +76,9 @@ def query_rows(
         rest = rows_after(connection, segment, after_id)
         if rest is not None and room > 0 and not any(part.cut for part in parts):
             parts.append(
-                read_columns(connection, rest, signals, deadline, after_id=after_id, limit=room)
+                read_columns(
+                    connection, rest, signals, deadline, after_id=after_id, limit=room, exact=True
+                )
             )
             room -= len(parts[-1].ids)
     return _page(time_range, signals, parts, limit, cut=any(part.cut for part in parts))

@@ -32,6 +32,10 @@ _PURGED: Final = (
     "SELECT started_sim_time_s, last_sim_time_s FROM run WHERE id = ? AND purged_rows > 0 "
     "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = run.id)"
 )
+_RUN_BEFORE: Final = (
+    "SELECT (SELECT max(id) FROM run b WHERE b.robot_id = run.robot_id AND b.id < run.id), "
+    "start_reason FROM run WHERE id = ?"
+)
 _FIRST: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
 _NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"
 _RUNS_IN: Final = (
@@ -223,8 +227,20 @@ def _in_simulation_time(
     end = just_after(max(newest_s, start)) if end_s is None else _bound(connection, subject, end_s)
     _require_order(start, end, "start_s", "end_s")
     segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
-    notes = tuple(coverage_notes(connection, run_id, (start, end), bounds))
-    return TimeRange(subject.robot_id, subject.robot, (segment,), "simulation", notes)
+    notes = [*coverage_notes(connection, run_id, (start, end), bounds)]
+    notes += _too_young(connection, subject, last_s, newest_s - first_s)
+    return TimeRange(subject.robot_id, subject.robot, (segment,), "simulation", tuple(notes))
+
+
+def _too_young(
+    connection: sqlite3.Connection, subject: Subject, last_s: float | None, age_s: float
+) -> list[str]:
+    """That the run has not lasted for `last_s`, and which run came before it."""
+    if last_s is None or moment_of(last_s) <= age_s:
+        return []
+    before, began_by = connection.execute(_RUN_BEFORE, (subject.run_id,)).fetchone()
+    young = f"run {subject.run_id} (begun by {began_by}) has lasted for {_told(age_s)} s only"
+    return [young if before is None else f"{young}; what was before it is in run {before}"]
 
 
 def _bound(connection: sqlite3.Connection, subject: Subject, time_s: float) -> float:

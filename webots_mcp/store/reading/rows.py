@@ -70,6 +70,7 @@ def read_columns(
     *,
     after_id: int = 0,
     limit: int = -1,
+    exact: bool = False,
 ) -> Columns:
     """Read the rows of a segment, in order, until the deadline.
 
@@ -80,9 +81,10 @@ def read_columns(
         deadline: After it no further rows are read, and the answer says that it was cut.
         after_id: Only rows with greater ids: those after the watermark, or after a page.
         limit: At most so many rows; -1 for all.
+        exact: Integers beyond 2^63 as they are, of which SQLite makes floats.
     """
     columns = Columns(segment.run_id, values={signal.name: [] for signal in signals})
-    decode = len(signals) > MAX_EXTRACTED or any(signal.decoded for signal in signals)
+    decode = exact or len(signals) > MAX_EXTRACTED or any(signal.decoded for signal in signals)
     read = _read_decoded if decode else _read_extracted
     bounds = (segment.run_id, segment.start_s, segment.end_s)
     parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id, limit)

@@ -134,6 +134,18 @@ def make_folder(folder: Path) -> None:
     folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
 
 
+def full_path(path: str | os.PathLike[str]) -> Path:
+    """The path with `~` and links followed.
+
+    Raises:
+        OSError: `~` is nobody's home, or links lead round in a circle.
+    """
+    try:
+        return Path(path).expanduser().resolve()
+    except RuntimeError as error:
+        raise OSError(f"{path} cannot be followed: {error}; give the full path") from error
+
+
 def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
     """Where the database and the pictures live; the same answer for bridge and server.
 
@@ -142,9 +154,9 @@ def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
     environment variable `WEBOTS_MCP_DATA_DIR`; the argument.
     """
     if data_dir is not None:
-        return Path(data_dir).expanduser().resolve()
+        return full_path(data_dir)
     if named := os.environ.get(DATA_DIR_VARIABLE):
-        return Path(named).expanduser().resolve()
+        return full_path(named)
     here = Path.cwd()
     for folder in (here, *here.parents):
         if (folder / "worlds").is_dir() and (folder / "controllers").is_dir():
@@ -165,6 +177,7 @@ def resolve_database(
 
     Raises:
         TypeError: `database` is of another type.
+        OSError: A path cannot be followed.
     """
     if isinstance(database, str) and database == ":memory:":
         database = MemoryDatabase()
@@ -178,5 +191,5 @@ def resolve_database(
             f"database={database!r} is a {type(database).__name__}; give a path, ':memory:' or a "
             "webots_mcp.MemoryDatabase (shared by bridge and server in one process)"
         )
-    file = Path(database).expanduser().resolve()
+    file = full_path(database)
     return file, file.parent if data_dir is None else resolve_data_dir(data_dir)

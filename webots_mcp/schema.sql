@@ -303,13 +303,6 @@ SELECT (
   strftime('%Y-%m-%d %H:%M:%f', e.wall_time_s, 'unixepoch') AS utc, e.kind, e.name,
   json_extract(j, '$.from') AS from_value, json_extract(j, '$.to') AS to_value, e.data
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM event) e;
-CREATE VIEW robot_log AS
-/* Log lines with their simulation time. */
-SELECT (
-  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = l.run_id) AS robot,
-  l.run_id, l.id AS log_id, l.sim_time_s,
-  strftime('%Y-%m-%d %H:%M:%f', l.wall_time_s, 'unixepoch') AS utc, l.level, l.source, l.message
-FROM log l;
 CREATE TABLE recording (
 	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
 	created_wall_time_s FLOAT NOT NULL, 
@@ -376,4 +369,11 @@ FROM (
       WHERE b.run_id = e.run_id AND b.kind = 'change' AND b.name = e.name AND b.id < e.id))
   ) c
 ) p JOIN run u ON u.id = p.run_id;
+CREATE VIEW robot_log AS
+/* Log lines with their simulation time. */
+SELECT (
+  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = l.run_id) AS robot,
+  l.run_id, l.id AS log_id, l.sim_time_s,
+  strftime('%Y-%m-%d %H:%M:%f', l.wall_time_s, 'unixepoch') AS utc, l.level, l.source, l.logger, l.message
+FROM log l;
 INSERT INTO alembic_version (version_num) VALUES ('0004');

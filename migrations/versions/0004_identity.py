@@ -89,6 +89,7 @@ FIRST_ROW = (
     "coalesce((SELECT min(f.sim_time_s) FROM state f WHERE f.run_id = v.id "
     "AND f.sim_time_s <= e.sim_time_s AND v.purged_rows = 0), v.started_sim_time_s /* purged */)"
 )
+LOGGER = ("l.source, l.message", "l.source, l.logger, l.message")
 NEW_UUID = {
     "sqlite": "lower(hex(randomblob(4)) || '-' || hex(randomblob(2)) || '-4' || "
     "substr(hex(randomblob(2)), 2) || '-' || substr('89ab', 1 + (random() & 3), 1) || "
@@ -134,16 +135,17 @@ def upgrade() -> None:
     create_recent_rollup()
     op.execute(ALL_ROLLUP)
     if dialect == "sqlite":
-        replace_in_robot_period(RUN_START, FIRST_ROW)
+        replace_in_view("robot_period", RUN_START, FIRST_ROW)
+        replace_in_view("robot_log", *LOGGER)
         op.execute("PRAGMA user_version = 4")
 
 
-def replace_in_robot_period(old: str, new: str) -> None:
-    """Make the view again with another expression for the start of a signal's first period."""
+def replace_in_view(view: str, old: str, new: str) -> None:
+    """Make a view again with another text in its place."""
     connection = op.get_bind()
-    found = "SELECT sql FROM sqlite_master WHERE type = 'view' AND name = 'robot_period'"
+    found = f"SELECT sql FROM sqlite_master WHERE type = 'view' AND name = '{view}'"
     sql: str = connection.exec_driver_sql(found).scalar_one()
-    connection.exec_driver_sql("DROP VIEW robot_period")
+    connection.exec_driver_sql(f"DROP VIEW {view}")
     connection.exec_driver_sql(sql.replace(old, new))
 
 
@@ -171,7 +173,8 @@ def create_recent_rollup() -> None:
 
 def downgrade() -> None:
     if op.get_context().dialect.name == "sqlite":
-        replace_in_robot_period(FIRST_ROW, RUN_START)
+        replace_in_view("robot_period", FIRST_ROW, RUN_START)
+        replace_in_view("robot_log", *reversed(LOGGER))
     op.execute("DROP VIEW all_rollup")
     op.execute(f"INSERT INTO rollup ({ROLLUP}) SELECT {ROLLUP} FROM recent_rollup")
     op.drop_table("recent_rollup")

@@ -78,6 +78,18 @@ def test_help_imports_nothing_heavy() -> None:
     assert ended.stderr.strip() == "set()"
 
 
+@pytest.mark.parametrize("option", ["--data-dir", "--database"])
+def test_a_path_that_cannot_be_followed_is_one_line(
+    option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    for path in ("~nobody-of-that-name/data", str(loop / "data")):
+        assert main(["status", option, path]) != 0
+        said = capsys.readouterr().err
+        assert path in said and said.count("\n") == 1
+
+
 def test_an_unknown_command_is_bad_input(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["fly"])

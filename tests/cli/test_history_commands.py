@@ -99,7 +99,7 @@ def test_json_is_one_object_for_other_programs(say: Say, command: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        ("history moed", "there is mode"),
+        ("history moed", "mode"),
         ("history mode --points 9999999", "from 1 to 500"),
         ("history mode --run 99", "newest runs are [3, 2, 1]"),
         ("trends --robot rovr", "did you mean 'rover'"),

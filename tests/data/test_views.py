@@ -137,8 +137,8 @@ def test_commands_tell_how_long_they_waited_and_ran(recorder: Recorder) -> None:
 
 
 def test_log_lines_and_events_name_their_robot(reader: sqlite3.Connection) -> None:
-    lines = rows(reader, "SELECT robot, run_id, level, message FROM robot_log")
-    assert lines[0] == ("rover", 1, "warning", "cruise -> back_up")
+    lines = rows(reader, "SELECT robot, run_id, level, message, logger FROM robot_log")
+    assert lines[0] == ("rover", 1, "warning", "cruise -> back_up", None)
     changes = rows(
         reader,
         "SELECT robot, from_value, to_value FROM robot_event WHERE name = 'mode' AND run_id = 1",

@@ -288,7 +288,7 @@ def test_a_run_that_has_only_begun_is_drawn(record: Record, rows: int) -> None:
     ("question", "error", "message"),
     [
         ({"signals": ["sensor.frnt"]}, UnknownSignalError, "there is sensors.front"),
-        ({"signals": ["pose"], "bands": "mod"}, UnknownSignalError, "there is mode"),
+        ({"signals": ["pose"], "bands": "mod"}, UnknownSignalError, "mode"),
         ({"signals": ["pose"], "bands": "ir"}, InvalidInputError, "'ir' holds numbers"),
         ({"signals": ["pose"], "bands": "sensors"}, InvalidInputError, "means 2 signals"),
         ({"run_ids": [77]}, UnknownRunError, "no run 77"),

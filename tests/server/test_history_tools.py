@@ -299,7 +299,7 @@ async def test_the_schema_is_told_before_anything_was_recorded(tmp_path: Path) -
 @pytest.mark.parametrize(
     ("tool", "arguments", "words"),
     [
-        ("webots_query_history", {"signals": ["moed"]}, "there is mode"),
+        ("webots_query_history", {"signals": ["moed"]}, "mode"),
         ("webots_query_history", {"signals": ["mode"], "run_id": 99}, "newest runs are [3, 2, 1]"),
         ("webots_get_trends", {"robot": "rovr"}, "did you mean 'rover'"),
         ("webots_get_trends", {"start_s": 9, "end_s": 3}, "reversed"),

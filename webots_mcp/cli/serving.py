@@ -141,7 +141,8 @@ def migrate(arguments: argparse.Namespace) -> None:
 )
 def demo(arguments: argparse.Namespace) -> None:
     """Run a robot on the stand-in simulator and talk to it: no Webots needed, under 30 s."""
+    from webots_mcp.contract import full_path
     from webots_mcp.demo import DEFAULT_DATA_DIR, run
 
-    chosen = Path(arguments.data_dir).expanduser().resolve() if arguments.data_dir else None
+    chosen = full_path(arguments.data_dir) if arguments.data_dir else None
     run(chosen or DEFAULT_DATA_DIR, keep=arguments.keep)

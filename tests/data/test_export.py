@@ -98,8 +98,19 @@ def flat(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
 def expected(state: dict[str, Any]) -> dict[str, Any]:
     leaves: dict[str, Any] = {}
     for name, value in flat(state):
-        leaves.setdefault(name, value)
+        leaves.setdefault(name, with_64_bits(value))
     return {f"state.{n}" if n in {*HEAD, "odd"} else n: v for n, v in leaves.items()}
+
+
+def with_64_bits(value: Any) -> Any:
+    """Integers beyond them are recorded as the nearest float."""
+    if isinstance(value, list):
+        return [with_64_bits(item) for item in value]  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, dict):
+        return {key: with_64_bits(item) for key, item in value.items()}  # pyright: ignore[reportUnknownVariableType]
+    if isinstance(value, int) and not -(2**63) <= value < 2**63:
+        return float(value)
+    return value
 
 
 def same(found: Any, wanted: Any) -> bool:

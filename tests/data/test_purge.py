@@ -166,7 +166,7 @@ def test_space_goes_back_to_the_disk_while_rows_still_go(filed: tuple[Path, Reco
     wanted = plan(recorded.connection, states(rows=100))
     freed = [done.freed_bytes for done in purge(recorded.connection, wanted, recorded.folder)
              if done.rows["state"] < 4900]  # fmt: skip
-    assert freed[len(freed) // 2] > freed[-1] / 4 > 0
+    assert 0 < freed[len(freed) // 2] < freed[-1]
 
 
 def test_no_write_of_a_purge_does_more_than_its_time_allows(filed: tuple[Path, Recorded]) -> None:

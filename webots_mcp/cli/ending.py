@@ -34,8 +34,11 @@ def ending_in_time() -> Generator[None]:
 
     One that reads from a terminal waits for the next line, which nobody will type.
     """
+    import logging  # only here: most commands do without it
 
     def end(number: int, frame: FrameType | None) -> None:
+        # A task that the interrupt meets in the middle is no defect that anybody has to read of.
+        logging.getLogger("asyncio").disabled = True
         late = threading.Timer(_GRACE_S, _exit, [number])
         late.daemon = True
         late.start()

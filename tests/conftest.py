@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import signal
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
+
+from tests.recordings.bridge import record
+from webots_mcp.connection import connect
 
 # The same examples each time, so that a red run was made red by the change that it tests;
 # `pytest --hypothesis-profile=explore` looks for new ones.
@@ -14,3 +22,15 @@ settings.load_profile("repeatable")
 
 # A script's background jobs ignore Ctrl-C and hand that down to the processes that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(scope="session")
+def bridge_recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The database of two runs of the rover; do not change it."""
+    return record(tmp_path_factory.mktemp("recorded"))
+
+
+@pytest.fixture
+def reader(bridge_recording: Path) -> Iterator[sqlite3.Connection]:
+    with closing(connect(bridge_recording, "reader")) as connection:
+        yield connection

@@ -7,8 +7,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Final
 
-from tests.history.long_recording import CYCLE_S, INTERVAL_S, build
-from tests.history.recording import WALL_START_S
+from tests.recordings.long import CYCLE_S, INTERVAL_S, build
+from tests.recordings.rover import WALL_START_S
 from webots_mcp.connection import connect
 from webots_mcp.store.rollup.rolling import roll
 

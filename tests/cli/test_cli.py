@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.store.recorded import Recorded, RecordedRobot
+from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.cli import COMMANDS, main
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.store.follow import Follower

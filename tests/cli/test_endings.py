@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.test_cli import run
-from tests.store.recorded import Recorded
+from tests.recordings.rows import Recorded
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals and terminals of POSIX")
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 import webots_mcp
-from tests.store.recorded import Recorded
+from tests.recordings.rows import Recorded
 
 # -I -S: nothing that is installed for this Python is found.
 PROGRAM = """

@@ -12,8 +12,8 @@ import pytest
 from mcp import Client, StdioServerParameters
 
 from tests import unprivileged
+from tests.recordings.rows import Recorded
 from tests.server.conftest import ask, fail
-from tests.store.recorded import Recorded
 from webots_mcp.contract import new_uuid
 from webots_mcp.entries import waiting_path
 from webots_mcp.store.migrate import upgrade

@@ -13,8 +13,8 @@ from tests.detection.drawing import draw_case
 from tests.detection.judging import Tally, Verdict, judge
 from tests.detection.labelled import Case, Incident, LabelledRun, Measure, repeated
 from tests.detection.writing import purge, roll_up, write_all
-from tests.history.recording import WALL_START_S
 from tests.memory import memory_connection
+from tests.recordings.rover import WALL_START_S
 
 Summaries = Literal["long", "purged"]
 Key = tuple[str, Measure, str]  # kind of recording, what is judged, under which conditions

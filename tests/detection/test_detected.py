@@ -14,8 +14,8 @@ from tests.detection.judging import judge
 from tests.detection.labelled import Case, Measure
 from tests.detection.measuring import measure
 from tests.detection.writing import write_all
-from tests.history.recording import WALL_START_S
 from tests.memory import memory_connection
+from tests.recordings.rover import WALL_START_S
 
 _REPEATABLE = settings.default is not None and settings.default.derandomize
 EXAMPLES = 4 if _REPEATABLE else 100

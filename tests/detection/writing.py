@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from tests.detection.labelled import LabelledRun
-from tests.history.recording import WALL_PER_SIM, Recorder
+from tests.recordings.rover import WALL_PER_SIM, Recorder
 from webots_mcp.store.retention import Limit, Retention, prune
 from webots_mcp.store.rollup.rolling import roll
 

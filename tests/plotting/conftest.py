@@ -9,8 +9,8 @@ from typing import Any, Protocol
 
 import pytest
 
-from tests.history.recording import Recorder, record_rover
 from tests.memory import memory_connection
+from tests.recordings.rover import Recorder, record_rover
 from webots_mcp.store.reading.ranges import TimeRange, resolve_range
 from webots_mcp.store.rollup.rolling import roll
 
@@ -27,7 +27,7 @@ class Record(Protocol):
 
 @pytest.fixture(scope="session")
 def rover() -> Iterator[sqlite3.Connection]:
-    """The story of tests.history.recording: runs 1 to 3 of one robot."""
+    """The story of tests.recordings.rover: runs 1 to 3 of one robot."""
     with memory_connection() as connection:
         record_rover(connection)
         roll(connection, 100_000)

@@ -13,7 +13,7 @@ import pytest
 from mcp import Client
 from mcp.types import CallToolResult, ImageContent, TextContent
 
-from tests.store.recorded import Recorded
+from tests.recordings.rows import Recorded
 from webots_mcp import MCPBridge
 from webots_mcp.server import create_server
 from webots_mcp.standin import InProcessSupervisor

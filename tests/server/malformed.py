@@ -21,7 +21,7 @@ import anyio
 from mcp import Client
 from PIL import Image
 
-from tests.store.recorded import Recorded, RecordedRobot, insert
+from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.server import create_server
 from webots_mcp.store.rollup.rolling import roll
 

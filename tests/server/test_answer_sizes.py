@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import pytest
 
-from tests.history.long_recording import build
+from tests.recordings.long import build
 from tests.server.conftest import text_of
 from tests.server.story import client_on
 from webots_mcp.connection import connect

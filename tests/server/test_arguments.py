@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
+from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, text_of
-from tests.store.recorded import Recorded
 
 pytestmark = pytest.mark.anyio
 

@@ -15,8 +15,8 @@ from typing import Any
 import anyio
 import pytest
 
+from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, ask, fail
-from tests.store.recorded import Recorded, RecordedRobot
 from tests.store.test_queue import claim
 from webots_mcp.connection import connect as connect_database
 from webots_mcp.errors import CommandRefusedError

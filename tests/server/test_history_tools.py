@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from tests.history.recording import GAP_S, NAN_S, STUCK_S, WALL_START_S
+from tests.recordings.rover import GAP_S, NAN_S, STUCK_S, WALL_START_S
+from tests.recordings.rows import Recorded
 from tests.server.conftest import ask, fail, pictures_of, text_of
 from tests.server.story import WAYS, Way, client_on, copy_of, rows_of, write_story
-from tests.store.recorded import Recorded
 from webots_mcp.connection import connect
 from webots_mcp.store.rollup.rolling import roll
 

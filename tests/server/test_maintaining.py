@@ -8,8 +8,8 @@ import anyio
 import pytest
 from mcp import Client
 
+from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect
-from tests.store.recorded import Recorded
 from tests.store.test_status import dead_pid
 from webots_mcp.server import create_server
 from webots_mcp.store.retention import Limit, Retention, prune

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, text_of
 from tests.server.malformed import Damage, damages, record, unusable_answers
-from tests.store.recorded import Recorded
 
 pytestmark = pytest.mark.anyio
 

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 from PIL import Image
 
+from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
-from tests.store.recorded import Recorded
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.server.shortening import compact_json

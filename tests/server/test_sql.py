@@ -11,8 +11,8 @@ import pytest
 from mcp import Client
 from mcp.types import CallToolResult
 
+from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, text_of
-from tests.store.recorded import Recorded
 from webots_mcp.contract import MemoryDatabase
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.server import create_server

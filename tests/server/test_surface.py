@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from mcp import Client, StdioServerParameters
 
+from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask
-from tests.store.recorded import Recorded
 
 pytestmark = pytest.mark.anyio
 

@@ -11,8 +11,8 @@ import anyio
 import pytest
 from mcp import Client
 
+from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, Driver, ask, fail
-from tests.store.recorded import Recorded, RecordedRobot
 from webots_mcp.connection import connect as open_database
 
 pytestmark = pytest.mark.anyio

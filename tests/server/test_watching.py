@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, ask
 from tests.server.story import rows_of
-from tests.store.recorded import Recorded, RecordedRobot
 
 pytestmark = pytest.mark.anyio
 

@@ -1,12 +1,19 @@
+"""Recordings for the tests of the store: empty, as the bridge writes them, and the known one."""
+
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.store.recorded import Recorded
+from tests.memory import memory_connection
+from tests.recordings.rover import record_rover
+from tests.recordings.rows import Recorded
 from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.store.reading import rows as columns
+from webots_mcp.store.rollup.rolling import roll
 
 
 @pytest.fixture
@@ -24,3 +31,41 @@ def database(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Databas
     memory = MemoryDatabase()
     yield memory
     memory.close()
+
+
+@pytest.fixture
+def empty() -> Iterator[sqlite3.Connection]:
+    """A database of the current schema without a row."""
+    with memory_connection() as connection:
+        yield connection
+
+
+@pytest.fixture(scope="session")
+def _recorded() -> Iterator[dict[str, sqlite3.Connection]]:
+    with memory_connection() as raw, memory_connection() as rolled:
+        for connection in (raw, rolled):
+            record_rover(connection)
+        assert roll(rolled, 100_000).done
+        yield {"raw": raw, "rolled": rolled}
+
+
+@pytest.fixture
+def long_ranges(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A range of more than 100 rows counts as one that is too long to be read row by row."""
+    monkeypatch.setattr(columns, "RAW_ROWS", 100)
+
+
+@pytest.fixture(params=["rows", "rollups"])
+def tier(request: pytest.FixtureRequest) -> str:
+    """Answers from rows; and from rollups, by letting a short range count as a long one."""
+    if request.param == "rollups":
+        request.getfixturevalue("long_ranges")
+    return request.param
+
+
+@pytest.fixture(params=["raw", "rolled"])
+def rover(
+    request: pytest.FixtureRequest, _recorded: dict[str, sqlite3.Connection]
+) -> sqlite3.Connection:
+    """The known recording; every answer has to be the same before and after rolling up."""
+    return _recorded[request.param]

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.store.recorded import Recorded
+from tests.recordings.rows import Recorded
 from webots_mcp.maintenance import LEASE_S, Maintainer
 
 LEASE = "INSERT INTO lease (name, holder, until_wall_time_s) VALUES ('maintainer', ?, ?)"

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from tests.recordings.rows import Recorded
 from tests.server.malformed import NOT_UTF8, Damage
-from tests.store.recorded import Recorded
 from webots_mcp.adoption import adopt
 from webots_mcp.entries import FORMAT
 from webots_mcp.settlement import gone_sessions

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.store.recorded import Recorded
+from tests.recordings.rows import Recorded
 from webots_mcp import settlement
 from webots_mcp.bridge.commands import CLAIM
 from webots_mcp.connection import connect

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from tests.store.recorded import Recorded
+from tests.recordings.rows import Recorded
 from webots_mcp.errors import (
     AmbiguousRobotError,
     NothingRecordedError,

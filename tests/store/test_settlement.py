@@ -6,7 +6,7 @@ import json
 import time
 from pathlib import Path
 
-from tests.store.recorded import Recorded, RecordedRobot, insert
+from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.adoption import adopt
 from webots_mcp.entries import FORMAT
 from webots_mcp.settlement import settle

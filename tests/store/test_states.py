@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.store.recorded import Recorded
+from tests.recordings.rows import Recorded
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.errors import InvalidInputError, InvalidRangeError
 from webots_mcp.store.logs import LogFilter, count_lines, newest_lines

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from tests.store.recorded import Recorded, RecordedRobot
+from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.store.queue import CommandQueue
 from webots_mcp.store.recording import look
 from webots_mcp.store.runs import current_run

@@ -15,7 +15,7 @@ from tests.benchmarks.measuring import Samples, time_calls
 from tests.benchmarks.recordings import end_s, record
 from tests.benchmarks.registry import Bench, benchmark
 from tests.benchmarks.table import Line, Target, duration
-from tests.history.long_recording import CYCLE_S
+from tests.recordings.long import CYCLE_S
 from webots_mcp.connection import connect
 from webots_mcp.plotting import plot
 from webots_mcp.store.detection.event import EventOptions

@@ -15,7 +15,7 @@ from tests.benchmarks.programs.wide_robot import STEP_S
 from tests.benchmarks.registry import Bench, benchmark
 from tests.benchmarks.states import State, make_states, make_wide_states
 from tests.benchmarks.table import Line, Target, duration
-from tests.history.recording import Recorder
+from tests.recordings.rover import Recorder
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.schema import create_schema

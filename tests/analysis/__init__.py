@@ -1,1 +1,0 @@
-"""Analysis is true of arrays whose truth is known."""

@@ -1,0 +1,289 @@
+"""The commands export, import, prune and keep, as a person runs them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.store.json_folder.test_import import Peer
+from webots_mcp.cli import main
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.retention import DEFAULT, Limit
+from webots_mcp.store.retention.notation import limit_text, parse_limit, size_text
+
+Say = Callable[..., str]
+
+
+@pytest.fixture
+def database(bridge_recording: Path, tmp_path: Path) -> Path:
+    """A copy of the recording that a test may change."""
+    folder = tmp_path / "mcp_data"
+    shutil.copytree(bridge_recording.parent, folder)
+    return folder / bridge_recording.name
+
+
+@pytest.fixture
+def say(database: Path, capsys: pytest.CaptureFixture[str]) -> Say:
+    """What a command prints when it succeeds."""
+
+    def said(*arguments: str) -> str:
+        assert main([*arguments, "--database", str(database)]) == 0
+        return capsys.readouterr().out
+
+    return said
+
+
+def complaint(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    assert main(arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    return said.err
+
+
+def query(database: Path, sql: str) -> list[Any]:
+    with closing(sqlite3.connect(database)) as connection:
+        return connection.execute(sql).fetchall()
+
+
+# -- export ---------------------------------------------------------------------------------------
+
+
+def test_export_writes_csv_to_a_pipe(database: Path) -> None:
+    line = [sys.executable, "-m", "webots_mcp", "export", "--database", str(database), "--run", "1"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=60, check=True)
+    rows = list(csv.DictReader(io.StringIO(done.stdout)))
+    assert len(rows) == 530
+    assert rows[0]["mode"] == "cruise"
+    assert done.stderr == ""
+
+
+def test_export_takes_the_format_from_the_name(say: Say, tmp_path: Path) -> None:
+    file = tmp_path / "run.jsonl"
+    assert say("export", "-o", str(file), "--since", "0") == f"{file}: 858 rows\n"
+    lines = [json.loads(line) for line in file.read_text().splitlines()]
+    assert {line["run_id"] for line in lines} == {1, 2}
+
+
+def test_export_of_parquet_can_be_read_back(say: Say, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra 'parquet' is not installed")
+    file = tmp_path / "run.parquet"
+    say("export", "-o", str(file), "--run", "1", "--start", "0", "--end", "8")
+    assert set(parquet.read_table(file).column("mode").to_pylist()) == {"cruise"}
+
+
+@pytest.mark.parametrize("output", ["a.csv", "-"])
+def test_a_range_beyond_the_recording_is_noted_beside_the_table(
+    database: Path, tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes], output: str
+) -> None:
+    file = str(tmp_path / output) if output != "-" else output
+    asked = ["export", "-o", file, "--run", "1", "--end", "99", "--database", str(database)]
+    assert main(asked) == 0
+    said = capfdbinary.readouterr()
+    assert b"note: the recording of run 1 ends at" in said.err
+    assert b"note" not in said.out
+
+
+def test_export_never_overwrites_the_recording(
+    database: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("export", "--database", str(database), "--format", "csv", "-o", str(database))
+    assert "is the recording itself" in complaint(capsys, *arguments)
+    assert query(database, "SELECT count(*) FROM run") == [(2,)]
+
+
+def test_a_name_without_a_format_is_bad_input(
+    database: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = complaint(capsys, "export", "--database", str(database), "-o", "run.xlsx")
+    assert "end it in .csv, .jsonl or .parquet" in said
+
+
+# -- import ---------------------------------------------------------------------------------------
+
+
+def test_import_makes_a_recording_where_there_is_none(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    peer = Peer(tmp_path / "peer")
+    peer.everything()
+    data_dir = tmp_path / "new"
+    line = ["import", str(peer.folder), "--robot", "rover", "--data-dir", str(data_dir)]
+    assert main(line) == 0
+    assert capsys.readouterr().out == (
+        "run 1 of robot 'rover': states 1, log lines 3, pictures 3, commands 1\n"
+    )
+    assert query(data_dir / "webots.db", "SELECT robot, end_reason FROM robot_run") == [
+        ("rover", "finished")
+    ]
+
+
+def test_a_bad_folder_is_one_line_and_exit_code_2(
+    database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    peer = Peer(tmp_path / "peer")
+    peer.everything()
+    peer.write("logs/controller.log", "[12:00:00] a\n[99:00:00] b\n")
+    said = complaint(capsys, "import", str(peer.folder), "--database", str(database))
+    assert said.count("\n") == 1
+    assert "controller.log, line 2" in said
+
+
+# -- prune and keep -------------------------------------------------------------------------------
+
+
+def test_a_dry_run_tells_what_would_go_and_deletes_nothing(say: Say, database: Path) -> None:
+    before = query(database, "SELECT count(*) FROM state")
+    text = say("prune", "--dry-run", "--keep-states", "400rows")
+    *table, disk = text.splitlines()
+    assert [line.split()[:2] for line in table] == [["would", "go"], ["state", "458"]]
+    assert disk.startswith("note: the file has ") and ", about: states " in disk
+    assert query(database, "SELECT count(*) FROM state") == before
+
+
+def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
+    text = say("prune", "--keep-states", "400rows", "--keep-images", "all")
+    assert text.splitlines()[1].split()[:2] == ["state", "458"]
+    assert query(database, "SELECT run_id, rows, purged_rows FROM robot_run") == [
+        (1, 530, 458),
+        (2, 328, 0),
+    ]
+    assert query(database, "PRAGMA integrity_check") == [("ok",)]
+    assert say("prune", "--keep-states", "400rows") == "nothing is beyond the limits\n"
+
+
+def test_a_run_that_is_kept_is_named_and_stays(say: Say, database: Path) -> None:
+    assert say("keep", "1") == ""
+    nothing, note = say("prune", "--keep-states", "400rows").splitlines()
+    assert nothing == "nothing is beyond the limits"
+    assert "kept because of a label, a note or a mark, and not counted: run 1, about " in note
+    say("keep", "1", "--release")
+    say("prune", "--keep-states", "400rows")
+    assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(458,)]
+
+
+def test_what_is_too_old_but_among_the_newest_is_told(say: Say, database: Path) -> None:
+    text = say("prune", "--dry-run", "--keep-states", "0s")
+    assert "beyond the limit, but spared: 858 rows of state, about " in text
+    assert "too old, but among the newest 50000" in text
+
+
+def test_prune_shrinks_the_file(say: Say, database: Path) -> None:
+    before = database.stat().st_size
+    assert "of the database file freed" in say("prune", "--keep-states", "100rows")
+    assert database.stat().st_size < 0.7 * before
+
+
+def test_a_run_that_does_not_exist_cannot_be_kept(
+    database: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "no run 9" in complaint(capsys, "keep", "9", "--database", str(database))
+
+
+@pytest.mark.parametrize("limit", ["", "none", "500", "5 parsecs", "1GB,2GB", "-3d", "1GB;2d"])
+def test_a_limit_that_is_none_is_told_how_to_write_one(
+    limit: str, database: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for command in ("prune", "serve"):
+        said = complaint(capsys, command, f"--keep-states={limit}", "--database", str(database))
+        assert "500MB" in said or "twice" in said
+
+
+@pytest.mark.parametrize(
+    "arguments", [["export"], ["prune"], ["prune", "--dry-run"], ["keep", "1"]]
+)
+def test_without_a_recording_each_says_so(
+    arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "no database at" in complaint(capsys, *arguments, "--data-dir", str(tmp_path))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_progress_is_shown_on_a_terminal_and_vanishes(database: Path) -> None:
+    pty = pytest.importorskip("pty", reason="terminals like these are of Unix")
+    parent, child = pty.openpty()
+    line = [sys.executable, "-m", "webots_mcp", "export", "--database", str(database)]
+    done = subprocess.run(line, stdout=subprocess.PIPE, stderr=child, timeout=60, check=True)
+    os.close(child)
+    shown = os.read(parent, 10_000).decode()
+    os.close(parent)
+    assert "exporting: " in shown
+    assert shown.endswith("\r\x1b[K")
+    assert b"exporting" not in done.stdout
+
+
+# -- how limits are written -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "limit"),
+    [
+        ("500MB", Limit(size_bytes=500_000_000)),
+        ("1.5 gb, 30d", Limit(size_bytes=1_500_000_000, age_s=30 * 86_400)),
+        ("2h,100000rows", Limit(age_s=7200, rows=100_000)),
+        ("all", Limit()),
+        ("0rows", Limit(rows=0)),
+    ],
+)
+def test_limits_are_read_as_they_are_written(text: str, limit: Limit) -> None:
+    assert parse_limit(text, Limit()) == limit
+
+
+def test_what_an_age_spares_does_not_depend_on_the_limit() -> None:
+    assert parse_limit("0rows", DEFAULT.state).spared_rows == DEFAULT.state.spared_rows
+    with pytest.raises(InvalidInputError):
+        parse_limit("many", DEFAULT.state)
+
+
+@pytest.mark.parametrize("text", ["500.0 MB", "7200s", "100000rows", "2.50 GB,60s,3rows", "all"])
+def test_a_limit_is_written_as_it_is_read(text: str) -> None:
+    assert limit_text(parse_limit(text, Limit())) == text
+
+
+@pytest.mark.parametrize("command", ["prune", "serve"])
+def test_the_help_tells_the_limits_that_are_in_force(
+    command: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    text = " ".join(capsys.readouterr().out.split())
+    options = text.partition("options:")[2]
+    for kind in ("state", "rollup", "log", "event", "image"):
+        limit, told = getattr(DEFAULT, kind), options.partition(f"--keep-{kind}s LIMIT")[2]
+        spared = f"; an age spares the newest {limit.spared_rows:,}" if limit.limits else ""
+        assert f"({limit_text(limit)}{spared})" in told.partition("--keep")[0]
+    assert f"({DEFAULT.outlive:g}), or for ever: all" in text
+    assert "an age spares the newest rows" in text or command == "serve"
+
+
+@pytest.mark.parametrize("times", ["0", "none", "nan", "-1"])
+def test_how_long_runs_are_kept_cannot_be_written_the_wrong_way_round(
+    times: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["prune", "--keep-runs", times])
+    assert "must be a number, 1 or more, or all" in capsys.readouterr().err
+
+
+def test_all_keeps_everything(say: Say, database: Path) -> None:
+    before = query(database, "SELECT count(*) FROM state")
+    say("prune", "--keep-states", "all", "--keep-runs", "all")
+    assert query(database, "SELECT count(*) FROM state") == before
+
+
+@pytest.mark.parametrize(
+    ("size", "text"), [(0, "0 B"), (999, "999 B"), (1500, "1.5 kB"), (2.5e9, "2.50 GB")]
+)
+def test_sizes_are_written_as_they_are_read(size: float, text: str) -> None:
+    assert size_text(size) == text

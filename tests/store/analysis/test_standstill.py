@@ -1,0 +1,53 @@
+"""One standstill is one, begins when it begins, and a creep is none."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.store.analysis.driving import noisy_track
+from webots_mcp.store.analysis.standstill import find_standstills
+
+RADIUS_M = 0.05
+LEAST_S = 3.0
+NOISES_M = [0.0, 0.005, 0.01, 0.015, 0.02, 0.03]
+
+
+@pytest.mark.parametrize("noise_m", NOISES_M)
+@pytest.mark.parametrize("interval_s", [0.032, 0.1])
+def test_each_standstill_is_one_with_its_begin_and_end(interval_s: float, noise_m: float) -> None:
+    phases = [(12.0, 0.25, 0.0), (20.0, 0.0, 0.0), (10.0, 0.2, 0.4), (6.0, 0.0, 0.0)]
+    phases += [(9.0, 0.3, -0.3), (40.0, 0.0, 0.0)]
+    track, _ = noisy_track(phases, interval_s, noise_m)
+    found = find_standstills(track, RADIUS_M, LEAST_S)
+    ends = list(accumulate(seconds for seconds, _, _ in phases))
+    slack_s = (4 if noise_m > 0.01 else 2.1) * interval_s + noise_m / 0.2
+    assert len(found) == 3
+    for at, each in enumerate(found):
+        assert track.times[each.start] == pytest.approx(ends[2 * at], abs=slack_s)
+        assert track.times[each.last] == pytest.approx(ends[2 * at + 1], abs=slack_s)
+
+
+@pytest.mark.parametrize("speed_m_s", [0.005, 0.01, 0.018])
+@pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.03])
+def test_a_steady_creep_is_slow_and_no_standstill(noise_m: float, speed_m_s: float) -> None:
+    track, _ = noisy_track([(10, 0.2, 0.0), (60, speed_m_s, 0.0), (10, 0.2, 0.0)], 0.1, noise_m)
+    assert find_standstills(track, RADIUS_M, LEAST_S) == []
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 1000), st.sampled_from(NOISES_M), st.floats(0, 60), st.floats(0, 60))
+def test_who_looks_at_more_time_finds_no_less(
+    seed: int, noise_m: float, before_s: float, after_s: float
+) -> None:
+    phases = [(before_s, 0.2, 0.1), (8.0, 0.2, 0.0), (10.0, 0.0, 0.0), (8.0, 0.2, 0.0)]
+    track, _ = noisy_track([*phases, (after_s, 0.2, -0.1)], 0.1, noise_m, seed)
+    spans = [
+        (float(track.times[each.start]), float(track.times[each.last]))
+        for each in find_standstills(track, RADIUS_M, LEAST_S)
+    ]
+    middle_s = before_s + 13.0
+    assert sum(start_s < middle_s < end_s for start_s, end_s in spans) == 1

@@ -1,0 +1,81 @@
+"""A robot at rest travels nothing, a driving one what it drove, whatever the noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.store.analysis.driving import noisy_track
+from webots_mcp.store.analysis.noise import noise_of, smooth
+from webots_mcp.store.analysis.track import path_length_m, track_of
+
+DRIVE = [
+    phase
+    for turn in (0.0, 0.6, -0.8, 1.2)
+    for phase in ((8.0, 0.25, 0.0), (4.0, 0.25, turn), (6.0, 0.15, 0.0))
+]
+INTERVALS_S = (0.008, 0.032, 0.1)
+
+
+@given(st.integers(0, 1000), st.floats(0.001, 10), st.floats(-5, 5))
+def test_the_noise_is_told_whatever_steady_motion_lies_under_it(
+    seed: int, deviation: float, speed: float
+) -> None:
+    rows = np.arange(1000)
+    values = speed * rows + np.random.default_rng(seed).normal(0, deviation, len(rows))
+    assert noise_of(values) == pytest.approx(deviation, rel=0.3)
+
+
+@given(st.floats(-10, 10), st.floats(-1, 1), st.floats(-0.01, 0.01))
+def test_a_smooth_course_has_no_noise_and_smoothing_leaves_it_as_it_is(
+    offset: float, slope: float, bend: float
+) -> None:
+    rows = np.arange(200.0)
+    course = offset + slope * rows + bend * rows**2
+    assert noise_of(course) == pytest.approx(0, abs=1e-9)
+    assert smooth(course, 21)[0] == pytest.approx(course, abs=1e-7)
+
+
+def test_an_outlier_is_no_noise() -> None:
+    values = np.zeros(500)
+    values[[100, 300]] = 50.0
+    assert noise_of(values) == 0
+
+
+@pytest.mark.parametrize("rows", range(7))
+def test_the_shortest_tracks_are_tracks(rows: int) -> None:
+    times = np.arange(rows, dtype=np.float64)
+    track = track_of(times, times, 0 * times)
+    assert path_length_m(track) == max(0, rows - 1)
+
+
+@pytest.mark.parametrize("interval_s", INTERVALS_S)
+@pytest.mark.parametrize("noise_m", [0.0, 0.01, 0.03])
+def test_a_robot_at_rest_for_two_minutes_has_not_travelled(
+    interval_s: float, noise_m: float
+) -> None:
+    track, _ = noisy_track([(120.0, 0.0, 0.0)], interval_s, noise_m)
+    assert path_length_m(track) <= (0.1 if noise_m <= 0.01 else 0.5)
+
+
+@pytest.mark.parametrize("interval_s", INTERVALS_S)
+@pytest.mark.parametrize(("noise_m", "share"), [(0.0, 0.02), (0.01, 0.02), (0.03, 0.05)])
+def test_the_way_of_a_driving_robot_is_as_long_as_it_was(
+    interval_s: float, noise_m: float, share: float
+) -> None:
+    track, length_m = noisy_track(DRIVE, interval_s, noise_m)
+    assert path_length_m(track) == pytest.approx(length_m, rel=share)
+
+
+@given(st.integers(0, 50), st.floats(-100, 100), st.floats(-100, 100), st.floats(0, 6.28))
+def test_the_length_of_a_way_hangs_neither_on_where_nor_on_whither(
+    seed: int, east_m: float, north_m: float, angle: float
+) -> None:
+    track, _ = noisy_track([(5.0, 0.3, 0.5), (5.0, 0.0, 0.0)], 0.05, 0.005, seed)
+    cos, sin = np.cos(angle), np.sin(angle)
+    x = cos * track.raw_x - sin * track.raw_y + east_m
+    y = sin * track.raw_x + cos * track.raw_y + north_m
+    elsewhere = path_length_m(track_of(track.times, x, y))
+    assert elsewhere == pytest.approx(path_length_m(track), rel=0.05)

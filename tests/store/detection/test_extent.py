@@ -1,0 +1,101 @@
+"""Since when, and how long: an event is told whole, also by a range that holds only a part."""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import WALL_START_S, Recorder
+from webots_mcp.store.detection.event import Event, EventOptions, Kind, Threshold
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+
+STOPS_S = 200.0  # the robot drives, then stands, at 300 s it drives on
+GOES_ON_S = 300.0
+
+
+@pytest.fixture
+def standing(empty: sqlite3.Connection, tier: str) -> sqlite3.Connection:
+    """For 100 s the robot is stuck, its sensor silent, its battery low and its heading flat."""
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    for step in range(4000):
+        time_s = round(step * 0.1, 6)
+        stands = STOPS_S <= time_s < GOES_ON_S
+        state = {
+            "pose": [STOPS_S if stands else time_s, 0.0],
+            "commanded_m_s": 1.0,
+            "front_m": None if stands else 1.0 + step % 7,
+            "battery_v": 3.0 if stands else 12.0,
+            "heading_deg": 5.0 if stands else float(step % 90),
+            "mode": "waits for help" if stands else "cruise",
+        }
+        recorder.publish(time_s, state)
+    recorder.end_run("finished")
+    roll(empty, 100_000)
+    return empty
+
+
+def told(connection: sqlite3.Connection, kind: Kind, **bounds: Any) -> list[Event]:
+    low = (Threshold("battery_v", below=5.0, for_s=2.0),)
+    name = {"silent": "front_m", "flat": "heading_deg", "change": "mode"}.get(kind, "*")
+    options = EventOptions(kinds=(kind,), signals=(name,), thresholds=low)
+    return list(find_events(connection, resolve_range(connection, **bounds), options).events)
+
+
+@pytest.mark.parametrize("kind", ["stuck", "threshold", "silent", "flat"])
+@pytest.mark.parametrize(
+    ("start_s", "end_s"), [(250.0, 255.0), (250.0, 250.5), (150.0, 250.0), (295.0, 350.0)]
+)
+def test_a_range_that_holds_a_part_tells_the_true_begin_and_end(
+    standing: sqlite3.Connection, kind: Kind, start_s: float, end_s: float
+) -> None:
+    (event,) = told(standing, kind, start_s=start_s, end_s=end_s)
+    assert event.start_s == pytest.approx(STOPS_S, abs=0.9)
+    assert event.end_s == pytest.approx(GOES_ON_S, abs=0.9)
+    assert event.wall_time_s == pytest.approx(WALL_START_S + STOPS_S / 2, abs=0.5)
+    assert not event.ongoing
+
+
+@pytest.mark.parametrize("kind", ["stuck", "threshold", "silent", "flat"])
+def test_what_was_over_before_the_range_is_not_in_it(
+    standing: sqlite3.Connection, kind: Kind
+) -> None:
+    assert told(standing, kind, start_s=302.0, end_s=330.0) == []
+    assert told(standing, kind, start_s=150.0, end_s=198.0) == []
+
+
+def test_a_change_lasts_until_the_next_one_also_beyond_the_range(
+    standing: sqlite3.Connection,
+) -> None:
+    (help_needed,) = told(standing, "change", start_s=150.0, end_s=220.0)
+    assert (help_needed.start_s, help_needed.end_s, help_needed.ongoing) == (200.0, 300.0, False)
+    (cruise,) = told(standing, "change", start_s=290.0, end_s=310.0)
+    assert (cruise.start_s, cruise.end_s, cruise.ongoing) == (300.0, 399.9, False)
+
+
+def test_two_limits_on_one_signal_are_two_events(standing: sqlite3.Connection) -> None:
+    limits = (Threshold("battery_v", below=5.0), Threshold("battery_v", below=4.0))
+    options = EventOptions(kinds=("threshold",), thresholds=limits)
+    found = find_events(standing, resolve_range(standing, start_s=250.0, end_s=255.0), options)
+    told = [(event.details["below"], event.start_s, event.end_s) for event in found.events]
+    assert sorted(told) == [(4.0, 200.0, 299.9), (5.0, 200.0, 299.9)]
+
+
+def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    for step in range(2000):
+        late = {"late_m": 1.0 + step} if step >= 1500 else {}
+        recorder.publish(round(step * 0.1, 6), {"x": step, **late})
+    recorder.end_run("finished")
+    roll(empty, 100_000)
+    asked = resolve_range(empty, start_s=70.0, end_s=80.0)
+    assert find_events(empty, asked, EventOptions(kinds=("silent",))).events == ()

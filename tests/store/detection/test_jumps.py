@@ -1,0 +1,73 @@
+"""A jump is what a value does, not what a recording, or the way an angle is written, does."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import Recorder
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+
+
+def record(
+    connection: sqlite3.Connection, state: Callable[[float], dict[str, Any]], *, gap: bool = False
+) -> None:
+    """200 s, with rows missing from 95 to 105 s if there is a gap."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    for step in range(2000):
+        if not (gap and 950 <= step < 1050):
+            recorder.publish(step * 0.1, state(step * 0.1))
+    roll(connection, 100_000)
+
+
+def jumps(connection: sqlite3.Connection, **options: Any) -> list[Event]:
+    asked = EventOptions(kinds=("jump",), **options)
+    return list(find_events(connection, resolve_range(connection), asked).events)
+
+
+def test_what_went_on_smoothly_during_a_gap_did_not_jump(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    def driving(time_s: float) -> dict[str, Any]:
+        return {"pose": [0.3 * time_s, 0.0], "battery_v": 12 - 0.01 * time_s + 1e-4 * (time_s % 7)}
+
+    record(empty, driving, gap=True)
+    assert jumps(empty) == []
+
+
+def test_a_jump_at_the_border_of_two_rollups_is_found(empty: sqlite3.Connection, tier: str) -> None:
+    record(empty, lambda t: {"temp_c": 20 + 0.01 * t + (50 if t >= 100 else 0)})
+    assert [(event.name, event.start_s) for event in jumps(empty)] == [("temp_c", 100.0)]
+
+
+def test_a_value_that_is_elsewhere_after_a_gap_jumped(empty: sqlite3.Connection) -> None:
+    record(empty, lambda t: {"temp_c": 20 + 0.01 * t + (50 if t >= 100 else 0)}, gap=True)
+    assert [event.name for event in jumps(empty)] == ["temp_c"]
+
+
+@pytest.mark.parametrize(("name", "turn"), [("course", math.tau), ("course_deg", 360.0)])
+def test_a_heading_that_goes_over_the_end_of_its_scale_does_not_jump(
+    empty: sqlite3.Connection, tier: str, name: str, turn: float
+) -> None:
+    record(empty, lambda t: {name: math.remainder(0.01 * turn * t, turn), "x": t})
+    assert jumps(empty) == []
+
+
+def test_a_signal_that_the_asker_names_is_searched_for_swings(empty: sqlite3.Connection) -> None:
+    record(empty, lambda t: {"sensors": {"front": math.sin(math.pi * t)}})
+    whole = resolve_range(empty)
+    unasked = find_events(empty, whole, EventOptions(kinds=("oscillation",)))
+    asked = EventOptions(kinds=("oscillation",), signals=("sensors.front",))
+    assert unasked.events == ()
+    assert "oscillation was not searched in 1 of 1 signals" in unasked.notes[0]
+    (swing,) = find_events(empty, whole, asked).events
+    assert swing.details["period_s"] == pytest.approx(2.0, rel=0.02)

@@ -1,0 +1,171 @@
+"""What sensors do at times: fall silent, freeze, drop out, wake late, change their shape."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import Recorder
+from webots_mcp.errors import UnknownSignalError
+from webots_mcp.store.detection.event import Event, EventOptions, Kind
+from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.signals.catalogue import known_signals, list_signals, resolve_signals
+
+State = Callable[[float], dict[str, Any]]
+
+
+def record(connection: sqlite3.Connection, state: State, *, until_s: float = 120.0) -> None:
+    """Rows every 0.1 s, rolled up."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    connection.execute("BEGIN")
+    for step in range(round(until_s * 10)):
+        recorder.publish(round(step * 0.1, 6), state(round(step * 0.1, 6)))
+    connection.execute("COMMIT")
+    roll(connection, 100_000)
+
+
+def ask(connection: sqlite3.Connection, kind: Kind, **bounds: Any) -> Events:
+    return find_events(connection, resolve_range(connection, **bounds), EventOptions(kinds=(kind,)))
+
+
+def told(events: Events) -> list[tuple[str | None, float, float]]:
+    return [(e.name, round(e.start_s, 1), round(e.end_s, 1)) for e in events.events]
+
+
+def range_m(time_s: float) -> float:
+    return 2.0 + 0.1 * math.sin(3 * time_s)
+
+
+def waking(time_s: float) -> dict[str, Any]:
+    return {"lidar": None if time_s < 30 else [range_m(time_s)] * 20, "x": time_s}
+
+
+def test_what_was_null_before_its_first_value_has_not_been_silent(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, lambda t: {"front": None if t < 30 else range_m(t), "x": t})
+    assert told(ask(empty, "silent")) == []
+    assert told(ask(empty, "silent", start_s=10.0, end_s=20.0)) == []
+
+
+def test_a_scalar_null_is_the_missing_value_of_what_comes_below_it(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, waking)
+    known = known_signals(empty, resolve_range(empty))
+    assert [s.name for s in resolve_signals(known, ["lidar"])] == [
+        "lidar.count", "lidar.min", "lidar.max", "lidar.mean", "lidar.argmin",
+    ]  # fmt: skip
+    assert "lidar" not in [signal.name for signal in list_signals(empty).signals]
+    assert told(ask(empty, "silent")) == []
+    assert trends(empty, resolve_range(empty)).runs[0].silent == ()
+
+
+def test_a_lidar_that_dies_is_silent_once(empty: sqlite3.Connection, tier: str) -> None:
+    record(empty, lambda t: waking(t) if t < 60 else {"lidar": None, "x": t})
+    assert told(ask(empty, "silent")) == [("lidar.*", 60.0, 119.9)]
+    (event,) = ask(empty, "silent", start_s=80.0, end_s=90.0).events
+    assert (event.start_s, event.end_s) == (60.0, pytest.approx(119.9))
+
+
+def test_an_array_that_crosses_16_items_is_not_silent(empty: sqlite3.Connection, tier: str) -> None:
+    record(empty, lambda t: {"hits": [range_m(t)] * (14 if t % 40 < 20 else 20)})
+    assert told(ask(empty, "silent")) == []
+
+
+def test_a_list_that_is_shorter_at_times_is_not_silent_and_a_dead_item_is(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    def state(time_s: float) -> dict[str, Any]:
+        seen = [range_m(time_s)] * (3 if time_s % 40 < 20 else 14)
+        return {"seen": seen, "near": [1.0, None if time_s > 60 else range_m(time_s)]}
+
+    record(empty, state)
+    assert told(ask(empty, "silent")) == [("near.1", 60.1, 119.9)]
+
+
+def test_a_sensor_that_is_dead_for_most_of_the_run_is_silent(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, lambda t: {"front": range_m(t) if t < 20 else None, "x": t})
+    assert told(ask(empty, "silent")) == [("front", 20.0, 119.9)]
+
+
+def test_a_signal_that_never_had_a_value_is_not_said_to_be_silent_for_good(
+    empty: sqlite3.Connection,
+) -> None:
+    record(empty, lambda t: {"front": None, "x": t})
+    assert told(ask(empty, "silent")) == []
+    assert trends(empty, resolve_range(empty)).runs[0].silent == ("front",)
+    with pytest.raises(UnknownSignalError):
+        resolve_signals(known_signals(empty, resolve_range(empty)), ["frount"])
+
+
+def test_many_silences_are_one_event(empty: sqlite3.Connection) -> None:
+    record(empty, lambda t: {"front": range_m(t) if t % 10 < 8 else None})
+    (event,) = ask(empty, "silent").events
+    assert event.details["count"] == 12
+    assert event.details["says"] == (
+        "12 times without a value, the first at 8 s, the last at 118 s"
+    )
+
+
+def test_what_comes_now_and_then_is_not_silent_meanwhile_and_the_answer_says_so(
+    empty: sqlite3.Connection,
+) -> None:
+    record(empty, lambda t: {"gps": t if round(t * 10) % 20 == 0 else None})
+    answer = ask(empty, "silent")
+    assert answer.events == ()
+    assert "gps has a value about every 1.8 s" in answer.notes[0]
+
+
+def test_a_sensor_that_is_frozen_for_most_of_the_run_is_flat(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, lambda t: {"front": range_m(min(t, 30.0)), "target": 3, "goal": float(t > 60)})
+    assert told(ask(empty, "flat")) == [("front", 30.0, 119.9)]
+
+
+@pytest.mark.parametrize("count", [2, 10, 40])
+@pytest.mark.parametrize("quiet", [True, False])
+def test_dropouts_are_told_however_many_there_are(
+    empty: sqlite3.Connection, count: int, quiet: bool
+) -> None:
+    times_s = [round(3.2 + place * 110 / count, 1) for place in range(count)]
+
+    def front(time_s: float) -> dict[str, Any]:
+        value = 2.0 if quiet else range_m(time_s)
+        return {"front_m": 0.0 if time_s in times_s else value}
+
+    record(empty, front)
+    answer = ask(empty, "jump")
+    if count <= 3:
+        assert [event.start_s for event in answer.events] == times_s
+        return
+    (event,) = answer.events
+    assert event.details["says"] == (
+        f"{count} dropouts to 0 m, the first at 3.2 s, the last at {times_s[-1]:g} s"
+    )
+    for end_s in (3.25, 60.0, 100.0, 119.0):
+        until = sum(time_s < end_s for time_s in times_s)
+        assert counted(ask(empty, "jump", end_s=end_s).events) == until
+
+
+def counted(events: tuple[Event, ...]) -> int:
+    return sum(event.details.get("count", 1) for event in events)
+
+
+def test_large_steps_that_are_how_a_signal_is_are_not_judged(empty: sqlite3.Connection) -> None:
+    record(empty, lambda t: {"nearest": range_m(t) + 5 * (round(t * 10) % 8 == 0)})
+    answer = ask(empty, "jump")
+    assert answer.events == ()
+    assert "jumps of nearest were not judged" in answer.notes[0]

@@ -1,0 +1,422 @@
+"""Events are found where the story of the recording has them, and nowhere else."""
+
+from __future__ import annotations
+
+import math
+import random
+import re
+import sqlite3
+from collections import Counter
+from itertools import count
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import WALL_START_S, Recorder
+from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.store.analysis.jumps import find_jumps
+from webots_mcp.store.detection.event import Event, EventOptions, Threshold
+from webots_mcp.store.detection.search import Detection
+from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.signals.catalogue import known_signals
+
+
+def ask(connection: sqlite3.Connection, kind: Any, *, bounds: Any = None, **options: Any) -> Events:
+    given: dict[str, Any] = bounds or {"run_id": 1}
+    found = resolve_range(connection, **given)
+    return find_events(connection, found, EventOptions(kinds=(kind,), **options), limit=200)
+
+
+def is_unrolled(events: Events) -> bool:
+    """A long range without rollups is not searched for these, and the answer admits it."""
+    return any("not rolled up yet" in note for note in events.notes)
+
+
+def spans(events: Events) -> list[tuple[float, float]]:
+    return [(round(event.start_s, 1), round(event.end_s, 1)) for event in events.events]
+
+
+def test_a_robot_that_should_move_and_does_not_is_stuck(
+    rover: sqlite3.Connection, tier: str
+) -> None:
+    (stuck,) = ask(rover, "stuck").events
+    slack = 0.2 if tier == "rows" else 0.9
+    assert stuck.start_s == pytest.approx(40.0, abs=slack)
+    assert stuck.end_s == pytest.approx(52.0, abs=slack)
+    assert stuck.details["x_m"] == pytest.approx(8.0, abs=0.02)
+    assert stuck.details["mode"] == "cruise" and stuck.details["commanded"] == 0.2
+    assert stuck.around["mode"] == "cruise"
+    assert stuck.wall_time_s == pytest.approx(WALL_START_S + 20.0, abs=0.5)
+
+
+def test_standing_in_a_mode_that_rests_is_not_stuck(rover: sqlite3.Connection) -> None:
+    moving = ask(rover, "stuck", commanded="target", moving_modes=("back_up",), min_commanded=9.0)
+    assert moving.events == ()
+
+
+def test_mode_changes_have_their_duration(rover: sqlite3.Connection, tier: str) -> None:
+    events = ask(rover, "change", signals=("mode",)).events
+    assert [(e.start_s, e.end_s, e.details["after"]) for e in events] == [
+        (52.0, 60.0, "back_up"), (60.0, 95.0, "avoid"), (95.0, pytest.approx(119.9), "cruise"),
+    ]  # fmt: skip
+    assert not any(event.ongoing for event in events)  # the run has ended
+
+
+def test_a_gap_is_an_event(rover: sqlite3.Connection, tier: str) -> None:
+    assert spans(ask(rover, "gap")) == [(89.9, 95.0)]
+
+
+def test_a_silent_sensor_is_found(rover: sqlite3.Connection, tier: str) -> None:
+    events = ask(rover, "silent")
+    if is_unrolled(events):
+        return
+    assert [event.name for event in events.events] == ["sensors.front"]
+    assert spans(events) == [(100.0, 103.9)]
+
+
+def test_a_flat_signal_is_found(rover: sqlite3.Connection) -> None:
+    events = ask(rover, "flat", signals=("pose.0", "battery_v", "target"), flat_s=5.0)
+    assert [event.name for event in events.events] == ["pose.0"]
+    assert spans(events) == [(40.0, 52.0)]
+
+
+def test_a_crossed_threshold_lasts_as_long_as_it_holds(
+    rover: sqlite3.Connection, tier: str
+) -> None:
+    far = Threshold("pose.0", above=7.5, for_s=5.0)
+    assert spans(ask(rover, "threshold", thresholds=(far,))) == [(37.6, 56.9), (75.1, 119.9)]
+    never = Threshold("pose.0", above=7.5, for_s=50.0)
+    assert ask(rover, "threshold", thresholds=(never,)).events == ()
+    low = Threshold("battery_v", below=12.5)
+    assert spans(ask(rover, "threshold", thresholds=(low,))) == [(100.1, 119.9)]
+
+
+def test_a_jump_of_the_position_is_found(rover: sqlite3.Connection) -> None:
+    jumps = [e for e in ask(rover, "jump").events if e.name == "position"]
+    assert [(jump.start_s, jump.details["distance_m"]) for jump in jumps] == [
+        (110.0, pytest.approx(1.0, abs=0.05))
+    ]
+
+
+def test_a_spike_is_a_jump_there_and_back(rover: sqlite3.Connection, tier: str) -> None:
+    events = ask(rover, "jump", signals=("ir",))
+    if is_unrolled(events):
+        return
+    (jump,) = events.events[:1]
+    assert (jump.name, jump.start_s) == ("ir", 70.0)
+    assert jump.end_s == pytest.approx(70.1)
+
+
+def test_a_swinging_heading_is_an_oscillation(rover: sqlite3.Connection) -> None:
+    (swing,) = ask(rover, "oscillation").events
+    assert swing.name == "heading"
+    assert (swing.start_s, swing.end_s) == (
+        pytest.approx(60.0, abs=0.2), pytest.approx(89.0, abs=0.2),
+    )  # fmt: skip
+    assert swing.details["period_s"] == pytest.approx(2.0, rel=0.02)
+    assert swing.details["amplitude"] == pytest.approx(0.5, rel=0.05)
+
+
+def test_commands_logs_and_notices_are_on_the_same_clock(rover: sqlite3.Connection) -> None:
+    (command,) = ask(rover, "command").events
+    assert (command.name, command.start_s, command.end_s) == ("set_speed", 20.0, 20.1)
+    assert command.details["status"] == "done" and command.details["result"] == 0.2
+    logs = ask(rover, "log").events
+    assert [(log.start_s, log.name) for log in logs] == [(45.0, "warning"), (104.0, "error")]
+    (noticed,) = ask(rover, "noticed").events
+    assert (noticed.start_s, noticed.details) == (61.0, {"what": "dropped", "data": {"rows": 3}})
+    (image,) = ask(rover, "image").events
+    assert image.details["path"] == "camera/1.png"
+
+
+def test_runs_begin_and_end_in_wall_time(rover: sqlite3.Connection) -> None:
+    whole = {"since": WALL_START_S - 1, "until": WALL_START_S + 1000}
+    events = ask(rover, "run", bounds=whole).events
+    told = [(e.run_id, e.details["what"], e.details["reason"]) for e in events]
+    assert told == [
+        (1, "began", "start"), (1, "ended", "reset"), (2, "began", "reset"),
+        (2, "ended", "crashed"), (3, "began", "start"), (3, "ended", "finished"),
+    ]  # fmt: skip
+
+
+def test_everything_at_once_is_in_order_and_counted(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, run_id=1)
+    events = find_events(rover, found, limit=200)
+    walls = [event.wall_time_s for event in events.events]
+    assert walls == sorted(walls)
+    assert sum(events.totals.values()) == len(events.events)
+    assert events.totals["change"] == 5
+
+
+def test_a_limit_keeps_rare_kinds_and_says_what_is_left_out(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, run_id=1)
+    events = find_events(rover, found, limit=12)
+    assert len(events.events) <= 12
+    kinds = {event.kind for event in events.events}
+    assert {"stuck", "gap", "command", "run"} <= kinds
+    told = Counter(event.kind for event in events.events)
+    left_out = {kind: each.count for kind, each in events.left_out.items()}
+    assert left_out and told + Counter(left_out) == events.totals
+
+
+def record_a_busy_run(connection: sqlite3.Connection) -> Recorder:
+    """100 s in which a flag changes each second, with 3 warnings, and 2 pictures a second."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    picture = {"kind": "camera", "width": 1, "height": 1, "bytes": 1}
+    for step in range(1000):
+        recorder.publish(step * 0.1, {"lit": step // 10 % 2 == 0, "mode": "ab"[step // 20 % 2]})
+        if step % 5 == 0:
+            recorder.insert("image", **recorder.at(step * 0.1), path=f"{step}.png", **picture)
+        if step in (100, 101, 700):
+            line = {"level": "warning", "source": "controller", "message": str(step)}
+            recorder.insert("log", **recorder.at(step * 0.1), **line)
+    return recorder
+
+
+@pytest.mark.parametrize("limit", [1, 7, 60])
+def test_cursors_lead_through_all_that_was_left_out_while_more_is_recorded(
+    empty: sqlite3.Connection, limit: int
+) -> None:
+    recorder = record_a_busy_run(empty)
+    whole = find_events(empty, resolve_range(empty), limit=1000).events
+    found: list[Event] = []
+    page = find_events(empty, resolve_range(empty), limit=limit)
+    while True:
+        assert 0 < len(page.events) <= limit
+        found += page.events
+        if page.cursor is None:
+            break
+        time_s = 100.0 + len(found)
+        recorder.publish(time_s, {"lit": None, "mode": "c"})
+        line = {"level": "error", "source": "controller", "message": "later"}
+        recorder.insert("log", **recorder.at(time_s), **line)
+        page = find_events(empty, resolve_range(empty), limit=limit, after=page.cursor)
+
+    def subject(event: Event) -> tuple[object, ...]:
+        return event.kind, event.name, event.start_s
+
+    early = [subject(event) for event in found if event.start_s < 100.0]
+    assert sorted(early, key=str) == sorted(map(subject, whole), key=str)
+
+
+def test_what_happens_all_the_time_crowds_nothing_out_and_is_named_by_time(
+    empty: sqlite3.Connection,
+) -> None:
+    record_a_busy_run(empty)
+    events = find_events(empty, resolve_range(empty), limit=6)
+    told = [(event.kind, event.name) for event in events.events]
+    assert told.count(("log", "warning")) == 3 and told.count(("run", None)) == 1
+    changes = events.left_out["change"]
+    assert changes.count == events.totals["change"] - 2
+    assert (changes.first_s, changes.last_s) == pytest.approx((1.0, 98.0), abs=0.01)
+
+
+def test_pictures_are_told_only_where_they_are_asked_for(empty: sqlite3.Connection) -> None:
+    record_a_busy_run(empty)
+    assert "image" not in find_events(empty, resolve_range(empty)).totals
+    assert ask(empty, "image").totals == {"image": 200}
+
+
+def test_a_cursor_of_find_events_that_is_none_is_refused(rover: sqlite3.Connection) -> None:
+    for wrong in ("x", "[]", "5", '{"log": 3}', '{"log": [1, 2]}', "null"):
+        with pytest.raises(InvalidInputError, match="no cursor"):
+            find_events(rover, resolve_range(rover), after=wrong)
+
+
+def test_what_there_was_no_time_for_is_named(rover: sqlite3.Connection, tier: str) -> None:
+    found = resolve_range(rover, run_id=1)
+    events = find_events(rover, found, deadline_s=0.0)
+    (note,) = (note for note in events.notes if "not looked for" in note and "jump" in note)
+    for kind in ("stuck", "silent", "flat", "jump", "oscillation"):
+        assert kind in note and kind not in events.totals
+    (note,) = (note for note in events.notes if "not looked for: run" in note)
+    assert "log" in note and "change" in note and not events.events
+
+
+def test_between_two_signals_the_time_is_looked_at(
+    rover: sqlite3.Connection,
+) -> None:
+    ticks = count()
+    time_range = resolve_range(rover, run_id=1)
+    detection = Detection(
+        rover,
+        known_signals(rover, time_range),
+        EventOptions(kinds=("jump",)),
+        Deadline(12.0, lambda: next(ticks)),
+        *(0.0, 119.9),
+    )
+    notes: list[str] = []
+    detection.events_touching(time_range.segments[0], notes)
+    told = " ".join(notes)
+    assert re.search(r"jump was not searched in \d+ signals", told), told
+
+
+def test_a_run_that_is_only_cruising_has_no_trouble(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, run_id=3)
+    events = find_events(rover, found, limit=200)
+    assert {event.kind for event in events.events} == {"run"}
+
+
+def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
+    with pytest.raises(InvalidInputError, match="kind"):
+        EventOptions(kinds=("stcuk",))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(InvalidInputError, match="above or below"):
+        Threshold("ir")
+    with pytest.raises(InvalidInputError, match="stuck_s"):
+        EventOptions(stuck_s=0)
+    with pytest.raises(UnknownSignalError):
+        ask(rover, "stuck", mode="moood")
+    with pytest.raises(InvalidInputError, match="means 2 signals"):
+        ask(rover, "stuck", position=("pose", "pose.1"))
+    with pytest.raises(UnknownSignalError):
+        ask(rover, "threshold", thresholds=(Threshold("nothing", above=1.0),))
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_noise_neither_jumps_nor_swings(seed: int) -> None:
+    noise = random.Random(seed)
+    times = [0.1 * index for index in range(2000)]
+    values = [noise.gauss(0, 1) for _ in times]
+    assert find_jumps(times, values, 12.0) == []
+
+
+def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tuple[Event, ...]:
+    """Ten seconds of driving and ten of standing; each signal has a value for either."""
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(200):
+        state = {name: pair[step > 100] for name, pair in moving_and_standing.items()}
+        recorder.publish(step * 0.1, state | {"gps": {"x": min(step, 100) * 0.02, "y": 0}})
+    return ask(empty, "stuck").events
+
+
+def test_a_measured_speed_of_zero_does_not_hide_that_it_is_stuck(empty: sqlite3.Connection) -> None:
+    (stuck,) = publish_stuck(empty, speed=(0.2, 0.0), mode=("drive", "drive"))
+    assert stuck.start_s == pytest.approx(10.0, abs=0.2) and stuck.ongoing
+
+
+def test_a_robot_told_to_stand_is_not_stuck(empty: sqlite3.Connection) -> None:
+    assert not publish_stuck(empty, commanded_m_s=(0.2, 0.0), mode=("drive", "drive"))
+
+
+@pytest.mark.parametrize("mode", ["returning", "threshold_wait", "forest", "already_home", "idle"])
+def test_no_verdict_hangs_on_what_a_mode_is_called(empty: sqlite3.Connection, mode: str) -> None:
+    (stuck,) = publish_stuck(empty, mode=(mode, mode))
+    assert stuck.start_s == pytest.approx(10.0, abs=0.2)
+    assert stuck.details["evidence"] == f"in mode {mode}, in which it moved at 0.2 m/s"
+
+
+def test_what_is_ready_or_idle_beside_switches_nothing_off(empty: sqlite3.Connection) -> None:
+    arm = {"state": "idle"}
+    others = {"status": ("ready", "ready"), "arm": (arm, arm)}
+    (stuck,) = publish_stuck(empty, commanded_m_s=(0.2, 0.2), **others)
+    assert stuck.details["commanded"] == 0.2
+
+
+def test_wheels_that_turn_show_that_it_is_stuck(empty: sqlite3.Connection) -> None:
+    wheels = {"left": 4.0, "right": 4.0}
+    (stuck,) = publish_stuck(empty, wheels=(wheels, wheels))
+    assert "wheels at 4" in stuck.details["evidence"]
+
+
+def test_a_mode_of_an_earlier_run_in_which_it_moved_is_evidence(empty: sqlite3.Connection) -> None:
+    publish_stuck(empty, mode=("S3", "S3"))
+    recorder = Recorder(empty, WALL_START_S + 1000)
+    recorder.run(1, 1)
+    for step in range(100):
+        recorder.publish(step * 0.1, {"mode": "S3", "gps": {"x": 1, "y": 0}})
+    (stuck,) = ask(empty, "stuck", bounds={"run_id": 2}).events
+    assert stuck.details["evidence"] == "in mode S3, in which it moved at 0.2 m/s in run 1"
+
+
+def test_what_stood_is_told_also_where_nothing_shows_that_it_was_stuck(
+    empty: sqlite3.Connection,
+) -> None:
+    assert not publish_stuck(empty, mode=("go", "S0"))
+    (still,) = ask(empty, "still").events
+    assert (still.start_s, still.ongoing) == (pytest.approx(10.0, abs=0.2), True)
+    assert still.details["mode"] == "S0"
+    assert still.details["not_stuck"] == "not seen moving in mode S0"
+
+
+def test_without_any_evidence_a_standstill_says_that_there_is_none(
+    empty: sqlite3.Connection,
+) -> None:
+    assert not publish_stuck(empty, volts=(12.0, 12.1))
+    (still,) = ask(empty, "still").events
+    assert "nothing that is published shows" in still.details["not_stuck"]
+
+
+def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(300):
+        turned, driven = max(0, step - 150) * 0.05, min(step, 150) * 0.02
+        place = [driven, 0.0, math.remainder(turned, 2 * math.pi)]
+        recorder.publish(step * 0.1, {"pose": place, "mode": "go"})
+    assert ask(empty, "stuck").events == ()
+    (still,) = ask(empty, "still").events
+    assert still.details["turned_rad"] == pytest.approx(7.45, abs=0.3)
+    assert "it turned in place" in still.details["not_stuck"]
+
+
+def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(300):
+        recorder.publish(step * 0.1, {"gps": {"x": step * 0.03, "y": 0}})
+    assert "it came 0.9 m far" in ask(empty, "stuck").notes[0]
+
+
+def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in (*range(100), *range(200, 300)):
+        recorder.publish(step * 0.1, {"gps": {"x": 1.0, "y": 0.0}})
+    assert spans(ask(empty, "still")) == [(0.0, 9.9), (20.0, 29.9)]
+
+
+def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder.publish(0.0, {"mode": "drive", "range": 1.0})
+    assert "no position is published" in ask(empty, "stuck", bounds={"run_id": 1}).notes[0]
+
+
+def test_a_wall_range_over_several_runs_knows_the_signals_of_each(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    session_id = recorder.session(robot_id, "a" * 64)
+    for run, name in enumerate(("alt_m", "depth_m", "temp_c")):
+        recorder.run(session_id, robot_id, "reset" if run else "start")
+        for step in range(30):
+            recorder.publish(step * 0.1, {name: float(step >= 20)})
+    above = tuple(Threshold(name, above=0.5) for name in ("alt_m", "depth_m", "temp_c"))
+    found = ask(empty, "threshold", bounds={"since": WALL_START_S}, thresholds=above)
+    assert [(e.run_id, e.name, e.start_s) for e in found.events] == [
+        (1, "alt_m", 2.0), (2, "depth_m", 2.0), (3, "temp_c", 2.0),
+    ]  # fmt: skip
+
+
+def test_a_gap_is_an_event_also_where_the_range_lies_within_it(
+    rover: sqlite3.Connection, tier: str
+) -> None:
+    for start_s, end_s in ((91.0, 93.0), (88.0, 92.0), (94.0, 99.0)):
+        asked = {"run_id": 1, "start_s": start_s, "end_s": end_s}
+        assert spans(ask(rover, "gap", bounds=asked)) == [(89.9, 95.0)]
+    for start_s, end_s in ((80.0, 89.9), (95.0, 99.0)):
+        asked = {"run_id": 1, "start_s": start_s, "end_s": end_s}
+        assert spans(ask(rover, "gap", bounds=asked)) == []

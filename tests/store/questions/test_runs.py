@@ -1,0 +1,274 @@
+"""Runs are listed with their code and their end, and compared by what they did."""
+
+from __future__ import annotations
+
+import math
+import random
+import sqlite3
+import statistics
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import WALL_PER_SIM, Recorder, record_rover
+from webots_mcp.errors import (
+    InvalidInputError,
+    NothingRecordedError,
+    UnknownRobotError,
+    UnknownRunError,
+)
+from webots_mcp.store.analysis.spread import Spread
+from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.differences import Difference
+from webots_mcp.store.questions.runs import annotate_run, list_runs, run_info
+
+
+def test_runs_are_listed_with_code_duration_and_end(rover: sqlite3.Connection) -> None:
+    listed = list_runs(rover)
+    assert (listed.total, listed.cursor) == (3, None)
+    third, second, first = listed.runs
+    assert (first.run_id, first.controller_sha256, first.git_commit) == (1, "a" * 64, "c0ffee")
+    assert (first.duration_s, first.rows) == (pytest.approx(119.9), 1150)
+    assert first.real_time_factor == pytest.approx(2.0, rel=0.01)
+    assert [run.end_reason for run in (first, second, third)] == ["reset", "crashed", "finished"]
+    assert first.notable == {"log warning": 1, "log error": 1, "dropped": 1}
+    assert third.notable == {}
+
+
+def test_a_long_list_comes_in_pages(rover: sqlite3.Connection) -> None:
+    page = list_runs(rover, robot="rover", limit=2)
+    assert ([run.run_id for run in page.runs], page.cursor) == ([3, 2], 2)
+    page = list_runs(rover, limit=2, before_id=page.cursor)
+    assert ([run.run_id for run in page.runs], page.cursor) == ([1], None)
+
+
+def test_a_run_that_goes_on_counts_its_newest_rows(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    run_id = recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(20):
+        recorder.publish(float(step), {"x": step})
+        if step == 9:
+            beat = "UPDATE run SET rows = 10, last_sim_time_s = 9.0, last_wall_time_s = ?"
+            empty.execute(beat, (recorder.wall_s,))
+    run = run_info(empty, run_id)
+    assert (run.rows, run.duration_s, run.wall_duration_s) == (20, 19.0, 19.0 * WALL_PER_SIM)
+
+
+def test_a_pause_is_no_part_of_the_real_time_factor(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    run_id = recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder.publish(0.0, {"x": 0})
+    assert run_info(empty, run_id).real_time_factor is None
+    recorder.insert("event", **recorder.at(2.0), kind="pause")
+    recorder.run_start_s += 20
+    recorder.insert("event", **recorder.at(2.0), kind="resume")
+    recorder.publish(5.0, {"x": 1})
+    run = run_info(empty, run_id)
+    assert (run.held_s, run.real_time_factor) == (20.0, 1 / WALL_PER_SIM)
+
+
+def test_a_note_stays_with_its_run(empty: sqlite3.Connection) -> None:
+    record_rover(empty)
+    annotate_run(empty, 2, label="baseline", note="before tuning")
+    assert (run_info(empty, 2).label, run_info(empty, 2).note) == ("baseline", "before tuning")
+    annotate_run(empty, 2, note="")
+    assert (run_info(empty, 2).label, run_info(empty, 2).note) == ("baseline", None)
+    with pytest.raises(InvalidInputError, match="label or a note"):
+        annotate_run(empty, 2)
+    with pytest.raises(InvalidInputError, match="101 characters"):
+        annotate_run(empty, 2, label="x" * 101)
+    with pytest.raises(UnknownRunError):
+        annotate_run(empty, 9, label="x")
+
+
+def difference(comparison: Comparison, name: str) -> Difference:
+    return next(each for each in comparison.differences if each.name == name)
+
+
+def measures(comparison: Comparison) -> dict[str, list[float | None]]:
+    """The medians of each group, by what is measured."""
+    return {
+        each.name: [None if one is None else one.median for one in each.spread]
+        for each in comparison.measures
+    }
+
+
+def medians(spreads: list[Spread | None]) -> list[float | None]:
+    return [None if each is None else each.median for each in spreads]
+
+
+def test_two_runs_differ_in_what_was_changed(rover: sqlite3.Connection, tier: str) -> None:
+    comparison = compare_runs(rover, [2, 3])
+    assert comparison.compared_s == pytest.approx(29.9, abs=0.01)
+    x = difference(comparison, "pose.0")
+    slow = [0.2 * 0.1 * step for step in range(300)]
+    fast = [0.3 * 0.1 * step for step in range(300)]
+    assert medians(x.mean) == [pytest.approx(statistics.fmean(each)) for each in (slow, fast)]
+    pooled = math.sqrt((statistics.variance(slow) + statistics.variance(fast)) / 2)
+    d = (statistics.fmean(fast) - statistics.fmean(slow)) / pooled
+    assert x.effect == [0.0, pytest.approx(d)]
+    assert x.deviation_ratio == [1.0, pytest.approx(1.5)]
+    assert x.count == [300, 300]
+    assert difference(comparison, "battery_v").effect == [0.0, pytest.approx(0.0, abs=1e-9)]
+    assert comparison.differences[0].name == "commanded_m_s"  # constant at 0.2, constant at 0.3
+    assert comparison.differences[0].effect == [0.0, None]
+
+
+def test_runs_are_measured_over_the_same_stretch(rover: sqlite3.Connection) -> None:
+    comparison = compare_runs(rover, [1, 3])
+    assert comparison.compared_s == pytest.approx(59.9, abs=0.01)
+    found = measures(comparison)
+    assert found["distance_m"] == [pytest.approx(8.7, abs=0.3), pytest.approx(0.3 * 59.9)]
+    assert found["mean_speed_m_s"][1] == pytest.approx(0.3, abs=0.001)
+    assert found["share of back_up"] == [pytest.approx(8.0 / 59.9, abs=0.005), 0.0]
+    assert found["stuck per min"] == [pytest.approx(1.0, abs=0.01), 0.0]
+
+
+def test_of_one_run_each_no_difference_is_claimed(rover: sqlite3.Connection) -> None:
+    comparison = compare_runs(rover, [2, 3])
+    verdicts = [each.different for each in (*comparison.measures, *comparison.differences)]
+    assert all(verdict == [False, None] for verdict in verdicts)
+    assert "one run each" in comparison.notes[0]
+
+
+def record_group(
+    recorder: Recorder, robot_id: int, code: str, runs: int, speed_m_s: float, dice: random.Random
+) -> None:
+    """Runs of 30 s that drive about as fast, with some bumps by chance and a noisy sensor."""
+    for _ in range(runs):
+        recorder.run(recorder.session(robot_id, code * 64), robot_id)
+        speed = speed_m_s * (1 + dice.gauss(0, 0.01))
+        swing = dice.gauss(0.2, 0.01)
+        for step in range(150):
+            time_s = 0.2 * step
+            bumped = dice.random() < 0.005
+            recorder.publish(
+                time_s,
+                {
+                    "pose": [speed * time_s, 0.0],
+                    "mode": "back_up" if bumped else "cruise",
+                    "error": swing * math.sin(time_s),
+                    "noise": dice.gauss(0, 1),
+                },
+            )
+
+
+def claimed(comparison: Comparison) -> set[str]:
+    found = (*comparison.measures, *comparison.differences)
+    return {each.name for each in found if each.different[1]}
+
+
+def test_between_like_runs_no_difference_is_claimed(empty: sqlite3.Connection) -> None:
+    dice = random.Random(4)
+    recorder = Recorder(empty)
+    for pair in range(20):
+        robot_id = recorder.robot(f"r{pair}")
+        empty.execute("BEGIN")
+        for code in "ab":
+            record_group(recorder, robot_id, code, 3, 0.2, dice)
+        empty.execute("COMMIT")
+        assert claimed(compare_code(empty, robot=f"r{pair}")) == set()
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_tenth_more_speed_is_found(empty: sqlite3.Connection, seed: int) -> None:
+    dice = random.Random(seed)
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    empty.execute("BEGIN")
+    record_group(recorder, robot_id, "a", 5, 0.2, dice)
+    record_group(recorder, robot_id, "b", 5, 0.22, dice)
+    empty.execute("COMMIT")
+    comparison = compare_code(empty)
+    assert {"distance_m", "mean_speed_m_s"} <= claimed(comparison)
+    assert "noise" not in claimed(comparison)
+    assert difference(comparison, "pose.0").different == [False, True]
+
+
+def test_a_swing_that_was_cut_comes_first(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    for swing in (0.4, 0.02):
+        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        for step in range(200):
+            state = {f"other_{i}": i * 0.1 + swing * 0.5 + step * 0.01 for i in range(6)}
+            recorder.publish(step * 0.1, {**state, "heading_error": swing * math.sin(step * 0.3)})
+    first, *_ = compare_runs(empty, [1, 2]).differences
+    assert first.name == "heading_error"
+    assert first.deviation_ratio[1] == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("noise_m", "speed_m_s", "way_m"), [(0.01, 0, 0), (0.0005, 0.1, 14)])
+def test_the_noise_of_a_position_is_no_way(
+    empty: sqlite3.Connection, noise_m: float, speed_m_s: float, way_m: float
+) -> None:
+    noise = random.Random(7)
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    session_id = recorder.session(robot_id, "x")
+    empty.execute("BEGIN")
+    for _ in range(2):
+        recorder.run(session_id, robot_id)
+        for step in range(4376):
+            x, y = (noise.gauss(speed_m_s * step * 0.032, noise_m), noise.gauss(1, noise_m))
+            recorder.publish(step * 0.032, {"pose": [x, y]})
+    empty.execute("COMMIT")
+    for distance_m in measures(compare_runs(empty, [1, 2]))["distance_m"]:
+        assert distance_m == pytest.approx(way_m, abs=0.03 * way_m + 0.6)
+
+
+def test_runs_before_and_after_the_last_edit_are_compared(rover: sqlite3.Connection) -> None:
+    comparison = compare_code(rover)
+    before, after = comparison.groups
+    assert [run.run_id for run in before.runs] == [1, 2]
+    assert [run.run_id for run in after.runs] == [3]
+    assert comparison.compared_s == pytest.approx(29.9, abs=0.01)
+    assert measures(comparison)["mean_speed_m_s"] == pytest.approx([0.2, 0.3], abs=0.001)
+
+
+def test_a_signal_that_only_one_run_has_is_named(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    session_id = recorder.session(robot_id, "x")
+    for state in ({"x": 1.0, "old": 1.0}, {"x": 2.0, "new": 1.0}):
+        recorder.run(session_id, robot_id)
+        for step in range(5):
+            recorder.publish(float(step), state)
+    comparison = compare_runs(empty, [1, 2])
+    assert comparison.only_in == {"old": ("run 1",), "new": ("run 2",)}
+    assert [each.name for each in comparison.differences] == ["x"]
+    with pytest.raises(NothingRecordedError, match="no edit"):
+        compare_code(empty)
+
+
+def test_runs_of_two_robots_can_be_compared(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    for name, x in (("a", 1.0), ("b", 3.0)):
+        robot_id = recorder.robot(name)
+        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        for step in range(30):
+            recorder.publish(float(step), {"filler_" + name: 0, "x": x + step % 2, "scan": None})
+    comparison = compare_runs(empty, [1, 2], names=["x", "scan"])
+    (x, *_) = comparison.differences
+    assert medians(x.mean) == [1.5, 3.5]
+    assert "these are runs of different robots: a, b" in comparison.notes
+    assert comparison.only_in == {}
+
+
+@pytest.mark.parametrize("run_ids", [[], [1], [1, 1], list(range(1, 12))])
+def test_a_comparison_without_sense_is_refused(
+    rover: sqlite3.Connection, run_ids: list[Any]
+) -> None:
+    with pytest.raises(InvalidInputError, match="2 to 10 different runs"):
+        compare_runs(rover, run_ids)
+
+
+def test_unknown_runs_and_robots_are_named(rover: sqlite3.Connection) -> None:
+    with pytest.raises(UnknownRunError, match="99"):
+        compare_runs(rover, [1, 99])
+    with pytest.raises(UnknownRobotError):
+        list_runs(rover, robot="rovre")
+    with pytest.raises(InvalidInputError, match="limit"):
+        list_runs(rover, limit=0)

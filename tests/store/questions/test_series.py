@@ -1,0 +1,186 @@
+"""A question over any stretch of time is answered with the true extremes and the true gaps."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import Recorder
+from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.store.questions.series import NumberColumns, query_history
+from webots_mcp.store.reading.pages import query_rows
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+
+
+def ask(connection: sqlite3.Connection, *names: str, max_points: int = 50, **bounds: Any):
+    found = resolve_range(connection, run_id=1, **bounds)
+    (run,) = query_history(connection, found, names, max_points=max_points).runs
+    return run
+
+
+def column(run: Any, name: str) -> NumberColumns:
+    return next(each for each in run.numbers if each.name == name)
+
+
+def test_an_extreme_of_a_single_row_survives_any_bucket(
+    rover: sqlite3.Connection, tier: str
+) -> None:
+    for max_points in (1, 3, 12, 200):
+        ir = column(ask(rover, "ir", max_points=max_points), "ir")
+        assert max(value for value in ir.max if value is not None) == 5.0
+        assert (ir.whole.max, ir.whole.max_sim_time_s) == (5.0, 70.0)
+        assert len(ir.max) <= max_points
+
+
+def test_counts_are_exact_at_both_ends(rover: sqlite3.Connection, tier: str) -> None:
+    run = ask(rover, "pose.0", start_s=3.05, end_s=61.05)
+    pose = column(run, "pose.0")
+    assert sum(pose.count) == pose.whole.present == 580
+    assert (pose.whole.first_sim_time_s, pose.whole.last_sim_time_s) == (3.1, 61.0)
+    assert pose.whole.max == pytest.approx(8.0)
+    assert run.tier == ("raw" if tier == "rows" else "rollup")
+
+
+def test_a_long_step_is_a_multiple_of_the_tier(
+    rover: sqlite3.Connection, long_ranges: None
+) -> None:
+    run = ask(rover, "ir", max_points=5)
+    assert (run.tier, run.step_s) == ("rollup", 30.0)
+    assert run.sim_time_s == [0.0, 30.0, 60.0, 90.0]
+
+
+def test_a_recording_gap_is_visible_as_such(rover: sqlite3.Connection, tier: str) -> None:
+    run = ask(rover, "ir", max_points=500)
+    (gap,) = run.gaps
+    assert (gap.start_s, gap.end_s) == (pytest.approx(89.9), 95.0)
+    assert run.interval_s == pytest.approx(0.1)
+    if tier == "rows":
+        empty = [t for t, n in zip(run.sim_time_s, column(run, "ir").count, strict=True) if n == 0]
+        assert empty and all(90 <= t < 95 for t in empty)
+
+
+def test_few_rows_come_as_they_are(rover: sqlite3.Connection) -> None:
+    run = ask(rover, "pose.0", "ir", start_s=10.0, end_s=11.0)
+    assert (run.tier, run.step_s, run.rows) == ("rows", None, 10)
+    assert column(run, "pose.0").last == [pytest.approx(2.0 + 0.02 * i) for i in range(10)]
+
+
+def test_an_angle_has_a_circular_mean(rover: sqlite3.Connection, tier: str) -> None:
+    heading = column(ask(rover, "heading", start_s=60.0, end_s=90.0, max_points=3), "heading")
+    assert all(abs(abs(mean or 0) - math.pi) < 0.01 for mean in heading.mean)
+    assert heading.min[0] is not None and heading.min[0] < -2.6
+
+
+def test_modes_come_as_change_points(rover: sqlite3.Connection, tier: str) -> None:
+    run = ask(rover, "mode", "sensors.bumper", start_s=45.0)
+    mode, bumper = run.changes
+    assert mode.points == [(0.0, "cruise"), (52.0, "back_up"), (60.0, "avoid"), (95.0, "cruise")]
+    assert mode.time_by_value_s == pytest.approx({"avoid": 35.0, "cruise": 31.9, "back_up": 8.0})
+    assert bumper.points == [(40.0, True), (52.0, False)]
+
+
+def test_odd_values_are_named(rover: sqlite3.Connection) -> None:
+    front = column(ask(rover, "sensors.front", start_s=99.0, end_s=106.0), "sensors.front")
+    assert front.odd == {"nan": 40}
+    assert sum(front.count) == 30
+
+
+def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(30):
+        state = {"short": [None, step, None if step < 9 else 1], "long": [1.0] * 30 + [None]}
+        odd = {"short.*": "nan", "long.*": "inf"}
+        recorder.publish(float(step), state, odd if step < 20 else {"short.0": "inf"})
+    roll(empty)
+    run = ask(empty, "short", "long.mean")
+    assert column(run, "short.0").odd == {"nan": 20, "inf": 10}
+    assert column(run, "short.1").odd == {}
+    assert column(run, "short.2").odd == {"nan": 9}
+    assert column(run, "long.mean").odd == {"inf": 20}
+    counted = dict(empty.execute("SELECT name, odd_rows FROM signal WHERE name LIKE 'short%'"))
+    assert counted == {"short.0": 30, "short.1": 0, "short.2": 9}
+
+
+def test_a_reduced_array_is_a_signal_like_any_other(rover: sqlite3.Connection, tier: str) -> None:
+    run = ask(rover, "lidar.min", "lidar.argmin", start_s=50.0, end_s=80.0)
+    lidar = column(run, "lidar.min")
+    assert lidar.whole.min == pytest.approx(1.55)
+    assert column(run, "lidar.argmin").whole.max == 7
+
+
+def test_rows_and_rollups_give_the_same_whole(rover: sqlite3.Connection, tier: str) -> None:
+    battery = column(ask(rover, "battery_v", start_s=3.3, end_s=117.7), "battery_v").whole
+    expected = [12.6 - 0.001 * i / 10 for i in range(33, 1177) if not 900 <= i < 950]
+    mean = math.fsum(expected) / len(expected)
+    assert battery.present == len(expected)
+    assert battery.mean == pytest.approx(mean)
+    squares = math.fsum((value - mean) ** 2 for value in expected)
+    assert battery.squares == pytest.approx(squares, rel=1e-6)
+
+
+def test_a_wall_range_gives_each_run_its_part(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, since=1_700_000_050.0, until=1_700_000_070.0)
+    answer = query_history(rover, found, ["battery_v"], max_points=20)
+    assert [run.run_id for run in answer.runs] == [1, 2]
+    assert sum(len(run.sim_time_s) for run in answer.runs) <= 20
+
+
+def test_a_deadline_that_passed_is_admitted(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, run_id=1)
+    (run,) = query_history(rover, found, ["lidar.min"], deadline_s=0.0).runs
+    assert run.cut_at_s is not None
+
+
+def test_pages_hold_every_row_once(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, run_id=1, start_s=5.0, end_s=40.0)
+    cursor, ids, xs = 0, list[int](), list[Any]()
+    while True:
+        page = query_rows(rover, found, ["pose.0"], limit=99, after_id=cursor)
+        ids += page.ids
+        xs += page.values["pose.0"]
+        if page.cursor is None:
+            break
+        cursor = page.cursor
+    assert len(ids) == len(set(ids)) == 350
+    assert xs[0] == pytest.approx(1.0) and xs[-1] == pytest.approx(7.98)
+
+
+def test_absurd_questions_are_refused(rover: sqlite3.Connection) -> None:
+    found = resolve_range(rover, run_id=1)
+    for max_points in (0, -1, 501, 10**9):
+        with pytest.raises(InvalidInputError, match="max_points"):
+            query_history(rover, found, ["ir"], max_points=max_points)
+    with pytest.raises(UnknownSignalError):
+        query_history(rover, found, ["nothing"])
+    with pytest.raises(InvalidInputError, match="limit"):
+        query_rows(rover, found, ["ir"], limit=0)
+
+
+def test_rows_after_the_watermark_are_in_the_answer(empty: sqlite3.Connection, tier: str) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(600):
+        recorder.publish(step * 0.1, {"x": float(step), "mode": f"m{step // 200}"})
+        if step == 450:
+            roll(empty, 10_000)
+    run = ask(empty, "x", "mode", start_s=0.05)
+    assert column(run, "x").whole[:2] == (599, 599)
+    assert column(run, "x").whole.last == 599.0
+    assert [point.value for point in run.changes[0].points] == ["m0", "m1", "m2"]
+
+
+def test_integers_beyond_64_bits_stay_what_they_are_in_rows(empty: sqlite3.Connection) -> None:
+    numbers = [2**63 - 1, 2**63, -(2**63) - 1, 10**30 + 1]
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step, number in enumerate(numbers):
+        recorder.publish(float(step), {"ticks": number})
+    assert list(query_rows(empty, resolve_range(empty), ["ticks"]).values["ticks"]) == numbers

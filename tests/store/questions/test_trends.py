@@ -1,0 +1,269 @@
+"""A trend says what the signal did, in numbers that can be computed another way."""
+
+from __future__ import annotations
+
+import math
+import random
+import sqlite3
+import statistics
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.recordings.rover import Recorder
+from webots_mcp.store.analysis.features import (
+    find_oscillation,
+    find_spikes,
+    fit_line,
+    flat_since,
+    time_effect,
+    unwrap,
+)
+from webots_mcp.store.questions.trend import Trend
+from webots_mcp.store.questions.trends import RunTrends, trends
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+
+Course = Callable[[float], float | None]  # from the time; None leaves the key out
+numbers = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=50)
+
+
+@given(numbers)
+def test_the_fitted_line_is_that_of_the_statistics_module(values: list[float]) -> None:
+    times = [0.5 * index for index in range(len(values))]
+    line = fit_line(times, values, statistics.fmean(values))
+    assert line is not None
+    expected = statistics.linear_regression(times, values)
+    assert line.slope_per_s == pytest.approx(expected.slope, abs=1e-6, rel=1e-6)
+    assert 0 <= line.r2 <= 1
+
+
+@given(st.floats(-3, 3), st.lists(st.floats(-3, 3), max_size=40))
+def test_an_unwrapped_angle_differs_by_whole_turns(first: float, turns: list[float]) -> None:
+    angles, total = [first], first
+    for turn in turns:
+        total += turn
+        angles.append(math.remainder(total, 2 * math.pi))
+    for wrapped, unwrapped in zip(angles, unwrap(angles), strict=True):
+        assert math.remainder(unwrapped - wrapped, 2 * math.pi) == pytest.approx(0, abs=1e-6)
+    assert unwrap(angles)[-1] - unwrap(angles)[0] == pytest.approx(total - first, abs=1e-6)
+
+
+def test_a_swing_has_its_period_and_amplitude() -> None:
+    times = [0.1 * index for index in range(600)]
+    values = [5 + 2 * math.sin(2 * math.pi * time / 3) for time in times]
+    crossings, swing = find_oscillation(times, values, 5.0, statistics.stdev(values))
+    assert swing is not None
+    assert swing.period_s == pytest.approx(3, rel=0.02)
+    assert swing.amplitude == pytest.approx(2, rel=0.02)
+    assert crossings in (39, 40, 41)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_is_no_oscillation_and_has_no_spikes(seed: int) -> None:
+    noise = random.Random(seed)
+    times = [0.1 * index for index in range(1000)]
+    white = [noise.gauss(0, 1) for _ in times]
+    walk = [sum(white[: index + 1]) for index in range(len(white))]
+    for values in (white, walk):
+        mean, deviation = statistics.fmean(values), statistics.stdev(values)
+        assert find_oscillation(times, values, mean, deviation)[1] is None
+        assert find_spikes(times, values) == []
+
+
+def test_a_spike_is_found_and_a_step_is_none() -> None:
+    times = [float(index) for index in range(100)]
+    values = [0.0] * 50 + [1.0] * 50
+    assert find_spikes(times, values) == []
+    values[20] = 3.0
+    (spike,) = find_spikes(times, values)
+    assert (spike.sim_time_s, spike.value) == (20.0, 3.0)
+
+
+def test_slow_change_counts_and_noise_does_not() -> None:
+    noise = random.Random(3)
+    times = [float(index) for index in range(800)]
+
+    def effect(values: list[float]) -> float:
+        mean = statistics.fmean(values)
+        return time_effect(times, values, mean, sum((value - mean) ** 2 for value in values))
+
+    assert effect([noise.gauss(0, 1) for _ in times]) < 0.05
+    assert effect(times) > 0.9
+    assert effect([1.0] * 800) == 0.0
+
+
+def test_flat_since_is_the_begin_of_the_rest() -> None:
+    times = [float(index) for index in range(100)]
+    assert flat_since(times, [min(index, 60.0) for index in range(100)]) == 60.0
+    assert flat_since(times, [float(index) for index in range(100)]) is None
+    assert flat_since(times, [2.0] * 100) == 0.0
+
+
+def ask(connection: sqlite3.Connection, *names: str, **bounds: Any) -> RunTrends:
+    found = resolve_range(connection, run_id=1, **bounds)
+    return trends(connection, found, names or ("*",)).runs[0]
+
+
+def one(connection: sqlite3.Connection, name: str, **bounds: Any) -> Trend:
+    return ask(connection, name, **bounds).numbers[0]
+
+
+def test_a_falling_battery_falls(rover: sqlite3.Connection, tier: str) -> None:
+    battery = one(rover, "battery_v")
+    assert (battery.shape, battery.monotonic) == ("falling", "falling")
+    assert battery.slope_per_s == pytest.approx(-0.001, rel=0.05)
+    assert battery.r2 == pytest.approx(1.0, abs=0.01)
+    assert battery.says == "falls from 12.6 to 12.48 V (-0.001 V/s)"
+
+
+def test_mean_and_deviation_are_exact_in_both_tiers(rover: sqlite3.Connection, tier: str) -> None:
+    battery = one(rover, "battery_v", start_s=2.05, end_s=80.0)
+    values = [12.6 - 0.0001 * step for step in range(21, 800)]
+    assert battery.mean == pytest.approx(statistics.fmean(values))
+    assert battery.deviation == pytest.approx(statistics.stdev(values))
+    assert battery.summary.present == len(values)
+
+
+def test_a_stuck_robot_rests(rover: sqlite3.Connection) -> None:
+    x = one(rover, "pose.0", end_s=52.0)
+    assert x.flat_since_s == pytest.approx(40.0, abs=0.3)
+    assert "flat at 8 since" in x.says
+
+
+def test_a_swinging_heading_is_described_across_the_turn(rover: sqlite3.Connection) -> None:
+    heading = one(rover, "heading", start_s=60.0, end_s=90.0)
+    assert heading.shape == "oscillating" and heading.oscillation is not None
+    assert heading.oscillation.period_s == pytest.approx(2.0, rel=0.02)
+    assert heading.oscillation.amplitude == pytest.approx(0.5, rel=0.03)
+    assert abs(heading.mean or 0) == pytest.approx(math.pi, abs=0.02)
+
+
+def test_a_spike_is_told(rover: sqlite3.Connection) -> None:
+    ir = one(rover, "ir", start_s=60.0, end_s=80.0)
+    assert ir.spikes is not None
+    assert [(spike.sim_time_s, spike.value) for spike in ir.spikes] == [(70.0, 5.0)]
+    assert "1 spike, the largest 5 at 70 s" in ir.says
+
+
+def record(
+    connection: sqlite3.Connection, *, rows: int, interval_s: float, **courses: Course
+) -> None:
+    """One run, rolled up: each signal by name with its course."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    connection.execute("BEGIN")
+    for index in range(rows):
+        time_s = round(index * interval_s, 6)
+        state = {name: course(time_s) for name, course in courses.items()}
+        present = {name: value for name, value in state.items() if value is not None}
+        recorder.publish(time_s, present)
+    connection.execute("COMMIT")
+    roll(connection, 100_000)
+
+
+def test_a_swing_faster_than_the_rollups_gets_no_period_of_an_alias(
+    empty: sqlite3.Connection, long_ranges: None
+) -> None:
+    def yaw(time_s: float) -> float:
+        return math.remainder(math.pi + 0.5 * math.sin(3 * time_s), 2 * math.pi)
+
+    record(empty, rows=4000, interval_s=0.1, sine=math.sin, yaw=yaw)
+    for name in ("sine", "yaw"):
+        trend = one(empty, name)
+        assert (trend.shape, trend.oscillation, trend.flat_since_s) == ("varying", None, None)
+        assert "varies faster than 10 s: ask for a shorter range" in trend.says
+        assert "varies faster" not in one(empty, name, start_s=100.0, end_s=109.0).says
+
+
+def test_a_swing_slower_than_the_rollups_is_told_in_both_tiers(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, rows=4000, interval_s=0.2, sine=lambda t: math.sin(2 * math.pi * t / 80))
+    sine = one(empty, "sine")
+    assert sine.shape == "oscillating" and sine.oscillation is not None
+    assert sine.oscillation.period_s == pytest.approx(80, rel=0.03)
+
+
+def test_what_swung_and_rests_is_said_to_have_swung(empty: sqlite3.Connection) -> None:
+    def swing(time_s: float) -> float:
+        return 0.3 * math.sin(math.pi * time_s) if 70 <= time_s < 82 else 0.0
+
+    record(empty, rows=1000, interval_s=0.1, swing=swing)
+    trend = one(empty, "swing")
+    assert trend.shape == "resting"
+    assert trend.says == "swung by 0.3 about 0 every 2 s from 70.1 to 82.1 s; flat at 0 since 82 s"
+
+
+def test_what_fell_rested_and_rose_twice_does_not_swing(empty: sqlite3.Connection) -> None:
+    record(empty, rows=1300, interval_s=0.1, front=lambda t: 1.0 if t % 60 < 30 else 0.05)
+    assert one(empty, "front").oscillation is None
+
+
+def test_noise_does_not_hide_a_swing(empty: sqlite3.Connection) -> None:
+    noise = random.Random(1)
+    record(
+        empty, rows=3000, interval_s=0.02,
+        sine=lambda t: math.sin(2 * math.pi * t / 5) + noise.gauss(0, 0.3),
+    )  # fmt: skip
+    sine = one(empty, "sine")
+    assert sine.oscillation is not None and sine.crossings in (23, 24)
+    assert sine.oscillation.period_s == pytest.approx(5, rel=0.02)
+
+
+@pytest.mark.parametrize("rate_rad_s", [0.2, -0.21])
+def test_an_angle_turns_by_as_much_as_it_turned(
+    empty: sqlite3.Connection, tier: str, rate_rad_s: float
+) -> None:
+    record(
+        empty, rows=2001, interval_s=0.05,
+        yaw=lambda t: math.remainder(0.6 + rate_rad_s * t, 2 * math.pi),
+    )  # fmt: skip
+    yaw = one(empty, "yaw")
+    assert yaw.says == f"turns by {rate_rad_s * 100:.3g} rad ({rate_rad_s:.3g} rad/s)"
+
+
+def test_rows_without_the_signal_are_rows_without_a_value(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, rows=2000, interval_s=0.1, x=float, lidar=lambda t: 1.0 + t if t < 100 else None)
+    lidar = one(empty, "lidar")
+    assert lidar.missing_share == pytest.approx(0.5)
+    assert "no value in 50 % of the rows" in lidar.says
+
+
+def test_missing_values_are_told(rover: sqlite3.Connection, tier: str) -> None:
+    front = one(rover, "sensors.front", start_s=90.0)
+    assert front.missing_share == pytest.approx(40 / 249, abs=0.002)
+    assert "no value in 16" in front.says
+
+
+def test_what_changed_most_comes_first(rover: sqlite3.Connection, tier: str) -> None:
+    run = ask(rover)
+    names = [trend.name for trend in run.numbers]
+    assert names.index("pose.0") < names.index("battery_v") < names.index("target")
+    assert run.total == len(names)
+    target = run.numbers[names.index("target")]
+    assert (target.shape, target.change, target.says) == ("constant", 0.0, "constant at 3")
+    assert run.resolution_s == (None if tier == "rows" else 10.0)
+
+
+def test_modes_are_counted_with_their_times(rover: sqlite3.Connection, tier: str) -> None:
+    mode, bumper = ask(rover, "mode", "sensors.bumper").states
+    assert (mode.changes, mode.last, mode.since_s) == (3, "cruise", 95.0)
+    assert mode.time_by_value_s == pytest.approx({"cruise": 76.9, "avoid": 35.0, "back_up": 8.0})
+    assert (bumper.changes, bumper.last) == (2, False)
+
+
+def test_a_signal_without_a_value_in_the_range_is_named(rover: sqlite3.Connection) -> None:
+    run = ask(rover, "sensors.front", start_s=101.0, end_s=103.0)
+    assert run.numbers == () and run.silent == ("sensors.front",)
+
+
+def test_an_empty_range_has_empty_trends(rover: sqlite3.Connection) -> None:
+    run = ask(rover, start_s=91.0, end_s=94.0)
+    assert run.numbers == () and run.rows == 0

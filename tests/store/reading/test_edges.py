@@ -1,0 +1,140 @@
+"""Two ranges that adjoin hold everything once; a time that was shown finds what it was shown of."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.memory import memory_connection
+from tests.recordings.rover import Recorder
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.questions.series import query_history
+from webots_mcp.store.questions.timeline import timeline
+from webots_mcp.store.reading.moments import moment_of, shown_time
+from webots_mcp.store.reading.pages import query_rows
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.window import resolve_window
+
+STEP_S = 0.032
+ROWS = 700
+
+
+def clock_times() -> list[float]:
+    """What a clock that adds up its steps comes to; 0.0625 s is half way between two of ours."""
+    times = [0.0]
+    while len(times) < ROWS:
+        times.append(times[-1] + STEP_S)
+    return sorted([*times, 0.0625, 0.1875])
+
+
+TIMES = clock_times()
+
+
+@pytest.fixture(scope="module", params=["raw", "rolled"])
+def clock(request: pytest.FixtureRequest) -> Iterator[sqlite3.Connection]:
+    """A mode that changes in every 7th row, and a log line in every 5th."""
+    with memory_connection() as connection:
+        recorder = Recorder(connection)
+        robot_id = recorder.robot("r")
+        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        for row, time_s in enumerate(TIMES):
+            recorder.publish(time_s, {"mode": "ab"[row // 7 % 2], "row": row})
+            if row % 5 == 0:
+                line = {"level": "warning", "source": "controller", "message": str(row)}
+                recorder.insert("log", **recorder.at(time_s), **line)
+        if request.param == "rolled":
+            assert roll(connection, 100_000).done
+        yield connection
+
+
+def rows_of(connection: sqlite3.Connection, **bounds: Any) -> list[int]:
+    found = query_rows(connection, resolve_range(connection, **bounds), ["row"], limit=1000)
+    return [int(str(value)) for value in found.values["row"]]
+
+
+def happened(connection: sqlite3.Connection, **bounds: Any) -> list[Event]:
+    options = EventOptions(kinds=("change", "log", "run"))
+    return list(
+        find_events(connection, resolve_range(connection, **bounds), options, limit=9999).events
+    )
+
+
+def test_clocks_that_add_up_are_meant() -> None:
+    assert sum(time_s != shown_time(time_s) for time_s in TIMES) > ROWS / 2
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.sampled_from(TIMES), st.floats(-0.002, 0.002))
+def test_adjoining_ranges_hold_every_row_change_and_event_once(
+    clock: sqlite3.Connection, time_s: float, beside_s: float
+) -> None:
+    for border_s in {shown_time(time_s), time_s, shown_time(time_s + beside_s)}:
+        if moment_of(border_s) <= 0 or border_s > TIMES[-1]:
+            continue
+        before, after = {"end_s": border_s}, {"start_s": border_s}
+        assert rows_of(clock, **before) + rows_of(clock, **after) == list(range(len(TIMES)))
+        parts = [*happened(clock, **before), *happened(clock, **after)]
+        assert [(e.kind, e.start_s, e.details) for e in parts] == [
+            (e.kind, e.start_s, e.details) for e in happened(clock)
+        ]
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.sampled_from(range(1, len(TIMES) - 1)))
+def test_a_shown_time_finds_its_row_and_no_other_within_the_millisecond(
+    clock: sqlite3.Connection, row: int
+) -> None:
+    shown_s = shown_time(TIMES[row])
+    assert rows_of(clock, start_s=shown_s)[0] == row
+    assert rows_of(clock, start_s=shown_s, end_s=shown_s + 0.001) == [row]
+    assert rows_of(clock, end_s=shown_s)[-1] == row - 1
+
+
+def test_a_change_at_the_start_of_a_range_is_in_it(clock: sqlite3.Connection) -> None:
+    shown_s = shown_time(TIMES[70])
+    whole = resolve_range(clock, start_s=shown_s, end_s=shown_s + 0.1)
+    for found in (
+        find_events(clock, whole, EventOptions(kinds=("change",))).events,
+        timeline(clock, whole, EventOptions(kinds=("change",))).events,
+    ):
+        assert [(e.start_s, e.details) for e in found] == [
+            (TIMES[70], {"before": "b", "after": "a"})
+        ]
+
+
+def test_log_lines_are_bounded_as_rows_are() -> None:
+    late = next(time_s for time_s in TIMES if time_s < shown_time(time_s))
+    early = next(time_s for time_s in TIMES if time_s > shown_time(time_s))
+    for time_s in (late, early):
+        shown_s = shown_time(time_s)
+        from_there = resolve_window(90.0, last_s=None, start_s=shown_s, end_s=None)
+        up_to_there = resolve_window(90.0, last_s=None, start_s=None, end_s=shown_s)
+        assert from_there.start_s <= time_s
+        assert not time_s < up_to_there.end_s
+
+
+def test_a_range_that_begins_with_the_first_row_is_within_the_recording(
+    clock: sqlite3.Connection,
+) -> None:
+    assert resolve_range(clock, start_s=0.0).notes == ()
+    assert "begins at 0 s" in resolve_range(clock, start_s=-0.001).notes[0]
+
+
+@pytest.mark.parametrize(("first", "last"), [(0, 1), (1, 2), (0, 2)])
+def test_summaries_of_whole_buckets_hold_the_rows_that_are_shown_in_them(
+    clock: sqlite3.Connection, first: int, last: int
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        whole = resolve_range(clock, start_s=10.0 * first, end_s=10.0 * last)
+        from_rows = query_history(clock, whole, ["row"], max_points=1)
+        patch.setattr("webots_mcp.store.reading.rows.RAW_ROWS", 100)
+        from_rollups = query_history(clock, whole, ["row"], max_points=1)
+    expected = len(rows_of(clock, start_s=10.0 * first, end_s=10.0 * last))
+    assert from_rows.runs[0].rows == from_rollups.runs[0].rows == expected

@@ -1,0 +1,99 @@
+"""Where something held for so long: in every row of that time, however the rows were read."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.memory import memory_connection
+from tests.recordings.rover import Recorder
+from webots_mcp.store.detection.event import EventOptions, Threshold
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading import rows as columns
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+
+Spans = list[tuple[str | None, float, float]]
+
+
+def record(
+    connection: sqlite3.Connection, states: Sequence[dict[str, Any]], every_s: float
+) -> None:
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    connection.execute("BEGIN")
+    for step, state in enumerate(states):
+        recorder.publish(round(step * every_s, 6), {"row": step, **state})
+    connection.execute("COMMIT")
+    roll(connection, 100_000)
+
+
+def spans(connection: sqlite3.Connection, **options: Any) -> Spans:
+    found = find_events(
+        connection, resolve_range(connection), EventOptions(**options), limit=10_000, around=()
+    )
+    return sorted((each.name, each.start_s, each.end_s) for each in found.events)
+
+
+def test_a_value_that_flickers_is_beyond_no_threshold_for_long(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, [{"alt_m": 10.0 * (step % 2)} for step in range(2000)], 0.02)
+    limits = (Threshold("alt_m", above=5, for_s=0.03), Threshold("alt_m", below=5, for_s=0.03))
+    assert spans(empty, kinds=("threshold",), thresholds=limits) == []
+
+
+def test_a_sensor_that_is_slower_than_the_rows_is_not_silent(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    slow = [{"front_m": 1.0 + step / 999} if step % 2 else {} for step in range(2000)]
+    record(empty, slow, 0.02)
+    assert spans(empty, kinds=("silent",), silent_s=0.03) == []
+
+
+def test_a_signal_that_is_not_published_any_more_is_silent(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    stops = [{"lidar_m": 1.0 + step % 5} if step < 250 else {} for step in range(400)]
+    record(empty, stops, 0.1)
+    ((name, start_s, end_s),) = spans(empty, kinds=("silent",))
+    assert (name, start_s) == ("lidar_m", 25.0)
+    assert end_s == pytest.approx(39.9, abs=0.1)
+
+
+def test_what_holds_throughout_is_one_span_across_every_border(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, [{"alt_m": 0.0 if step in (5, 333) else 9.0} for step in range(500)], 0.1)
+    high = (Threshold("alt_m", above=5, for_s=1.0),)
+    assert spans(empty, kinds=("threshold",), thresholds=high) == [
+        ("alt_m", 0.6, 33.2), ("alt_m", 33.4, 49.9),
+    ]  # fmt: skip
+
+
+LEVELS = st.sampled_from([0.0, 10.0, None, ()])  # the last: the row does not hold the signal
+STRETCHES = st.lists(st.tuples(LEVELS, st.integers(1, 12)), min_size=1, max_size=30)
+
+
+@settings(max_examples=40, deadline=None)
+@given(STRETCHES)
+def test_rollups_and_rows_tell_the_same_spans(stretches: list[tuple[Any, int]]) -> None:
+    levels = [level for level, rows in stretches for _ in range(rows)]
+    states = [{} if level == () else {"alt_m": level} for level in levels]
+    states += [{"alt_m": 0.0}]
+    limits = {"above": 5.0}, {"below": 5.0}
+    asked: dict[str, Any] = {
+        "kinds": ("threshold",),
+        "thresholds": [Threshold("alt_m", for_s=1.0, **limit) for limit in limits],
+    }
+    with memory_connection() as connection, pytest.MonkeyPatch.context() as patch:
+        record(connection, states, 1.0)
+        from_rows = spans(connection, **asked)
+        patch.setattr(columns, "RAW_ROWS", 3)
+        assert spans(connection, **asked) == from_rows

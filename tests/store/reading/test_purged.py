@@ -1,0 +1,120 @@
+"""What is said of a run whose first rows, or all of them, were purged: its rollups stay."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from tests.recordings.rover import WALL_START_S, record_rover
+from webots_mcp.store.analysis.spread import Spread
+from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.questions.series import RunHistory, query_history
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.rollup.rolling import roll
+
+
+def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:
+    wanted = resolve_range(connection, run_id=1, start_s=start_s)
+    return query_history(connection, wanted, ["pose.0", "mode"], max_points=12).runs[0]
+
+
+def keep_rows(connection: sqlite3.Connection, folder: Path, rows: int) -> None:
+    limits = Retention(state=Limit(rows=rows), outlive=0)
+    prune(connection, folder, limits, rest=False)
+
+
+@pytest.fixture
+def rover(empty: sqlite3.Connection) -> sqlite3.Connection:
+    record_rover(empty)
+    roll(empty, 100_000)
+    return empty
+
+
+def test_an_overview_is_the_same_after_a_purge(rover: sqlite3.Connection, tmp_path: Path) -> None:
+    before = overview(rover)
+    keep_rows(rover, tmp_path, 1500)
+    after = overview(rover)
+    assert after.tier == "rollup"
+    assert (after.start_s, after.end_s, after.rows) == (before.start_s, before.end_s, before.rows)
+    assert after.numbers[0].max == before.numbers[0].max
+    assert after.numbers[0].count == before.numbers[0].count
+    assert after.changes == before.changes
+
+
+def test_what_is_left_is_read_from_rows(rover: sqlite3.Connection, tmp_path: Path) -> None:
+    keep_rows(rover, tmp_path, 1500)
+    assert overview(rover, start_s=60).tier == "raw"
+
+
+def test_a_run_of_which_only_rollups_are_left_still_has_an_overview(
+    rover: sqlite3.Connection, tmp_path: Path
+) -> None:
+    keep_rows(rover, tmp_path, 900)
+    assert rover.execute("SELECT count(*) FROM state WHERE run_id = 1").fetchone() == (0,)
+    run = overview(rover)
+    assert run.numbers[0].count == [*[100] * 9, 50, 100, 100]
+    assert run.age_s > 0
+
+
+def test_a_range_that_begins_before_the_first_row_left_says_so(
+    rover: sqlite3.Connection, tmp_path: Path
+) -> None:
+    keep_rows(rover, tmp_path, 1500)
+    (note,) = resolve_range(rover, run_id=1).notes
+    assert "rows of run 1 before 55 s were purged" in note and "10 s summaries" in note
+    assert resolve_range(rover, run_id=1, start_s=60.0).notes == ()
+    assert "were purged" in resolve_range(rover, run_id=1, start_s=10.0, end_s=20.0).notes[0]
+
+
+def test_wall_time_reaches_into_what_was_purged(rover: sqlite3.Connection, tmp_path: Path) -> None:
+    keep_rows(rover, tmp_path, 1500)
+    start, end = WALL_START_S + 10, WALL_START_S + 40
+    found = resolve_range(rover, run_id=1, since=start, until=end)
+    (segment,) = found.segments
+    assert (segment.start_s, segment.end_s) == (
+        pytest.approx(20, abs=0.2), pytest.approx(80, abs=0.2),
+    )  # fmt: skip
+    assert "were purged" in found.notes[0]
+    (run,) = query_history(rover, found, ["pose.0"], max_points=500).runs
+    assert run.sim_time_s[0] <= 30.0
+
+
+def test_a_run_of_which_only_rollups_are_left_is_found_by_wall_time(
+    rover: sqlite3.Connection, tmp_path: Path
+) -> None:
+    keep_rows(rover, tmp_path, 900)
+    found = resolve_range(rover, since=WALL_START_S, until=WALL_START_S + 30)
+    assert [segment.run_id for segment in found.segments] == [1]
+    assert found.segments[0].end_s == pytest.approx(60, abs=0.2)
+    assert "the rows of run 1 were purged" in found.notes[0]
+    whole = resolve_range(rover, run_id=1, since=WALL_START_S - 9)
+    (run,) = query_history(rover, whole, ["pose.0"]).runs
+    assert run.rows == 1150
+
+
+def test_where_rows_were_purged_events_do_not_claim_to_have_looked_at_them(
+    rover: sqlite3.Connection, tmp_path: Path
+) -> None:
+    keep_rows(rover, tmp_path, 1500)
+    notes = find_events(rover, resolve_range(rover, run_id=1)).notes
+    assert any("searched from 55 s on only" in note for note in notes)
+
+
+def distance(comparison: Comparison) -> list[Spread | None]:
+    return next(each.spread for each in comparison.measures if each.name == "distance_m")
+
+
+@pytest.mark.parametrize("rows", [900, 1500])
+def test_the_distance_of_a_run_that_lost_rows_is_not_known(
+    rover: sqlite3.Connection, tmp_path: Path, rows: int
+) -> None:
+    keep_rows(rover, tmp_path, rows)
+    comparison = compare_runs(rover, [1, 3])
+    first, third = distance(comparison)
+    assert first is None and third is not None
+    assert any("run 1 were purged" in note and "distance" in note for note in comparison.notes)
+    assert distance(compare_code(rover))[0] is None  # of one of its runs it is not known

@@ -1,0 +1,161 @@
+"""Limits belong to the database: who sets them, who keeps to them, who says that others hold."""
+
+from __future__ import annotations
+
+import json
+import os
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import pytest
+
+from tests.recordings.runs import Recorded
+from webots_mcp.cli import main
+from webots_mcp.connection import connect
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.schema import create_schema
+from webots_mcp.store.retention import DEFAULT, Limit, Upkeep, in_force
+from webots_mcp.store.retention.limits import ask_at_start, ask_where_unset, set_limits, unheeded
+from webots_mcp.store.rollup.rolling import roll
+
+Say = Callable[..., str]
+MB = 1_000_000
+SERVE = [sys.executable, "-m", "webots_mcp", "serve"]
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Iterator[Recorded]:
+    with closing(connect(tmp_path / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+        recorded = Recorded(connection, tmp_path)
+        recorded.add_run(20)
+        recorded.add_run(20)
+        yield recorded
+
+
+@pytest.fixture
+def say(recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Say:
+    def said(*line: str) -> str:
+        assert main([*line, "--data-dir", str(tmp_path)]) == 0
+        return capsys.readouterr().out
+
+    return said
+
+
+@contextmanager
+def another_server(connection: sqlite3.Connection, pid: int) -> Generator[None]:
+    until = time.time() + 60
+    lease = ("maintainer", f"server {pid} abc", until)
+    connection.execute("INSERT INTO lease VALUES (?, ?, ?)", lease)
+    yield
+    connection.execute("DELETE FROM lease")
+
+
+def test_keep_sets_a_limit_and_deletes_nothing(say: Say, recorded: Recorded) -> None:
+    assert say("keep", "--keep-states", "30rows", "--keep-runs", "all") == ""
+    assert recorded.rows() == {1: 20, 2: 20}
+    assert in_force(recorded.connection).state.rows == 30
+    assert "states 30rows (set by keep, " in say("status")
+    assert "runs all (set by keep, " in say("status")
+    assert "logs 100.0 MB (default)" in say("status")
+    shown = json.loads(say("status", "--json"))
+    assert shown["limits"]["states"].startswith("30rows (set by keep")
+    assert shown["file"]["file_bytes"] > shown["file"]["free_in_file_bytes"] >= 0
+
+
+def test_who_maintains_keeps_to_what_was_set(say: Say, recorded: Recorded) -> None:
+    roll(recorded.connection, 1000)
+    upkeep = Upkeep(recorded.folder, interval_s=0, budget_s=60)
+    upkeep(recorded.connection)
+    assert recorded.rows() == {1: 20, 2: 20}
+    say("keep", "--keep-states", "30rows")
+    while recorded.rows() != {1: 10, 2: 20}:
+        upkeep(recorded.connection)
+
+
+def test_prune_sets_what_it_is_given_and_a_dry_run_only_tries_it(
+    say: Say, recorded: Recorded
+) -> None:
+    say("prune", "--dry-run", "--keep-states", "5rows")
+    assert in_force(recorded.connection) == DEFAULT
+    say("prune", "--keep-states", "30rows")
+    assert recorded.rows() == {1: 10, 2: 20}
+    recorded.publish(100.0, {"x": 1})
+    say("prune")
+    assert recorded.rows() == {1: 9, 2: 21}
+    say("keep", "--keep-states", "default")
+    assert in_force(recorded.connection) == DEFAULT
+
+
+def test_keep_without_runs_and_limits_says_what_it_takes(
+    recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["keep", "--data-dir", str(tmp_path)]) == 2
+    assert "--keep-states 20GB" in capsys.readouterr().err
+
+
+def test_a_server_sets_what_nobody_has_set_and_what_an_earlier_server_had(
+    recorded: Recorded,
+) -> None:
+    db = recorded.connection
+    for size in (60 * MB, 5 * MB):
+        assert ask_at_start(db, {"state": Limit(size_bytes=size)}) == []
+        assert in_force(db).state.size_bytes == size
+    set_limits(db, {"state": Limit(size_bytes=80 * MB), "outlive": 3.0}, "keep")
+    (states,) = ask_at_start(db, {"state": Limit(size_bytes=5 * MB), "outlive": 3.0})
+    assert states.startswith(
+        "--keep-states 5.0 MB is not in force: the database keeps 80.0 MB (set by keep, "
+    )
+    assert states.endswith("'webots-mcp keep --keep-states ...' changes it")
+    assert in_force(db).state.size_bytes == 80 * MB
+
+
+def test_beside_a_server_that_runs_the_limits_stay_as_they_are(recorded: Recorded) -> None:
+    db, others = recorded.connection, {"state": Limit(size_bytes=5 * MB)}
+    ask_at_start(db, {"state": Limit(size_bytes=60 * MB)})
+    with another_server(db, os.getppid()):
+        assert "the database keeps 60.0 MB (set by serve" in ask_at_start(db, others)[0]
+    ask_where_unset(db, others)
+    assert in_force(db).state.size_bytes == 60 * MB
+    assert unheeded(db, others)
+
+
+def test_a_server_that_was_killed_is_none(recorded: Recorded) -> None:
+    db = recorded.connection
+    ask_at_start(db, {"state": Limit(size_bytes=60 * MB)})
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()
+    with another_server(db, ended.pid):
+        assert ask_at_start(db, {"state": Limit(size_bytes=5 * MB)}) == []
+
+
+def test_a_second_server_says_which_limit_holds(recorded: Recorded, tmp_path: Path) -> None:
+    line, where = [*SERVE, "--data-dir", str(tmp_path)], recorded.connection
+    with subprocess.Popen(
+        [*line, "--keep-states", "60MB"], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as first:
+        while not where.execute("SELECT 1 FROM lease WHERE holder LIKE 'server %'").fetchone():
+            assert first.poll() is None
+            time.sleep(0.02)
+        second = subprocess.run(
+            [*line, "--keep-states", "5MB"], stdin=subprocess.DEVNULL, capture_output=True,
+            timeout=60, check=False,
+        )  # fmt: skip
+        first.communicate()
+    assert b"--keep-states 5.0 MB is not in force: the database keeps 60.0 MB" in second.stderr
+    assert in_force(where).state.size_bytes == 60 * MB
+
+
+@pytest.mark.parametrize("wrong", ["'state', -1", "'state', 'many'", "'soup', 1"])
+def test_a_row_that_is_no_limit_is_named(recorded: Recorded, wrong: str) -> None:
+    recorded.connection.execute(
+        "INSERT INTO retention_limit (kind, size_bytes, set_by, set_wall_time_s) "
+        f"VALUES ({wrong}, 'hand', 0)"
+    )
+    with pytest.raises(InvalidInputError, match="retention_limit is no limit"):
+        in_force(recorded.connection)

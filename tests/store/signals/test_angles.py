@@ -1,0 +1,93 @@
+"""Which numbers are angles, so that their means and trends go the short way round."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.recordings.rover import Recorder
+from webots_mcp.store.analysis.features import unwrap
+from webots_mcp.store.questions.trend import Trend
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.signals.catalogue import known_signals
+
+
+def turning(time_s: float) -> dict[str, Any]:
+    yaw_rad = math.remainder(0.3 * time_s, math.tau)
+    return {
+        "pose": [time_s, 0.0, yaw_rad],
+        "arm": {"pose": [0.1, 0.2, 0.05 * time_s]},
+        "drone": {"pose": [time_s, 0.0, 1.5, 0.0, 0.0, yaw_rad]},
+    }
+
+
+def test_the_third_item_of_a_planar_pose_is_an_angle(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    for second in range(200):
+        recorder.publish(float(second), turning(float(second)))
+    before = known_signals(empty, resolve_range(empty))
+    roll(empty, 100_000)
+    for known in (before, known_signals(empty, resolve_range(empty))):
+        assert (known["pose.2"].kind, known["pose.2"].unit) == ("angle", "rad")
+        assert known["arm.pose.2"].kind == "num"  # goes up to 10
+        assert known["drone.pose.2"].kind == "num"  # of six items the third is z
+
+
+@given(st.lists(st.floats(-50, 50), min_size=1, max_size=50))
+def test_unwrapping_is_numpys(angles: list[float]) -> None:
+    assert unwrap(angles) == np.unwrap(angles).tolist()
+    assert unwrap(angles, 360.0) == np.unwrap(angles, period=360.0).tolist()
+
+
+def trend_of(connection: sqlite3.Connection, name: str, course: Callable[[float], float]) -> Trend:
+    """One minute of it, a row each 0.1 s."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    for step in range(600):
+        recorder.publish(step * 0.1, {name: course(step * 0.1)})
+    roll(connection, 100_000)
+    return trends(connection, resolve_range(connection)).runs[0].numbers[0]
+
+
+@pytest.mark.parametrize(("name", "turn"), [("heading", math.tau), ("heading_deg", 360.0)])
+def test_a_heading_that_swings_across_the_end_of_its_scale_has_narrow_extremes(
+    empty: sqlite3.Connection, name: str, turn: float
+) -> None:
+    heading = trend_of(
+        empty, name, lambda t: math.remainder(turn / 2 + turn / 60 * math.sin(t), turn)
+    )
+    low, high = heading.summary.min, heading.summary.max
+    assert low is not None and high is not None and heading.mean is not None
+    assert high - low == pytest.approx(turn / 30, rel=0.02)
+    assert heading.deviation == pytest.approx(turn / 60 / 2**0.5, rel=0.05)
+    assert abs(heading.mean) == pytest.approx(turn / 2, rel=0.01)
+
+
+def test_degrees_are_turned_by_more_than_a_turn(empty: sqlite3.Connection) -> None:
+    heading = trend_of(empty, "heading_deg", lambda t: (20 * t) % 360)
+    assert heading.says == "turns by 1.2e+03 deg (20 deg/s)"
+    assert heading.turned == pytest.approx(20 * 59.9)
+
+
+def test_a_bearing_to_the_nearest_of_several_things_does_not_turn(
+    empty: sqlite3.Connection,
+) -> None:
+    nearest = (0.3, 2.4, -1.8)
+    bearing = trend_of(empty, "bearing", lambda t: nearest[int(t / 2) % 3] + 0.01 * math.sin(t))
+    assert bearing.turned is None
+    assert "turns are not counted" in bearing.says and "turns by" not in bearing.says
+    assert (bearing.summary.min, bearing.summary.max) == (
+        pytest.approx(-1.8, abs=0.02), pytest.approx(2.4, abs=0.02),
+    )  # fmt: skip

@@ -1,0 +1,195 @@
+"""The views that a person meets in the `sqlite3` shell."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.memory import memory_connection
+from tests.recordings.rover import Recorder
+from webots_mcp.connection import connect
+from webots_mcp.store.migrate import downgrade, upgrade
+
+POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
+    ({"pose": [1, 2, 0.5], "mode": "cruise"}, (1, 2, 0.5, "cruise")),
+    ({"pose": [1, 2, 9, 0.5]}, (1, 2, 0.5, None)),
+    ({"pose": [1, 2, 9, 0, 0, 0.5]}, (1, 2, 0.5, None)),
+    ({"pose": {"x": 1, "y": 2, "yaw": 0.5}, "state": "turn"}, (1, 2, 0.5, "turn")),
+    ({"pose": {"x": 1, "y": 2, "theta": 0.5}, "mode": 3}, (1, 2, 0.5, None)),
+    ({"position": [1, 2, 9], "heading": 0.5}, (1, 2, 0.5, None)),
+    ({"position": {"x": 1, "y": 2}, "state": {"deep": 1}}, (1, 2, None, None)),
+    ({"gps": [1, 2, 9], "yaw": 0.5}, (1, 2, 0.5, None)),
+    ({"x": 1, "y": 2}, (1, 2, None, None)),
+    ({"pose": None, "mode": None}, (None, None, None, None)),
+    ({"pose": "unknown"}, (None, None, None, None)),
+    ({}, (None, None, None, None)),
+]
+VIEWS = {
+    "robot_now", "robot_trajectory", "robot_run", "robot_command", "robot_event", "robot_log",
+    "robot_period", "all_rollup",
+}  # fmt: skip
+
+
+@pytest.fixture
+def recorder() -> Iterator[Recorder]:
+    """A run that a test fills by SQL."""
+    with memory_connection() as connection:
+        recorder = Recorder(connection)
+        robot_id = recorder.robot("rover")
+        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+        yield recorder
+
+
+def rows(connection: sqlite3.Connection, sql: str) -> list[Any]:
+    return connection.execute(sql).fetchall()
+
+
+@pytest.mark.parametrize(("state", "flat"), POSES, ids=[json.dumps(state) for state, _ in POSES])
+def test_the_usual_ways_to_publish_a_pose_are_understood(
+    recorder: Recorder, state: dict[str, Any], flat: tuple[Any, ...]
+) -> None:
+    recorder.publish(1.0, state)
+    for view in ("robot_trajectory", "robot_now"):
+        assert rows(recorder.connection, f"SELECT x_m, y_m, yaw_rad, mode FROM {view}") == [flat]
+
+
+@pytest.mark.parametrize("data", ["", "no JSON", '{"pose": NaN}', "[1, 2]", "3", "null", '{"a":'])
+def test_a_row_whose_data_is_no_json_object_is_shown_without_values(
+    recorder: Recorder, data: str
+) -> None:
+    recorder.publish(0.0, {"pose": [1, 2, 3]})
+    recorder.insert("state", **recorder.at(1.0), data=data)
+    recorder.insert("event", **recorder.at(1.0), kind="change", name="mode", data=data)
+    connection = recorder.connection
+    flat = "SELECT sim_time_s, x_m, mode FROM"
+    assert rows(connection, f"{flat} robot_trajectory") == [(0.0, 1, None), (1.0, None, None)]
+    assert rows(connection, f"{flat} robot_now") == [(1.0, None, None)]
+    assert rows(connection, "SELECT kind, from_value FROM robot_event") == [("change", None)]
+    assert len(rows(connection, "SELECT * FROM robot_period")) == 2
+
+
+def test_a_robot_that_never_recorded_a_state_is_shown_all_the_same(recorder: Recorder) -> None:
+    recorder.robot("idle")
+    sql = "SELECT robot, run_id, sim_time_s, age_s FROM robot_now ORDER BY robot"
+    assert rows(recorder.connection, sql) == [
+        ("idle", None, None, None),
+        ("rover", 1, None, None),
+    ]
+
+
+def test_periods_cover_each_run_without_gap_or_overlap(reader: sqlite3.Connection) -> None:
+    periods = rows(
+        reader,
+        "SELECT value, start_s, end_s, duration_s FROM robot_period "
+        "WHERE run_id = 1 AND signal = 'mode' ORDER BY start_s",
+    )
+    assert [period[0] for period in periods] == ["cruise", "back_up", "turn", "cruise"]
+    first = "SELECT min(sim_time_s) FROM state WHERE run_id = run.id"
+    ends = rows(reader, f"SELECT ({first}), last_sim_time_s FROM run WHERE id = 1")[0]
+    assert (periods[0][1], periods[-1][2]) == ends
+    assert [period[1] for period in periods[1:]] == [period[2] for period in periods[:-1]]
+    assert sum(period[3] for period in periods) == pytest.approx(ends[1] - ends[0], abs=0.01)
+
+
+def test_the_first_period_begins_with_the_first_row_not_with_the_controller(
+    recorder: Recorder,
+) -> None:
+    for time_s, mode in ((5.0, "a"), (8.0, "b"), (9.0, "b")):
+        recorder.publish(time_s, {"mode": mode})
+    change = {"kind": "change", "name": "mode", "data": '{"from": "a", "to": "b"}'}
+    recorder.insert("event", **recorder.at(8.0), **change)
+    recorder.end_run("finished")
+    sql = "SELECT value, start_s, end_s FROM robot_period ORDER BY start_s"
+    assert rows(recorder.connection, sql) == [("a", 5.0, 8.0), ("b", 8.0, 9.0)]
+
+
+def test_runs_tell_durations_speed_and_rows(reader: sqlite3.Connection) -> None:
+    sql = (
+        "SELECT robot, duration_s, round(wall_duration_s * real_time_factor), rows, purged_rows, "
+        "start_reason, end_reason FROM robot_run ORDER BY run_id"
+    )
+    first, second = rows(reader, sql)
+    assert first == ("rover", 19.984, 20, 530, 0, "start", "reset")
+    assert second == ("rover", pytest.approx(11.968), 12, 328, 0, "reset", "finished")
+
+
+def test_commands_tell_how_long_they_waited_and_ran(recorder: Recorder) -> None:
+    connection, created_s = recorder.connection, recorder.wall_s
+    base = {"robot_id": 1, "action": "a", "params": "{}", "created_wall_time_s": created_s}
+    base["expires_wall_time_s"] = created_s + 10
+    claimed = {"claimed_wall_time_s": created_s + 1, "claimed_sim_time_s": 4.0}
+    done = {"finished_wall_time_s": created_s + 3, "finished_sim_time_s": 8.0}
+    recorder.insert("command", **base, status="done", **claimed, **done)
+    recorder.insert("command", **base, status="expired", finished_wall_time_s=created_s + 10)
+    recorder.insert("command", **base, status="pending")
+    sql = "SELECT status, waiting_s, running_s, running_sim_s FROM robot_command"
+    finished, expired, pending = rows(connection, sql)
+    assert finished == ("done", 1, 2, 4)
+    assert expired == ("expired", 10, None, None)
+    assert pending[1] > 1000  # it was made in 2023 and nobody claimed it
+    assert pending[2:] == (None, None)
+
+
+def test_log_lines_and_events_name_their_robot(reader: sqlite3.Connection) -> None:
+    lines = rows(reader, "SELECT robot, run_id, level, message, logger FROM robot_log")
+    assert lines[0] == ("rover", 1, "warning", "cruise -> back_up", None)
+    changes = rows(
+        reader,
+        "SELECT robot, from_value, to_value FROM robot_event WHERE name = 'mode' AND run_id = 1",
+    )
+    assert changes[0] == ("rover", "cruise", "back_up")
+
+
+@pytest.mark.parametrize(
+    ("sql", "expected"),
+    [
+        ("SELECT * FROM robot_now", "SEARCH state USING COVERING INDEX"),
+        ("SELECT * FROM robot_trajectory WHERE run_id = 1 AND sim_time_s > 9", "SEARCH state"),
+        ("SELECT * FROM robot_event WHERE run_id = 1", "SEARCH event"),
+        ("SELECT * FROM robot_log WHERE run_id = 1 AND sim_time_s > 9", "SEARCH l USING INDEX"),
+        ("SELECT * FROM robot_period WHERE run_id = 1", "SEARCH e USING INDEX"),
+    ],
+)
+def test_a_view_asked_about_one_run_uses_its_index(
+    reader: sqlite3.Connection, sql: str, expected: str
+) -> None:
+    plan = [row[3] for row in rows(reader, f"EXPLAIN QUERY PLAN {sql}")]
+    assert any(expected in line for line in plan)
+    assert not any(line.startswith(("SCAN state", "SCAN e", "SCAN l")) for line in plan)
+
+
+def test_the_newest_rows_are_found_without_sorting(reader: sqlite3.Connection) -> None:
+    sql = "SELECT * FROM robot_trajectory ORDER BY state_id DESC LIMIT 5"
+    plan = [row[3] for row in rows(reader, f"EXPLAIN QUERY PLAN {sql}")]
+    assert not any("TEMP B-TREE" in line for line in plan)
+
+
+def test_the_shell_shows_what_each_view_is_for(reader: sqlite3.Connection) -> None:
+    views = dict(rows(reader, "SELECT name, sql FROM sqlite_master WHERE type = 'view'"))
+    assert set(views) == VIEWS
+    assert all("\n/* " in sql for sql in views.values())
+
+
+def test_the_views_come_and_go_with_their_revision_and_the_data_stays(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    upgrade(file, "0002")
+    with closing(connect(file, "writer")) as connection:
+        recorder = Recorder(connection)
+        robot_id = recorder.robot("rover")
+        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+        recorder.publish(0.0, {"pose": [1, 2, 3]})
+
+        assert upgrade(file, "0003") == (2, 3)
+        assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
+        assert rows(connection, "SELECT keep, purged_rows FROM run") == [(0, 0)]
+
+        assert downgrade(file, "0002") == (3, 2)
+        assert rows(connection, "SELECT name FROM sqlite_master WHERE type = 'view'") == []
+        assert rows(connection, "SELECT count(*) FROM state") == [(1,)]
+        assert rows(connection, "SELECT count(*) FROM pragma_table_info('run')") == [(15,)]

@@ -23,13 +23,14 @@ ALLOWED = {
     "schema": {"connection", "contract", "errors"},
     "liveness": set[str](),
     "notice": set[str](),
+    "naming": set[str](),
     "settlement": {"contract", "entries", "liveness"},
     "entries": set[str](),
     "adoption": {"connection", "entries", "errors", "notice"},
     "maintenance": {"adoption", "connection", "errors", "notice", "schema"},
     "standin": {"standin", "bundled"},
 }
-ENTRIES = {"bundled", "maintenance", "settlement"}
+ENTRIES = {"bundled", "maintenance", "naming", "settlement"}
 STDLIB = {
     *ENTRIES,
     *ALLOWED["maintenance"],

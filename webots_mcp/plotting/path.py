@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from itertools import accumulate, pairwise
 from typing import Final, NamedTuple
 
+from webots_mcp.naming import Value
 from webots_mcp.store.questions.series import MOST_POINTS, query_history
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rhythm_of
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.rows import exceeds, read_columns
-from webots_mcp.store.signals.flatten import Value
 from webots_mcp.store.signals.registry import Signal
 
 _LEAP: Final = 10.0  # times the speed that 95 % of the steps keep to

@@ -15,7 +15,7 @@ from mcp.server.mcpserver.tools import Tool
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from webots_mcp.store.nearest import nearest_first
+from webots_mcp.naming import nearest_first
 
 _MOST_FAULTS: Final = 3
 _LONGEST_VALUE: Final = 80

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, Final, cast
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.nearest import nearest_first
+from webots_mcp.naming import nearest_first
 from webots_mcp.store.rows import columns_of
 
 

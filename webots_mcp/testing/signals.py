@@ -7,9 +7,9 @@ from itertools import pairwise
 from typing import Any, Final
 
 from webots_mcp.errors import NothingRecordedError
+from webots_mcp.naming import Value
 from webots_mcp.store.analysis.summary import usable_numbers
 from webots_mcp.store.reading.rows import Columns
-from webots_mcp.store.signals.flatten import Value
 
 _SHOWN_STATE_CHARACTERS: Final = 500
 

@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, record_rover
 from webots_mcp.connection import connect, never_wait
+from webots_mcp.naming import flatten
 from webots_mcp.schema import create_schema
 from webots_mcp.store.analysis.summary import Summary, merge, summarise
 from webots_mcp.store.questions.series import query_history
@@ -26,7 +27,6 @@ from webots_mcp.store.reading.ranges import resolve_range
 from webots_mcp.store.rollup.rolling import BUCKET_S, forget, roll, watermark
 from webots_mcp.store.rollup.tables import Addition, held, store
 from webots_mcp.store.signals.catalogue import list_signals
-from webots_mcp.store.signals.flatten import flatten
 
 Rows = list[tuple[float, dict[str, Any]]]
 finite = st.floats(-1e9, 1e9, allow_nan=False) | st.integers(-1000, 1000)

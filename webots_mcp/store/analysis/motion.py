@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
+from webots_mcp.naming import find_position
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
 
 FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer of 400 digits)
 
-_BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location", "")
-_AXES: Final = (("0", "1"), ("x", "y"), ("x_m", "y_m"))
 _MODE: Final = re.compile(r"(^|\.)(mode|behaviou?r|action|task|phase)$", re.IGNORECASE)
 _STATE: Final = re.compile(r"(^|\.)(state|status)$", re.IGNORECASE)  # of anything, often of an arm
 _TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps))*$"
@@ -119,13 +118,8 @@ def _position(
     if named is not None:
         x, y = (_named(known, name) for name in named)
         return (x, y) if x and y else None
-    others = sorted(name[:-2] for name in known if name.endswith(".x"))
-    for branch in (*_BRANCHES, *others):
-        for x, y in _AXES if branch else _AXES[1:]:
-            names = (f"{branch}.{x}", f"{branch}.{y}") if branch else (x, y)
-            if all(name in known and known[name].is_number for name in names):
-                return known[names[0]], known[names[1]]
-    return None
+    names = find_position({name for name, signal in known.items() if signal.is_number})
+    return (known[names[0]], known[names[1]]) if names else None
 
 
 def _first(

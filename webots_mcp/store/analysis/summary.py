@@ -12,7 +12,7 @@ from itertools import pairwise
 from operator import attrgetter, mul, ne
 from typing import Any, Final, NamedTuple, cast
 
-from webots_mcp.store.signals.flatten import Value
+from webots_mcp.naming import Value
 
 _NUMBERS: Final = frozenset({int, float, bool})
 _LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow

@@ -8,7 +8,7 @@ from typing import Any, Final, Literal, get_args
 
 from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.signals.flatten import Value
+from webots_mcp.naming import Value
 
 Kind = Literal[
     "run", "gap", "change", "still", "stuck", "threshold", "silent", "flat", "jump", "oscillation",

@@ -13,12 +13,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from webots_mcp.naming import Value
 from webots_mcp.store.analysis.motion import Motion
 from webots_mcp.store.analysis.noise import Array, noise_of
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.habits import MovedIn
 from webots_mcp.store.reading.rows import Columns
-from webots_mcp.store.signals.flatten import Value
 from webots_mcp.store.signals.registry import Signal
 
 Flags = NDArray[np.bool_]

@@ -10,13 +10,13 @@ from typing import Final
 
 import numpy as np
 
+from webots_mcp.naming import Value
 from webots_mcp.store.analysis.motion import Motion, tracks_in
 from webots_mcp.store.analysis.track import Track, path_length_m
 from webots_mcp.store.reading.changes import Point, change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.rows import read_columns
-from webots_mcp.store.signals.flatten import Value
 
 ROLLS_OUT_S: Final = 1.5  # after a mode began, the motion of the mode before may go on
 WINDOW_S: Final = 20.0  # at once is read

@@ -9,8 +9,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple, cast
 
+from webots_mcp.naming import LONGEST_SPREAD_ARRAY
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.signals.flatten import LONGEST_SPREAD_ARRAY, parse
+from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.states import put_back
 
 Progress = Callable[[int, int], object]

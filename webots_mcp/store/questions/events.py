@@ -11,6 +11,7 @@ from importlib import import_module
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.naming import Value, flatten
 from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import Event, EventOptions, Kind
@@ -32,7 +33,7 @@ from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, just_after, recorded_bounds
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import known_signals, resolve_signals
-from webots_mcp.store.signals.flatten import Value, flatten, parse
+from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
 MOST_AROUND: Final = 6  # values that are told with an event

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Final, Literal, Protocol
 
+from webots_mcp.naming import Value
 from webots_mcp.store.analysis.summary import Summary, usable_numbers
 from webots_mcp.store.detection.event import Threshold
 from webots_mcp.store.reading.deadline import Deadline
@@ -19,7 +20,6 @@ from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import Pieces
 from webots_mcp.store.reading.rows import read_columns
 from webots_mcp.store.rollup.rolling import BUCKET_S
-from webots_mcp.store.signals.flatten import Value
 from webots_mcp.store.signals.registry import Signal
 
 MOSTLY: Final = 0.5  # of the rows

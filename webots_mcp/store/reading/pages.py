@@ -9,13 +9,13 @@ from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.naming import Value
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.rollups import rows_after
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
-from webots_mcp.store.signals.flatten import Value
 from webots_mcp.store.signals.registry import Signal
 
 MOST_ROWS: Final = 1000

@@ -8,10 +8,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
+from webots_mcp.naming import Value, flatten
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.batch import is_odd, odd_names
-from webots_mcp.store.signals.flatten import Value, flatten, parse, reduce_text, shown
+from webots_mcp.store.signals.flatten import parse, reduce_text, shown
 from webots_mcp.store.signals.registry import Signal
 
 RAW_ROWS: Final = 30_000  # 2 to 3 us each: what a question may read without rollups

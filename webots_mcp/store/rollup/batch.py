@@ -6,13 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Final, cast
 
-from webots_mcp.store.signals.flatten import (
-    LONGEST_SPREAD_ARRAY,
-    REDUCTIONS,
-    Value,
-    flatten,
-    parse,
-)
+from webots_mcp.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, flatten
+from webots_mcp.store.signals.flatten import parse
 
 ANY_ITEM: Final = "*"
 

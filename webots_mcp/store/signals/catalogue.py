@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
+from webots_mcp.naming import REDUCTIONS, Value, flatten, nearest_first
 from webots_mcp.store.analysis.summary import Summary, summarise
-from webots_mcp.store.nearest import nearest_first
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.rows import cleaned
@@ -19,7 +19,7 @@ from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
 from webots_mcp.store.rollup.rolling import watermark
 from webots_mcp.store.rollup.tables import both
-from webots_mcp.store.signals.flatten import REDUCTIONS, Kind, Value, flatten, parse
+from webots_mcp.store.signals.flatten import Kind, parse
 from webots_mcp.store.signals.registry import MAX_SIGNALS, Signal, by_name, registered, seen_now
 
 SAMPLED_ROWS: Final = 200  # rows not yet rolled up that are searched for new names and kinds

@@ -1,23 +1,19 @@
-"""The values of one published state by their dotted names: pose.0, sensors.front, lidar.min."""
+"""Where the values of a recorded state stand, and what a name and its values tell of a signal."""
 
 from __future__ import annotations
 
 import json
 import math
 import re
-from collections.abc import Iterable
 from typing import Any, Final, Literal, NamedTuple, cast
 
-Kind = Literal["num", "bool", "text", "angle", "null"]
-Value = int | float | str | None  # a bool is an int
+from webots_mcp.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, reduce_array
 
-LONGEST_SPREAD_ARRAY: Final = 16  # a longer one is reduced: nobody asks for lidar.117
-REDUCTIONS: Final = ("count", "min", "max", "mean", "argmin")
+Kind = Literal["num", "bool", "text", "angle", "null"]
 MAX_TEXT: Final = 200  # characters of a text value that are kept and compared
 MAX_ANGLE_RAD: Final = 6.3  # a value beyond is in degrees, or turns were counted
 MAX_YAW_RAD: Final = 3.2  # the third item of a pose that goes beyond is no yaw
 
-_INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
 _ANGLE_NAME: Final = re.compile(
     r"(^|[._])(yaw|heading|theta|bearing|roll|pitch)(_rad)?(\.\d+)?$", re.IGNORECASE
 )
@@ -52,56 +48,6 @@ def parse(text: str) -> dict[str, Any]:
     except (ValueError, RecursionError):
         return {}
     return cast("dict[str, Any]", state) if isinstance(state, dict) else {}
-
-
-def flatten(state: dict[str, Any]) -> dict[str, Value]:
-    """Every number, flag, text and null of a state, by its dotted name.
-
-    Arrays of more than 16 items become `name.count`, `.min`, `.max`, `.mean` and `.argmin` (of
-    their numbers; `count` and `argmin` of all items). Where two leaves share a name (a key that
-    holds a dot), the last counts.
-    """
-    leaves: dict[str, Value] = {}
-    _spread("", state.items(), leaves)
-    return leaves
-
-
-def _spread(prefix: str, items: Iterable[tuple[str, Any]], leaves: dict[str, Value]) -> None:
-    for key, value in items:
-        kind = value.__class__
-        if kind is dict:
-            _spread(f"{prefix}{key}.", value.items(), leaves)
-        elif kind is not list:
-            leaves[prefix + key] = value
-        elif len(value) <= LONGEST_SPREAD_ARRAY:
-            _spread(f"{prefix}{key}.", zip(_INDEXES, value, strict=False), leaves)
-        else:
-            _reduce(prefix + key, value, leaves)
-
-
-def _reduce(name: str, array: list[Any], leaves: dict[str, Value]) -> None:
-    for reduction, value in zip(REDUCTIONS, reduce_array(array), strict=True):
-        leaves[f"{name}.{reduction}"] = value
-
-
-def reduce_array(array: list[Any]) -> tuple[Value, ...]:
-    """An array as one value per reduction."""
-    numbers = [item for item in array if type(item) is float or type(item) is int]
-    low = min(numbers, default=None)
-    return (
-        len(array),
-        low,
-        max(numbers, default=None),
-        _mean(numbers),
-        None if low is None else array.index(low),
-    )
-
-
-def _mean(numbers: list[int | float]) -> float | None:
-    try:
-        return sum(numbers) / len(numbers) if numbers else None
-    except OverflowError:  # an integer beyond all floats
-        return None
 
 
 def reduce_text(text: object) -> dict[str, Value]:

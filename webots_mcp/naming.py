@@ -1,0 +1,104 @@
+"""How the values of a state are named: pose.0, sensors.front, lidar.min.
+
+Recorded rows are read by these names, and so are the states that a controller publishes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from typing import Any, Final, TypeAlias
+
+Value: TypeAlias = "int | float | str | None"  # a bool is an int
+
+LONGEST_SPREAD_ARRAY: Final = 16  # a longer one is reduced: nobody asks for lidar.117
+REDUCTIONS: Final = ("count", "min", "max", "mean", "argmin")
+
+_INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
+_BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location", "")
+_AXES: Final = (("0", "1"), ("x", "y"), ("x_m", "y_m"))
+_LONGEST_COMPARED: Final = 100  # characters of a name
+
+
+def flatten(state: dict[str, Any]) -> dict[str, Value]:
+    """Every number, flag, text and null of a state, by its dotted name.
+
+    Arrays of more than 16 items become `name.count`, `.min`, `.max`, `.mean` and `.argmin` (of
+    their numbers; `count` and `argmin` of all items). Where two leaves share a name (a key that
+    holds a dot), the last counts.
+    """
+    leaves: dict[str, Value] = {}
+    _spread("", state.items(), leaves)
+    return leaves
+
+
+def _spread(prefix: str, items: Iterable[tuple[str, Any]], leaves: dict[str, Value]) -> None:
+    for key, value in items:
+        kind = value.__class__
+        if kind is dict:
+            _spread(f"{prefix}{key}.", value.items(), leaves)
+        elif kind is not list:
+            leaves[prefix + key] = value
+        elif len(value) <= LONGEST_SPREAD_ARRAY:
+            _spread(f"{prefix}{key}.", zip(_INDEXES, value, strict=False), leaves)
+        else:
+            _reduce(prefix + key, value, leaves)
+
+
+def _reduce(name: str, array: list[Any], leaves: dict[str, Value]) -> None:
+    for reduction, value in zip(REDUCTIONS, reduce_array(array), strict=True):
+        leaves[f"{name}.{reduction}"] = value
+
+
+def reduce_array(array: list[Any]) -> tuple[Value, ...]:
+    """An array as one value per reduction."""
+    numbers = [item for item in array if type(item) is float or type(item) is int]
+    low = min(numbers, default=None)
+    return (
+        len(array),
+        low,
+        max(numbers, default=None),
+        mean_of(numbers),
+        None if low is None else array.index(low),
+    )
+
+
+def mean_of(numbers: Collection[int | float]) -> float | None:
+    """Their mean; None of no numbers, and of integers beyond all floats."""
+    try:
+        return sum(numbers) / len(numbers) if numbers else None
+    except OverflowError:
+        return None
+
+
+def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
+    """The names of a robot's x and y in metres, among those of its numbers; None without any.
+
+    It is what is called `pose`, `position`, `pos`, `gps`, `odometry`, `odom` or `location` (in
+    this order), or `x` and `y` at the top, or else the first branch by name that has an x and y.
+    """
+    others = sorted(name[:-2] for name in numeric if name.endswith(".x"))
+    for branch in (*_BRANCHES, *others):
+        for x, y in _AXES if branch else _AXES[1:]:
+            names = (f"{branch}.{x}", f"{branch}.{y}") if branch else (x, y)
+            if names[0] in numeric and names[1] in numeric:
+                return names
+    return None
+
+
+def nearest_first(name: str, known: Iterable[str]) -> list[str]:
+    """The known names, those most like the given one first; equally like ones keep their order.
+
+    Alike is who has the same letters, whatever their case, as a whole or in the last part of a
+    dotted name: `front` is near `sensors.front`.
+    """
+    meant = name[:_LONGEST_COMPARED].lower()
+    return sorted(known, key=lambda each: -_likeness(meant, each[:_LONGEST_COMPARED].lower()))
+
+
+def _likeness(name: str, other: str) -> float:
+    """From 0 (no letter in common) to 1 (the same)."""
+    from difflib import SequenceMatcher  # a controller seldom needs it
+
+    parts = {(name, other), (name, other.rpartition(".")[2]), (name.rpartition(".")[2], other)}
+    likeness = max(SequenceMatcher(None, *pair).ratio() for pair in parts)
+    return max(likeness, 0.8) if name and name in other else likeness

@@ -9,7 +9,7 @@ import os
 import sqlite3
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Literal, get_args
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, get_args
 
 if TYPE_CHECKING:
     import tempfile
@@ -38,13 +38,35 @@ _LEVEL_ALIASES: Final[dict[str, LogLevel]] = {
     "fatal": "critical",
 }
 
-PAUSED: Final = "paused"  # how a bridge holds its controller's loop, as the session tells it
+PAUSED: Final = "paused"  # what a command does to the loop, as the column session.hold tells it
 STEPPING: Final = "stepping"
 
-SUPERVISOR_ACTIONS: Final = (
-    "pause", "resume", "fast", "step", "reset", "reload", "screenshot",
-)  # fmt: skip
-BUILT_IN_ACTIONS: Final = (*SUPERVISOR_ACTIONS, "reset_state")
+
+class BuiltInAction(NamedTuple):
+    """What has to be known of an action that every bridge has, before it is run.
+
+    Attributes:
+        needs_supervisor: Only a Supervisor can do it.
+        interrupts_steps: A `step` command that is still at work ends with it.
+        runs_user_code: It calls functions of the controller, which may take their time.
+    """
+
+    needs_supervisor: bool = True
+    interrupts_steps: bool = False
+    runs_user_code: bool = False
+
+
+# The one list of them. What each does is the function of that name in `bridge.actions`.
+BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
+    "pause": BuiltInAction(interrupts_steps=True),
+    "resume": BuiltInAction(interrupts_steps=True),
+    "fast": BuiltInAction(interrupts_steps=True),
+    "step": BuiltInAction(interrupts_steps=True),
+    "reset": BuiltInAction(interrupts_steps=True),
+    "reload": BuiltInAction(interrupts_steps=True),
+    "screenshot": BuiltInAction(),
+    "reset_state": BuiltInAction(needs_supervisor=False, runs_user_code=True),
+}
 
 COMMAND_TIME_TO_LIVE_S: Final = 10.0
 HEARTBEAT_INTERVAL_S: Final = 0.5  # how often a session says that its loop is alive

@@ -156,7 +156,7 @@ def catch_up(bridge: MCPBridge) -> None:
 
 def heartbeat_now(bridge: MCPBridge) -> None:
     """The next call looks after the file, as it would half a second later."""
-    bridge._heart._next_s = 0.0  # pyright: ignore[reportPrivateUsage]
+    bridge._heartbeat._next_s = 0.0  # pyright: ignore[reportPrivateUsage]
     bridge.get_command()
 
 

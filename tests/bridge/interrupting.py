@@ -155,7 +155,7 @@ def drive(folder: Path, interrupter: Interrupter) -> Outcome:
             publish(n)
             interrupter.run(bridge.get_command)
             if n in (5, 7):
-                interrupter.run(lambda: bridge._heart.beat())  # pyright: ignore[reportPrivateUsage]
+                interrupter.run(lambda: bridge._heartbeat.beat())  # pyright: ignore[reportPrivateUsage]
             if interrupter.done and not before and not other.in_transaction:
                 blocked = not _can_write(other)
     interrupter.run(bridge.close)

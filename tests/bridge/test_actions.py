@@ -9,6 +9,8 @@ from PIL import Image
 
 from tests.bridge.conftest import STEP_MS, Recording, eager
 from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.bridge import actions
+from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
 
 
@@ -244,3 +246,7 @@ def test_a_plain_robot_refuses_what_needs_a_supervisor(
             assert status == "failed"
             assert error is not None
             assert error.startswith(f"{action} needs a Supervisor") and "Supervisor()" in error
+
+
+def test_each_action_that_the_server_offers_is_one_that_bridges_run() -> None:
+    assert list(actions._actions) == list(BUILT_IN_ACTIONS)  # pyright: ignore[reportPrivateUsage]

@@ -51,7 +51,7 @@ def test_an_interrupt_between_claim_and_start_leaves_no_command_claimed(
 ) -> None:
     bridge.register_command("dance", lambda _: None)
     eager(bridge)
-    line = _line_after("self._queue.claim(")
+    line = _line_after("queue.claim(")
     sent = recording.send("dance")
 
     def interrupt(frame: FrameType, event: str, _: object) -> Any:

@@ -42,10 +42,10 @@ class Clock:
         self._reset_from_s = None
         self.ended_sim_time_s = before
         self.run = Run("reset", now)
-        self.let_go()
+        self.start_moving()
         return True
 
-    def let_go(self) -> None:
+    def start_moving(self) -> None:
         """From this moment on time moves; it counts as standing only after a while without."""
         self.moved_s = time.monotonic()
 

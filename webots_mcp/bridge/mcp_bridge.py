@@ -15,14 +15,17 @@ from typing import TYPE_CHECKING, Any, Final
 from webots_mcp.bridge import open_bridges
 from webots_mcp.bridge.changes import Changes
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.commands import describe
-from webots_mcp.bridge.control import Control, Handler
+from webots_mcp.bridge.commands import CommandQueue, describe
+from webots_mcp.bridge.context import Context
+from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.devices import read_devices
 from webots_mcp.bridge.encoding import encode, text_of
-from webots_mcp.bridge.heart import Heart
+from webots_mcp.bridge.handlers import Handler
+from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.open_bridges import OpenBridge
+from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.reloads import Reloads
@@ -116,7 +119,7 @@ class MCPBridge:
         try:
             if self._clock.look():
                 self._begin_run()
-            if self._throttle.admits(force or self._heart.hold is not None):
+            if self._throttle.admits(force or self._heartbeat.loop is not None):
                 self._record_state(state)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("publish", error)
@@ -138,7 +141,7 @@ class MCPBridge:
             if self._simulation.over:
                 return None
             command = self._control.serve()
-            self._heart.poll()
+            self._heartbeat.poll()
             if self._simulation.over:
                 self._end()
             return command.as_dict() if command else None
@@ -158,7 +161,7 @@ class MCPBridge:
         try:
             if self._clock.look():
                 self._begin_run()
-            if self._throttle.admits(self._heart.hold is not None):
+            if self._throttle.admits(self._heartbeat.loop is not None):
                 self._record_state({**self._read_devices(include_time), **_finite(extra or {})})
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("auto_publish", error)
@@ -231,7 +234,7 @@ class MCPBridge:
             ValueError: The name is built in, empty, over 100 characters, or not printable.
             TypeError: The name is no text, or the handler is not a plain function.
         """
-        self._control.register(action, handler)
+        self._control.handlers.register(action, handler)
 
     def on_reload(self, callback: Callable[[], object]) -> None:
         """Call `callback` once for each reload or reset of the world, and on `reset_state`.
@@ -320,19 +323,24 @@ class MCPBridge:
         self._recorder = Recorder(self.database, self._identity, self._clock, strict=self._strict)
         self._album = Album(self._recorder, self._clock, self.data_dir)
         self._journal = Journal(self._recorder, self._clock)
-        self._heart = Heart(self._recorder, self._clock)
-        self._control = Control(
-            self._simulation,
-            self._recorder,
-            self._clock,
-            self._journal,
-            self._album,
-            self._reloads.call_back,
-            self._heart,
-            self._throttle,
-            self._look,
-        )
+        self._heartbeat = Heartbeat(self._recorder, self._clock)
+        self._pause = Pause(self._simulation, self._journal, self._heartbeat, self._look)
+        self._control = Control(self._context())
         self._maintainer = self._start_maintainer()
+
+    def _context(self) -> Context:
+        return Context(
+            simulation=self._simulation,
+            clock=self._clock,
+            recorder=self._recorder,
+            journal=self._journal,
+            album=self._album,
+            heartbeat=self._heartbeat,
+            throttle=self._throttle,
+            reloads=self._reloads,
+            queue=CommandQueue(self._recorder),
+            pause=self._pause,
+        )
 
     def _start_maintainer(self) -> Maintainer | None:
         """A log to keep short exists only in a file."""
@@ -359,13 +367,13 @@ class MCPBridge:
             times = {"now": time.time(), "sim_time": self._clock.sim_time_s}
             mode = self._simulation.mode_name if self._simulation.supervisor else None
             self._recorder.record("reload confirmed", run, {**times, "mode": mode})
-            if registration.held_mode is not None:
-                self._control.take_over(registration.held_mode)
+            if registration.paused_mode is not None:
+                self._pause.take_over(registration.paused_mode)
 
     def _let_go(self) -> None:
-        """A hold that nobody could end any more would stop the whole simulation."""
+        """A pause that nobody could end any more would stop the whole simulation."""
         try:
-            self._control.let_go()
+            self._pause.close()
             self._control.report_end(extern=self._identity.extern)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("close", error)
@@ -374,7 +382,7 @@ class MCPBridge:
         """Time has passed, or gone back, outside of the loop: in a step of a handler's."""
         if self._clock.look():
             self._begin_run()
-        self._heart.beat_if_due()
+        self._heartbeat.beat_if_due()
 
     def _begin_run(self) -> None:
         """Simulation time went back: the old run ends with what was last known of it."""
@@ -384,11 +392,11 @@ class MCPBridge:
         self._reloads.happened()
         self._journal.event("reset")
         self._reloads.fire()
-        self._heart.beat()
+        self._heartbeat.beat()
 
     @property
     def _end_reason(self) -> str:
-        return "reload" if self._control.actions.reloading else "finished"
+        return "reload" if self._reloads.requested_by else "finished"
 
     def _end(self) -> None:
         """Webots may kill the process from here on, or let the loop say its last words."""
@@ -405,7 +413,7 @@ class MCPBridge:
         if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
             for name, before, after in self._changes.look(state):
                 self._journal.event("change", {"from": before, "to": after}, name)
-        self._heart.beat_if_due()
+        self._heartbeat.beat_if_due()
         self._cost.add(time.perf_counter() - started_s)
 
     def _leave_to_parent(self) -> None:

@@ -27,10 +27,10 @@ from webots_mcp.adoption import Taken, is_unfit, take_in
 from webots_mcp.bridge.backlog import Backlog, Row
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.drops import Drops
+from webots_mcp.bridge.heartbeat_rows import LoopStatus, RecordingStatus, write_heartbeat
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.log_watch import LogWatch
 from webots_mcp.bridge.opening import is_ours, move_aside, open_session, why_readers_block
-from webots_mcp.bridge.pulse import Health, Pulse, write_pulse
 from webots_mcp.bridge.registration import (
     Registration,
     deregister,
@@ -295,22 +295,23 @@ class Recorder:
 
     # -- heartbeat and end ---------------------------------------------------------------------
 
-    def beat(self, pulse: Pulse) -> None:
+    def beat(self, loop: LoopStatus) -> None:
         """Say that the loop is alive. Skipped while rows wait: a late heartbeat tells nothing."""
-        self._in_turn(lambda: self._beat(pulse))
+        self._in_turn(lambda: self._beat(loop))
 
-    def _beat(self, pulse: Pulse) -> None:
+    def _beat(self, loop: LoopStatus) -> None:
         self._look_after_files()
         if self._is_behind(self.run) and not self._catch_up(self.run):
             return
         connection, registration = self.connection, self.registration
         assert connection is not None
         assert registration is not None
-        health = Health(self.rows_waiting, self.drops.rows, self.trouble.last_error)
+        recording = RecordingStatus(self.rows_waiting, self.drops.rows, self.trouble.last_error)
+        ids = (registration.session_id, self.run)
         _patiently(
             lambda: together(
                 connection,
-                lambda: write_pulse(connection, pulse, health, registration.session_id, self.run),
+                lambda: write_heartbeat(connection, loop, recording, *ids),
             )
         )
 

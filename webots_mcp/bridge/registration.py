@@ -29,7 +29,7 @@ _RELOADED: Final = (
     "UNION SELECT 1 FROM command WHERE robot_id = :robot "
     "AND status = 'claimed' AND action = 'reload' AND issued_wall_time_s IS NOT NULL"
 )
-_HELD: Final = (
+_PAUSED_MODE: Final = (
     "SELECT coalesce(hold_mode, 'real_time') FROM session WHERE id = (SELECT max(id) FROM session "
     "WHERE robot_id = ?) AND instance = ? AND hold = ?"
 )
@@ -46,8 +46,8 @@ class Registration(NamedTuple):
     robot_name: str
     session_id: int
     reloaded: bool
-    held_mode: str | None
-    """The mode to go back to, where the session before this one held the simulation at its end."""
+    paused_mode: str | None
+    """The mode to go back to, where the session before this one left the simulation paused."""
 
 
 def register(
@@ -66,11 +66,11 @@ def register(
         name = _free_name(connection, identity, now_s)
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         reloaded = _is_reload(connection, identity, robot_id, now_s)
-        held_mode = _held_mode(connection, identity, robot_id)
+        paused_mode = _paused_mode(connection, identity, robot_id)
         session = describe_session(identity, session_uuid, actions)
         session_id = enter_session(connection, robot_id, session)
     _own_sessions.add(session_id)
-    return Registration(robot_id, name, session_id, reloaded, held_mode)
+    return Registration(robot_id, name, session_id, reloaded, paused_mode)
 
 
 def deregister(session_id: int) -> None:
@@ -103,10 +103,10 @@ def _is_reload(
     return connection.execute(_RELOADED, values).fetchone() is not None
 
 
-def _held_mode(connection: sqlite3.Connection, identity: Identity, robot_id: int) -> str | None:
+def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: int) -> str | None:
     """What the robot's last session left behind in this same Webots."""
     values = (robot_id, identity.instance, PAUSED)
-    row = connection.execute(_HELD, values).fetchone()
+    row = connection.execute(_PAUSED_MODE, values).fetchone()
     return row[0] if row else None
 
 

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from webots_mcp.bridge.commands import Command
+
 Callback = Callable[[], object]
 
 
@@ -12,11 +14,15 @@ class Reloads:
 
     Args:
         failed: Told of a callback that raised; the next one still runs.
+
+    Attributes:
+        requested_by: The command that asked Webots for a reload, while it has not come yet.
     """
 
     def __init__(self, failed: Callable[[str, Exception], None]) -> None:
         self._failed = failed
         self._callbacks: list[Callback] = []
+        self.requested_by: Command | None = None
         self._undetected = False
         self._unfired = False
 

@@ -7,7 +7,7 @@ import sqlite3
 import time
 from typing import Final
 
-from webots_mcp.contract import BUILT_IN_ACTIONS, ISSUED_TIME_TO_LIVE_S, SUPERVISOR_ACTIONS
+from webots_mcp.contract import BUILT_IN_ACTIONS, ISSUED_TIME_TO_LIVE_S
 from webots_mcp.errors import CommandRefusedError, UnknownActionError
 from webots_mcp.store.recording import View, look
 from webots_mcp.store.robots import list_robots, robot_name
@@ -33,15 +33,20 @@ def find_addressee(connection: sqlite3.Connection, robot: str | None, action: st
             another robot holds the simulation.
         NothingRecordedError: No robot was ever seen.
     """
-    if robot is None and action in SUPERVISOR_ACTIONS:
+    if robot is None and _needs_supervisor(action):
         robot = _only_supervisor(connection)
     view = look(connection, robot)
     _require_action(view, action)
     session = _require_live(view)
-    if action in SUPERVISOR_ACTIONS and not session.supervisor:
+    if _needs_supervisor(action) and not session.supervisor:
         raise CommandRefusedError(_who_may(view, session, action))
     _require_free(view, session, action)
     return view
+
+
+def _needs_supervisor(action: str) -> bool:
+    built_in = BUILT_IN_ACTIONS.get(action)
+    return built_in is not None and built_in.needs_supervisor
 
 
 def _only_supervisor(connection: sqlite3.Connection) -> str | None:

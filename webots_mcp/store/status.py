@@ -137,7 +137,8 @@ def handler_at_work(connection: sqlite3.Connection, session: Session, now_s: flo
     """The custom action that the loop is inside of; it beats and steps only by itself there."""
     claimed = connection.execute(_CLAIMED, (session.robot_id, session.id)).fetchall()
     for command_id, action, since_s in claimed:
-        if action == "reset_state" or action not in BUILT_IN_ACTIONS:
+        built_in = BUILT_IN_ACTIONS.get(action)
+        if built_in is None or built_in.runs_user_code:
             return (
                 f"its loop is inside the handler of command {command_id} ({action}) for "
                 f"{max(now_s - since_s, 0.0):.1f} s"

@@ -5,26 +5,25 @@ from __future__ import annotations
 import time
 
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.pulse import Pulse
+from webots_mcp.bridge.heartbeat_rows import LoopStatus
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S, PAUSED
 
 
-def wall_time_s(monotonic_s: float | None) -> float | None:
-    """When that was by the wall clock as it is set now."""
-    return None if monotonic_s is None else time.time() - (time.monotonic() - monotonic_s)
+class Heartbeat:
+    """Written a few times a second, and at once where a command pauses the loop or lets it go.
 
-
-class Heart:
-    """Writes the session's heartbeat: a few times a second, and at once where the hold changes."""
+    Attributes:
+        loop: What a command does to the loop now: `PAUSED`, `STEPPING`, or None.
+    """
 
     def __init__(self, recorder: Recorder, clock: Clock) -> None:
         self._recorder = recorder
         self._clock = clock
         self._next_s = 0.0
         self._last_poll_s: float | None = None
-        self.hold: str | None = None
-        self.hold_mode: str | None = None
+        self._mode_before: str | None = None
+        self.loop: str | None = None
 
     def poll(self) -> None:
         """The loop asked for commands; beat if it is time to."""
@@ -39,18 +38,23 @@ class Heart:
     def beat(self) -> None:
         """Say now that the loop is alive, and what it can see of time."""
         self._next_s = time.monotonic() + HEARTBEAT_INTERVAL_S
-        polled_s, moved_s = wall_time_s(self._last_poll_s), wall_time_s(self._clock.moved_s)
-        hold = (self.hold, self.hold_mode)
-        self._recorder.beat(Pulse(self._clock.sim_time_s, polled_s, moved_s, *hold))
+        polled_s, moved_s = _wall_time_s(self._last_poll_s), _wall_time_s(self._clock.moved_s)
+        pause = (self.loop, self._mode_before)
+        self._recorder.beat(LoopStatus(self._clock.sim_time_s, polled_s, moved_s, *pause))
 
-    def change_hold(self, hold: str | None, mode_before: str | None = None) -> None:
+    def change_loop(self, loop: str | None, mode_before: str | None = None) -> None:
         """Tell at once: whoever reads the command's answer must not see the old status.
 
         Args:
-            hold: How the loop is held now; None where it is not.
+            loop: As `loop` is from now on.
             mode_before: The simulation mode to go back to, where it is paused.
         """
-        self.hold, self.hold_mode = hold, mode_before
-        if hold != PAUSED:
-            self._clock.let_go()
+        self.loop, self._mode_before = loop, mode_before
+        if loop != PAUSED:
+            self._clock.start_moving()
         self.beat()
+
+
+def _wall_time_s(monotonic_s: float | None) -> float | None:
+    """When that was by the wall clock as it is set now."""
+    return None if monotonic_s is None else time.time() - (time.monotonic() - monotonic_s)

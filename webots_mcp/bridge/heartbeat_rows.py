@@ -1,4 +1,4 @@
-"""How a session and its run stand, as the database holds it: each heartbeat, and the end."""
+"""What a heartbeat writes of a session and its run."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _BEAT_RUN: Final = (
 )
 
 
-class Pulse(NamedTuple):
+class LoopStatus(NamedTuple):
     """What a heartbeat says of the loop."""
 
     sim_time_s: float
@@ -38,7 +38,7 @@ class Pulse(NamedTuple):
     hold_mode: str | None
 
 
-class Health(NamedTuple):
+class RecordingStatus(NamedTuple):
     """What a heartbeat says of the recording."""
 
     rows_waiting: int
@@ -46,12 +46,16 @@ class Health(NamedTuple):
     last_error: str | None
 
 
-def write_pulse(
-    connection: sqlite3.Connection, pulse: Pulse, health: Health, session_id: int, run: Run
+def write_heartbeat(
+    connection: sqlite3.Connection,
+    loop: LoopStatus,
+    recording: RecordingStatus,
+    session_id: int,
+    run: Run,
 ) -> None:
     """Write session and run as they are now, inside a transaction of the caller."""
     now = time.time()
-    seen = (now, time.monotonic(), pulse.last_poll_wall_time_s, pulse.moved_wall_time_s)
-    loop = (pulse.sim_time_s, pulse.hold, pulse.hold_mode)
-    connection.execute(_BEAT_SESSION, (*seen, *loop, *health, session_id))
-    connection.execute(_BEAT_RUN, (now, pulse.sim_time_s, run.rows, run.id))
+    seen = (now, time.monotonic(), loop.last_poll_wall_time_s, loop.moved_wall_time_s)
+    how = (loop.sim_time_s, loop.hold, loop.hold_mode)
+    connection.execute(_BEAT_SESSION, (*seen, *how, *recording, session_id))
+    connection.execute(_BEAT_RUN, (now, loop.sim_time_s, run.rows, run.id))

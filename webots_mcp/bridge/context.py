@@ -1,0 +1,31 @@
+"""The parts of one bridge."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.commands import CommandQueue
+from webots_mcp.bridge.heartbeat import Heartbeat
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pictures import Album
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.reloads import Reloads
+from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.throttle import Throttle
+
+
+class Context(NamedTuple):
+    """What serving commands, and each built-in action, has to work with."""
+
+    simulation: Simulation
+    clock: Clock
+    recorder: Recorder
+    journal: Journal
+    album: Album
+    heartbeat: Heartbeat
+    throttle: Throttle
+    reloads: Reloads
+    queue: CommandQueue
+    pause: Pause

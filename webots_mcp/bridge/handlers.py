@@ -1,0 +1,88 @@
+"""The custom actions: functions of the controller that an assistant may have run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Final
+
+from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.text import cut, storable
+from webots_mcp.contract import BUILT_IN_ACTIONS
+from webots_mcp.errors import CommandRefusedError
+
+Handler = Callable[[dict[str, Any]], object]
+
+_MOST_NAME_CHARACTERS: Final = 100
+_MOST_DOC_CHARACTERS: Final = 4000
+
+
+class Handlers:
+    """The registered functions by the name of their action.
+
+    Attributes:
+        running: A function is at work: this call comes from within it.
+    """
+
+    def __init__(self, recorder: Recorder, pause: Pause) -> None:
+        self._recorder = recorder
+        self._pause = pause
+        self._handlers: dict[str, Handler] = {}
+        self.running = False
+
+    def register(self, action: str, handler: Handler) -> None:
+        """Make a custom action known, here and in the session's row.
+
+        Raises:
+            ValueError: The name is built in, empty, too long, or no text that can be sent.
+            TypeError: The name is no text, or the handler is not a plain function.
+        """
+        _require_name(action)
+        import inspect  # only here: it would be a fifth of the bridge's import time
+
+        if not callable(handler) or inspect.iscoroutinefunction(handler):
+            raise TypeError(f"the handler of {action!r} must be a plain function, not {handler!r}")
+        written = getattr(handler, "__doc__", None)
+        doc = inspect.cleandoc(written) if isinstance(written, str) else ""
+        self._handlers[action] = handler
+        self._recorder.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
+        self._recorder.update_actions()
+
+    def run(self, command: Command) -> object:
+        """What the function of the command's action returns; whatever it raises is passed on.
+
+        Raises:
+            CommandRefusedError: There are such functions, and none for this action.
+        """
+        handler = self._handlers.get(command.action)
+        if handler is not None:
+            return self._call(handler, command)
+        if self._handlers:
+            known = ", ".join((*self._handlers, *BUILT_IN_ACTIONS))
+            raise CommandRefusedError(f"no action {command.action!r}; this robot knows {known}")
+        # A loop without registered actions may look at what get_command() returns by itself.
+        return {"returned_by_get_command": True}
+
+    def _call(self, handler: Handler, command: Command) -> object:
+        outer, self.running = self.running, True
+        try:
+            with self._pause.user_code():
+                return handler(command.as_dict())
+        finally:
+            self.running = outer
+
+
+def _require_name(action: object) -> None:
+    if not isinstance(action, str):
+        raise TypeError(f"the name of an action is a text, not {type(action).__name__} {action!r}")
+    if not action or action in BUILT_IN_ACTIONS:
+        raise ValueError(
+            f"action {action!r} cannot be registered: choose a name that is not empty and "
+            f"not built in ({', '.join(BUILT_IN_ACTIONS)})"
+        )
+    if len(action) > _MOST_NAME_CHARACTERS or not action.isprintable():
+        raise ValueError(
+            f"action {action[:_MOST_NAME_CHARACTERS]!r} cannot be registered: choose a name of "
+            f"printable characters, at most {_MOST_NAME_CHARACTERS}"
+        )

@@ -1,0 +1,153 @@
+"""Pausing the simulation without locking out its own resume."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from typing import Final
+
+from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.gate import QUIT, Step
+from webots_mcp.bridge.heartbeat import Heartbeat
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.contract import PAUSED, STEPPING
+
+PUMP_INTERVAL_S: Final = 0.01
+
+
+class Pause:
+    """Whether the bridge has paused the simulation, and the mode to go back to.
+
+    A paused simulation blocks every `step(n > 0)`, so after a pause the bridge stays inside
+    `get_command()`, pumps `step(0)`, and goes on serving commands there. Code of the user's that
+    runs there (a handler, a callback) may step all the same: time passes for just that step.
+
+    Args:
+        simulation: What is paused.
+        journal: Is told when the pause begins and ends.
+        heartbeat: Tells others of it.
+        stepped: Is told of each step that user code made during the pause.
+
+    Attributes:
+        active: The loop stays where it is.
+        serve: Serves commands until the pause has ended: for a loop that steps during it.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        journal: Journal,
+        heartbeat: Heartbeat,
+        stepped: Callable[[], object],
+    ) -> None:
+        self._simulation = simulation
+        self._journal = journal
+        self._heartbeat = heartbeat
+        self._stepped = stepped
+        self._mode_before = "real_time"
+        self._user_code_depth = 0  # a handler may ask for commands itself
+        self.active = False
+        self.serve: Callable[[], object] = self.pump
+
+    @property
+    def running_mode(self) -> str:
+        """The simulation mode now, or the one before the pause."""
+        return self._mode_before if self.active else self._simulation.mode_name
+
+    def begin(self, command: Command) -> None:
+        """Pause the simulation and keep the loop from here on."""
+        if self.active:
+            return
+        self._activate(self._simulation.mode_name)
+        self._simulation.set_mode("pause")
+        self._journal.event("pause", {"command_id": command.id})
+        self._heartbeat.change_loop(PAUSED, self._mode_before)
+
+    def end(self, command: Command, mode: str | None = None, *, stepping: bool = False) -> None:
+        """Let the loop go on, in `mode` or in the one that it ran in before."""
+        self._simulation.set_mode(mode or _running(self.running_mode))
+        if self.active:
+            self._deactivate()
+            self._journal.event("resume", {"command_id": command.id})
+        self._heartbeat.change_loop(STEPPING if stepping else None)
+
+    def take_over(self, mode_before: str) -> None:
+        """Go on with the pause of a bridge whose process is gone, if the simulation still stands.
+
+        Args:
+            mode_before: The mode before that pause.
+        """
+        if not self._simulation.supervisor or not self._simulation.pump():
+            return
+        if self._simulation.paused:
+            self._activate(mode_before)
+            self._journal.event("pause", {"by": "the controller's session before this one"})
+            self._heartbeat.change_loop(PAUSED, mode_before)
+
+    def close(self) -> None:
+        """Nobody will serve commands any more: where it is paused, time goes on."""
+        if self.active and not self._simulation.over:
+            self._simulation.set_mode(_running(self._mode_before))
+            self._end_by("the bridge, which was closed")
+
+    def pump(self) -> None:
+        """Hear from Webots: it may want to quit, or a person may have pressed play."""
+        if not self._simulation.pump():
+            self._deactivate()
+        elif not self._simulation.paused:
+            self._end_by("a person or another controller, in Webots")
+
+    @contextmanager
+    def user_code(self) -> Generator[None]:
+        """While a handler or a callback runs: its steps are made, also during the pause."""
+        self._user_code_depth += 1
+        try:
+            yield
+        finally:
+            self._user_code_depth -= 1
+
+    def _end_by(self, whom: str) -> None:
+        self._deactivate()
+        self._journal.event("resume", {"by": whom})
+        self._heartbeat.change_loop(None)
+
+    def _activate(self, mode_before: str) -> None:
+        self._mode_before = mode_before
+        self.active = True
+        self._simulation.guard_steps(self._on_step)
+
+    def _deactivate(self) -> None:
+        self.active = False
+        self._simulation.guard_steps(None)
+
+    def _on_step(self, step: Step) -> int:
+        if step.begins and self._user_code_depth:
+            self.pump()  # a person may have ended the pause by now
+        elif step.begins:
+            self.serve()
+        if self._simulation.over:
+            return QUIT
+        return self._let_pass(step) if self.active else step.make()
+
+    def _let_pass(self, step: Step) -> int:
+        """Leave the pause for just this step."""
+        if step.begins:
+            self._simulation.set_mode(_running(self._mode_before))
+        try:
+            answer = step.make()
+        except BaseException:
+            self._simulation.set_mode("pause")
+            raise
+        if answer == QUIT:
+            self._simulation.end()
+            self._deactivate()
+        elif step.ends:
+            self._simulation.set_mode("pause")
+            self._stepped()
+        return answer
+
+
+def _running(mode_before: str) -> str:
+    """The mode in which time goes on."""
+    return "fast" if mode_before == "fast" else "real_time"

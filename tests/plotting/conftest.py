@@ -18,11 +18,9 @@ State = Callable[[float], dict[str, Any]]
 
 
 class Record(Protocol):
-    """Records one run of a robot."""
+    """Records runs of a robot, each of so many rows; without any number one of 100 rows."""
 
-    def __call__(
-        self, state: State, rows: int = 100, interval_s: float = 0.1
-    ) -> sqlite3.Connection: ...
+    def __call__(self, state: State, *rows: int, interval_s: float = 0.1) -> sqlite3.Connection: ...
 
 
 @pytest.fixture(scope="session")
@@ -36,17 +34,19 @@ def rover() -> Iterator[sqlite3.Connection]:
 
 @pytest.fixture
 def record() -> Iterator[Record]:
-    """Record one run; its state is a function of the simulation time."""
+    """Record runs; their state is a function of the simulation time."""
     opened = ExitStack()
 
-    def write(state: State, rows: int = 100, interval_s: float = 0.1) -> sqlite3.Connection:
+    def write(state: State, *rows: int, interval_s: float = 0.1) -> sqlite3.Connection:
         connection = opened.enter_context(memory_connection())
         recorder = Recorder(connection)
         connection.execute("BEGIN IMMEDIATE")
         robot_id = recorder.robot("spot")
-        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
-        for row in range(rows):
-            recorder.publish(round(row * interval_s, 6), state(row * interval_s))
+        session_id = recorder.session(robot_id, "a" * 64)
+        for count in rows or (100,):
+            recorder.run(session_id, robot_id)
+            for row in range(count):
+                recorder.publish(round(row * interval_s, 6), state(row * interval_s))
         connection.execute("COMMIT")
         return connection
 

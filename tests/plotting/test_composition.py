@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.plotting.conftest import Record, whole
+from webots_mcp.plotting.canvas import Sheet
 from webots_mcp.plotting.curves import Curve
 from webots_mcp.plotting.palette import AREAS, OTHER, area_colours
 from webots_mcp.plotting.panels import MOST_CURVES, MOST_PANELS, by_scale, by_signal
@@ -70,7 +71,7 @@ def test_modes_stand_behind_the_curves_and_not_where_nothing_was_recorded(
 
 
 def test_more_modes_than_colours_share_a_name(record: Record) -> None:
-    connection = record(lambda t: {"mode": f"m{int(t)}", "x": t}, rows=200)
+    connection = record(lambda t: {"mode": f"m{int(t)}", "x": t}, 200)
     bands = timeline_of(connection, "x").bands
     assert bands is not None
     assert len(bands.values) == 8
@@ -95,6 +96,28 @@ def test_of_an_event_that_reaches_out_of_the_range_the_part_in_it_is_drawn(
     timeline, _ = compose_timeline(rover, [part], ["pose.0"])
     (stuck,) = next(lane.spans for lane in timeline.events if lane.name == "stuck")
     assert (stuck.start_s, stuck.end_s) == timeline.x_range == (45, 50)
+
+
+def test_the_same_data_looks_the_same_in_a_short_and_in_a_long_run(record: Record) -> None:
+    connection = record(lambda t: {"wave": math.sin(2 * math.pi * t)}, 600, 3000)
+    runs = [whole(connection, 1), whole(connection, 2)]
+    (panel,) = compose_timeline(connection, runs, ["wave"])[0].panels
+    short, long = (curve.points for curve in panel.curves)
+    assert len(long) >= 200
+    assert short[:-1] == long[: len(short) - 1]
+
+
+def test_a_wider_picture_shows_more(record: Record) -> None:
+    connection = record(lambda t: {"wave": math.sin(t)}, 3000)
+    points = [
+        len(
+            only_curve(
+                compose_timeline(connection, [whole(connection)], ["wave"], sheet=sheet)[0]
+            ).points
+        )
+        for sheet in (Sheet(500), Sheet(1600))
+    ]
+    assert points[1] > 3 * points[0]
 
 
 def test_a_unit_is_an_axis_and_so_is_a_scale(rover: sqlite3.Connection) -> None:

@@ -97,7 +97,7 @@ def test_a_picture_names_what_it_shows(rover: sqlite3.Connection) -> None:
         "rover, run 1, 0 to 119.9 s", "pose.0", "heading [rad]", "mode:", "cruise", "back_up",
         "avoid", "nothing recorded", "stuck", "oscillation", "log", "error", "command", "set_speed",
     }  # fmt: skip
-    steps = "simulation time [s]      line: mean, band: minimum to maximum of every 0.5 s"
+    steps = "simulation time [s]      line: mean, band: minimum to maximum of every 0.6 s"
     assert " ".join(steps.split()) in {" ".join(word.split()) for word in words(picture)}
     assert picture.caption == "rover, run 1, 0 to 119.9 s: pose.0, heading over mode"
 
@@ -206,13 +206,13 @@ def unseen_labels(axes: Any) -> list[Any]:
 def test_no_text_leaves_the_picture_or_covers_another(
     record: Record, names: list[str], size: tuple[int, int]
 ) -> None:
-    connection = record(odd_names, rows=300)
+    connection = record(odd_names, 300)
     timeline, _ = compose_timeline(connection, [whole(connection)], names)
     assert_readable(texts_of(lambda figure: paint_timeline(figure, timeline), Sheet(*size)), size)
 
 
 def test_no_text_of_a_trajectory_leaves_the_picture_or_covers_another(record: Record) -> None:
-    connection = record(odd_names, rows=300)
+    connection = record(odd_names, 300)
     ground, _ = compose_ground(connection, [whole(connection)])
     texts = texts_of(lambda figure: paint_ground(figure, ground), Sheet())
     assert_readable(texts, (900, 500))
@@ -264,7 +264,7 @@ def test_matplotlib_waits_for_the_first_picture(module: str) -> None:
 
 
 def test_a_recording_too_long_to_be_read_is_drawn_from_its_rollups(record: Record) -> None:
-    connection = record(lambda t: {"v": 3.0 if t == 160 else 12.0, "x": t, "y": 0.0}, 31_000, 0.1)
+    connection = record(lambda t: {"v": 3.0 if t == 160 else 12.0, "x": t, "y": 0.0}, 31_000)
     assert roll(connection, 100_000).done
     timeline, _ = compose_timeline(connection, [whole(connection)], ["v", "x"])
     (curve,) = [c for panel in timeline.panels for c in panel.curves if c.name == "v"]
@@ -275,7 +275,7 @@ def test_a_recording_too_long_to_be_read_is_drawn_from_its_rollups(record: Recor
 
 @pytest.mark.parametrize("rows", [1, 2])
 def test_a_run_that_has_only_begun_is_drawn(record: Record, rows: int) -> None:
-    connection = record(lambda t: {"pose": [0.0, 0.0], "mode": "idle"}, rows=rows)
+    connection = record(lambda t: {"pose": [0.0, 0.0], "mode": "idle"}, rows)
     for kind in ("signals", "trajectory"):
         assert plot(connection, kind, image_format="svg").data
     assert plot(connection, "trajectory", bands="").data
@@ -318,7 +318,7 @@ def test_a_robot_without_a_position_is_asked_for_one(record: Record) -> None:
 
 
 def test_too_many_runs_in_one_picture_are_refused(record: Record) -> None:
-    connection = record(lambda t: {"n": t}, rows=2)
+    connection = record(lambda t: {"n": t}, 2)
     ranges = [whole(connection)] * 5
     with pytest.raises(InvalidInputError, match="holds 5 runs, and at most 4"):
         plot_signals(connection, ranges, ["n"])

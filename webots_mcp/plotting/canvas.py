@@ -15,6 +15,7 @@ from typing import Any, Final, Literal, get_args
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plotting.palette import FAINT, INK
+from webots_mcp.store.questions.series import MOST_POINTS
 
 ImageFormat = Literal["png", "svg"]
 
@@ -23,6 +24,8 @@ HEIGHT_PX: Final = 500
 LEAST_PX: Final = 300
 MOST_PX: Final = 2000
 _DPI: Final = 100
+_BESIDE_PX: Final = 200  # what stands beside an axis, about: its labels and a legend
+_BUCKET_PX: Final = 3  # in fewer pixels the band of extremes would hide behind the line
 _LONGEST_NAME: Final = 24
 
 # A user's matplotlibrc must not change the pictures; what is recorded is text, never TeX.
@@ -83,6 +86,16 @@ class Sheet:
         if self.image_format not in get_args(ImageFormat):
             known = " or ".join(get_args(ImageFormat))
             raise InvalidInputError(f"a picture can be {known}, not {self.image_format!r}")
+
+    @property
+    def axis_px(self) -> int:
+        """About how long the time axis becomes; exactly that is known only after painting."""
+        return self.width_px - _BESIDE_PX
+
+    @property
+    def points(self) -> int:
+        """How many buckets a curve is made of."""
+        return min(self.axis_px // _BUCKET_PX, MOST_POINTS)
 
 
 def draw(sheet: Sheet, paint: Callable[[Any], None]) -> bytes:

@@ -11,7 +11,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.series import RunHistory, query_history
+from webots_mcp.store.questions.series import DEFAULT_POINTS, History, RunHistory, query_history
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.runs import fetch_run
 from webots_mcp.store.signals.catalogue import one_signal, signals_of
@@ -21,7 +21,6 @@ Known = dict[str, Signal]
 
 MOST_RUNS: Final = 4  # more lines of each signal could not be told apart
 _SHOWN_NAMES: Final = 10
-_POINTS: Final = 260  # of 3 pixels each: narrower, and the band hides behind the line
 
 
 @dataclass(frozen=True)
@@ -59,9 +58,18 @@ class Part:
 
 
 def parts_of(
-    connection: sqlite3.Connection, ranges: Sequence[TimeRange], names: Sequence[str]
+    connection: sqlite3.Connection,
+    ranges: Sequence[TimeRange],
+    names: Sequence[str],
+    points: int = DEFAULT_POINTS,
 ) -> list[Part]:
     """Read the signals of each run in the ranges; several runs begin at 0 each.
+
+    Args:
+        connection: Any.
+        ranges: Those of the picture.
+        names: Signals, with `*`.
+        points: The most buckets of a run; the buckets of all runs have one length.
 
     Raises:
         UnknownSignalError: A name meets nothing.
@@ -75,8 +83,7 @@ def parts_of(
             "name them by their ids"
         )
     parts: list[Part] = []
-    for each in ranges:
-        history = query_history(connection, each, names, max_points=_POINTS)
+    for each, history in zip(ranges, _histories(connection, ranges, names, points), strict=True):
         for segment, run in zip(each.segments, history.runs, strict=True):
             alone = replace(each, segments=(segment,))
             parts.append(_part(connection, alone, run, count > 1))
@@ -84,6 +91,23 @@ def parts_of(
         notes = [note for each in ranges for note in each.notes]
         raise NothingRecordedError("; ".join(["nothing was recorded in the range", *notes]))
     return [part for part in parts if part.has_rows]
+
+
+def _histories(
+    connection: sqlite3.Connection, ranges: Sequence[TimeRange], names: Sequence[str], points: int
+) -> list[History]:
+    """The same data must look the same: the longest run decides how long a bucket is."""
+    least_step_s = 0.0
+    while True:
+        histories = [
+            query_history(connection, each, names, max_points=points, least_step_s=least_step_s)
+            for each in ranges
+        ]
+        runs = [run for history in histories for run in history.runs if run.sim_time_s]
+        steps_s = {run.step_s or 0.0 for run in runs}
+        if len(steps_s) <= 1 or max(steps_s) == least_step_s:
+            return histories
+        least_step_s = max(steps_s)
 
 
 def _part(

@@ -50,7 +50,9 @@ def plot_signals(
         NothingRecordedError: None of the signals has a value in the range.
     """
     sheet = sheet or Sheet()
-    timeline, notes = compose_timeline(connection, ranges, names, bands=bands, events=events)
+    timeline, notes = compose_timeline(
+        connection, ranges, names, bands=bands, events=events, sheet=sheet
+    )
     if not timeline.panels:
         rows = len(timeline.lanes) + len(timeline.events)
         sheet = replace(sheet, height_px=_height_of_rows(rows, sheet))
@@ -65,10 +67,12 @@ def compose_timeline(
     *,
     bands: str | None = None,
     events: bool = True,
+    sheet: Sheet | None = None,
 ) -> tuple[Timeline, tuple[str, ...]]:
     """What `plot_signals` paints, and its notes; arguments and errors as there."""
     mode = mode_signal(known_signals(connection, ranges), bands)
-    parts = parts_of(connection, ranges, [*names, *([mode] if mode else [])])
+    wanted = [*names, *([mode] if mode else [])]
+    parts = parts_of(connection, ranges, wanted, (sheet or Sheet()).points)
     overlaid = len(parts) > 1
     curves = [curve for part in parts for curve in _curves(part)]
     panels, left_out = by_signal(curves) if overlaid else by_scale(curves)

@@ -119,6 +119,7 @@ def query_history(
     names: Sequence[str],
     *,
     max_points: int = DEFAULT_POINTS,
+    least_step_s: float = 0.0,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> History:
     """Signals over a range, in columns of at most `max_points` buckets.
@@ -132,6 +133,8 @@ def query_history(
         time_range: From `resolve_range`; over several runs each gets its share of the points.
         names: Signals, with `*`.
         max_points: 1 to 500.
+        least_step_s: The least length of a bucket, so that runs of unlike length can be drawn over
+            each other; 0 leaves it open.
         deadline_s: After it, what was read so far is the answer, and says so.
 
     Raises:
@@ -143,9 +146,12 @@ def query_history(
     total_s = sum(segment.end_s - segment.start_s for segment in time_range.segments)
     deadline = Deadline(deadline_s)
     runs = [
-        _run_history(connection, segment, signals, _share(max_points, segment, total_s), deadline)
+        _run_history(
+            connection, segment, signals, _share(max_points, segment, total_s), deadline,
+            least_step_s,
+        )
         for segment in time_range.segments
-    ]
+    ]  # fmt: skip
     return History(time_range.robot, tuple(runs), time_range.notes)
 
 
@@ -159,10 +165,11 @@ def _run_history(
     signals: Sequence[Signal],
     max_points: int,
     deadline: Deadline,
+    least_step_s: float,
 ) -> RunHistory:
     numbers = [signal for signal in signals if signal.is_number]
     states = [signal for signal in signals if not signal.is_number]
-    table = tabulate(connection, segment, numbers, max_points, deadline)
+    table = tabulate(connection, segment, numbers, max_points, deadline, least_step_s)
     points = change_points(connection, segment, states, deadline)
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
     return RunHistory(

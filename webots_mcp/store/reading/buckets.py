@@ -55,17 +55,31 @@ def tabulate(
     signals: Sequence[Signal],
     max_points: int,
     deadline: Deadline,
+    least_step_s: float = 0.0,
 ) -> Table:
-    """Put a segment into at most `max_points` buckets: from rows up to 30,000 of them."""
+    """Put a segment into at most `max_points` buckets: from rows up to 30,000 of them.
+
+    Args:
+        connection: Any.
+        segment: The part of one run.
+        signals: Numeric ones.
+        max_points: The most buckets.
+        deadline: When to stop reading.
+        least_step_s: No bucket is shorter; above 0 no row is a bucket of its own.
+    """
     if exceeds(connection, segment):
-        return _from_rollups(connection, segment, signals, max_points, deadline)
+        return _from_rollups(connection, segment, signals, max_points, deadline, least_step_s)
     columns = read_columns(connection, segment, signals, deadline)
-    return _from_rows(columns, signals, max_points)
+    return _from_rows(columns, signals, max_points, least_step_s)
 
 
-def _from_rows(columns: Columns, signals: Sequence[Signal], max_points: int) -> Table:
+def _from_rows(
+    columns: Columns, signals: Sequence[Signal], max_points: int, least_step_s: float
+) -> Table:
     times = columns.times
-    step_s = None if len(times) <= max_points else _step(times[0], times[-1], max_points)
+    step_s = None
+    if times and (least_step_s > 0 or len(times) > max_points):
+        step_s = _step(times[0], times[-1], max_points, least_s=least_step_s)
     starts, edges = (times, list(range(len(times) + 1)))
     if step_s is not None:
         starts, edges = _edges(times, step_s)
@@ -102,11 +116,13 @@ def _number(time_s: float, step_s: float) -> int:
     return math.floor(time_s / step_s + 1e-9)
 
 
-def _step(first_s: float, last_s: float, max_points: int, unit_s: float = 0.0) -> float:
+def _step(
+    first_s: float, last_s: float, max_points: int, *, unit_s: float = 0.0, least_s: float = 0.0
+) -> float:
     """The shortest round bucket length (a multiple of `unit_s`) that needs no more buckets."""
-    for step_s in _round_steps(max(unit_s, (last_s - first_s) / max_points / 10, 1e-9)):
-        whole = unit_s == 0 or step_s % unit_s == 0
-        if whole and _number(last_s, step_s) - _number(first_s, step_s) < max_points:
+    for step_s in _round_steps(max(unit_s, least_s, (last_s - first_s) / max_points / 10, 1e-9)):
+        fits = step_s >= least_s and (unit_s == 0 or step_s % unit_s == 0)
+        if fits and _number(last_s, step_s) - _number(first_s, step_s) < max_points:
             return step_s
     raise AssertionError("the steps go on for ever")
 
@@ -123,6 +139,7 @@ def _from_rollups(
     signals: Sequence[Signal],
     max_points: int,
     deadline: Deadline,
+    least_step_s: float,
 ) -> Table:
     pieces = read_pieces(connection, segment, signals, deadline)
     found = {signal.name: pieces.of(signal.name) for signal in signals}
@@ -131,7 +148,8 @@ def _from_rollups(
     if not numbers:
         return Table("rollup", BUCKET_S, [], {}, None, rhythm, None, pieces.cut_at_s)
     first, last = min(numbers), max(numbers)
-    step_s = _step(first * BUCKET_S, last * BUCKET_S, max_points, BUCKET_S)
+    bounds = (first * BUCKET_S, last * BUCKET_S)
+    step_s = _step(*bounds, max_points, unit_s=BUCKET_S, least_s=least_step_s)
     width = round(step_s / BUCKET_S)
     indexes = range(first // width, last // width + 1)
     starts = [index * step_s for index in indexes]

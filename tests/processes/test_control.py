@@ -14,7 +14,7 @@ from tests.bridge.conftest import Recording
 from tests.processes.conftest import CONTROLLER, Start, has_states
 from webots_mcp.connection import connect
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.server.addressee import find_addressee
+from webots_mcp.server.target import find_target
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.recording import look
@@ -173,7 +173,7 @@ def test_the_reload_of_an_extern_controller_is_answered_when_its_process_has_end
         connection = connect(filed.database, "reader")
         assert "start it by hand" in (look(connection, "rover").status.why or "")
         with pytest.raises(CommandRefusedError, match="start it by hand"):
-            find_addressee(connection, "rover", "pause")
+            find_target(connection, "rover", "pause")
         connection.close()
 
 

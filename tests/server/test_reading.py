@@ -160,7 +160,7 @@ async def test_odd_values_are_recognisable(connect: Connect, recorded: Recorded)
         answer = await ask(client, "webots_get_sensors")
     assert answer["sensors"]["front"] == "nan"
     assert answer["sensors"]["lidar"]["inf"] == 40
-    assert answer["odd"]["front"] == "nan"
+    assert answer["replaced"]["front"] == "nan"
     assert "x" not in answer["sensors"]
     assert answer["unnamed_devices"] == {"eye": "Camera"}
 

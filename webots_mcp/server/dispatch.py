@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
 from typing import Any, Final
 
 import anyio
 from anyio import to_thread
 
 from webots_mcp.contract import HEARTBEAT_LATE_S
-from webots_mcp.server.addressee import find_addressee
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
+from webots_mcp.server.target import find_target
 from webots_mcp.store.queue import Command, CommandQueue, fetch_command
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
@@ -31,23 +30,20 @@ _OUTLIVES_WAITING_S: Final = 1.0
 _ERROR_CHARACTERS: Final = 2_000
 
 
-@dataclass(frozen=True)
-class Request:
-    """An action for one robot, and how long to wait for its outcome."""
-
-    robot: str | None
-    action: str
-    params: Mapping[str, Any]
-    timeout_s: float
-
-
 class Dispatcher:
-    """Sends commands and watches their rows."""
+    """Sends commands, watches their rows and reports to the client how long it has waited."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: Recording, report: Report) -> None:
         self._recording = recording
+        self._report = report
 
-    async def ask(self, request: Request, report: Report) -> CommandAnswer:
+    async def ask(
+        self,
+        robot: str | None,
+        action: str,
+        timeout_s: float,
+        params: Mapping[str, Any] | None = None,
+    ) -> CommandAnswer:
         """Send a command, wait until its fate is settled or time is up, and say what happened.
 
         At the deadline a command that nobody has claimed is taken back, so that it cannot run when
@@ -59,11 +55,12 @@ class Dispatcher:
             NothingRecordedError: There is no robot to ask.
         """
         started_s = time.monotonic()
-        command = await self._send(request, report)
+        sent = await to_thread.run_sync(self._enqueue, robot, action, params or {}, timeout_s)
+        command = await self._outcome(sent, timeout_s)
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
 
-    async def wait(self, command_id: int, timeout_s: float, report: Report) -> CommandAnswer:
+    async def wait(self, command_id: int, timeout_s: float) -> CommandAnswer:
         """Go on waiting for a command that was sent before; nothing is taken back at the deadline.
 
         Raises:
@@ -71,33 +68,34 @@ class Dispatcher:
         """
         started_s = time.monotonic()
         await to_thread.run_sync(self._recording.settle)
-        command = await self._watch(command_id, timeout_s, report)
+        command = await self._watch(command_id, timeout_s)
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
 
-    async def _send(self, request: Request, report: Report) -> Command:
-        command = await to_thread.run_sync(self._enqueue, request)
+    async def _outcome(self, command: Command, timeout_s: float) -> Command:
         try:
-            command = await self._watch(command.id, request.timeout_s, report)
+            command = await self._watch(command.id, timeout_s)
             return await to_thread.run_sync(self._at_the_deadline, command)
         except anyio.get_cancelled_exc_class():
             with anyio.CancelScope(shield=True):
                 await to_thread.run_sync(self._leave, command.id)
             raise
 
-    def _enqueue(self, request: Request) -> Command:
+    def _enqueue(
+        self, robot: str | None, action: str, params: Mapping[str, Any], timeout_s: float
+    ) -> Command:
         with self._recording.reader() as connection:
-            view = find_addressee(connection, request.robot, request.action)
+            view = find_target(connection, robot, action)
         with self._recording.writer() as connection:
             return CommandQueue(connection).enqueue(
                 view.robot.id,
-                request.action,
-                request.params,
-                time_to_live_s=request.timeout_s + _OUTLIVES_WAITING_S,
+                action,
+                params,
+                time_to_live_s=timeout_s + _OUTLIVES_WAITING_S,
                 requested_by="mcp",
             )
 
-    async def _watch(self, command_id: int, timeout_s: float, report: Report) -> Command:
+    async def _watch(self, command_id: int, timeout_s: float) -> Command:
         started_s = time.monotonic()
         next_report_s = _REPORT_INTERVAL_S
         with self._recording.reader() as connection:
@@ -108,7 +106,7 @@ class Dispatcher:
                 if waited_s >= next_report_s:
                     next_report_s += _REPORT_INTERVAL_S
                     await to_thread.run_sync(self._recording.settle)
-                    await report(waited_s, timeout_s, _progress(command, waited_s))
+                    await self._report(waited_s, timeout_s, _progress(command, waited_s))
                 await anyio.sleep(_POLL_INTERVAL_S)
             return command
 

@@ -44,7 +44,7 @@ class NumberSeries(BaseModel):
     )
     whole: dict[str, float | None] | None = Field(default=None, description="Over the range.")
     silent: bool | None = Field(default=None, description="True: no value in the range.")
-    odd: dict[str, int] | None = Field(
+    replaced: dict[str, int] | None = Field(
         default=None, description="How often nan, inf, ... stood there."
     )
 
@@ -87,7 +87,7 @@ class RowColumns(BaseModel):
     run_id: list[int] | None = Field(default=None, description="Where it is not the header's.")
     sim_time_s: list[float | None]
     signals: dict[str, list[Any]]
-    odd: dict[str, dict[str, int]] | None = None
+    replaced: dict[str, dict[str, int]] | None = None
 
 
 class HistoryAnswer(NotedAnswer):

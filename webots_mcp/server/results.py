@@ -47,7 +47,7 @@ class SensorsAnswer(Answer):
     """The newest sensor values."""
 
     sensors: dict[str, Any] = Field(default_factory=dict[str, Any])
-    odd: dict[str, str] | None = Field(
+    replaced: dict[str, str] | None = Field(
         default=None, description="Values that JSON cannot hold: path to nan, inf, ..."
     )
     unnamed_devices: dict[str, str] | None = Field(
@@ -66,7 +66,7 @@ class FullStateAnswer(Answer):
         default=None, description="Ask again with this offset for more."
     )
     shortened: str | None = None
-    odd: dict[str, str] | None = None
+    replaced: dict[str, str] | None = None
     events: Table | None = None
     recorder: dict[str, Any] | None = Field(
         default=None, description="Rows waiting and dropped, last error, controller code."

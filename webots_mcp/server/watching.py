@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from webots_mcp.server.bounds import newest_runs
-from webots_mcp.server.fitting import figure
+from webots_mcp.server.budget import figure
 from webots_mcp.store.analysis.motion import find_motion, path_length, places_of
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.deadline import Deadline

@@ -11,12 +11,12 @@ from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.contract import MAX_STEPS
-from webots_mcp.server.addressee import find_addressee
-from webots_mcp.server.boundary import ACTS, RESTARTS, reporter, tool
-from webots_mcp.server.dispatch import Dispatcher, Request
+from webots_mcp.server.declaring import ACTS, RESTARTS, tool
+from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.keyboard import press_reset
 from webots_mcp.server.parameters import MAX_WAIT_S, RobotName, TimeoutS
 from webots_mcp.server.results import CommandAnswer
+from webots_mcp.server.target import find_target
 from webots_mcp.store.recording import Recording
 
 Control = Literal["pause", "resume", "fast", "step", "reset", "reload"]
@@ -26,123 +26,128 @@ _RELOAD_WAIT_S: Final = 30.0
 _RESET_POLL_S: Final = 0.05
 
 
-class ControlTools:
-    """Pause, step, reset, reload."""
+@tool("Control the simulation", RESTARTS)
+async def webots_simulation_control(
+    recording: Recording,
+    command: Annotated[Control, Field(description="reset and reload begin a new run at time 0.")],
+    ctx: Context[Any],
+    steps: Annotated[
+        int,
+        Field(
+            ge=1,
+            le=MAX_STEPS,
+            description="For step: so many rounds of the controller's own loop, then paused.",
+        ),
+    ] = 1,
+    robot: RobotName = None,
+    timeout_s: Annotated[
+        float | None,
+        Field(
+            ge=0.1,
+            le=MAX_WAIT_S,
+            description="By default 10 s, for reload 30, for step up to 90; then "
+            "webots_wait_for_command goes on waiting.",
+        ),
+    ] = None,
+) -> CommandAnswer:
+    """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self._dispatcher = Dispatcher(recording)
+    Needs a controller that is a Supervisor. The whole simulation is steered, not one robot
+    alone. `reload` restarts the controllers that Webots starts, with their code as it is on
+    disk now; an extern controller ends, and somebody has to start it again by hand.
+    """
+    params = {"steps": steps} if command == "step" else {}
+    waiting_s = timeout_s or await to_thread.run_sync(
+        _usual_wait_s, recording, command, steps, robot
+    )
+    return await Dispatcher(recording, ctx.report_progress).ask(robot, command, waiting_s, params)
 
-    @tool("Control the simulation", RESTARTS)
-    async def webots_simulation_control(
-        self,
-        command: Annotated[
-            Control, Field(description="reset and reload begin a new run at time 0.")
-        ],
-        ctx: Context[Any],
-        steps: Annotated[
-            int,
-            Field(
-                ge=1,
-                le=MAX_STEPS,
-                description="For step: so many rounds of the controller's own loop, then paused.",
-            ),
-        ] = 1,
-        robot: RobotName = None,
-        timeout_s: Annotated[
-            float | None,
-            Field(
-                ge=0.1,
-                le=MAX_WAIT_S,
-                description="By default 10 s, for reload 30, for step up to 90; then "
-                "webots_wait_for_command goes on waiting.",
-            ),
-        ] = None,
-    ) -> CommandAnswer:
-        """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
 
-        Needs a controller that is a Supervisor. The whole simulation is steered, not one robot
-        alone. `reload` restarts the controllers that Webots starts, with their code as it is on
-        disk now; an extern controller ends, and somebody has to start it again by hand.
-        """
-        params = {"steps": steps} if command == "step" else {}
-        waiting_s = timeout_s or await to_thread.run_sync(self._usual_wait_s, command, steps, robot)
-        return await self._dispatcher.ask(Request(robot, command, params, waiting_s), reporter(ctx))
+@tool("Reload the world", RESTARTS)
+async def webots_world_reload(
+    recording: Recording,
+    ctx: Context[Any],
+    robot: RobotName = None,
+    timeout_s: TimeoutS = _RELOAD_WAIT_S,
+) -> CommandAnswer:
+    """Reload the world from disk and restart its controllers; waits until a new one records.
 
-    @tool("Reload the world", RESTARTS)
-    async def webots_world_reload(
-        self, ctx: Context[Any], robot: RobotName = None, timeout_s: TimeoutS = _RELOAD_WAIT_S
-    ) -> CommandAnswer:
-        """Reload the world from disk and restart its controllers; waits until a new one records.
+    An extern controller ends, and somebody has to start it again by hand.
+    """
+    return await Dispatcher(recording, ctx.report_progress).ask(robot, "reload", timeout_s)
 
-        An extern controller ends, and somebody has to start it again by hand.
-        """
-        return await self._dispatcher.ask(Request(robot, "reload", {}, timeout_s), reporter(ctx))
 
-    @tool("Reset the world", RESTARTS)
-    async def webots_world_reset(
-        self,
-        ctx: Context[Any],
-        force: Annotated[
-            bool,
-            Field(
-                description="Press Webots' own keys instead of asking the controller (macOS only): "
-                "for a controller that does not answer any more."
-            ),
-        ] = False,
-        robot: RobotName = None,
-        timeout_s: TimeoutS = _WAIT_S,
-    ) -> CommandAnswer:
-        """Put the world back to its start, simulation time 0; controllers go on running."""
-        if force:
-            return await self._reset_by_keys(robot, timeout_s)
-        return await self._dispatcher.ask(Request(robot, "reset", {}, timeout_s), reporter(ctx))
+@tool("Reset the world", RESTARTS)
+async def webots_world_reset(
+    recording: Recording,
+    ctx: Context[Any],
+    force: Annotated[
+        bool,
+        Field(
+            description="Press Webots' own keys instead of asking the controller (macOS only): "
+            "for a controller that does not answer any more."
+        ),
+    ] = False,
+    robot: RobotName = None,
+    timeout_s: TimeoutS = _WAIT_S,
+) -> CommandAnswer:
+    """Put the world back to its start, simulation time 0; controllers go on running."""
+    if force:
+        return await _reset_by_keys(recording, robot, timeout_s)
+    return await Dispatcher(recording, ctx.report_progress).ask(robot, "reset", timeout_s)
 
-    @tool("Reset the controller's state", ACTS)
-    async def webots_reset_controller_state(
-        self, ctx: Context[Any], robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
-    ) -> CommandAnswer:
-        """Run the callbacks that the controller registered with bridge.on_reload().
 
-        They put the controller's own variables back; the world stays as it is.
-        """
-        return await self._dispatcher.ask(
-            Request(robot, "reset_state", {}, timeout_s), reporter(ctx)
+@tool("Reset the controller's state", ACTS)
+async def webots_reset_controller_state(
+    recording: Recording, ctx: Context[Any], robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
+) -> CommandAnswer:
+    """Run the callbacks that the controller registered with bridge.on_reload().
+
+    They put the controller's own variables back; the world stays as it is.
+    """
+    return await Dispatcher(recording, ctx.report_progress).ask(robot, "reset_state", timeout_s)
+
+
+def _usual_wait_s(recording: Recording, command: Control, steps: int, robot: str | None) -> float:
+    """Long enough for steps at half of real time, and for a reload."""
+    if command == "reload":
+        return _RELOAD_WAIT_S
+    if command != "step":
+        return _WAIT_S
+    with recording.reader() as connection:
+        run = find_target(connection, robot, command).run
+        step_ms = (run.basic_time_step_ms if run else None) or 32.0
+    return min(_WAIT_S + 2 * steps * step_ms / 1000, MAX_WAIT_S)
+
+
+async def _reset_by_keys(
+    recording: Recording, robot: str | None, timeout_s: float
+) -> CommandAnswer:
+    """Press the keys, then wait for the run that a reset begins."""
+    before = await to_thread.run_sync(_current_run_id, recording, robot)
+    await to_thread.run_sync(press_reset)
+    started_s = time.monotonic()
+    while (run_id := await to_thread.run_sync(_current_run_id, recording, robot)) == before:
+        if time.monotonic() - started_s > timeout_s:
+            break
+        await anyio.sleep(_RESET_POLL_S)
+    return await to_thread.run_sync(_after_keys, recording, robot, run_id != before, started_s)
+
+
+def _current_run_id(recording: Recording, robot: str | None) -> int | None:
+    with recording.view(robot) as view:
+        return view.run.id if view.run else None
+
+
+def _after_keys(
+    recording: Recording, robot: str | None, begun: bool, started_s: float
+) -> CommandAnswer:
+    hint = "the keys were sent, but no new run has begun: look at Webots' window"
+    with recording.view(robot) as view:
+        return CommandAnswer(
+            **view.header(),
+            action="reset",
+            outcome="done" if begun else "failed",
+            waited_s=round(time.monotonic() - started_s, 3),
+            hint=None if begun else hint,
         )
-
-    def _usual_wait_s(self, command: Control, steps: int, robot: str | None) -> float:
-        """Long enough for steps at half of real time, and for a reload."""
-        if command == "reload":
-            return _RELOAD_WAIT_S
-        if command != "step":
-            return _WAIT_S
-        with self._recording.reader() as connection:
-            run = find_addressee(connection, robot, command).run
-            step_ms = (run.basic_time_step_ms if run else None) or 32.0
-        return min(_WAIT_S + 2 * steps * step_ms / 1000, MAX_WAIT_S)
-
-    async def _reset_by_keys(self, robot: str | None, timeout_s: float) -> CommandAnswer:
-        """Press the keys, then wait for the run that a reset begins."""
-        before = await to_thread.run_sync(self._current_run_id, robot)
-        await to_thread.run_sync(press_reset)
-        started_s = time.monotonic()
-        while (run_id := await to_thread.run_sync(self._current_run_id, robot)) == before:
-            if time.monotonic() - started_s > timeout_s:
-                break
-            await anyio.sleep(_RESET_POLL_S)
-        return await to_thread.run_sync(self._after_keys, robot, run_id != before, started_s)
-
-    def _current_run_id(self, robot: str | None) -> int | None:
-        with self._recording.view(robot) as view:
-            return view.run.id if view.run else None
-
-    def _after_keys(self, robot: str | None, begun: bool, started_s: float) -> CommandAnswer:
-        hint = "the keys were sent, but no new run has begun: look at Webots' window"
-        with self._recording.view(robot) as view:
-            return CommandAnswer(
-                **view.header(),
-                action="reset",
-                outcome="done" if begun else "failed",
-                waited_s=round(time.monotonic() - started_s, 3),
-                hint=None if begun else hint,
-            )

@@ -8,9 +8,8 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.bounds import Bounds
-from webots_mcp.server.fitting import (
+from webots_mcp.server.budget import (
     BUDGET,
     LARGE_BUDGET,
     answer_about,
@@ -21,6 +20,7 @@ from webots_mcp.server.fitting import (
     size_of,
     without_empty,
 )
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import EventsAnswer
 from webots_mcp.server.parameters import (
     AnyNames,
@@ -47,69 +47,63 @@ EVENT_COLUMNS: Final = ("kind", "run_id", "start_s", "duration_s", "ongoing", "n
 DEFAULT_LIMIT: Final = 50
 
 
-class EventTools:
-    """What happened in a stretch of time."""
+@tool("Find events", READS)
+def webots_find_events(
+    recording: Recording,
+    kinds: Kinds = None,
+    signals: AnyNames = None,
+    above: Annotated[
+        float | None, Field(description="For threshold: where the signals were above this ...")
+    ] = None,
+    below: Annotated[float | None, Field(description="... or below this ...")] = None,
+    for_s: Annotated[
+        float, Field(ge=0, description="... for at least so many simulated seconds.")
+    ] = 0,
+    stuck_s: Annotated[
+        float, Field(gt=0, description="Still, or stuck, is who for so long ...")
+    ] = EventOptions.stuck_s,
+    stuck_m: Annotated[
+        float,
+        Field(
+            gt=0,
+            description="... stays within so many metres (more where the position is noisy).",
+        ),
+    ] = EventOptions.stuck_m,
+    log_level: LogLevel = "warning",
+    last_s: LastS = None,
+    start_s: StartS = None,
+    end_s: EndS = None,
+    since: Since = None,
+    until: Until = None,
+    limit: ShownLimit = None,
+    cursor: TextCursor = "",
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> EventsAnswer:
+    """What happened in a stretch of time, by default the whole run, with begin and duration.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-
-    @tool("Find events", READS)
-    def webots_find_events(
-        self,
-        kinds: Kinds = None,
-        signals: AnyNames = None,
-        above: Annotated[
-            float | None, Field(description="For threshold: where the signals were above this ...")
-        ] = None,
-        below: Annotated[float | None, Field(description="... or below this ...")] = None,
-        for_s: Annotated[
-            float, Field(ge=0, description="... for at least so many simulated seconds.")
-        ] = 0,
-        stuck_s: Annotated[
-            float, Field(gt=0, description="Still, or stuck, is who for so long ...")
-        ] = EventOptions.stuck_s,
-        stuck_m: Annotated[
-            float,
-            Field(
-                gt=0,
-                description="... stays within so many metres (more where the position is noisy).",
-            ),
-        ] = EventOptions.stuck_m,
-        log_level: LogLevel = "warning",
-        last_s: LastS = None,
-        start_s: StartS = None,
-        end_s: EndS = None,
-        since: Since = None,
-        until: Until = None,
-        limit: ShownLimit = None,
-        cursor: TextCursor = "",
-        robot: RobotName = None,
-        run_id: RunId = None,
-    ) -> EventsAnswer:
-        """What happened in a stretch of time, by default the whole run, with begin and duration.
-
-        Changed modes and flags, still (it stood), stuck (it stood and should have moved; evidence
-        says why), oscillation, jumps, thresholds, silent or flat sensors, recording gaps, runs,
-        commands, log lines: "since when, how often, in which mode". Many jumps, silences or flat
-        times of one signal are one event with count and says. Pictures only with kinds=["image"].
-        What is not shown is counted; cursor shows it.
-        """
-        bounds = Bounds(last_s, start_s, end_s, since, until)
-        thresholds = thresholds_on(signals or (), above, below, for_s)
-        options = EventOptions(
-            kinds=_kinds(kinds, thresholds),
-            signals=tuple(signals or ("*",)),
-            thresholds=thresholds,
-            stuck_s=stuck_s,
-            stuck_m=stuck_m,
-            log_level=log_level,
+    Changed modes and flags, still (it stood), stuck (it stood and should have moved; evidence
+    says why), oscillation, jumps, thresholds, silent or flat sensors, recording gaps, runs,
+    commands, log lines: "since when, how often, in which mode". Many jumps, silences or flat
+    times of one signal are one event with count and says. Pictures only with kinds=["image"].
+    What is not shown is counted; cursor shows it.
+    """
+    bounds = Bounds(last_s, start_s, end_s, since, until)
+    thresholds = thresholds_on(signals or (), above, below, for_s)
+    options = EventOptions(
+        kinds=_kinds(kinds, thresholds),
+        signals=tuple(signals or ("*",)),
+        thresholds=thresholds,
+        stuck_s=stuck_s,
+        stuck_m=stuck_m,
+        log_level=log_level,
+    )
+    with recording.view(robot, run_id) as view:
+        return answer_about(
+            view,
+            EventsAnswer,
+            lambda: _found(view, bounds.resolve(view, run_id), options, limit, cursor),
         )
-        with self._recording.view(robot, run_id) as view:
-            return answer_about(
-                view,
-                EventsAnswer,
-                lambda: _found(view, bounds.resolve(view, run_id), options, limit, cursor),
-            )
 
 
 def _kinds(kinds: Sequence[Kind] | None, thresholds: Sequence[Threshold]) -> tuple[Kind, ...]:

@@ -9,9 +9,8 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.bounds import Bounds
-from webots_mcp.server.fitting import (
+from webots_mcp.server.budget import (
     BUDGET,
     LARGE_BUDGET,
     answer_about,
@@ -24,6 +23,7 @@ from webots_mcp.server.fitting import (
     size_of,
     some,
 )
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import (
     ChangeSeries,
     HistoryAnswer,
@@ -60,46 +60,40 @@ _CELL_CHARACTERS: Final = 28  # of a bucket of a numeric signal: min, max, mean 
 _SIGNAL_CHARACTERS: Final = 200  # of a signal, beside its buckets
 
 
-class HistoryTools:
-    """Signals over a stretch of time."""
+@tool("Query the history", READS)
+def webots_query_history(
+    recording: Recording,
+    signals: Names,
+    last_s: LastS = None,
+    start_s: StartS = None,
+    end_s: EndS = None,
+    since: Since = None,
+    until: Until = None,
+    max_points: MaxPoints = None,
+    raw: Annotated[
+        bool, Field(description="The rows as they are, exact, in pages, instead of buckets.")
+    ] = False,
+    cursor: Cursor = None,
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> HistoryAnswer:
+    """Signals over time, by default the whole run: min, max, mean, last per bucket.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
+    No extreme is averaged away; empty buckets are null, gaps are listed. Text and flags come as
+    the points at which they changed. For "what happened" webots_get_trends is shorter.
+    """
+    if cursor is not None and not raw:
+        raise InvalidInputError("cursor goes on with rows: give it together with raw=true")
+    bounds = Bounds(last_s, start_s, end_s, since, until)
+    with recording.view(robot, run_id) as view:
 
-    @tool("Query the history", READS)
-    def webots_query_history(
-        self,
-        signals: Names,
-        last_s: LastS = None,
-        start_s: StartS = None,
-        end_s: EndS = None,
-        since: Since = None,
-        until: Until = None,
-        max_points: MaxPoints = None,
-        raw: Annotated[
-            bool, Field(description="The rows as they are, exact, in pages, instead of buckets.")
-        ] = False,
-        cursor: Cursor = None,
-        robot: RobotName = None,
-        run_id: RunId = None,
-    ) -> HistoryAnswer:
-        """Signals over time, by default the whole run: min, max, mean, last per bucket.
+        def find() -> dict[str, Any]:
+            asked = bounds.resolve(view, run_id)
+            if raw:
+                return _page(view, asked, signals, max_points, cursor or 0)
+            return _series(view, asked, signals, max_points)
 
-        No extreme is averaged away; empty buckets are null, gaps are listed. Text and flags come as
-        the points at which they changed. For "what happened" webots_get_trends is shorter.
-        """
-        if cursor is not None and not raw:
-            raise InvalidInputError("cursor goes on with rows: give it together with raw=true")
-        bounds = Bounds(last_s, start_s, end_s, since, until)
-        with self._recording.view(robot, run_id) as view:
-
-            def find() -> dict[str, Any]:
-                asked = bounds.resolve(view, run_id)
-                if raw:
-                    return _page(view, asked, signals, max_points, cursor or 0)
-                return _series(view, asked, signals, max_points)
-
-            return answer_about(view, HistoryAnswer, find)
+        return answer_about(view, HistoryAnswer, find)
 
 
 def _series(
@@ -180,14 +174,14 @@ def _usual_counts(numbers: Sequence[NumberColumns]) -> list[int] | None:
 def _number_series(
     columns: NumberColumns, counts: list[int] | None, *, rows_only: bool
 ) -> NumberSeries:
-    odd = columns.odd or None
+    replaced = columns.odd or None
     if not columns.whole.present:
-        return NumberSeries(silent=True, odd=odd)
+        return NumberSeries(silent=True, replaced=replaced)
     if rows_only:
-        return NumberSeries(unit=columns.unit, value=figures(columns.last), odd=odd)
+        return NumberSeries(unit=columns.unit, value=figures(columns.last), replaced=replaced)
     whole = columns.whole
     if whole.min == whole.max and columns.count == counts:
-        return NumberSeries(unit=columns.unit, constant=figure(whole.min), odd=odd)
+        return NumberSeries(unit=columns.unit, constant=figure(whole.min), replaced=replaced)
     return NumberSeries(
         unit=columns.unit,
         min=figures(columns.min),
@@ -202,7 +196,7 @@ def _number_series(
             "max_at_s": seconds(whole.max_sim_time_s),
             "mean": figure(whole.direction if columns.kind == "angle" else whole.mean),
         },
-        odd=odd,
+        replaced=replaced,
     )
 
 
@@ -263,5 +257,5 @@ def _row_columns(page: Page, rows: int, view: View) -> RowColumns:
             ]
             for name, values in page.values.items()
         },
-        odd=page.odd or None,
+        replaced=page.odd or None,
     )

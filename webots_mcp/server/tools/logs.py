@@ -7,7 +7,7 @@ from typing import Annotated, Final
 from pydantic import Field
 
 from webots_mcp.contract import LogLevel
-from webots_mcp.server.boundary import READS, tool
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import Cursor, EndS, LastS, RobotName, RunId, StartS
 from webots_mcp.server.results import LogsAnswer, Table
 from webots_mcp.server.shortening import cut_text
@@ -20,45 +20,35 @@ _LONGEST_MESSAGE: Final = 500
 _BUDGET: Final = 6_000
 
 
-class LogTools:
-    """What the controller and the bridge said."""
+@tool("Get log lines", READS)
+def webots_get_logs(
+    recording: Recording,
+    lines: Annotated[int, Field(ge=1, le=1000, description="At most so many lines.")] = 50,
+    filter_text: Annotated[
+        str, Field(max_length=200, description="Only lines that contain this text.")
+    ] = "",
+    level: Annotated[LogLevel | None, Field(description="This level and those above it.")] = None,
+    last_s: LastS = None,
+    start_s: StartS = None,
+    end_s: EndS = None,
+    cursor: Cursor = None,
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> LogsAnswer:
+    """The newest log lines, oldest first, each with its run.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-
-    @tool("Get log lines", READS)
-    def webots_get_logs(
-        self,
-        lines: Annotated[int, Field(ge=1, le=1000, description="At most so many lines.")] = 50,
-        filter_text: Annotated[
-            str, Field(max_length=200, description="Only lines that contain this text.")
-        ] = "",
-        level: Annotated[
-            LogLevel | None, Field(description="This level and those above it.")
-        ] = None,
-        last_s: LastS = None,
-        start_s: StartS = None,
-        end_s: EndS = None,
-        cursor: Cursor = None,
-        robot: RobotName = None,
-        run_id: RunId = None,
-    ) -> LogsAnswer:
-        """The newest log lines, oldest first, each with its run.
-
-        Of all runs of the robot, so also from before a reset; with a run_id or a range of time of
-        that run, or the current one. Lines of the bridge begin with 'bridge:', those of Python's
-        logging with '[name of the logger]'.
-        """
-        with self._recording.view(robot, run_id) as view:
-            run = view.require_run()
-            one_run = any(bound is not None for bound in (run_id, last_s, start_s, end_s))
-            window = resolve_window(
-                run.last_sim_time_s, last_s=last_s, start_s=start_s, end_s=end_s
-            )
-            subject = run.id if one_run else None
-            lowest = level or "debug"
-            asked = LogFilter(subject, window, filter_text, lowest, cursor, view.robot.id)
-            return _answer(view, asked, lines)
+    Of all runs of the robot, so also from before a reset; with a run_id or a range of time of
+    that run, or the current one. Lines of the bridge begin with 'bridge:', those of Python's
+    logging with '[name of the logger]'.
+    """
+    with recording.view(robot, run_id) as view:
+        run = view.require_run()
+        one_run = any(bound is not None for bound in (run_id, last_s, start_s, end_s))
+        window = resolve_window(run.last_sim_time_s, last_s=last_s, start_s=start_s, end_s=end_s)
+        subject = run.id if one_run else None
+        lowest = level or "debug"
+        asked = LogFilter(subject, window, filter_text, lowest, cursor, view.robot.id)
+        return _answer(view, asked, lines)
 
 
 def log_row(line: LogLine) -> list[object]:

@@ -12,8 +12,8 @@ from anyio import to_thread
 from mcp.server.mcpserver import Context
 from pydantic import Field
 
-from webots_mcp.server.boundary import READS, reporter, tool
-from webots_mcp.server.fitting import BUDGET, answer_about, notes_of
+from webots_mcp.server.budget import BUDGET, answer_about, notes_of
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import MonitorAnswer
 from webots_mcp.server.parameters import MAX_WAIT_S, RobotName
 from webots_mcp.server.tools.events import fitting_events, not_shown_of
@@ -29,64 +29,61 @@ _SHOWN_SIGNALS: Final = 12
 _SHOWN_EVENTS: Final = 30
 
 
-class MonitorTools:
-    """Watching a robot."""
+@tool("Watch the robot", READS)
+async def webots_monitor(
+    recording: Recording,
+    ctx: Context[Any],
+    duration_s: Annotated[
+        float, Field(ge=1, le=MAX_WAIT_S, description="How long to watch, wall seconds.")
+    ] = 10,
+    lookback_s: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            le=86_400,
+            description="Do not watch: report at once on so many wall seconds before the "
+            "newest row.",
+        ),
+    ] = None,
+    robot: RobotName = None,
+) -> MonitorAnswer:
+    """Watch for some seconds, then report what was recorded meanwhile; or look back at once.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
+    Movement, trends and events (changed modes and flags, stuck, pauses, commands, warnings) of
+    exactly the rows of that window: nothing depends on when one looked.
+    """
+    if lookback_s is not None:
+        return await to_thread.run_sync(_look_back, recording, robot, lookback_s)
+    name, started_s = await to_thread.run_sync(_start, recording, robot)
+    for second in range(1, math.ceil(duration_s) + 1):
+        await anyio.sleep(min(_REPORT_INTERVAL_S, duration_s - second + 1))
+        doing = await to_thread.run_sync(_doing, recording, name)
+        await ctx.report_progress(min(second, duration_s), duration_s, doing)
+    return await to_thread.run_sync(_watched, recording, name, started_s)
 
-    @tool("Watch the robot", READS)
-    async def webots_monitor(
-        self,
-        ctx: Context[Any],
-        duration_s: Annotated[
-            float, Field(ge=1, le=MAX_WAIT_S, description="How long to watch, wall seconds.")
-        ] = 10,
-        lookback_s: Annotated[
-            float | None,
-            Field(
-                gt=0,
-                le=86_400,
-                description="Do not watch: report at once on so many wall seconds before the "
-                "newest row.",
-            ),
-        ] = None,
-        robot: RobotName = None,
-    ) -> MonitorAnswer:
-        """Watch for some seconds, then report what was recorded meanwhile; or look back at once.
 
-        Movement, trends and events (changed modes and flags, stuck, pauses, commands, warnings) of
-        exactly the rows of that window: nothing depends on when one looked.
-        """
-        if lookback_s is not None:
-            return await to_thread.run_sync(self._look_back, robot, lookback_s)
-        name, started_s = await to_thread.run_sync(self._start, robot)
-        report = reporter(ctx)
-        for second in range(1, math.ceil(duration_s) + 1):
-            await anyio.sleep(min(_REPORT_INTERVAL_S, duration_s - second + 1))
-            doing = await to_thread.run_sync(self._doing, name)
-            await report(min(second, duration_s), duration_s, doing)
-        return await to_thread.run_sync(self._watched, name, started_s)
+def _start(recording: Recording, robot: str | None) -> tuple[str, float]:
+    with recording.view(robot) as view:
+        view.require_run()
+        return view.robot.name, time.time()
 
-    def _start(self, robot: str | None) -> tuple[str, float]:
-        with self._recording.view(robot) as view:
-            view.require_run()
-            return view.robot.name, time.time()
 
-    def _doing(self, robot: str) -> str:
-        with self._recording.view(robot) as view:
-            at = f", simulation time {view.state.sim_time_s:.2f} s" if view.state else ""
-            return f"{robot}: {view.status.text}{at}"
+def _doing(recording: Recording, robot: str) -> str:
+    with recording.view(robot) as view:
+        at = f", simulation time {view.state.sim_time_s:.2f} s" if view.state else ""
+        return f"{robot}: {view.status.text}{at}"
 
-    def _watched(self, robot: str, started_s: float) -> MonitorAnswer:
-        with self._recording.view(robot) as view:
-            return _report(view, started_s, view.now_s - started_s)
 
-    def _look_back(self, robot: str | None, lookback_s: float) -> MonitorAnswer:
-        with self._recording.view(robot) as view:
-            run = view.require_run()
-            newest_s = view.state.wall_time_s if view.state else run.last_wall_time_s
-            return _report(view, newest_s - lookback_s, lookback_s)
+def _watched(recording: Recording, robot: str, started_s: float) -> MonitorAnswer:
+    with recording.view(robot) as view:
+        return _report(view, started_s, view.now_s - started_s)
+
+
+def _look_back(recording: Recording, robot: str | None, lookback_s: float) -> MonitorAnswer:
+    with recording.view(robot) as view:
+        run = view.require_run()
+        newest_s = view.state.wall_time_s if view.state else run.last_wall_time_s
+        return _report(view, newest_s - lookback_s, lookback_s)
 
 
 def _report(view: View, wall_start_s: float, window_s: float) -> MonitorAnswer:

@@ -9,8 +9,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
-from webots_mcp.server.boundary import ACTS, READS, tool
-from webots_mcp.server.fitting import (
+from webots_mcp.server.budget import (
     BUDGET,
     LARGE_BUDGET,
     answer_about,
@@ -24,6 +23,7 @@ from webots_mcp.server.fitting import (
     shown,
     without_empty,
 )
+from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.history_results import ComparisonAnswer, RunsAnswer
 from webots_mcp.server.parameters import (
     AnyNames,
@@ -73,82 +73,78 @@ _GOING_ON: Final = "going on"
 _TAKE_AWAY: Final = "-"
 
 
-class RunTools:
-    """Runs as a whole."""
+@tool("List the runs", READS)
+def webots_list_runs(
+    recording: Recording, limit: Limit = 20, cursor: Cursor = None, robot: RobotName = None
+) -> RunsAnswer:
+    """Runs, newest first: controller file and its hash, world, duration, pace, how it ended.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
+    A run is a stretch of rising simulation time: a start, reset or reload begins the next.
+    `notable` counts warnings, errors, dropped rows, failed commands.
+    """
+    with recording.reader() as connection:
+        header = look(connection, robot).header() if robot else header_of_only(connection)
+        most = min(limit, MOST_RUNS)
+        found = list_runs(connection, robot=robot, limit=most, before_id=cursor)
+        rows = fitting([run_row(run) for run in found.runs])
+        older = len(rows) < len(found.runs)
+        return RunsAnswer(
+            **header,
+            runs=without_empty(RUN_COLUMNS, rows),
+            total=found.total,
+            cursor=found.runs[len(rows) - 1].run_id if older else found.cursor,
+            hint=None if rows else "no run was recorded, or none before that cursor",
+        )
 
-    @tool("List the runs", READS)
-    def webots_list_runs(
-        self, limit: Limit = 20, cursor: Cursor = None, robot: RobotName = None
-    ) -> RunsAnswer:
-        """Runs, newest first: controller file and its hash, world, duration, pace, how it ended.
 
-        A run is a stretch of rising simulation time: a start, reset or reload begins the next.
-        `notable` counts warnings, errors, dropped rows, failed commands.
-        """
-        with self._recording.reader() as connection:
-            header = look(connection, robot).header() if robot else header_of_only(connection)
-            most = min(limit, MOST_RUNS)
-            found = list_runs(connection, robot=robot, limit=most, before_id=cursor)
-            rows = fitting([run_row(run) for run in found.runs])
-            older = len(rows) < len(found.runs)
-            return RunsAnswer(
-                **header,
-                runs=without_empty(RUN_COLUMNS, rows),
-                total=found.total,
-                cursor=found.runs[len(rows) - 1].run_id if older else found.cursor,
-                hint=None if rows else "no run was recorded, or none before that cursor",
-            )
+@tool("Compare runs", READS)
+def webots_compare_runs(
+    recording: Recording,
+    run_ids: RunIds = None,
+    signals: AnyNames = None,
+    limit: ShownLimit = None,
+    robot: RobotName = None,
+) -> ComparisonAnswer:
+    """Did my edit help? Runs beside each other; the first group is the reference.
 
-    @tool("Compare runs", READS)
-    def webots_compare_runs(
-        self,
-        run_ids: RunIds = None,
-        signals: AnyNames = None,
-        limit: ShownLimit = None,
-        robot: RobotName = None,
-    ) -> ComparisonAnswer:
-        """Did my edit help? Runs beside each other; the first group is the reference.
+    Without run_ids: the runs before and after the last edit of the controller's file. Over the
+    same stretch of each run: distance, mean speed, share of time per mode, events per minute,
+    and the signals that differ most. `different` is true only beyond the spread of like runs,
+    which takes several runs of each: null says that it cannot be told.
+    """
+    with recording.view(robot, run_ids[0] if run_ids else None) as view:
+        return answer_about(
+            view, ComparisonAnswer, lambda: _compared(view, run_ids, signals, limit)
+        )
 
-        Without run_ids: the runs before and after the last edit of the controller's file. Over the
-        same stretch of each run: distance, mean speed, share of time per mode, events per minute,
-        and the signals that differ most. `different` is true only beyond the spread of like runs,
-        which takes several runs of each: null says that it cannot be told.
-        """
-        with self._recording.view(robot, run_ids[0] if run_ids else None) as view:
-            return answer_about(
-                view, ComparisonAnswer, lambda: _compared(view, run_ids, signals, limit)
-            )
 
-    @tool("Annotate a run", ACTS)
-    def webots_annotate_run(
-        self,
-        label: Annotated[
-            str,
-            Field(
-                max_length=100,
-                description="Short name to find it by; '-' takes it away, '' leaves it.",
-            ),
-        ] = "",
-        note: Annotated[
-            str, Field(max_length=4000, description="Any text; '-' takes it away, '' leaves it.")
-        ] = "",
-        robot: RobotName = None,
-        run_id: RunId = None,
-    ) -> RunsAnswer:
-        """Give a run a label or a note, by default the current one.
+@tool("Annotate a run", ACTS)
+def webots_annotate_run(
+    recording: Recording,
+    label: Annotated[
+        str,
+        Field(
+            max_length=100,
+            description="Short name to find it by; '-' takes it away, '' leaves it.",
+        ),
+    ] = "",
+    note: Annotated[
+        str, Field(max_length=4000, description="Any text; '-' takes it away, '' leaves it.")
+    ] = "",
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> RunsAnswer:
+    """Give a run a label or a note, by default the current one.
 
-        A run with either is kept for good: retention deletes nothing of it.
-        """
-        with self._recording.view(robot, run_id) as view:
-            run = view.require_run()
-        with self._recording.writer() as connection:
-            annotate_run(connection, run.id, label=_change(label), note=_change(note))
-        with self._recording.view(robot, run.id) as view:
-            told = run_info(view.connection, run.id)
-            return RunsAnswer(**view.header(), runs=without_empty(RUN_COLUMNS, [run_row(told)]))
+    A run with either is kept for good: retention deletes nothing of it.
+    """
+    with recording.view(robot, run_id) as view:
+        run = view.require_run()
+    with recording.writer() as connection:
+        annotate_run(connection, run.id, label=_change(label), note=_change(note))
+    with recording.view(robot, run.id) as view:
+        told = run_info(view.connection, run.id)
+        return RunsAnswer(**view.header(), runs=without_empty(RUN_COLUMNS, [run_row(told)]))
 
 
 def _change(text: str) -> str | None:

@@ -6,8 +6,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
-from webots_mcp.server.boundary import READS, tool
-from webots_mcp.server.fitting import (
+from webots_mcp.server.budget import (
     answer_about,
     figure,
     fitting,
@@ -17,6 +16,7 @@ from webots_mcp.server.fitting import (
     shown,
     without_empty,
 )
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import SignalsAnswer
 from webots_mcp.server.parameters import Cursor, Limit, RobotName, RunId
 from webots_mcp.store.recording import Recording, View
@@ -27,31 +27,23 @@ SIGNAL_COLUMNS: Final = (
 )  # fmt: skip
 
 
-class SignalTools:
-    """Which signals there are."""
+@tool("List the signals", READS)
+def webots_list_signals(
+    recording: Recording,
+    pattern: Annotated[
+        str, Field(max_length=200, description="Only these names; '*' stands for any text.")
+    ] = "*",
+    limit: Limit = 100,
+    cursor: Cursor = None,
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> SignalsAnswer:
+    """The dotted names of all that was published in a run: kind, last value, range, nulls.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-
-    @tool("List the signals", READS)
-    def webots_list_signals(
-        self,
-        pattern: Annotated[
-            str, Field(max_length=200, description="Only these names; '*' stands for any text.")
-        ] = "*",
-        limit: Limit = 100,
-        cursor: Cursor = None,
-        robot: RobotName = None,
-        run_id: RunId = None,
-    ) -> SignalsAnswer:
-        """The dotted names of all that was published in a run: kind, last value, range, nulls.
-
-        Arrays of more than 16 items are kept as .count, .min, .max, .mean and .argmin.
-        """
-        with self._recording.view(robot, run_id) as view:
-            return answer_about(
-                view, SignalsAnswer, lambda: _found(view, pattern, limit, cursor or 0)
-            )
+    Arrays of more than 16 items are kept as .count, .min, .max, .mean and .argmin.
+    """
+    with recording.view(robot, run_id) as view:
+        return answer_about(view, SignalsAnswer, lambda: _found(view, pattern, limit, cursor or 0))
 
 
 def signal_row(info: SignalInfo) -> list[Any]:

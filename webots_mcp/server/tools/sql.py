@@ -9,11 +9,12 @@ from typing import Annotated, Any, Final
 
 import anyio
 from anyio import to_thread
+from anyio.lowlevel import RunVar
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.boundary import READS, tool
-from webots_mcp.server.fitting import LONGEST_NAME, header_of_only
+from webots_mcp.server.budget import LONGEST_NAME, header_of_only
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import SqlAnswer
 from webots_mcp.server.parameters import ShownLimit
 from webots_mcp.server.results import Table
@@ -30,76 +31,76 @@ _MOST_COLUMNS: Final = 60
 _AT_ONCE: Final = 2
 _LONGEST_WAIT_S: Final = 30.0
 _PROCESS_TIMEOUT_S: Final = 20.0  # its own deadline counts from when it has started
+_turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once")
 
 
-class SqlTools:
-    """What the other tools do not cover."""
+@tool("Query by SQL", READS)
+async def webots_query_sql(
+    recording: Recording,
+    sql: Annotated[str, Field(min_length=1, max_length=10_000, description="One SELECT.")],
+    limit: ShownLimit = None,
+) -> SqlAnswer:
+    """Read by SQL (SQLite) what the other tools do not cover; nothing but reading is allowed.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-        self._turns = anyio.Semaphore(_AT_ONCE)
+    Tables: robot, session (a controller process), run(id, robot_id, session_id, rows, label,
+    last_sim_time_s), state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path),
+    all_rollup(run_id, signal_id, bucket of 10 s, min, max, sum, present), change, log, event,
+    command, image. Views: robot_now, robot_run, robot_trajectory, robot_period, robot_event,
+    robot_log, robot_command. Ask by run_id and sim_time_s: they are indexed. Values of a state:
+    json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.
+    """
+    budget = _BUDGET_BYTES if limit is None else _LARGE_BUDGET_BYTES
+    require_select(sql)
+    header = await to_thread.run_sync(_header, recording)
+    found = await _run(recording, sql, limit or DEFAULT_ROWS, budget)
+    columns = [cut_text(name, LONGEST_NAME) for name in found.columns[:_MOST_COLUMNS]]
+    rows = [[_cell(cell) for cell in row[:_MOST_COLUMNS]] for row in found.rows]
+    more = len(found.columns) > _MOST_COLUMNS
+    return SqlAnswer(
+        **header,
+        result=Table(columns=columns, rows=rows),
+        truncated=found.truncated,
+        shortened=found.shortened or None,
+        hint=f"only the first {_MOST_COLUMNS} columns are shown" if more else _none(rows),
+    )
 
-    @tool("Query by SQL", READS)
-    async def webots_query_sql(
-        self,
-        sql: Annotated[str, Field(min_length=1, max_length=10_000, description="One SELECT.")],
-        limit: ShownLimit = None,
-    ) -> SqlAnswer:
-        """Read by SQL (SQLite) what the other tools do not cover; nothing but reading is allowed.
 
-        Tables: robot, session (a controller process), run(id, robot_id, session_id, rows, label,
-        last_sim_time_s), state(run_id, sim_time_s, wall_time_s, data: JSON), signal(name, path),
-        all_rollup(run_id, signal_id, bucket of 10 s, min, max, sum, present), change, log, event,
-        command, image. Views: robot_now, robot_run, robot_trajectory, robot_period, robot_event,
-        robot_log, robot_command. Ask by run_id and sim_time_s: they are indexed. Values of a state:
-        json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.
-        """
-        budget = _BUDGET_BYTES if limit is None else _LARGE_BUDGET_BYTES
-        require_select(sql)
-        header = await to_thread.run_sync(self._header)
-        found = await self._run(sql, limit or DEFAULT_ROWS, budget)
-        columns = [cut_text(name, LONGEST_NAME) for name in found.columns[:_MOST_COLUMNS]]
-        rows = [[_cell(cell) for cell in row[:_MOST_COLUMNS]] for row in found.rows]
-        more = len(found.columns) > _MOST_COLUMNS
-        return SqlAnswer(
-            **header,
-            result=Table(columns=columns, rows=rows),
-            truncated=found.truncated,
-            shortened=found.shortened or None,
-            hint=f"only the first {_MOST_COLUMNS} columns are shown" if more else _none(rows),
-        )
+def _header(recording: Recording) -> dict[str, Any]:
+    with recording.reader() as connection:
+        return header_of_only(connection)
 
-    def _header(self) -> dict[str, Any]:
-        with self._recording.reader() as connection:
-            return header_of_only(connection)
 
-    async def _run(self, sql: str, max_rows: int, max_bytes: int) -> Result:
-        """Run it in a process of its own, which ends with its deadline or with the asker."""
-        async with self._turn():
-            with as_file(self._recording.database) as file:
-                asked = Statement(str(file), sql, max_rows, max_bytes, QUESTION_DEADLINE_S)
-                with anyio.move_on_after(_PROCESS_TIMEOUT_S):
-                    ended = await anyio.run_process(
-                        LINE, input=asked.encoded(), check=False, stderr=None, cwd=FOLDER
-                    )
-                    return decode(ended.stdout, ended.returncode, asked)
+async def _run(recording: Recording, sql: str, max_rows: int, max_bytes: int) -> Result:
+    """Run it in a process of its own, which ends with its deadline or with the asker."""
+    async with _turn():
+        with as_file(recording.database) as file:
+            asked = Statement(str(file), sql, max_rows, max_bytes, QUESTION_DEADLINE_S)
+            with anyio.move_on_after(_PROCESS_TIMEOUT_S):
+                ended = await anyio.run_process(
+                    LINE, input=asked.encoded(), check=False, stderr=None, cwd=FOLDER
+                )
+                return decode(ended.stdout, ended.returncode, asked)
+    raise InvalidInputError(
+        f"no process answered within {_PROCESS_TIMEOUT_S:g} s: this machine is overloaded"
+    )
+
+
+@asynccontextmanager
+async def _turn() -> AsyncGenerator[None]:
+    """Wait until few enough statements run; they take memory and a processor each."""
+    turns = _turns.get(None)
+    if turns is None:
+        _turns.set(turns := anyio.Semaphore(_AT_ONCE))
+    with anyio.move_on_after(_LONGEST_WAIT_S) as waiting:
+        await turns.acquire()
+    if waiting.cancelled_caught:
         raise InvalidInputError(
-            f"no process answered within {_PROCESS_TIMEOUT_S:g} s: this machine is overloaded"
+            f"other statements were running for {_LONGEST_WAIT_S:g} s: ask again, one at a time"
         )
-
-    @asynccontextmanager
-    async def _turn(self) -> AsyncGenerator[None]:
-        """Wait until few enough statements run; they take memory and a processor each."""
-        with anyio.move_on_after(_LONGEST_WAIT_S) as waiting:
-            await self._turns.acquire()
-        if waiting.cancelled_caught:
-            raise InvalidInputError(
-                f"other statements were running for {_LONGEST_WAIT_S:g} s: ask again, one at a time"
-            )
-        try:
-            yield
-        finally:
-            self._turns.release()
+    try:
+        yield
+    finally:
+        turns.release()
 
 
 def _cell(cell: Cell) -> Cell:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Final, cast
 from pydantic import Field
 
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.server.boundary import READS, tool
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import RobotName, RunId
 from webots_mcp.server.results import FullStateAnswer, SensorsAnswer, StateAnswer, Table
 from webots_mcp.server.sensing import sensor_part, unnamed_devices
@@ -31,7 +31,7 @@ _PUBLISH: Final = (
 _EARLIER: Final = "SELECT max(id) FROM run WHERE robot_id = ? AND id < ? AND rows > 0"
 _PURGED: Final = "SELECT purged_rows FROM run WHERE id = ?"
 _EVENTS: Final = 10
-_SHOWN_ODD: Final = 20
+_SHOWN_REPLACED: Final = 20
 _SHOWN_DEVICES: Final = 30
 _ERROR_CHARACTERS: Final = 300
 
@@ -47,73 +47,73 @@ PageSize = Annotated[
 ]
 
 
-class StateTools:
-    """The newest state, whole or in part."""
+@tool("Get the robot's state", READS)
+def webots_get_robot_state(
+    recording: Recording, robot: RobotName = None, run_id: RunId = None
+) -> StateAnswer:
+    """The newest state that the robot's controller published, shortened where it is long.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
+    Long arrays come as count, min, max, mean, argmin; webots_get_full_state has them whole.
+    """
+    with recording.view(robot, run_id) as view:
+        if view.state is None:
+            return StateAnswer(**view.header(), hint=_nothing_yet(view))
+        short = shorten(view.state.value())
+        hint = "webots_get_full_state(path=...) shows a part whole" if short.rule else None
+        return StateAnswer(**view.header(), state=short.value, shortened=short.rule, hint=hint)
 
-    @tool("Get the robot's state", READS)
-    def webots_get_robot_state(self, robot: RobotName = None, run_id: RunId = None) -> StateAnswer:
-        """The newest state that the robot's controller published, shortened where it is long.
 
-        Long arrays come as count, min, max, mean, argmin; webots_get_full_state has them whole.
-        """
-        with self._recording.view(robot, run_id) as view:
-            if view.state is None:
-                return StateAnswer(**view.header(), hint=_nothing_yet(view))
-            short = shorten(view.state.value())
-            hint = "webots_get_full_state(path=...) shows a part whole" if short.rule else None
-            return StateAnswer(**view.header(), state=short.value, shortened=short.rule, hint=hint)
+@tool("Get the sensors", READS)
+def webots_get_sensors(
+    recording: Recording, robot: RobotName = None, run_id: RunId = None
+) -> SensorsAnswer:
+    """The newest sensor values: members of the state named after a sensor device or like one.
 
-    @tool("Get the sensors", READS)
-    def webots_get_sensors(self, robot: RobotName = None, run_id: RunId = None) -> SensorsAnswer:
-        """The newest sensor values: members of the state named after a sensor device or like one.
+    Values that JSON cannot hold (nan, inf) are named in their place and listed in `replaced`.
+    """
+    with recording.view(robot, run_id) as view:
+        if view.state is None:
+            return SensorsAnswer(**view.header(), hint=_nothing_yet(view))
+        state = view.state.value()
+        sensors = sensor_part(state, view.robot.devices)
+        short = shorten(sensors)
+        missing = unnamed_devices(sensors, view.robot.devices)
+        return SensorsAnswer(
+            **view.header(),
+            sensors=short.value,
+            replaced=_replaced_in(view.state, sensors),
+            unnamed_devices=dict(list(missing.items())[:_SHOWN_DEVICES]) or None,
+            shortened=short.rule,
+            hint=None if sensors else _no_sensors(state),
+        )
 
-        Values that JSON cannot hold (nan, inf) are named in their place and listed in `odd`.
-        """
-        with self._recording.view(robot, run_id) as view:
-            if view.state is None:
-                return SensorsAnswer(**view.header(), hint=_nothing_yet(view))
-            state = view.state.value()
-            sensors = sensor_part(state, view.robot.devices)
-            short = shorten(sensors)
-            missing = unnamed_devices(sensors, view.robot.devices)
-            return SensorsAnswer(
-                **view.header(),
-                sensors=short.value,
-                odd=_odd_in(view.state, sensors),
-                unnamed_devices=dict(list(missing.items())[:_SHOWN_DEVICES]) or None,
-                shortened=short.rule,
-                hint=None if sensors else _no_sensors(state),
-            )
 
-    @tool("Get the full state", READS)
-    def webots_get_full_state(
-        self,
-        path: PagePath = "",
-        offset: Offset = 0,
-        limit: PageSize = 500,
-        robot: RobotName = None,
-        run_id: RunId = None,
-    ) -> FullStateAnswer:
-        """The newest state with exact numbers, or a part of it, in pages where it is long.
+@tool("Get the full state", READS)
+def webots_get_full_state(
+    recording: Recording,
+    path: PagePath = "",
+    offset: Offset = 0,
+    limit: PageSize = 500,
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> FullStateAnswer:
+    """The newest state with exact numbers, or a part of it, in pages where it is long.
 
-        Without a path also the newest events and the recorder's health: rows waiting and dropped,
-        last error, version of the controller's code.
-        """
-        with self._recording.view(robot, run_id) as view:
-            if view.state is None:
-                hint, recorder = _nothing_yet(view), _recorder(view)
-                return FullStateAnswer(**view.header(), hint=hint, recorder=recorder)
-            part = select(view.state.value(), path)
-            answer = _page(part, path, offset, limit)
-            answer |= view.header()
-            if not path:
-                odd = list(view.state.odd_paths().items())[:_SHOWN_ODD]
-                answer |= {"odd": dict(odd) or None, "events": _events(view)}
-                answer |= {"recorder": _recorder(view)}
-            return FullStateAnswer(**answer)
+    Without a path also the newest events and the recorder's health: rows waiting and dropped,
+    last error, version of the controller's code.
+    """
+    with recording.view(robot, run_id) as view:
+        if view.state is None:
+            hint, recorder = _nothing_yet(view), _recorder(view)
+            return FullStateAnswer(**view.header(), hint=hint, recorder=recorder)
+        part = select(view.state.value(), path)
+        answer = _page(part, path, offset, limit)
+        answer |= view.header()
+        if not path:
+            replaced = list(view.state.odd_paths().items())[:_SHOWN_REPLACED]
+            answer |= {"replaced": dict(replaced) or None, "events": _events(view)}
+            answer |= {"recorder": _recorder(view)}
+        return FullStateAnswer(**answer)
 
 
 def _nothing_yet(view: View) -> str:
@@ -205,14 +205,14 @@ def _recorder(view: View) -> dict[str, Any] | None:
     }
 
 
-def _odd_in(state: State, part: dict[str, Any]) -> dict[str, str] | None:
+def _replaced_in(state: State, part: dict[str, Any]) -> dict[str, str] | None:
     """The replaced values among those members of the state."""
-    odd = {
+    replaced = {
         path: kind
         for path, kind in state.odd_paths().items()
         if any(path == key or path.startswith(f"{key}.") for key in part)
     }
-    return dict(list(odd.items())[:_SHOWN_ODD]) or None
+    return dict(list(replaced.items())[:_SHOWN_REPLACED]) or None
 
 
 def _no_sensors(state: dict[str, Any]) -> str:

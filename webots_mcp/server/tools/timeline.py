@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.bounds import Bounds
-from webots_mcp.server.fitting import BUDGET, LARGE_BUDGET, answer_about, notes_of, size_of
+from webots_mcp.server.budget import BUDGET, LARGE_BUDGET, answer_about, notes_of, size_of
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import TimelineAnswer
 from webots_mcp.server.parameters import (
     EndS,
@@ -31,41 +31,35 @@ from webots_mcp.store.recording import Recording, View
 DEFAULT_LIMIT: Final = 50
 
 
-class TimelineTools:
-    """What happened, in order."""
+@tool("Get the timeline", READS)
+def webots_get_timeline(
+    recording: Recording,
+    kinds: Kinds = None,
+    log_level: LogLevel = "info",
+    last_s: LastS = None,
+    start_s: StartS = None,
+    end_s: EndS = None,
+    since: Since = None,
+    until: Until = None,
+    limit: ShownLimit = None,
+    cursor: TextCursor = "",
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> TimelineAnswer:
+    """Changes, commands, log lines, pictures, gaps, begin and end of runs in one order, paged.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-
-    @tool("Get the timeline", READS)
-    def webots_get_timeline(
-        self,
-        kinds: Kinds = None,
-        log_level: LogLevel = "info",
-        last_s: LastS = None,
-        start_s: StartS = None,
-        end_s: EndS = None,
-        since: Since = None,
-        until: Until = None,
-        limit: ShownLimit = None,
-        cursor: TextCursor = "",
-        robot: RobotName = None,
-        run_id: RunId = None,
-    ) -> TimelineAnswer:
-        """Changes, commands, log lines, pictures, gaps, begin and end of runs in one order, paged.
-
-        By default from the start of the run on; webots_find_events also finds what nobody noted.
-        """
-        if "threshold" in (kinds or ()):
-            raise InvalidInputError("a threshold has no place here: ask webots_find_events(above)")
-        bounds = Bounds(last_s, start_s, end_s, since, until)
-        options = EventOptions(kinds=tuple(kinds or STORED), log_level=log_level)
-        with self._recording.view(robot, run_id) as view:
-            return answer_about(
-                view,
-                TimelineAnswer,
-                lambda: _found(view, bounds.resolve(view, run_id), options, limit, cursor),
-            )
+    By default from the start of the run on; webots_find_events also finds what nobody noted.
+    """
+    if "threshold" in (kinds or ()):
+        raise InvalidInputError("a threshold has no place here: ask webots_find_events(above)")
+    bounds = Bounds(last_s, start_s, end_s, since, until)
+    options = EventOptions(kinds=tuple(kinds or STORED), log_level=log_level)
+    with recording.view(robot, run_id) as view:
+        return answer_about(
+            view,
+            TimelineAnswer,
+            lambda: _found(view, bounds.resolve(view, run_id), options, limit, cursor),
+        )
 
 
 def _found(

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from webots_mcp.server.boundary import READS, tool
 from webots_mcp.server.bounds import Bounds
-from webots_mcp.server.fitting import (
+from webots_mcp.server.budget import (
     BUDGET,
     LARGE_BUDGET,
     answer_about,
@@ -20,6 +19,7 @@ from webots_mcp.server.fitting import (
     some,
     without_empty,
 )
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import RunTrendTables, TrendsAnswer
 from webots_mcp.server.parameters import (
     AnyNames,
@@ -50,37 +50,31 @@ _LONGEST_SAYING: Final = 200
 _SHOWN_VALUES: Final = 6
 
 
-class TrendTools:
-    """What signals did over a stretch of time."""
+@tool("Get the trends", READS)
+def webots_get_trends(
+    recording: Recording,
+    signals: AnyNames = None,
+    last_s: LastS = None,
+    start_s: StartS = None,
+    end_s: EndS = None,
+    since: Since = None,
+    until: Until = None,
+    limit: ShownLimit = None,
+    robot: RobotName = None,
+    run_id: RunId = None,
+) -> TrendsAnswer:
+    """What each signal did over a stretch of time, by default the whole run, in one line each.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
-
-    @tool("Get the trends", READS)
-    def webots_get_trends(
-        self,
-        signals: AnyNames = None,
-        last_s: LastS = None,
-        start_s: StartS = None,
-        end_s: EndS = None,
-        since: Since = None,
-        until: Until = None,
-        limit: ShownLimit = None,
-        robot: RobotName = None,
-        run_id: RunId = None,
-    ) -> TrendsAnswer:
-        """What each signal did over a stretch of time, by default the whole run, in one line each.
-
-        What changed most comes first: rises, falls, swings (period, amplitude), rests since when,
-        spikes, missing values; of modes and flags the changes and the time in each value.
-        """
-        bounds = Bounds(last_s, start_s, end_s, since, until)
-        with self._recording.view(robot, run_id) as view:
-            return answer_about(
-                view,
-                TrendsAnswer,
-                lambda: _found(view, bounds.resolve(view, run_id), signals or ["*"], limit),
-            )
+    What changed most comes first: rises, falls, swings (period, amplitude), rests since when,
+    spikes, missing values; of modes and flags the changes and the time in each value.
+    """
+    bounds = Bounds(last_s, start_s, end_s, since, until)
+    with recording.view(robot, run_id) as view:
+        return answer_about(
+            view,
+            TrendsAnswer,
+            lambda: _found(view, bounds.resolve(view, run_id), signals or ["*"], limit),
+        )
 
 
 def _found(view: View, asked: TimeRange, names: Sequence[str], limit: int | None) -> dict[str, Any]:

@@ -6,7 +6,7 @@ import time
 from typing import Any, Final
 
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.server.boundary import READS, tool
+from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import RobotName, RunId
 from webots_mcp.server.results import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.server.shortening import cut_text, round_number
@@ -27,66 +27,64 @@ _ROBOT_COLUMNS: Final = (
 )  # fmt: skip
 
 
-class WorldTools:
-    """Robots, worlds and runs."""
+@tool("List the robots", READS)
+def webots_list_robots(recording: Recording) -> RobotsAnswer:
+    """Every robot ever recorded: whether it is live, whether its time moves, its current run.
 
-    def __init__(self, recording: Recording) -> None:
-        self._recording = recording
+    The header is that of the only live robot, if there is just one. `actions` counts the
+    robot's own commands; webots_list_commands describes them.
+    """
+    with recording.reader() as connection:
+        now_s = time.time()
+        robots = list_robots(connection, now_s)
+        if not robots:
+            raise NothingRecordedError(f"no robot has been recorded yet. {GETTING_STARTED}")
+        views = [view_of(connection, robot, None, now_s) for robot in _liveliest(robots)]
+        live = [view for view in views if view.robot.live]
+        hint = f"{len(robots)} robots in all, the latest {len(views)} are shown"
+        return RobotsAnswer(
+            **(live[0].header() if len(live) == 1 else storage(connection)),
+            robots=Table(columns=list(_ROBOT_COLUMNS), rows=[_row(view) for view in views]),
+            hint=hint if len(robots) > len(views) else None,
+        )
 
-    @tool("List the robots", READS)
-    def webots_list_robots(self) -> RobotsAnswer:
-        """Every robot ever recorded: whether it is live, whether its time moves, its current run.
 
-        The header is that of the only live robot, if there is just one. `actions` counts the
-        robot's own commands; webots_list_commands describes them.
-        """
-        with self._recording.reader() as connection:
-            now_s = time.time()
-            robots = list_robots(connection, now_s)
-            if not robots:
-                raise NothingRecordedError(f"no robot has been recorded yet. {GETTING_STARTED}")
-            views = [view_of(connection, robot, None, now_s) for robot in _liveliest(robots)]
-            live = [view for view in views if view.robot.live]
-            hint = f"{len(robots)} robots in all, the latest {len(views)} are shown"
-            return RobotsAnswer(
-                **(live[0].header() if len(live) == 1 else storage(connection)),
-                robots=Table(columns=list(_ROBOT_COLUMNS), rows=[_row(view) for view in views]),
-                hint=hint if len(robots) > len(views) else None,
-            )
+@tool("Get world information", READS)
+def webots_get_world_info(
+    recording: Recording, robot: RobotName = None, run_id: RunId = None
+) -> WorldAnswer:
+    """The world file, its time step, the run and its pace, the controller's code, other robots.
 
-    @tool("Get world information", READS)
-    def webots_get_world_info(self, robot: RobotName = None, run_id: RunId = None) -> WorldAnswer:
-        """The world file, its time step, the run and its pace, the controller's code, other robots.
+    Also where the database and the pictures lie.
+    """
+    with recording.view(robot, run_id) as view:
+        run = view.require_run()
+        session = fetch_session(view.connection, run.session_id)
+        return WorldAnswer(
+            **view.header(),
+            world=run.world,
+            basic_time_step_ms=run.basic_time_step_ms,
+            real_time_factor=_pace(view, run),
+            supervisor=session.supervisor if session else None,
+            run=_run(view, run),
+            runs_recorded=count_runs(view.connection, view.robot.id),
+            controller=_controller(session),
+            devices=_devices(view.robot.devices),
+            companions=_companions(view),
+            database=name_of(recording.database),
+            retention=_retention(recording, view),
+            data_dir=str(recording.data_dir),
+        )
 
-        Also where the database and the pictures lie.
-        """
-        with self._recording.view(robot, run_id) as view:
-            run = view.require_run()
-            session = fetch_session(view.connection, run.session_id)
-            return WorldAnswer(
-                **view.header(),
-                world=run.world,
-                basic_time_step_ms=run.basic_time_step_ms,
-                real_time_factor=_pace(view, run),
-                supervisor=session.supervisor if session else None,
-                run=_run(view, run),
-                runs_recorded=count_runs(view.connection, view.robot.id),
-                controller=_controller(session),
-                devices=_devices(view.robot.devices),
-                companions=_companions(view),
-                database=name_of(self._recording.database),
-                retention=self._retention(view),
-                data_dir=str(self._recording.data_dir),
-            )
 
-    def _retention(self, view: View) -> dict[str, Any]:
-        """What is kept of the recording, how large it is, and which limits of ours do not hold."""
-        notes = unheeded(view.connection, self._recording.limits)
-        return {
-            "kept": described(view.connection),
-            **file_sizes(view.connection),
-            **({"not_in_force": notes} if notes else {}),
-        }
+def _retention(recording: Recording, view: View) -> dict[str, Any]:
+    """What is kept of the recording, how large it is, and which limits of ours do not hold."""
+    notes = unheeded(view.connection, recording.limits)
+    return {
+        "kept": described(view.connection),
+        **file_sizes(view.connection),
+        **({"not_in_force": notes} if notes else {}),
+    }
 
 
 def _liveliest(robots: list[Any]) -> list[Any]:

@@ -1,4 +1,4 @@
-"""Where our functions become MCP tools: their declaration, their errors and their answers.
+"""Where functions become MCP tools: their declaration, their errors and their answers.
 
 Every tool passes `tool`, so that this is the one place where our exceptions become `ToolError`
 and where an answer gets its text.
@@ -9,12 +9,13 @@ from __future__ import annotations
 import functools
 import inspect
 import logging
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Final, ParamSpec, TypeVar, cast, get_type_hints
+from types import ModuleType
+from typing import Any, Final, get_type_hints
 
+from anyio import to_thread
 from mcp import MCPError
-from mcp.server.mcpserver import Context
 from mcp.server.mcpserver.exceptions import ToolError
 from mcp.server.mcpserver.tools import Tool
 from mcp.types import CallToolResult, TextContent, ToolAnnotations
@@ -28,6 +29,7 @@ from webots_mcp.errors import (
 from webots_mcp.server.arguments import CheckedTool
 from webots_mcp.server.results import Answer, CommandAnswer
 from webots_mcp.server.shortening import compact_json, cut_text
+from webots_mcp.store.recording import Recording
 from webots_mcp.store.sound import Unsound, past_unsound_rows
 
 READS: Final = ToolAnnotations(read_only_hint=True, open_world_hint=False)
@@ -39,104 +41,83 @@ RESTARTS: Final = ACTS.model_copy(update={"destructive_hint": True})
 _BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
 _LONGEST_DEFECT: Final = 200
 _LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
-_DECLARATION: Final = "webots_mcp_declaration"
 
 _log = logging.getLogger(__name__)
-
-_P = ParamSpec("_P")
-_R = TypeVar("_R")
 
 
 @dataclass(frozen=True)
 class Declaration:
-    """What a client is told about a tool beside its name and its parameters."""
+    """A function that is a tool, and what a client is told of it beside name and parameters.
 
+    Attributes:
+        function: Its first parameter is the recording; the others are the client's.
+    """
+
+    function: Callable[..., Any]
     title: str
     annotations: ToolAnnotations
 
+    @property
+    def only_reads(self) -> bool:
+        """Whether it changes nothing, neither the simulation nor the recording."""
+        return self.annotations.read_only_hint is True
 
-def tool(
-    title: str, annotations: ToolAnnotations
-) -> Callable[[Callable[_P, _R]], Callable[_P, _R]]:
-    """Declare a method as an MCP tool of its own name.
+    def registered(self, recording: Recording) -> Tool:
+        """The tool on a recording."""
+        return CheckedTool.from_function(
+            _bound(self.function, recording, only_reads=self.only_reads),
+            title=self.title,
+            description=inspect.getdoc(self.function),
+            annotations=self.annotations,
+        )
+
+
+def tool(title: str, annotations: ToolAnnotations) -> Callable[[Callable[..., Any]], Declaration]:
+    """Declare a function as an MCP tool of its own name.
 
     Its docstring is the description. An `Answer` goes out as structured content and as the same
     compact text; our errors become `ToolError`; where nothing was recorded, a reading tool
     answers so instead of failing.
     """
-
-    def declare(method: Callable[_P, _R]) -> Callable[_P, _R]:
-        wrap = _wrap_async if inspect.iscoroutinefunction(method) else _wrap
-        wrapper = wrap(method, _empty_answer(method, annotations))
-        setattr(wrapper, _DECLARATION, Declaration(title, annotations))
-        return cast("Callable[_P, _R]", wrapper)
-
-    return declare
+    return lambda function: Declaration(function, title, annotations)
 
 
-def tools_of(family: object, *, read_only: bool) -> Iterator[Tool]:
-    """The declared tools of an object; with `read_only` those that only read."""
-    for method, declaration in _declared(family):
-        if declaration.annotations.read_only_hint or not read_only:
-            yield CheckedTool.from_function(
-                method,
-                title=declaration.title,
-                description=inspect.getdoc(method),
-                annotations=declaration.annotations,
-            )
+def tools_of(module: ModuleType, recording: Recording, *, read_only: bool) -> Iterator[Tool]:
+    """The tools that a module declares; with `read_only` those that only read."""
+    for declared in tuple(vars(module).values()):
+        if isinstance(declared, Declaration) and (declared.only_reads or not read_only):
+            yield declared.registered(recording)
 
 
-def reporter(ctx: Context[Any]) -> Callable[[float, float, str], Awaitable[None]]:
-    """Progress for the client that asked, if it wants any: done, total, message."""
-
-    async def report(done: float, total: float, message: str) -> None:
-        await ctx.report_progress(done, total, message)
-
-    return report
-
-
-def _declared(family: object) -> Iterator[tuple[Callable[..., Any], Declaration]]:
-    for name in vars(type(family)):
-        declaration = getattr(getattr(family, name), _DECLARATION, None)
-        if isinstance(declaration, Declaration):
-            yield getattr(family, name), declaration
-
-
-def _wrap(method: Callable[..., Any], empty: Callable[[str], Any] | None) -> Callable[..., Any]:
-    @functools.wraps(method)
-    def wrapper(*args: Any, **kwargs: Any) -> Any:
-        unsound: Unsound | None = None
-        try:
-            if empty is not None:
-                try:
-                    return _as_result(method(*args, **kwargs))
-                except Exception as error:  # noqa: BLE001  (the next line tells which)
-                    _require_over_a_value(error)
-            with past_unsound_rows() as unsound:
-                return _as_result(method(*args, **kwargs), unsound)
-        except Exception as error:  # noqa: BLE001  (each becomes an answer)
-            return _as_result(_answer_error(method.__name__, error, empty, unsound), unsound)
-
-    return wrapper
-
-
-def _wrap_async(
-    method: Callable[..., Any], empty: Callable[[str], Any] | None
+def _bound(
+    function: Callable[..., Any], recording: Recording, *, only_reads: bool
 ) -> Callable[..., Any]:
-    @functools.wraps(method)
-    async def wrapper(*args: Any, **kwargs: Any) -> Any:
+    """The function as the SDK calls it: on the recording, with an answer for whatever happens."""
+    empty = _empty_answer(function) if only_reads else None
+    is_async = inspect.iscoroutinefunction(function)
+
+    async def call(arguments: dict[str, Any]) -> Any:
+        if is_async:
+            return await function(recording, **arguments)
+        return await to_thread.run_sync(lambda: function(recording, **arguments))
+
+    @functools.wraps(function)
+    async def wrapper(**arguments: Any) -> Any:
         unsound: Unsound | None = None
         try:
             if empty is not None:
                 try:
-                    return _as_result(await method(*args, **kwargs))
+                    return _as_result(await call(arguments))
                 except Exception as error:  # noqa: BLE001  (the next line tells which)
                     _require_over_a_value(error)
             with past_unsound_rows() as unsound:
-                return _as_result(await method(*args, **kwargs), unsound)
+                return _as_result(await call(arguments), unsound)
         except Exception as error:  # noqa: BLE001  (each becomes an answer)
-            return _as_result(_answer_error(method.__name__, error, empty, unsound), unsound)
+            return _as_result(_answer_error(function.__name__, error, empty, unsound), unsound)
 
+    signature = inspect.signature(function, eval_str=True)
+    _, *parameters = signature.parameters.values()
+    vars(wrapper)["__signature__"] = signature.replace(parameters=parameters)
     return wrapper
 
 
@@ -170,16 +151,12 @@ def _answer_error(
     ) from error
 
 
-def _empty_answer(
-    method: Callable[..., Any], annotations: ToolAnnotations
-) -> Callable[[str], Any] | None:
-    """How a reading tool answers that nothing was recorded; None for one that acts.
+def _empty_answer(function: Callable[..., Any]) -> Callable[[str], Any]:
+    """How a reading tool answers that nothing was recorded.
 
-    A reading tool can be asked twice; one that acts looks past unsound rows at once.
+    Only a reading tool can be asked twice; one that acts looks past unsound rows at once.
     """
-    if not annotations.read_only_hint:
-        return None
-    answer = get_type_hints(method)["return"]
+    answer = get_type_hints(function)["return"]
     if isinstance(answer, type) and issubclass(answer, Answer):
         return lambda text: answer(status="never seen", hint=text)
     return lambda text: [text]

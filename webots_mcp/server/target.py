@@ -21,7 +21,7 @@ _MAKE_ONE: Final = (
 )
 
 
-def find_addressee(connection: sqlite3.Connection, robot: str | None, action: str) -> View:
+def find_target(connection: sqlite3.Connection, robot: str | None, action: str) -> View:
     """The robot that is to run an action.
 
     Without a name it is the only live robot; for what steers the simulation, the only live

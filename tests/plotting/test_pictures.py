@@ -32,6 +32,7 @@ from webots_mcp.plotting.ground import paint_ground
 from webots_mcp.plotting.signals import compose_timeline
 from webots_mcp.plotting.timeline import paint_timeline
 from webots_mcp.plotting.trajectory import compose_ground
+from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.rollup.rolling import roll
 
 Ask = dict[str, Any]
@@ -52,7 +53,8 @@ QUESTIONS: dict[str, Ask] = {
 
 def ask(connection: sqlite3.Connection, **question: Any) -> Picture:
     question.setdefault("run_ids", [1])
-    return plot(connection, **question)
+    bounds = {name: question.pop(name) for name in ("start_s", "end_s") if name in question}
+    return plot(connection, **question, scope=Scope(**bounds))
 
 
 def words(picture: Picture) -> set[str]:

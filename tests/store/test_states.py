@@ -12,6 +12,7 @@ from tests.recordings.rows import Recorded
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.errors import InvalidInputError, InvalidRangeError
 from webots_mcp.store.logs import LogFilter, count_lines, newest_lines
+from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.states import (
     State,
     newest_state,
@@ -19,7 +20,7 @@ from webots_mcp.store.states import (
     select,
     states_of,
 )
-from webots_mcp.store.window import Window, resolve_window
+from webots_mcp.store.window import Window, window_of
 
 
 def recorded_state(published: dict[str, Any]) -> State:
@@ -123,10 +124,8 @@ def test_log_lines_are_filtered_by_text_level_and_time(recorded: Recorded) -> No
 
 
 def test_a_window_is_half_open_and_last_s_counts_back_from_the_newest_row() -> None:
-    assert resolve_window(9.0, last_s=2.0, start_s=None, end_s=None).start_s == pytest.approx(
-        7.0, abs=0.0005
-    )
-    bounds = resolve_window(9.0, last_s=None, start_s=1.0, end_s=4.0)
+    assert window_of(Scope(last_s=2.0), 9.0).start_s == pytest.approx(7.0, abs=0.0005)
+    bounds = window_of(Scope(start_s=1.0, end_s=4.0), 9.0)
     assert bounds == pytest.approx((1.0, 4.0), abs=0.0005)
 
 
@@ -141,6 +140,5 @@ def test_a_window_is_half_open_and_last_s_counts_back_from_the_newest_row() -> N
     ],
 )
 def test_a_contradictory_window_is_refused(bounds: dict[str, float]) -> None:
-    given_bounds = {"last_s": None, "start_s": None, "end_s": None} | bounds
     with pytest.raises(InvalidRangeError):
-        resolve_window(9.0, **given_bounds)
+        window_of(Scope(**bounds), 9.0)  # pyright: ignore[reportArgumentType]

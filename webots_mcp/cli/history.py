@@ -7,7 +7,7 @@ import json
 import sqlite3
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, is_dataclass
+from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -31,15 +31,29 @@ if TYPE_CHECKING:
     from webots_mcp.store.questions.compare import Comparison
     from webots_mcp.store.questions.series import RunHistory
     from webots_mcp.store.questions.trends import RunTrends, StateTrend
-    from webots_mcp.store.reading.ranges import TimeRange
+    from webots_mcp.store.reading.ranges import Scope, TimeRange
 
 RUN: Final = argument(
     "--run", type=int, dest="run_id", metavar="ID", help="that run instead of the newest one"
 )
 TIMES: Final[tuple[Argument, ...]] = (
-    argument("--last", type=float, metavar="S", help="the last S seconds of simulation time"),
-    argument("--start", type=float, metavar="S", help="from this simulation time on"),
-    argument("--end", type=float, metavar="S", help="up to, not including, this simulation time"),
+    argument(
+        "--last",
+        type=float,
+        dest="last_s",
+        metavar="S",
+        help="the last S seconds of simulation time",
+    ),
+    argument(
+        "--start", type=float, dest="start_s", metavar="S", help="from this simulation time on"
+    ),
+    argument(
+        "--end",
+        type=float,
+        dest="end_s",
+        metavar="S",
+        help="up to, not including, this simulation time",
+    ),
     argument("--since", metavar="TIME", help="from this wall time on (ISO 8601 or Unix seconds)"),
     argument("--until", metavar="TIME", help="up to, not including, this wall time"),
 )
@@ -169,19 +183,13 @@ def plot(arguments: argparse.Namespace) -> None:
     from webots_mcp import plotting
 
     file = Path(arguments.output)
-    run_ids = [*([arguments.run_id] if arguments.run_id is not None else []), *arguments.run_ids]
     with reading(arguments) as connection:
         picture = plotting.plot(
             connection,
             "trajectory" if arguments.trajectory else "signals",
             arguments.signals,
-            robot=arguments.robot,
-            run_ids=run_ids,
-            start_s=arguments.start,
-            end_s=arguments.end,
-            last_s=arguments.last,
-            since=arguments.since,
-            until=arguments.until,
+            scope=scope_of(arguments),
+            run_ids=arguments.run_ids,
             image_format=plotting.image_format_of(file),
         )
     try:
@@ -215,19 +223,17 @@ def compare(arguments: argparse.Namespace) -> None:
 
 
 def range_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> TimeRange:
-    """What the arguments of `RANGE` ask for."""
-    from webots_mcp.store.reading.ranges import resolve_range
+    """What the arguments of `RANGE` mean in the recording."""
+    from webots_mcp.store.reading.ranges import find_range
 
-    return resolve_range(
-        connection,
-        robot=arguments.robot,
-        run_id=arguments.run_id,
-        start_s=arguments.start,
-        end_s=arguments.end,
-        last_s=arguments.last,
-        since=arguments.since,
-        until=arguments.until,
-    )
+    return find_range(connection, scope_of(arguments))
+
+
+def scope_of(arguments: argparse.Namespace) -> Scope:
+    """What the arguments of `RANGE` ask for."""
+    from webots_mcp.store.reading.ranges import Scope
+
+    return Scope(**{each.name: getattr(arguments, each.name) for each in fields(Scope)})
 
 
 def _options(arguments: argparse.Namespace) -> EventOptions:

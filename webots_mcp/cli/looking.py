@@ -38,8 +38,7 @@ def status(arguments: argparse.Namespace) -> None:
     with recording.reader() as connection:
         now_s = time.time()
         views = [
-            recordings.view_of(connection, robot, None, now_s)
-            for robot in list_robots(connection, now_s)
+            recordings.view_of(connection, robot, now_s) for robot in list_robots(connection, now_s)
         ]
         facts = {
             "database": str(recording.database),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final, Literal, get_args
 
 from webots_mcp.errors import InvalidInputError
@@ -11,7 +12,7 @@ from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, Picture
 from webots_mcp.plotting.signals import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.ranges import TimeRange, resolve_range
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 
 PlotKind = Literal["signals", "trajectory"]
 
@@ -23,13 +24,8 @@ def plot(
     kind: PlotKind = "signals",
     signals: Sequence[str] = (),
     *,
-    robot: str | None = None,
+    scope: Scope | None = None,
     run_ids: Sequence[int] = (),
-    start_s: float | None = None,
-    end_s: float | None = None,
-    last_s: float | None = None,
-    since: float | str | None = None,
-    until: float | str | None = None,
     bands: str | None = None,
     events: bool = True,
     width_px: int = WIDTH_PX,
@@ -43,13 +39,8 @@ def plot(
         kind: "signals" over time, or "trajectory" in the plane.
         signals: Names, with `*`; none for the three that changed most. Of a trajectory the two of
             the position, or none to find them by name.
-        robot: Whose; may be left out where only one is meant.
-        run_ids: None for the robot's newest run; of several, each from its start, in one picture.
-        start_s: The range, as of `resolve_range`; without any the whole run.
-        end_s: See there.
-        last_s: See there.
-        since: See there.
-        until: See there.
+        scope: Robot and stretch of time; None for the whole newest run.
+        run_ids: More runs than that of the scope; of several, each from its start, in one picture.
         bands: The text signal that stands behind the curves or colours the way; None for the mode,
             where there is one; "" for none (a trajectory is coloured by time then).
         events: Whether to mark events.
@@ -63,19 +54,10 @@ def plot(
         NothingRecordedError: There is nothing to draw in the range.
     """
     sheet = Sheet(width_px, height_px, image_format)
-    ranges = [
-        resolve_range(
-            connection,
-            robot=robot,
-            run_id=run_id,
-            start_s=start_s,
-            end_s=end_s,
-            last_s=last_s,
-            since=since,
-            until=until,
-        )
-        for run_id in (tuple(dict.fromkeys(run_ids)) or (None,))
-    ]
+    asked = scope or Scope()
+    several = dict.fromkeys((asked.run_id, *run_ids) if asked.run_id is not None else run_ids)
+    scopes = [replace(asked, run_id=run_id) for run_id in several] or [asked]
+    ranges = [find_range(connection, each) for each in scopes]
     if kind == "signals":
         names = signals or _changed_most(connection, ranges[-1])
         return plot_signals(connection, ranges, names, bands=bands, events=events, sheet=sheet)

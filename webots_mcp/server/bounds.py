@@ -2,48 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final
 
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.store.reading.ranges import TimeRange, resolve_range
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.recording import View
 
 MOST_RUNS: Final = 5  # of which one answer tells
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """The parameters of a range, as tools have them; all None is the whole run."""
+def range_in(view: View, scope: Scope) -> TimeRange:
+    """What a scope means for the robot of a view, in its newest few runs.
 
-    last_s: float | None = None
-    start_s: float | None = None
-    end_s: float | None = None
-    since: float | str | None = None
-    until: float | str | None = None
-
-    def resolve(self, view: View, run_id: int | None) -> TimeRange:
-        """What they mean for the robot of a view, in its newest few runs.
-
-        Raises:
-            InvalidRangeError: See `resolve_range`.
-            NothingRecordedError: There is no row, or none in that wall time.
-        """
-        found = resolve_range(
-            view.connection,
-            robot=view.robot.name,
-            run_id=run_id,
-            start_s=self.start_s,
-            end_s=self.end_s,
-            last_s=self.last_s,
-            since=self.since,
-            until=self.until,
+    Raises:
+        InvalidRangeError: See `find_range`.
+        NothingRecordedError: There is no row, or none in that wall time.
+    """
+    found = find_range(view.connection, scope, view.subject)
+    if not found.segments:
+        raise NothingRecordedError(
+            f"{'; '.join(found.notes)}: webots_list_runs tells when each run was"
         )
-        if not found.segments:
-            raise NothingRecordedError(
-                f"{'; '.join(found.notes)}: webots_list_runs tells when each run was"
-            )
-        return newest_runs(found)
+    return newest_runs(found)
 
 
 def newest_runs(found: TimeRange) -> TimeRange:

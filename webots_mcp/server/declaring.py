@@ -27,8 +27,10 @@ from webots_mcp.errors import (
     WebotsMCPError,
 )
 from webots_mcp.server.arguments import CheckedTool
+from webots_mcp.server.parameters import SCOPE
 from webots_mcp.server.results import Answer, CommandAnswer
 from webots_mcp.server.shortening import compact_json, cut_text
+from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.sound import Unsound, past_unsound_rows
 
@@ -41,6 +43,10 @@ RESTARTS: Final = ACTS.model_copy(update={"destructive_hint": True})
 _BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
 _LONGEST_DEFECT: Final = 200
 _LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
+_SCOPE_PARAMETERS: Final = [
+    inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+    for name, annotation in SCOPE.items()
+]
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +56,8 @@ class Declaration:
     """A function that is a tool, and what a client is told of it beside name and parameters.
 
     Attributes:
-        function: Its first parameter is the recording; the others are the client's.
+        function: Its first parameter is the recording, the others are the client's; in place of
+            one called `scope`, a client gives what `SCOPE` lists.
     """
 
     function: Callable[..., Any]
@@ -96,7 +103,15 @@ def _bound(
     empty = _empty_answer(function) if only_reads else None
     is_async = inspect.iscoroutinefunction(function)
 
+    signature = inspect.signature(function, eval_str=True)
+    _, *parameters = signature.parameters.values()
+    gathers = any(each.annotation is Scope for each in parameters)
+
     async def call(arguments: dict[str, Any]) -> Any:
+        if gathers:
+            scope = Scope(**{name: arguments[name] for name in SCOPE})
+            rest = {name: value for name, value in arguments.items() if name not in SCOPE}
+            arguments = rest | {"scope": scope}
         if is_async:
             return await function(recording, **arguments)
         return await to_thread.run_sync(lambda: function(recording, **arguments))
@@ -115,9 +130,9 @@ def _bound(
         except Exception as error:  # noqa: BLE001  (each becomes an answer)
             return _as_result(_answer_error(function.__name__, error, empty, unsound), unsound)
 
-    signature = inspect.signature(function, eval_str=True)
-    _, *parameters = signature.parameters.values()
-    vars(wrapper)["__signature__"] = signature.replace(parameters=parameters)
+    flat = [each for each in parameters if each.annotation is not Scope]
+    flat += _SCOPE_PARAMETERS if gathers else []
+    vars(wrapper)["__signature__"] = signature.replace(parameters=flat)
     return wrapper
 
 

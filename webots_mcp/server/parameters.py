@@ -98,3 +98,13 @@ RunIds = Annotated[
     list[_RowId] | None,
     Field(max_length=10, description="Several runs by their ids (webots_list_runs)."),
 ]
+# What a client gives for a `Scope`, which tools take whole.
+SCOPE: Final = {
+    "last_s": LastS,
+    "start_s": StartS,
+    "end_s": EndS,
+    "since": Since,
+    "until": Until,
+    "robot": RobotName,
+    "run_id": RunId,
+}

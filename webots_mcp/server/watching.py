@@ -12,7 +12,7 @@ from webots_mcp.server.budget import figure
 from webots_mcp.store.analysis.motion import find_motion, path_length, places_of
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.ranges import Segment, TimeRange, resolve_range
+from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.recording import View
 from webots_mcp.store.signals.catalogue import known_signals
@@ -37,7 +37,7 @@ class Window:
 
 def window_from(view: View, wall_start_s: float) -> Window:
     """The window of a robot from that wall time (Unix) on."""
-    found = resolve_range(view.connection, robot=view.robot.name, since=wall_start_s)
+    found = find_range(view.connection, Scope(since=wall_start_s), view.subject)
     found = newest_runs(found if found.segments else replace(found, notes=()))
     around = [
         replace(segment, start_s=_row_before(view.connection, segment))

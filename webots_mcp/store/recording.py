@@ -35,9 +35,10 @@ from webots_mcp.errors import (
 )
 from webots_mcp.schema import create_schema, require_current, schema_version
 from webots_mcp.store.queue import any_unfinished
+from webots_mcp.store.reading.subject import Subject, choose, require_run
 from webots_mcp.store.retention.limits import Asked
-from webots_mcp.store.robots import Robot, resolve_robot, robot_name
-from webots_mcp.store.runs import Run, current_run, fetch_run
+from webots_mcp.store.robots import Robot
+from webots_mcp.store.runs import Run, current_run
 from webots_mcp.store.sessions import Session
 from webots_mcp.store.sound import shadow_if_asked
 from webots_mcp.store.states import State, newest_state
@@ -65,7 +66,6 @@ class View:
     meanwhile would tell of a robot that stands still and yet has moved on.
 
     Attributes:
-        is_current: Whether the run is the robot's newest.
         state: The newest state of the run.
         status: Whether time is moving in this run.
     """
@@ -73,7 +73,6 @@ class View:
     connection: sqlite3.Connection
     robot: Robot
     run: Run | None
-    is_current: bool
     now_s: float
     state: State | None
     status: Status
@@ -109,14 +108,13 @@ class View:
         return round(max(self.now_s - wall_time_s, 0.0), 2)
 
     def require_run(self) -> Run:
-        """The run.
+        """The run; see `subject.require_run`."""
+        return require_run(self.robot, self.run)
 
-        Raises:
-            NothingRecordedError: The robot's controller has begun none.
-        """
-        if self.run is None:
-            raise NothingRecordedError(f"robot {self.robot.name!r} has no run recorded yet")
-        return self.run
+    @property
+    def subject(self) -> Subject:
+        """What a question about this robot and this run is about."""
+        return Subject(self.robot.id, self.robot.name, self.require_run().id)
 
 
 @dataclass(frozen=True)
@@ -246,25 +244,25 @@ class Recording:
 def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None = None) -> View:
     """A view over an open connection; see `Recording.view`."""
     now_s = time.time()
-    if robot is None and run_id is not None:
-        robot = robot_name(connection, fetch_run(connection, run_id).robot_id)
     try:
-        chosen = resolve_robot(connection, robot, now_s)
+        chosen, run = choose(connection, robot, run_id, now_s)
     except NothingRecordedError as error:
         raise NothingRecordedError(f"{error}. {GETTING_STARTED}") from error
-    return view_of(connection, chosen, run_id, now_s)
+    return view_of(connection, chosen, now_s, run)
 
 
-def view_of(connection: sqlite3.Connection, robot: Robot, run_id: int | None, now_s: float) -> View:
-    """A view of a robot that is already known."""
+def view_of(
+    connection: sqlite3.Connection, robot: Robot, now_s: float, run: Run | None = None
+) -> View:
+    """A view of a robot that is already known, and of that run or its newest one."""
     current = current_run(connection, robot.id)
-    run = current if run_id is None else fetch_run(connection, run_id, robot.id)
+    run = run or current
     if run is None or run == current:
         status = judge(connection, robot.session, run, now_s)
     else:
         status = _of_earlier_run(run, now_s)
     state = newest_state(connection, run.id) if run else None
-    return View(connection, robot, run, run == current, now_s, state, status)
+    return View(connection, robot, run, now_s, state, status)
 
 
 def _of_earlier_run(run: Run, now_s: float) -> Status:

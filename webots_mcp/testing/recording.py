@@ -20,7 +20,7 @@ from webots_mcp.store.logs import LogFilter, LogLine, newest_lines
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.queue import CommandQueue, list_commands
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.ranges import resolve_range, whole_run
+from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
 from webots_mcp.store.reading.rows import read_columns
 from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.rollup.rolling import roll
@@ -124,7 +124,7 @@ class Recording:
         self._roll_up()
         wanted = EventOptions(kinds=kinds or USUAL_KINDS, **options)
         with self._subject() as (connection, subject):
-            whole = resolve_range(connection, robot=subject.robot, run_id=subject.run_id)
+            whole = find_range(connection, Scope(), subject)
             found = find_events(connection, whole, wanted, limit=sys.maxsize, deadline_s=math.inf)
         return list(found.events)
 

@@ -18,9 +18,9 @@ from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.timeline import timeline
 from webots_mcp.store.reading.moments import moment_of, shown_time
 from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, resolve_range
 from webots_mcp.store.rollup.rolling import roll
-from webots_mcp.store.window import resolve_window
+from webots_mcp.store.window import window_of
 
 STEP_S = 0.032
 ROWS = 700
@@ -114,8 +114,8 @@ def test_log_lines_are_bounded_as_rows_are() -> None:
     early = next(time_s for time_s in TIMES if time_s > shown_time(time_s))
     for time_s in (late, early):
         shown_s = shown_time(time_s)
-        from_there = resolve_window(90.0, last_s=None, start_s=shown_s, end_s=None)
-        up_to_there = resolve_window(90.0, last_s=None, start_s=None, end_s=shown_s)
+        from_there = window_of(Scope(start_s=shown_s), 90.0)
+        up_to_there = window_of(Scope(end_s=shown_s), 90.0)
         assert from_there.start_s <= time_s
         assert not time_s < up_to_there.end_s
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.bounds import Bounds
+from webots_mcp.server.bounds import range_in
 from webots_mcp.server.budget import (
     BUDGET,
     LARGE_BUDGET,
@@ -24,23 +24,16 @@ from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import EventsAnswer
 from webots_mcp.server.parameters import (
     AnyNames,
-    EndS,
     Kinds,
-    LastS,
     LogLevel,
-    RobotName,
-    RunId,
     ShownLimit,
-    Since,
-    StartS,
     TextCursor,
-    Until,
 )
 from webots_mcp.server.results import Table
 from webots_mcp.store.detection.event import USUAL_KINDS, Event, EventOptions, Kind, Threshold
 from webots_mcp.store.detection.thresholds import thresholds_on
 from webots_mcp.store.questions.events import Events, Found, search_events
-from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
 EVENT_COLUMNS: Final = ("kind", "run_id", "start_s", "duration_s", "ongoing", "name", "details")
@@ -50,6 +43,7 @@ DEFAULT_LIMIT: Final = 50
 @tool("Find events", READS)
 def webots_find_events(
     recording: Recording,
+    scope: Scope,
     kinds: Kinds = None,
     signals: AnyNames = None,
     above: Annotated[
@@ -70,15 +64,8 @@ def webots_find_events(
         ),
     ] = EventOptions.stuck_m,
     log_level: LogLevel = "warning",
-    last_s: LastS = None,
-    start_s: StartS = None,
-    end_s: EndS = None,
-    since: Since = None,
-    until: Until = None,
     limit: ShownLimit = None,
     cursor: TextCursor = "",
-    robot: RobotName = None,
-    run_id: RunId = None,
 ) -> EventsAnswer:
     """What happened in a stretch of time, by default the whole run, with begin and duration.
 
@@ -88,7 +75,6 @@ def webots_find_events(
     times of one signal are one event with count and says. Pictures only with kinds=["image"].
     What is not shown is counted; cursor shows it.
     """
-    bounds = Bounds(last_s, start_s, end_s, since, until)
     thresholds = thresholds_on(signals or (), above, below, for_s)
     options = EventOptions(
         kinds=_kinds(kinds, thresholds),
@@ -98,11 +84,11 @@ def webots_find_events(
         stuck_m=stuck_m,
         log_level=log_level,
     )
-    with recording.view(robot, run_id) as view:
+    with recording.view(scope.robot, scope.run_id) as view:
         return answer_about(
             view,
             EventsAnswer,
-            lambda: _found(view, bounds.resolve(view, run_id), options, limit, cursor),
+            lambda: _found(view, range_in(view, scope), options, limit, cursor),
         )
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.bounds import Bounds
+from webots_mcp.server.bounds import range_in
 from webots_mcp.server.budget import (
     BUDGET,
     LARGE_BUDGET,
@@ -33,15 +33,8 @@ from webots_mcp.server.history_results import (
 )
 from webots_mcp.server.parameters import (
     Cursor,
-    EndS,
-    LastS,
     MaxPoints,
     Names,
-    RobotName,
-    RunId,
-    Since,
-    StartS,
-    Until,
 )
 from webots_mcp.store.questions.series import (
     DEFAULT_POINTS,
@@ -51,7 +44,7 @@ from webots_mcp.store.questions.series import (
     query_history,
 )
 from webots_mcp.store.reading.pages import Page, query_rows
-from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.signals.catalogue import signals_of
 
@@ -63,19 +56,13 @@ _SIGNAL_CHARACTERS: Final = 200  # of a signal, beside its buckets
 @tool("Query the history", READS)
 def webots_query_history(
     recording: Recording,
+    scope: Scope,
     signals: Names,
-    last_s: LastS = None,
-    start_s: StartS = None,
-    end_s: EndS = None,
-    since: Since = None,
-    until: Until = None,
     max_points: MaxPoints = None,
     raw: Annotated[
         bool, Field(description="The rows as they are, exact, in pages, instead of buckets.")
     ] = False,
     cursor: Cursor = None,
-    robot: RobotName = None,
-    run_id: RunId = None,
 ) -> HistoryAnswer:
     """Signals over time, by default the whole run: min, max, mean, last per bucket.
 
@@ -84,11 +71,10 @@ def webots_query_history(
     """
     if cursor is not None and not raw:
         raise InvalidInputError("cursor goes on with rows: give it together with raw=true")
-    bounds = Bounds(last_s, start_s, end_s, since, until)
-    with recording.view(robot, run_id) as view:
+    with recording.view(scope.robot, scope.run_id) as view:
 
         def find() -> dict[str, Any]:
-            asked = bounds.resolve(view, run_id)
+            asked = range_in(view, scope)
             if raw:
                 return _page(view, asked, signals, max_points, cursor or 0)
             return _series(view, asked, signals, max_points)

@@ -12,8 +12,9 @@ from webots_mcp.server.parameters import Cursor, EndS, LastS, RobotName, RunId, 
 from webots_mcp.server.results import LogsAnswer, Table
 from webots_mcp.server.shortening import cut_text
 from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, count_lines, newest_lines
+from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.window import resolve_window
+from webots_mcp.store.window import window_of
 
 LOG_COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
 _LONGEST_MESSAGE: Final = 500
@@ -41,13 +42,13 @@ def webots_get_logs(
     that run, or the current one. Lines of the bridge begin with 'bridge:', those of Python's
     logging with '[name of the logger]'.
     """
+    scope = Scope(robot=robot, run_id=run_id, last_s=last_s, start_s=start_s, end_s=end_s)
     with recording.view(robot, run_id) as view:
         run = view.require_run()
-        one_run = any(bound is not None for bound in (run_id, last_s, start_s, end_s))
-        window = resolve_window(run.last_sim_time_s, last_s=last_s, start_s=start_s, end_s=end_s)
-        subject = run.id if one_run else None
         lowest = level or "debug"
-        asked = LogFilter(subject, window, filter_text, lowest, cursor, view.robot.id)
+        window = window_of(scope, run.last_sim_time_s)
+        one_run = run.id if scope.in_one_run else None
+        asked = LogFilter(one_run, window, filter_text, lowest, cursor, view.robot.id)
         return _answer(view, asked, lines)
 
 

@@ -5,27 +5,20 @@ from __future__ import annotations
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.bounds import Bounds
+from webots_mcp.server.bounds import range_in
 from webots_mcp.server.budget import BUDGET, LARGE_BUDGET, answer_about, notes_of, size_of
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import TimelineAnswer
 from webots_mcp.server.parameters import (
-    EndS,
     Kinds,
-    LastS,
     LogLevel,
-    RobotName,
-    RunId,
     ShownLimit,
-    Since,
-    StartS,
     TextCursor,
-    Until,
 )
 from webots_mcp.server.tools.events import events_table
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.timeline import STORED, timeline
-from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
 DEFAULT_LIMIT: Final = 50
@@ -34,17 +27,11 @@ DEFAULT_LIMIT: Final = 50
 @tool("Get the timeline", READS)
 def webots_get_timeline(
     recording: Recording,
+    scope: Scope,
     kinds: Kinds = None,
     log_level: LogLevel = "info",
-    last_s: LastS = None,
-    start_s: StartS = None,
-    end_s: EndS = None,
-    since: Since = None,
-    until: Until = None,
     limit: ShownLimit = None,
     cursor: TextCursor = "",
-    robot: RobotName = None,
-    run_id: RunId = None,
 ) -> TimelineAnswer:
     """Changes, commands, log lines, pictures, gaps, begin and end of runs in one order, paged.
 
@@ -52,13 +39,12 @@ def webots_get_timeline(
     """
     if "threshold" in (kinds or ()):
         raise InvalidInputError("a threshold has no place here: ask webots_find_events(above)")
-    bounds = Bounds(last_s, start_s, end_s, since, until)
     options = EventOptions(kinds=tuple(kinds or STORED), log_level=log_level)
-    with recording.view(robot, run_id) as view:
+    with recording.view(scope.robot, scope.run_id) as view:
         return answer_about(
             view,
             TimelineAnswer,
-            lambda: _found(view, bounds.resolve(view, run_id), options, limit, cursor),
+            lambda: _found(view, range_in(view, scope), options, limit, cursor),
         )
 
 

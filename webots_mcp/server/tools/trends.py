@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from webots_mcp.server.bounds import Bounds
+from webots_mcp.server.bounds import range_in
 from webots_mcp.server.budget import (
     BUDGET,
     LARGE_BUDGET,
@@ -23,19 +23,12 @@ from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import RunTrendTables, TrendsAnswer
 from webots_mcp.server.parameters import (
     AnyNames,
-    EndS,
-    LastS,
-    RobotName,
-    RunId,
     ShownLimit,
-    Since,
-    StartS,
-    Until,
 )
 from webots_mcp.server.shortening import cut_text
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
-from webots_mcp.store.reading.ranges import TimeRange
+from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
 TREND_COLUMNS: Final = (
@@ -53,27 +46,20 @@ _SHOWN_VALUES: Final = 6
 @tool("Get the trends", READS)
 def webots_get_trends(
     recording: Recording,
+    scope: Scope,
     signals: AnyNames = None,
-    last_s: LastS = None,
-    start_s: StartS = None,
-    end_s: EndS = None,
-    since: Since = None,
-    until: Until = None,
     limit: ShownLimit = None,
-    robot: RobotName = None,
-    run_id: RunId = None,
 ) -> TrendsAnswer:
     """What each signal did over a stretch of time, by default the whole run, in one line each.
 
     What changed most comes first: rises, falls, swings (period, amplitude), rests since when,
     spikes, missing values; of modes and flags the changes and the time in each value.
     """
-    bounds = Bounds(last_s, start_s, end_s, since, until)
-    with recording.view(robot, run_id) as view:
+    with recording.view(scope.robot, scope.run_id) as view:
         return answer_about(
             view,
             TrendsAnswer,
-            lambda: _found(view, bounds.resolve(view, run_id), signals or ["*"], limit),
+            lambda: _found(view, range_in(view, scope), signals or ["*"], limit),
         )
 
 

@@ -39,7 +39,7 @@ def webots_list_robots(recording: Recording) -> RobotsAnswer:
         robots = list_robots(connection, now_s)
         if not robots:
             raise NothingRecordedError(f"no robot has been recorded yet. {GETTING_STARTED}")
-        views = [view_of(connection, robot, None, now_s) for robot in _liveliest(robots)]
+        views = [view_of(connection, robot, now_s) for robot in _liveliest(robots)]
         live = [view for view in views if view.robot.live]
         hint = f"{len(robots)} robots in all, the latest {len(views)} are shown"
         return RobotsAnswer(

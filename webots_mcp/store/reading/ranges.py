@@ -1,6 +1,7 @@
-"""The one place where time ranges are defined.
+"""The one place where it is defined what a question is about: robot, run and stretch of time.
 
-A range is half-open, [start, end), and given in one of three ways:
+A `Scope` says what was asked for, a `TimeRange` what that is in a recording. A range is half-open,
+[start, end), and given in one of three ways:
 
 - in simulation seconds of one run (`start_s`, `end_s`; either may be left out, then the range
   reaches to the run's first row, or up to and with its newest),
@@ -20,7 +21,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
 from webots_mcp.store.reading.coverage import coverage_notes, purge_notes
@@ -112,53 +113,84 @@ class TimeRange:
     notes: tuple[str, ...] = ()
 
 
-def resolve_range(
-    connection: sqlite3.Connection,
-    *,
-    robot: str | None = None,
-    run_id: int | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
-    last_s: float | None = None,
-    since: float | str | None = None,
-    until: float | str | None = None,
-) -> TimeRange:
-    """Find what a range means in the recording.
+@dataclass(frozen=True, kw_only=True)
+class Scope:
+    """What a question is about, as it was asked; nothing given is the whole newest run.
+
+    Attributes:
+        robot: May be left out where only one is meant.
+        run_id: None for the robot's newest run; in wall time for all of its runs.
+        start_s: In one of three ways, as this module says.
 
     Raises:
         InvalidRangeError: Reversed, empty, not finite, or given in two ways at once.
+    """
+
+    robot: str | None = None
+    run_id: int | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+    last_s: float | None = None
+    since: float | str | None = None
+    until: float | str | None = None
+
+    def __post_init__(self) -> None:
+        if (self.in_simulation_time + self.in_wall_time + (self.last_s is not None)) > 1:
+            raise InvalidRangeError(
+                "the range is given in two ways: use start_s and end_s (simulation time), or "
+                "last_s, or since and until (wall time)"
+            )
+        if self.last_s is not None and not 0 < self.last_s < math.inf:
+            raise InvalidRangeError(f"last_s={self.last_s} must be a number of seconds above 0")
+        for name, value in (("start_s", self.start_s), ("end_s", self.end_s)):
+            if value is not None and not math.isfinite(value):
+                raise InvalidRangeError(f"{name}={value} must be a finite number of seconds")
+        if self.start_s is not None and self.end_s is not None:
+            _require_order(self.start_s, self.end_s, "start_s", "end_s")
+
+    @property
+    def in_simulation_time(self) -> bool:
+        """Whether it begins or ends at a simulation time."""
+        return self.start_s is not None or self.end_s is not None
+
+    @property
+    def in_wall_time(self) -> bool:
+        """Whether it begins or ends at a wall time."""
+        return self.since is not None or self.until is not None
+
+    @property
+    def in_one_run(self) -> bool:
+        """Whether it names a run, or times that make sense in one run only."""
+        return self.run_id is not None or self.in_simulation_time or self.last_s is not None
+
+
+def find_range(
+    connection: sqlite3.Connection, scope: Scope, subject: Subject | None = None
+) -> TimeRange:
+    """Find what a scope means in the recording.
+
+    Args:
+        connection: Any.
+        scope: What was asked for.
+        subject: Its robot and run, where they are known already.
+
+    Raises:
+        InvalidRangeError: See `Scope`.
         UnknownRobotError, AmbiguousRobotError, UnknownRunError: As they say.
         NothingRecordedError: The run has no state row yet.
     """
-    _reject_contradictions(start_s, end_s, last_s, since, until)
-    if since is None and until is None:
-        subject = find_subject(connection, robot, run_id)
-        return _in_simulation_time(connection, subject, start_s, end_s, last_s)
-    walls = (parse_wall_time(since, -math.inf), parse_wall_time(until, math.inf))
+    if not scope.in_wall_time:
+        subject = subject or find_subject(connection, scope.robot, scope.run_id)
+        return _in_simulation_time(connection, subject, scope)
+    walls = (parse_wall_time(scope.since, -math.inf), parse_wall_time(scope.until, math.inf))
     _require_order(*walls, "since", "until")
-    subject = find_subject(connection, robot, run_id)
-    return _in_wall_time(connection, subject, run_id, *walls)
+    subject = subject or find_subject(connection, scope.robot, scope.run_id)
+    return _in_wall_time(connection, subject, scope.run_id, *walls)
 
 
-def _reject_contradictions(
-    start_s: float | None,
-    end_s: float | None,
-    last_s: float | None,
-    since: float | str | None,
-    until: float | str | None,
-) -> None:
-    simulation = start_s is not None or end_s is not None
-    wall = since is not None or until is not None
-    if simulation + wall + (last_s is not None) > 1:
-        raise InvalidRangeError(
-            "the range is given in two ways: use start_s and end_s (simulation time), or last_s, "
-            "or since and until (wall time)"
-        )
-    if last_s is not None and not 0 < last_s < math.inf:
-        raise InvalidRangeError(f"last_s={last_s} must be a number of seconds above 0")
-    for name, value in (("start_s", start_s), ("end_s", end_s)):
-        if value is not None and not math.isfinite(value):
-            raise InvalidRangeError(f"{name}={value} must be a finite number of seconds")
+def resolve_range(connection: sqlite3.Connection, **asked: Any) -> TimeRange:
+    """Find the range of a scope that is given by its attributes; see `find_range`."""
+    return find_range(connection, Scope(**asked))
 
 
 def _require_order(start_s: float, end_s: float, start_name: str, end_name: str) -> None:
@@ -208,11 +240,9 @@ def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
 def _in_simulation_time(
     connection: sqlite3.Connection,
     subject: Subject,
-    start_s: float | None,
-    end_s: float | None,
-    last_s: float | None,
+    scope: Scope,
 ) -> TimeRange:
-    run_id = subject.run_id
+    run_id, start_s, end_s, last_s = subject.run_id, scope.start_s, scope.end_s, scope.last_s
     bounds = recorded_bounds(connection, run_id)
     if bounds is None:
         raise NothingRecordedError(

@@ -27,7 +27,7 @@ from webots_mcp.entries import (
     waiting_paths,
 )
 from webots_mcp.errors import SessionGoneError
-from webots_mcp.notice import say
+from webots_mcp.notice import warn
 
 _PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
 
@@ -177,18 +177,18 @@ def _adopt_file(connection: sqlite3.Connection, path: Path) -> int:
     except Exception as error:
         if not (isinstance(error, _OF_THE_FILE) or is_unfit(error)):
             raise
-        _say_once(path, error)
+        _warn_once(path, error)
         return 0
     return count
 
 
-def _say_once(path: Path, error: Exception) -> None:
+def _warn_once(path: Path, error: Exception) -> None:
     """A file that stays is met again each second."""
     if path not in _strange:
         _strange.add(path)
         speaks = isinstance(error, (OSError, ValueError))
         why = str(error) if speaks else f"it is damaged ({error!r})"
-        say(f"what waits in {path} cannot be taken in: {why}")
+        warn(f"what waits in {path} cannot be taken in: {why}")
 
 
 def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:
@@ -206,7 +206,7 @@ def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:
         for counted in connection.execute(_RECOUNT, (session_id,)).fetchall():
             connection.execute(_SET_ROWS, counted)
     if unfit:
-        say(f"{len(unfit)} rows that waited in {file.name} were refused: {unfit[0]}")
+        warn(f"{len(unfit)} rows that waited in {file.name} were refused: {unfit[0]}")
     return count
 
 

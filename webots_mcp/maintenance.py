@@ -34,7 +34,7 @@ from webots_mcp.connection import (
     text_of,
 )
 from webots_mcp.errors import WebotsMCPError
-from webots_mcp.notice import say
+from webots_mcp.notice import warn
 from webots_mcp.schema import require_current
 
 INTERVAL_S: Final = 1.0
@@ -107,7 +107,7 @@ class Maintainer(threading.Thread):
             self.failures += 1
             if not is_busy(error) and repr(error) != self._complained:
                 self._complained = repr(error)
-                say(f"maintenance waits: {_described(error)}")
+                warn(f"maintenance waits: {_described(error)}")
 
     def stop(self) -> None:
         """End the thread within an instant and give the lease back."""
@@ -209,7 +209,7 @@ class Maintainer(threading.Thread):
         try:
             self._connection.execute(GIVE_LEASE_BACK, (self._holder,))
         except sqlite3.Error as error:
-            say(f"the lease runs out by itself: {error}")
+            warn(f"the lease runs out by itself: {error}")
         self._disconnect()
 
     def _disconnect(self) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import sys
 
 
-def say(text: str) -> None:
+def warn(text: str) -> None:
     """A stderr that is full, closed or (under pythonw) not there costs the line, nothing else."""
     if sys.stderr is None:  # pyright: ignore[reportUnnecessaryComparison]
         return

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.bridge import encoding, recorder
+from webots_mcp.bridge import encoding, recovery
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, Database
 from webots_mcp.entries import waiting_path
@@ -99,7 +99,7 @@ def filed(file: Path) -> Recording:
 @pytest.fixture
 def retry_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """No waiting between tries, so that the tests need no sleep."""
-    monkeypatch.setattr(recorder, "_RETRY_INTERVAL_S", 0.0)
+    monkeypatch.setattr(recovery, "_RETRY_INTERVAL_S", 0.0)
 
 
 @pytest.fixture
@@ -138,7 +138,7 @@ def numbers(recording: Recording) -> list[int]:
 def waiting_file(bridge: MCPBridge) -> Path:
     """Where the rows of the bridge wait while its database takes none."""
     assert isinstance(bridge.database, Path)
-    return waiting_path(bridge.database, bridge._recorder._uuid)  # pyright: ignore[reportPrivateUsage]
+    return waiting_path(bridge.database, bridge._recorder.session.uuid)  # pyright: ignore[reportPrivateUsage]
 
 
 def keep_in_memory(bridge: MCPBridge) -> None:

@@ -26,8 +26,9 @@ PACKAGE = str(Path(webots_mcp.__file__).parent)
 WRITING = {
     f"{name}.py"
     for name in (
-        *("recorder", "backlog", "turn", "drops", "journal", "heart", "pulse", "run"),
-        *("mcp_bridge", "adoption", "entries", "connection"),
+        *("recorder", "row_writer", "recovery", "session_connection", "connection_lock"),
+        *("row_counts", "backlog", "journal", "heartbeat", "heartbeat_rows", "run"),
+        *("mcp_bridge", "publisher", "adoption", "entries", "connection"),
     )
 }
 Place = tuple[str, int, int]  # file, line, and the instruction in it or -1
@@ -178,8 +179,9 @@ def _is_held(bridge: MCPBridge) -> bool:
     """Whether the recorder stays taken, or a transaction open, after one more call."""
     recorder = bridge._recorder  # pyright: ignore[reportPrivateUsage]
     recorder.flush()
-    held = bool(recorder._turn._held)  # pyright: ignore[reportPrivateUsage]
-    return held or (recorder.connection is not None and recorder.connection.in_transaction)
+    held = bool(recorder._lock._held)  # pyright: ignore[reportPrivateUsage]
+    connection = recorder.session.connection
+    return held or (connection is not None and connection.in_transaction)
 
 
 def _count(file: Path, returned: list[int]) -> tuple[int, int, int]:

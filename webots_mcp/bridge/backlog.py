@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, Final
 
+from webots_mcp.bridge.row_counts import RowCounts
 from webots_mcp.bridge.run import Run
 from webots_mcp.entries import ENTRIES_AT_ONCE, Entry, Kind, Values, WaitingFile
 
@@ -30,19 +31,27 @@ class Backlog:
 
     A row stays in memory only where the file does not take it (a full disk, a database in memory),
     or until the next call where another thread was writing. Any thread may `put`; the rest belongs
-    to whose turn it is. An interrupt at any place leaves too much here, never too little; what the
-    database has already is known by its number.
+    to who has the connection lock. An interrupt at any place leaves too much here, never too
+    little; what the database has already is known by its number.
 
     Args:
         file: Where rows survive the process; None for memory alone.
         describe_run: The values of a run's own entry.
+        counts: Is told of rows that are dropped.
+
+    Attributes:
+        why: Why rows wait.
     """
 
     def __init__(
-        self, file: WaitingFile | None, describe_run: Callable[[Run], dict[str, Any]]
+        self,
+        file: WaitingFile | None,
+        describe_run: Callable[[Run], dict[str, Any]],
+        counts: RowCounts,
     ) -> None:
         self._file = file
         self._describe_run = describe_run
+        self._counts = counts
         self._rows: deque[Row] = deque()
         self._bytes = 0
         self._last_number = 0
@@ -51,7 +60,7 @@ class Backlog:
         self._read: list[tuple[int, Entry]] = []
         self._described: set[str] = set()
         self._names: dict[str, str] = {}
-        self.obstacle: str | None = None  # why the file did not take the last row
+        self.why = "too many wait"
 
     @property
     def waits(self) -> bool:
@@ -73,6 +82,14 @@ class Backlog:
         self._rows.append(row)
         self._bytes += _weight(row)
 
+    def keep(self, row: Row) -> None:
+        """Put a row where it survives the process; in memory only where that fails."""
+        self.put(row)
+        self.save()
+        while len(self._rows) > MAX_WAITING_ROWS or self._bytes > MAX_WAITING_BYTES:
+            self._remove_oldest()
+            self._counts.lose(1, self.why)
+
     def save(self) -> None:
         """Move the rows in memory to the file, as far as it takes them."""
         while self._rows and self._file is not None:
@@ -80,14 +97,12 @@ class Backlog:
             self._in_file += 1
             try:
                 self._file.append(self._entries(row, self._described))
-            except OSError as error:
+            except OSError:
                 self._in_file -= 1
-                self.obstacle = str(error)
-                return
-            self.obstacle = None
+                return  # in memory it waits as well
             if row.run is not None:
                 self._described.add(row.run.uuid)
-            self.remove_oldest()
+            self._remove_oldest()
 
     def next_entries(self) -> list[Entry]:
         """The oldest entries; they stay until they are forgotten. None are left where empty."""
@@ -114,22 +129,18 @@ class Backlog:
             rows = sum(entry.kind != "run" for _, entry in done)
             self._in_file = max(1, self._in_file - rows)  # 0 once the end was seen
         while self._rows and (self._rows[0].number or number + 1) <= number:
-            self.remove_oldest()
+            self._remove_oldest()
 
     def rename_run(self, before: str, now: str) -> None:
         """What waits in the file for a run belongs to its continuation in another database."""
         self._names = {old: now if name == before else name for old, name in self._names.items()}
         self._names[before] = now
 
-    def remove_oldest(self) -> Row:
-        """Take the oldest row out of memory."""
-        row = self._rows.popleft()
-        self._bytes -= _weight(row)
-        return row
-
-    def is_over_limit(self) -> bool:
-        """Whether more waits in memory than may."""
-        return len(self._rows) > MAX_WAITING_ROWS or self._bytes > MAX_WAITING_BYTES
+    def drop_rows_in_memory(self, why: str) -> None:
+        """Nothing will take them any more."""
+        while self._rows:
+            self._remove_oldest()
+            self._counts.lose(1, why)
 
     def close(self) -> str | None:
         """Close the file; where it holds entries, it stays, and is named."""
@@ -139,11 +150,16 @@ class Backlog:
         file.close(remove=not self._in_file)
         return str(file.path) if self._in_file else None
 
-    def leave_file(self) -> None:
-        """In a forked child: the file belongs to the parent."""
+    def abandon(self) -> None:
+        """In a forked child: what waits belongs to the parent."""
         if self._file is not None:
             self._file.close(remove=False)
             self._file = None
+        self._rows.clear()
+        self._bytes = self._in_file = 0
+
+    def _remove_oldest(self) -> None:
+        self._bytes -= _weight(self._rows.popleft())
 
     def _renamed(self, entry: Entry) -> Entry:
         if isinstance(entry.values, dict) and (

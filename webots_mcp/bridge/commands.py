@@ -83,7 +83,7 @@ class CommandQueue:
                 database is in trouble.
         """
         recorder, now = self._recorder, time.time()
-        registration = recorder.registration
+        registration = recorder.session.registration
         if registration is not None and self._claiming:
             self._fail_interrupted(registration.session_id, sim_time_s)
         if registration is None or not recorder.fetch(PEEK, (registration.robot_id, now)):
@@ -113,7 +113,7 @@ class CommandQueue:
     def _look_for_successor(self, registration: Registration) -> None:
         ids = (registration.robot_id, registration.session_id)
         for (pid,) in self._recorder.fetch(_SUCCESSOR, ids):
-            self._recorder.complain(
+            self._recorder.errors.warn(
                 "successor",
                 f"commands for robot {registration.robot_name!r} go to process {pid}, which began "
                 "later under the same name: end one of the two",
@@ -160,7 +160,7 @@ class CommandQueue:
         times = {"now": time.time(), "sim_time": at_s}
         fate = {"command": command.id, "status": status, "result": result, "error": error}
         if self._recorder.record("command finished", None, {**fate, **times}) == 0:
-            self._recorder.complain(
+            self._recorder.errors.warn(
                 f"command {command.id}",
                 f"command {command.id} ({command.action}) was judged lost before it was {status}",
             )

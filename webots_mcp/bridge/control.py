@@ -75,7 +75,7 @@ class Control:
             command = self._context.queue.claim(self._context.clock.sim_time_s)
         except sqlite3.Error as error:
             if not is_busy(error):
-                self._context.recorder.complain("claim", f"commands cannot be read: {error}")
+                self._context.recorder.errors.warn("claim", f"commands cannot be read: {error}")
             return None
         if command is not None:
             self._start(command)

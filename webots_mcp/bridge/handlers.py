@@ -46,7 +46,7 @@ class Handlers:
         written = getattr(handler, "__doc__", None)
         doc = inspect.cleandoc(written) if isinstance(written, str) else ""
         self._handlers[action] = handler
-        self._recorder.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
+        self._recorder.session.actions[action] = storable(cut(doc, _MOST_DOC_CHARACTERS))
         self._recorder.update_actions()
 
     def run(self, command: Command) -> object:

@@ -198,7 +198,7 @@ class MCPBridge:
             known = find_log_level(level)
             if known is None:
                 names = ", ".join(LOG_LEVELS)
-                self._recorder.complain("level", f"log level {level!r:.80} is none of {names}")
+                self._recorder.errors.warn("level", f"log level {level!r:.80} is none of {names}")
             self._journal.log(known or "info", "controller", text_of(message), logger)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._failed("log", error)
@@ -259,7 +259,7 @@ class MCPBridge:
     @property
     def robot_name(self) -> str:
         """The name under which this robot is recorded: its own, or `name#2` if that is taken."""
-        registration = self._recorder.registration
+        registration = self._recorder.session.registration
         return registration.robot_name if registration else self._identity.robot_name
 
     @property
@@ -271,16 +271,16 @@ class MCPBridge:
         """What was recorded so far, and what was not."""
         recorder = self._recorder
         return BridgeStats(
-            rows_written=recorder.rows_written,
+            rows_written=recorder.counts.written,
             rows_waiting=recorder.rows_waiting,
-            rows_dropped=recorder.drops.rows,
+            rows_dropped=recorder.counts.lost,
             publish_calls=self._throttle.calls,
             publish_throttled=self._throttle.skipped,
             values_replaced=self._journal.values_replaced,
             publish_mean_us=self._cost.mean_us,
             publish_max_us=self._cost.max_us,
             failures=self._failures,
-            last_error=recorder.trouble.last_error,
+            last_error=recorder.errors.last_error,
         )
 
     def close(self, reason: str | None = None) -> None:
@@ -357,7 +357,7 @@ class MCPBridge:
             recorder.flush()
 
     def _begin_first_run(self) -> None:
-        run, registration = self._clock.run, self._recorder.registration
+        run, registration = self._clock.run, self._recorder.session.registration
         reloaded = registration is not None and registration.reloaded
         run.start_reason = "reload" if reloaded else "start"
         self._journal.event(run.start_reason)
@@ -387,7 +387,7 @@ class MCPBridge:
     def _begin_run(self) -> None:
         """Simulation time went back: the old run ends with what was last known of it."""
         self._recorder.end_run("reset", self._clock.ended_sim_time_s)
-        self._recorder.run = self._clock.run
+        self._recorder.session.run = self._clock.run
         self._changes.forget()
         self._reloads.happened()
         self._journal.event("reset")
@@ -446,7 +446,7 @@ class MCPBridge:
         if self._strict:
             raise error
         kind = f"{method} {type(error).__name__}"
-        self._recorder.complain(kind, f"{method} failed: {describe(error)}")
+        self._recorder.errors.warn(kind, f"{method} failed: {describe(error)}")
 
 
 def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:

@@ -69,7 +69,7 @@ class Album:
 
     @property
     def _robot_name(self) -> str:
-        registration = self._recorder.registration
+        registration = self._recorder.session.registration
         return registration.robot_name if registration else "robot"
 
     def _kept_of(self, name: str) -> deque[str]:

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.connection import is_about_a_value, is_damage
-from webots_mcp.notice import say
+from webots_mcp.notice import warn
 from webots_mcp.store.analysis.summary import Summary, merge, summarise
 from webots_mcp.store.reading.rows import cleaned
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
@@ -157,7 +157,7 @@ def _take_in_sound(connection: sqlite3.Connection, after: int, last: int, pause_
         rows = connection.execute(_SOUND_ROWS, (after, last)).fetchall()
         stored = _take_in_halves(connection, rows, pause_s, unsound)
     if stored:
-        say(f"left out of the rollups: {'; '.join(unsound.described())}")
+        warn(f"left out of the rollups: {'; '.join(unsound.described())}")
     return stored
 
 

@@ -1,14 +1,14 @@
-"""What went wrong in a bridge: remembered, and said once."""
+"""What went wrong in a bridge: remembered, and warned of once."""
 
 from __future__ import annotations
 
 from webots_mcp.errors import DatabaseError
-from webots_mcp.notice import say
+from webots_mcp.notice import warn
 
 _MOST_CHARACTERS = 2000
 
 
-class Trouble:
+class ErrorReport:
     """The newest thing that could not be recorded, and why.
 
     Args:
@@ -17,15 +17,15 @@ class Trouble:
 
     def __init__(self, *, strict: bool) -> None:
         self._strict = strict
-        self._said: set[str] = set()
+        self._warned: set[str] = set()
         self.last_error: str | None = None
 
-    def complain(self, kind: str, text: str) -> None:
-        """Remember what went wrong; say it on stderr once a kind; raise in strict mode."""
+    def warn(self, kind: str, text: str) -> None:
+        """Remember what went wrong; one line a kind on stderr; raise in strict mode."""
         text = text[:_MOST_CHARACTERS].encode("utf-8", "replace").decode()
         self.last_error = text
-        if kind not in self._said:
-            self._said.add(kind)
-            say(text)
+        if kind not in self._warned:
+            self._warned.add(kind)
+            warn(text)
         if self._strict:
             raise DatabaseError(text)

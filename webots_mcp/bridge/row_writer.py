@@ -1,0 +1,132 @@
+"""Writing rows in order: what waits comes before what is new."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any, Final
+
+from webots_mcp.adoption import Taken, is_unfit, take_in
+from webots_mcp.bridge.backlog import Backlog, Row
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.recovery import Recovery
+from webots_mcp.bridge.row_counts import RowCounts
+from webots_mcp.bridge.run import Run
+from webots_mcp.bridge.session_connection import SessionConnection
+from webots_mcp.connection import roll_back
+from webots_mcp.entries import STATEMENTS, Kind, Values, bind
+
+_CATCH_UP_S: Final = 0.002  # a loop that catches up must not stall over it
+
+
+class RowWriter:
+    """Writes a row, or keeps it where it waits. All calls come from who has the connection lock."""
+
+    def __init__(
+        self,
+        session: SessionConnection,
+        backlog: Backlog,
+        recovery: Recovery,
+        counts: RowCounts,
+        clock: Clock,
+    ) -> None:
+        self._session = session
+        self._backlog = backlog
+        self._recovery = recovery
+        self._counts = counts
+        self._clock = clock
+
+    def write(self, kind: Kind, run: Run | None, values: Values) -> int | None:
+        """How many rows the statement changed, or None where it was put off."""
+        session = self._session
+        if not self.is_ready(run):
+            self._keep(Row(kind, run, values))
+            return None
+        _, registration = session.opened
+        bound = bind(run.id if run else None, registration.session_id, values)
+        try:
+            changed = session.execute(STATEMENTS[kind], bound)
+        except Exception as error:  # noqa: BLE001  (see `is_busy`)
+            self._write_failed(Row(kind, run, values), error)
+            return None
+        self._counts.written += 1
+        if kind == "state" and run is not None:
+            run.rows += 1
+        return changed
+
+    def fetch(self, statement: str, values: Values) -> Sequence[Any]:
+        """The rows that a statement reads or changes; none while something else comes first."""
+        if not self.is_ready(None):
+            return ()
+        connection, _ = self._session.opened
+        # to the end: a RETURNING that is not read so far keeps the write lock
+        return connection.execute(statement, values).fetchall()
+
+    def is_ready(self, run: Run | None) -> bool:
+        """Whether the database has all that comes before a row of that run, as of now."""
+        return not self._is_behind(run) or self.catch_up(run)
+
+    def catch_up(self, run: Run | None) -> bool:
+        """Write what comes before; False where that is not possible now, or not all of it."""
+        if not self._recovery.is_connected():
+            return False
+        connection, _ = self._session.opened
+        roll_back(connection)  # what an interrupt left open
+        try:
+            self._take_in_waiting()
+            if run is not None and run.id is None and not self._backlog.waits:
+                self._session.enter_run(run)
+        except Exception as error:  # noqa: BLE001  (see `is_busy`)
+            self._backlog.save()
+            self._recovery.put_off(error)
+            return False
+        if self._backlog.waits:
+            return False
+        self._tell_losses()
+        return not self._backlog.waits
+
+    def _is_behind(self, run: Run | None) -> bool:
+        connection = self._session.connection
+        return (
+            connection is None
+            or self._backlog.waits
+            or connection.in_transaction
+            or (run is not None and run.id is None)
+            or self._counts.untold > 0
+        )
+
+    def _write_failed(self, row: Row, error: Exception) -> None:
+        if is_unfit(error):
+            self._counts.lose(1, str(error))
+        else:
+            self._keep(row)
+            self._recovery.put_off(error)
+
+    def _keep(self, row: Row) -> None:
+        if self._recovery.off is not None:
+            self._counts.lose(1, self._recovery.off)
+        else:
+            self._backlog.keep(row)
+
+    def _take_in_waiting(self) -> None:
+        connection, registration = self._session.opened
+        until_s = time.monotonic() + _CATCH_UP_S
+        while self._backlog.waits and (entries := self._backlog.next_entries()):
+            taken = take_in(connection, registration.session_id, entries)
+            self._backlog.forget(taken.number)
+            self._count(taken)
+            if time.monotonic() > until_s:
+                break
+
+    def _count(self, taken: Taken) -> None:
+        run = self._session.run
+        self._counts.written += sum(entry.kind != "run" for entry in taken.written)
+        run.rows += sum(e.kind == "state" and e.run == run.uuid for e in taken.written)
+        for why in taken.unfit:
+            self._counts.lose(1, why)
+
+    def _tell_losses(self) -> None:
+        if self._counts.untold:
+            run, text = self._session.run, self._counts.tell()
+            now = (self._clock.newest_s(run), time.time())
+            self.write("event", run, (*now, "dropped", None, text))

@@ -117,6 +117,20 @@ def test_a_handler_that_ends_the_controller_fails_its_command_and_ends_it(
         assert (status, (reason or "").split(":")[0]) == ("failed", type(error).__name__)
 
 
+def test_a_handler_that_closes_the_bridge_is_answered_before(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    def leave(_: dict[str, Any]) -> str:
+        bridge.close()
+        return "closed"
+
+    bridge.register_command("leave", leave)
+    sent = recording.send("leave")
+    eager(bridge)
+    assert recording.fate(sent) == ("done", "closed", None)
+    assert recording.rows("SELECT end_reason FROM session") == ["finished"]
+
+
 def test_a_long_reason_is_cut_and_says_so(bridge: MCPBridge, recording: Recording) -> None:
     def fail(command: dict[str, Any]) -> None:
         raise ValueError("x" * 1_000_000)

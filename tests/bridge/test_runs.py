@@ -100,6 +100,19 @@ def test_a_successor_in_the_same_webots_is_a_reload(
     assert recording.rows("SELECT start_reason FROM run ORDER BY id") == ["start", "reload"]
 
 
+def test_a_robot_that_webots_starts_again_was_ended_by_the_reload(
+    database: MemoryDatabase, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WEBOTS_INSTANCE_PATH", "first")
+    monkeypatch.setenv("WEBOTS_ROBOT_NAME", "rover")
+    for _ in range(2):
+        with MCPBridge(InProcessRobot("rover"), database=database) as bridge:
+            bridge.publish({}, force=True)
+    for table in ("session", "run"):
+        ends = recording.rows(f"SELECT end_reason FROM {table} ORDER BY id")
+        assert ends == ["reload", "finished"]
+
+
 def test_a_successor_in_another_webots_is_a_start(
     database: MemoryDatabase, monkeypatch: pytest.MonkeyPatch
 ) -> None:

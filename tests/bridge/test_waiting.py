@@ -26,6 +26,7 @@ from tests.bridge.conftest import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.adoption import adopt
+from webots_mcp.bridge.row_writer import RowWriter
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.entries import waiting_paths
@@ -418,7 +419,7 @@ def test_a_signals_handler_that_logs_in_the_middle_of_a_row_deadlocks_nothing(
 ) -> None:
     def trace(frame: object, event: str, _: object) -> object:
         code = getattr(frame, "f_code")  # noqa: B009
-        if code.co_name == "_write" and event == "call":
+        if code is RowWriter.write.__code__ and event == "call":
             sys.settrace(None)
             bridge.log("from within")
         return None

@@ -11,9 +11,10 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.bridge.commands import Command, describe
+from webots_mcp.bridge.commands import Command
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.pictures import complete_png_size
+from webots_mcp.bridge.text import describe
 from webots_mcp.contract import BUILT_IN_ACTIONS, MAX_STEPS, SCREENSHOT_FOLDER
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 

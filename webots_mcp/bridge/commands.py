@@ -10,18 +10,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final, cast
 
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
-from webots_mcp.bridge.text import cut, storable
-from webots_mcp.errors import WebotsMCPError
+from webots_mcp.bridge.text import storable
 
 _MOST_NAMED: Final = 10
-
-_MOST_CHARACTERS: Final = 2000
 
 # An indexed read takes no lock. An UPDATE takes the write lock even where it matches nothing, so
 # it is made only after this said that there is something. The texts come as bytes: one that is no
@@ -164,27 +160,6 @@ class CommandQueue:
                 f"command {command.id}",
                 f"command {command.id} ({command.action}) was judged lost before it was {status}",
             )
-
-
-def describe(error: BaseException) -> str:
-    """What was wrong; for an exception of the user's own code also its kind and place."""
-    text = _text_of(error)
-    if isinstance(error, WebotsMCPError):
-        return text
-    frame = error.__traceback__
-    while frame is not None and frame.tb_next is not None:
-        frame = frame.tb_next
-    if frame is None:
-        return f"{type(error).__name__}: {text}"
-    place = Path(frame.tb_frame.f_code.co_filename).name
-    return f"{type(error).__name__}: {text} ({place}, line {frame.tb_lineno})"
-
-
-def _text_of(error: BaseException) -> str:
-    try:
-        return cut(str(error), _MOST_CHARACTERS)
-    except Exception as failure:  # noqa: BLE001  (an exception of the user's own kind)
-        return f"(without words: its str() raised {type(failure).__name__})"
 
 
 def _name_replaced(odd: Mapping[str, str]) -> str | None:

@@ -8,10 +8,11 @@ from typing import Final
 
 from webots_mcp.bridge import actions
 from webots_mcp.bridge.actions import Progress
-from webots_mcp.bridge.commands import Command, describe
+from webots_mcp.bridge.commands import Command
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.handlers import Handlers
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S
+from webots_mcp.bridge.text import describe
 from webots_mcp.connection import is_busy
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.errors import CommandRefusedError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from webots_mcp.bridge.text import describe
 from webots_mcp.errors import DatabaseError
 from webots_mcp.notice import warn
 
@@ -9,16 +10,20 @@ _MOST_CHARACTERS = 2000
 
 
 class ErrorReport:
-    """The newest thing that could not be recorded, and why.
+    """The newest thing that could not be done, and why.
 
     Args:
         strict: Raise it as well.
+
+    Attributes:
+        failures: Calls of the bridge's methods that failed.
     """
 
     def __init__(self, *, strict: bool) -> None:
         self._strict = strict
         self._warned: set[str] = set()
         self.last_error: str | None = None
+        self.failures = 0
 
     def warn(self, kind: str, text: str) -> None:
         """Remember what went wrong; one line a kind on stderr; raise in strict mode."""
@@ -29,3 +34,10 @@ class ErrorReport:
             warn(text)
         if self._strict:
             raise DatabaseError(text)
+
+    def failed(self, method: str, error: Exception) -> None:
+        """Count a call that failed, and warn of it; in strict mode raise what it raised."""
+        self.failures += 1
+        if self._strict:
+            raise error
+        self.warn(f"{method} {type(error).__name__}", f"{method} failed: {describe(error)}")

@@ -27,7 +27,7 @@ class Pause:
         simulation: What is paused.
         journal: Is told when the pause begins and ends.
         heartbeat: Tells others of it.
-        stepped: Is told of each step that user code made during the pause.
+        stepped: Is told of each step that user code made.
 
     Attributes:
         active: The loop stays where it is.
@@ -102,10 +102,12 @@ class Pause:
     def user_code(self) -> Generator[None]:
         """While a handler or a callback runs: its steps are made, also during the pause."""
         self._user_code_depth += 1
+        self._guard_steps()
         try:
             yield
         finally:
             self._user_code_depth -= 1
+            self._guard_steps()
 
     def _end_by(self, whom: str) -> None:
         self._deactivate()
@@ -115,22 +117,36 @@ class Pause:
     def _activate(self, mode_before: str) -> None:
         self._mode_before = mode_before
         self.active = True
-        self._simulation.guard_steps(self._on_step)
+        self._guard_steps()
 
     def _deactivate(self) -> None:
         self.active = False
-        self._simulation.guard_steps(None)
+        self._guard_steps()
+
+    def _guard_steps(self) -> None:
+        """Outside of a pause the steps of user code are only told: they show that it lives."""
+        needed = self.active or self._user_code_depth > 0
+        self._simulation.guard_steps(self._on_step if needed else None)
 
     def _on_step(self, step: Step) -> int:
-        if step.begins and self._user_code_depth:
-            self.pump()  # a person may have ended the pause by now
-        elif step.begins:
-            self.serve()
+        if self.active and step.begins:
+            if self._user_code_depth:
+                self.pump()  # a person may have ended the pause by now
+            else:
+                self.serve()
         if self._simulation.over:
             return QUIT
-        return self._let_pass(step) if self.active else step.make()
+        if not (self.active or self._user_code_depth):
+            return step.make()
+        answer = self._leave_for(step) if self.active else step.make()
+        if answer == QUIT:
+            self._simulation.end()
+            self.active = False
+        elif step.ends:
+            self._stepped()
+        return answer
 
-    def _let_pass(self, step: Step) -> int:
+    def _leave_for(self, step: Step) -> int:
         """Leave the pause for just this step."""
         if step.begins:
             self._simulation.set_mode(_running(self._mode_before))
@@ -139,12 +155,8 @@ class Pause:
         except BaseException:
             self._simulation.set_mode("pause")
             raise
-        if answer == QUIT:
-            self._simulation.end()
-            self._deactivate()
-        elif step.ends:
+        if answer != QUIT and step.ends:
             self._simulation.set_mode("pause")
-            self._stepped()
         return answer
 
 

@@ -53,11 +53,11 @@ class Recorder:
     """
 
     def __init__(
-        self, database: Database, identity: Identity, clock: Clock, *, strict: bool
+        self, database: Database, identity: Identity, clock: Clock, errors: ErrorReport
     ) -> None:
-        self.errors = ErrorReport(strict=strict)
-        self.counts = RowCounts(self.errors)
-        self.session = SessionConnection(database, identity, clock.run, self.errors)
+        self.errors = errors
+        self.counts = RowCounts(errors)
+        self.session = SessionConnection(database, identity, clock.run, errors)
         self.last_use_s = time.monotonic()
         self._lock = ConnectionLock()
         self._backlog = Backlog(self._waiting_file(), self.session.describe_run, self.counts)

@@ -29,6 +29,16 @@ _RELOADED: Final = (
     "UNION SELECT 1 FROM command WHERE robot_id = :robot "
     "AND status = 'claimed' AND action = 'reload' AND issued_wall_time_s IS NOT NULL"
 )
+# A controller that is no Supervisor cannot tell a reload from any other end that Webots asks for;
+# that Webots starts its successor shows which it was.
+_RELOADED_SESSION: Final = (
+    "UPDATE session SET end_reason = 'reload' WHERE end_reason = 'finished' "
+    "AND id = (SELECT max(id) FROM session WHERE robot_id = ?)"
+)
+_RELOADED_RUN: Final = (
+    "UPDATE run SET end_reason = 'reload' WHERE end_reason = 'finished' "
+    "AND id = (SELECT max(id) FROM run WHERE robot_id = ?)"
+)
 _PAUSED_MODE: Final = (
     "SELECT coalesce(hold_mode, 'real_time') FROM session WHERE id = (SELECT max(id) FROM session "
     "WHERE robot_id = ?) AND instance = ? AND hold = ?"
@@ -66,6 +76,9 @@ def register(
         name = _free_name(connection, identity, now_s)
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         reloaded = _is_reload(connection, identity, robot_id, now_s)
+        if reloaded and _is_started_by_webots(identity):
+            connection.execute(_RELOADED_SESSION, (robot_id,))
+            connection.execute(_RELOADED_RUN, (robot_id,))
         paused_mode = _paused_mode(connection, identity, robot_id)
         session = describe_session(identity, session_uuid, actions)
         session_id = enter_session(connection, robot_id, session)
@@ -98,9 +111,13 @@ def _is_reload(
         "robot": robot_id,
         "instance": identity.instance,
         "earliest": now_s - _LONGEST_RELOAD_S,
-        "in_webots": not identity.extern and "WEBOTS_INSTANCE_PATH" in os.environ,
+        "in_webots": _is_started_by_webots(identity),
     }
     return connection.execute(_RELOADED, values).fetchone() is not None
+
+
+def _is_started_by_webots(identity: Identity) -> bool:
+    return not identity.extern and "WEBOTS_INSTANCE_PATH" in os.environ
 
 
 def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: int) -> str | None:

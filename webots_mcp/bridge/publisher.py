@@ -1,0 +1,84 @@
+"""What happens with a published state: admitted or throttled, encoded, recorded, compared."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from itertools import islice
+from typing import Any
+
+from webots_mcp.bridge.changes import Changes
+from webots_mcp.bridge.context import Context
+from webots_mcp.bridge.devices import read_devices
+from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.runs import Runs
+from webots_mcp.bridge.stats import PublishCost
+
+
+class Publisher:
+    """Takes each call of `publish` and `auto_publish`.
+
+    Attributes:
+        cost: How long the recorded calls took.
+    """
+
+    def __init__(self, context: Context, runs: Runs) -> None:
+        self._context = context
+        self._clock = context.clock
+        self._heartbeat = context.heartbeat
+        self._throttle = context.throttle
+        self._runs = runs
+        self._changes = Changes()
+        self._run = context.clock.run
+        self.cost = PublishCost()
+
+    def publish(self, state: Mapping[Any, Any], force: bool) -> None:
+        """Record the state if it is this call's turn."""
+        if self._clock.look():
+            self._runs.begin()
+        if self._throttle.admits(force or self._heartbeat.loop is not None):
+            self._record(state)
+
+    def publish_devices(self, extra: Mapping[Any, Any], include_time: bool) -> None:
+        """Record what the devices say, if it is this call's turn."""
+        if self._clock.look():
+            self._runs.begin()
+        if self._throttle.admits(self._heartbeat.loop is not None):
+            self._record({**self._read_devices(include_time), **_finite(extra)})
+
+    def _record(self, state: Mapping[Any, Any]) -> None:
+        started_s = time.perf_counter()
+        self._context.reloads.fire()
+        encoded = encode(state)
+        if not encoded.text.startswith("{"):
+            raise TypeError(f"publish() takes a dict, got {type(state).__name__}")
+        self._context.journal.state(encoded)
+        if isinstance(state, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
+            self._record_changes(state)
+        self._heartbeat.beat_if_due()
+        self.cost.add(time.perf_counter() - started_s)
+
+    def _record_changes(self, state: Mapping[Any, Any]) -> None:
+        if self._clock.run is not self._run:
+            self._run = self._clock.run
+            self._changes.forget()
+        for name, before, after in self._changes.look(state):
+            self._context.journal.event("change", {"from": before, "to": after}, name)
+
+    def _read_devices(self, include_time: bool) -> dict[str, object]:
+        """What the devices say; without what cannot be read, which is counted."""
+        try:
+            state = read_devices(self._context.simulation.robot)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._context.recorder.errors.failed("auto_publish", error)
+            state = dict[str, object]()
+        if include_time:
+            state["time"] = self._clock.sim_time_s
+        return state
+
+
+def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
+    """As many items as it says; a mapping of the user's own may never come to its end."""
+    if not isinstance(extra, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
+        raise TypeError(f"extra is a dict, got {type(extra).__name__}")
+    return dict(islice(extra.items(), len(extra)))

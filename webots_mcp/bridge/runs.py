@@ -1,0 +1,58 @@
+"""Beginning runs: the first of a session, and one with each reset of the world."""
+
+from __future__ import annotations
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.heartbeat import Heartbeat
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.reloads import Reloads
+
+
+class Runs:
+    """Enters each run as it begins, and tells the controller's code of it."""
+
+    def __init__(
+        self,
+        clock: Clock,
+        recorder: Recorder,
+        journal: Journal,
+        heartbeat: Heartbeat,
+        reloads: Reloads,
+    ) -> None:
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._heartbeat = heartbeat
+        self._reloads = reloads
+
+    def look(self, *, came_round: bool = False) -> None:
+        """Begin a run if simulation time went back since the last look.
+
+        Args:
+            came_round: The user's loop has come round, so that it has made a step.
+        """
+        if self._clock.look(came_round=came_round):
+            self.begin()
+
+    def look_after_step(self) -> None:
+        """Time has passed, or gone back, outside of the loop: in a step of a handler's."""
+        self.look()
+        self._heartbeat.beat_if_due()
+
+    def begin(self) -> None:
+        """Simulation time went back: the old run ends with what was last known of it."""
+        self._recorder.end_run("reset", self._clock.ended_sim_time_s)
+        self._recorder.session.run = self._clock.run
+        self._reloads.happened()
+        self._journal.event("reset")
+        self._reloads.fire()
+        self._heartbeat.beat()
+
+    def begin_first(self, *, reloaded: bool) -> None:
+        """The session's first run, after a reload or not."""
+        run = self._clock.run
+        run.start_reason = "reload" if reloaded else "start"
+        self._journal.event(run.start_reason)
+        if reloaded:
+            self._reloads.happened()

@@ -1,0 +1,142 @@
+"""The session of one controller process: its parts, its beginning and its end."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.commands import Command, CommandQueue
+from webots_mcp.bridge.context import Context
+from webots_mcp.bridge.control import Control
+from webots_mcp.bridge.error_report import ErrorReport
+from webots_mcp.bridge.heartbeat import Heartbeat
+from webots_mcp.bridge.identity import identify
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.pictures import Album
+from webots_mcp.bridge.publisher import Publisher
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.registration import Registration
+from webots_mcp.bridge.reloads import Reloads
+from webots_mcp.bridge.runs import Runs
+from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.throttle import Throttle
+from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.maintenance import Maintainer
+
+_IDLE_S: Final = 0.5  # a loop that recorded nothing for so long stands still
+
+
+class Session:
+    """Everything that a bridge has from its construction to its end.
+
+    Attributes:
+        context: The parts that commands work with.
+        control: Serves commands.
+        publisher: Takes published states.
+        runs: Notices resets.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        database: Database,
+        data_dir: Path,
+        throttle: Throttle,
+        errors: ErrorReport,
+    ) -> None:
+        from webots_mcp import __version__
+
+        self._identity = identify(simulation.robot, simulation.supervisor, __version__)
+        clock = Clock(simulation)
+        recorder = Recorder(database, self._identity, clock, errors)
+        journal, heartbeat = Journal(recorder, clock), Heartbeat(recorder, clock)
+        reloads = Reloads(errors.failed)
+        self.runs = Runs(clock, recorder, journal, heartbeat, reloads)
+        self.context = Context(
+            simulation=simulation,
+            clock=clock,
+            recorder=recorder,
+            journal=journal,
+            album=Album(recorder, clock, data_dir),
+            heartbeat=heartbeat,
+            throttle=throttle,
+            reloads=reloads,
+            queue=CommandQueue(recorder),
+            pause=Pause(simulation, journal, heartbeat, self.runs.look_after_step),
+        )
+        self.control = Control(self.context)
+        self.publisher = Publisher(self.context, self.runs)
+        self._maintainer = _start_maintainer(database, self._flush_if_idle)
+
+    @property
+    def robot_name(self) -> str:
+        """The name under which the robot is recorded."""
+        registration = self.context.recorder.session.registration
+        return registration.robot_name if registration else self._identity.robot_name
+
+    def begin(self) -> None:
+        """Enter the first run, and go on with what the session before this one left."""
+        registration = self.context.recorder.session.registration
+        self.runs.begin_first(reloaded=registration is not None and registration.reloaded)
+        if registration is not None:
+            self._succeed_to(registration)
+
+    def _succeed_to(self, registration: Registration) -> None:
+        simulation, clock = self.context.simulation, self.context.clock
+        mode = simulation.mode_name if simulation.supervisor else None
+        values = {"now": time.time(), "sim_time": clock.sim_time_s, "mode": mode}
+        self.context.recorder.record("reload confirmed", clock.run, values)
+        if registration.paused_mode is not None:
+            self.context.pause.take_over(registration.paused_mode)
+
+    def serve(self) -> Command | None:
+        """One round of the loop: the commands that wait, and the heartbeat."""
+        simulation = self.context.simulation
+        self.runs.look(came_round=True)
+        if simulation.over:
+            return None
+        command = self.control.serve()
+        self.context.heartbeat.poll()
+        if simulation.over:
+            self._end()
+        return command
+
+    def close(self, reason: str | None) -> None:
+        """Write what waits and end; for the reason given, or as far as it is known."""
+        if self._maintainer is not None:
+            self._maintainer.stop()
+        reason = reason or self._end_reason
+        self.context.recorder.close(reason, self.context.clock.sim_time_s)
+
+    def let_go(self) -> None:
+        """A pause that nobody could end any more would stop the whole simulation."""
+        self.context.pause.close()
+        self.control.report_end(extern=self._identity.extern)
+
+    @property
+    def _end_reason(self) -> str:
+        return "reload" if self.context.reloads.requested_by else "finished"
+
+    def _end(self) -> None:
+        """Webots may kill the process from here on, or let the loop say its last words."""
+        self.control.report_end(extern=self._identity.extern)
+        self.context.recorder.end(self._end_reason, self.context.clock.sim_time_s)
+
+    def _flush_if_idle(self) -> None:
+        """Called from the maintainer's thread: write what waits if the loop stands still."""
+        recorder = self.context.recorder
+        if recorder.rows_waiting and time.monotonic() - recorder.last_use_s > _IDLE_S:
+            recorder.flush()
+
+
+def _start_maintainer(database: Database, on_tick: Callable[[], Any]) -> Maintainer | None:
+    """A log to keep short exists only in a file."""
+    if isinstance(database, MemoryDatabase):
+        return None
+    maintainer = Maintainer(database, "bridge", on_tick=on_tick)
+    maintainer.start()
+    return maintainer

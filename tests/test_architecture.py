@@ -24,13 +24,14 @@ ALLOWED = {
     "liveness": set[str](),
     "notice": set[str](),
     "naming": set[str](),
+    "conditions": {"conditions", "errors", "naming"},
     "settlement": {"contract", "entries", "liveness"},
     "entries": set[str](),
     "adoption": {"connection", "entries", "errors", "notice"},
     "maintenance": {"adoption", "connection", "errors", "notice", "schema"},
     "standin": {"standin", "bundled"},
 }
-ENTRIES = {"bundled", "maintenance", "naming", "settlement"}
+ENTRIES = {"bundled", "conditions", "maintenance", "naming", "settlement"}
 STDLIB = {
     *ENTRIES,
     *ALLOWED["maintenance"],

@@ -18,8 +18,10 @@ of its own.
     │   ├── UnknownRunError
     │   ├── UnknownSignalError
     │   ├── UnknownActionError
+    │   ├── InvalidConditionError
     │   └── InvalidRangeError
     ├── NothingRecordedError        the question is fine, the recording has no answer yet
+    ├── ConditionFailedError        a condition met values that it cannot be asked of
     └── CommandRefusedError         the simulation or the robot cannot do what was asked
 
 Each message names the value that was wrong and the next step to take.
@@ -86,12 +88,20 @@ class UnknownActionError(InvalidInputError):
     """The robot's controller has registered no such action."""
 
 
+class InvalidConditionError(InvalidInputError):
+    """A condition is not in the language; the text says where, and what would be."""
+
+
 class InvalidRangeError(InvalidInputError):
     """A time range is empty, reversed or contradictory."""
 
 
 class NothingRecordedError(WebotsMCPError):
     """The question is fine, but nothing has been recorded that answers it."""
+
+
+class ConditionFailedError(WebotsMCPError):
+    """A condition met values that it cannot be asked of: is a text less than a number?"""
 
 
 class CommandRefusedError(WebotsMCPError):

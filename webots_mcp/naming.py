@@ -5,6 +5,7 @@ Recorded rows are read by these names, and so are the states that a controller p
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterable
 from typing import Any, Final, TypeAlias
 
@@ -13,7 +14,9 @@ Value: TypeAlias = "int | float | str | None"  # a bool is an int
 LONGEST_SPREAD_ARRAY: Final = 16  # a longer one is reduced: nobody asks for lidar.117
 REDUCTIONS: Final = ("count", "min", "max", "mean", "argmin")
 
-_INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
+INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
+FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer of 400 digits)
+
 _BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location", "")
 _AXES: Final = (("0", "1"), ("x", "y"), ("x_m", "y_m"))
 _LONGEST_COMPARED: Final = 100  # characters of a name
@@ -39,7 +42,7 @@ def _spread(prefix: str, items: Iterable[tuple[str, Any]], leaves: dict[str, Val
         elif kind is not list:
             leaves[prefix + key] = value
         elif len(value) <= LONGEST_SPREAD_ARRAY:
-            _spread(f"{prefix}{key}.", zip(_INDEXES, value, strict=False), leaves)
+            _spread(f"{prefix}{key}.", zip(INDEXES, value, strict=False), leaves)
         else:
             _reduce(prefix + key, value, leaves)
 
@@ -63,11 +66,12 @@ def reduce_array(array: list[Any]) -> tuple[Value, ...]:
 
 
 def mean_of(numbers: Collection[int | float]) -> float | None:
-    """Their mean; None of no numbers, and of integers beyond all floats."""
+    """Their mean; None of no numbers, and where their sum is beyond all floats."""
     try:
-        return sum(numbers) / len(numbers) if numbers else None
+        mean = sum(numbers) / len(numbers) if numbers else math.inf
     except OverflowError:
         return None
+    return mean if math.isfinite(mean) else None
 
 
 def find_position(numeric: Collection[str]) -> tuple[str, str] | None:

@@ -60,6 +60,9 @@ from webots_mcp.bridge.cleaning import (
 )
 from webots_mcp.bridge.conversions import convert, is_number_array, item_count
 
+# Codes of numpy; orjson writes shorter floats in its own way.
+_ORDINARY_NUMBERS: Final = frozenset("?bBhHiIlLqQd")
+
 orjson: Any
 try:
     import orjson
@@ -127,6 +130,14 @@ def encode(state: object) -> Encoded:
     except Exception:  # noqa: BLE001  (something odd is inside: it is found and named below)
         return _encode_odd(state)
     return _encode_odd(state)
+
+
+def plain(value: Any) -> Any:
+    """What a row holds of a value, in JSON's terms; numbers of numpy may still be NaN."""
+    usual = is_number_array(value) and value.dtype.char in _ORDINARY_NUMBERS
+    if usual and item_count(value) <= MAX_ROOM:
+        return value.tolist()
+    return json.loads(encode(value).text)
 
 
 def is_small(value: object) -> bool:

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.naming import find_position
+from webots_mcp.naming import FARTHEST_M, find_position
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
@@ -18,8 +18,6 @@ from webots_mcp.store.signals.registry import Signal
 
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.track import Track
-
-FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer of 400 digits)
 
 _MODE: Final = re.compile(r"(^|\.)(mode|behaviou?r|action|task|phase)$", re.IGNORECASE)
 _STATE: Final = re.compile(r"(^|\.)(state|status)$", re.IGNORECASE)  # of anything, often of an arm

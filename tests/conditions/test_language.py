@@ -1,0 +1,120 @@
+"""What is a condition and what is none; a refusal names the place and what would be possible."""
+
+from __future__ import annotations
+
+import pytest
+
+from webots_mcp.conditions import parse_condition
+from webots_mcp.errors import InvalidConditionError
+
+
+@pytest.mark.parametrize(
+    ("text", "signals"),
+    [
+        ("front_m < 0.1", ["front_m"]),
+        ("front_m < 0.1 for 0.5", ["front_m"]),
+        ("(front_m < 0.1 for 0.5) and mode == 'drive'", ["front_m", "mode"]),
+        ("0 < sensors.front <= front[2] + 1", ["sensors.front", "front.2"]),
+        ("pose['x y'][0] > -.5e-3", ["pose.x y.0"]),
+        ("signal('front left').x > 1", ["front left.x"]),
+        ("changed(mode) or missing(lidar.min)", ["mode", "lidar.min"]),
+        ("not bumper", ["bumper"]),
+        ("rate(abs(speed - target)) > max(1, limit)", ["speed", "target", "limit"]),
+        ("displacement(3) < 0.05", []),
+        ("door == 'waiting for you'", ["door"]),
+        ("a.__class__ == 1", ["a.__class__"]),  # the name of a signal, nothing of Python's
+        ("Größe_m > 1 for 2", ["Größe_m"]),
+    ],
+)
+def test_a_condition_names_the_signals_that_it_reads(text: str, signals: list[str]) -> None:
+    condition = parse_condition(f"  {text} ")
+
+    assert condition.text == text
+    assert list(condition.signals) == signals
+    assert condition.asks_position == ("displacement" in text)
+
+
+@pytest.mark.parametrize(
+    ("text", "column", "why"),
+    [
+        ("front_m = 0.1", 9, "write =="),
+        ("front_m < ", 10, "missing at the end"),
+        ("front_m < 0.1 fro 0.5", 15, "'fro 0.5'"),
+        ("(front_m < 0.1", 1, "never closed"),
+        ("front_m < 0.1)", 14, "unmatched"),
+        ("a < 1 && b < 1", 7, "`and`"),
+        ("a < 'x", 5, "not closed"),
+        ("a < 1\nb < 2", 6, "one line"),
+        ("a < 1 for 1 for 2", 13, "parentheses"),
+        ("a < 1 for b", 11, "number of seconds"),
+        ("a < 1 for 0", 11, "above 0"),
+        ("a < 1 for 9999", 11, "at most 3600"),
+        ("max(a for 1, 3) < 2", 7, "parentheses"),
+        ("a, b < 1", 1, "commas"),
+        ("a ** 9 < 1", 1, "+ - * /"),
+        ("a // 2 < 1", 1, "+ - * /"),
+        ("a % 2 < 1", 3, "remainder"),
+        ("a[-1] < 1", 3, "from 0"),
+        ("a[b] < 1", 3, "from 0"),
+        ("a in b", 1, "no `in`"),
+        ("a is b", 1, "no `in` and no `is`"),
+        ("b if a else c", 1, "compares"),
+        ("lambda: a", 7, "lambdas"),
+        ("[a] < 1", 1, "needed here"),
+        ("(a < 1) + 1 < 2", 2, "needed here"),
+        ("a + 1", 1, "compares"),
+        ("'text' + a < 1", 1, "number"),
+        ("1 < 2", 1, "no signal"),
+        ("a == None", 6, "missing(x)"),
+        ("a < 1e999", 5, "1e+300"),
+        ("abs(a, b) < 1", 1, "one value"),
+        ("min(a) < 1", 1, "ranges.min"),
+        ("min(*a) < 1", 1, "values only"),
+        ("abs(x=a) < 1", 6, "=="),
+        ("changed(a) < 1", 1, "is a condition"),
+        ("chagned(a)", 1, "compares"),
+        ("chagned(a) == 1", 1, "changed()"),
+        ("a.b(1) < 1", 1, "functions"),
+        ("f'{a}' == b", 2, "space or an operator"),
+        ("0x10 < a", 2, "space or an operator"),
+        ("1j < a", 2, "space or an operator"),
+        ("a\\b < 1", 2, "no escapes"),
+        ("a @ b < 1", 3, "no meaning"),
+        ("a < 1 # why", 7, "no meaning"),
+        ("signal(a) < 1", 8, "in quotes"),
+        ("héé < 1 fr 2", 9, "'fr 2'"),
+    ],
+)
+def test_a_refusal_names_the_column_and_what_would_do(text: str, column: int, why: str) -> None:
+    with pytest.raises(InvalidConditionError, match=f"column {column}: ") as refused:
+        parse_condition(text)
+
+    assert why in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "   ",
+        "a < 1 or " * 60 + "a < 1",
+        "(" * 240 + "a < 1" + ")" * 240,
+        "-" * 400 + "a < 1",
+        "not " * 100 + "a",
+        "+".join(["a"] * 60) + " < 1",
+        "a" + "[0]" * 100 + " < 1",
+        "9" * 490 + " < a",
+    ],
+)
+def test_what_is_empty_long_or_deep_is_refused(text: str) -> None:
+    with pytest.raises(InvalidConditionError):
+        parse_condition(text)
+
+
+def test_unknown_signals_are_told_with_the_nearest_ones() -> None:
+    condition = parse_condition("frnt_m < 0.1 and mode == 'drive'")
+
+    (told,) = condition.describe_unknown(["front_m", "mode", "speed"])
+
+    assert told.startswith("frnt_m is missing as long as it is not published; there is front_m")
+    assert "nothing is yet" in condition.describe_unknown([])[0]

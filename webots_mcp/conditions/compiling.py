@@ -1,0 +1,419 @@
+"""A parsed condition as closures: each node that is allowed has one place here, no other has any.
+
+Nothing is evaluated as Python.
+"""
+
+from __future__ import annotations
+
+import ast
+import math
+import operator
+from collections.abc import Callable
+from functools import reduce
+from typing import Any, Final, NoReturn, TypeAlias, cast
+
+from webots_mcp.conditions.memory import Changed, Displacement, Lasting, Memory, Rate
+from webots_mcp.conditions.reading import Plain, PositionReader, Read, State, reader
+from webots_mcp.conditions.scanning import Scanned, refusal
+from webots_mcp.errors import ConditionFailedError
+from webots_mcp.naming import Value, nearest_first
+
+MAX_DEPTH: Final = 50
+MAX_DURATION_S: Final = 3600.0
+MAX_NUMBER: Final = 1e300
+MAX_NAME_CHARACTERS: Final = 200
+
+Number: TypeAlias = "int | float"
+Holds: TypeAlias = Callable[[State], bool]
+Compare: TypeAlias = Callable[[Value, Value], bool]
+ReadNumber: TypeAlias = Callable[[State], "Number | None"]
+
+_COMPARISONS: Final[dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]]] = {
+    ast.Lt: ("<", operator.lt),
+    ast.LtE: ("<=", operator.le),
+    ast.Gt: (">", operator.gt),
+    ast.GtE: (">=", operator.ge),
+    ast.Eq: ("==", operator.eq),
+    ast.NotEq: ("!=", operator.ne),
+}
+_ARITHMETIC: Final[dict[type[ast.operator], Callable[[Any, Any], Any]]] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: lambda a, b: a / b,
+}
+_FLAGS: Final = {"true": True, "false": False, "True": True, "False": False}
+_OF_NUMBERS: Final[dict[str, Callable[..., Any]]] = {"abs": abs, "min": min, "max": max}
+_GIVING_FLAGS: Final = ("changed", "missing")
+FUNCTIONS: Final = (*_OF_NUMBERS, *_GIVING_FLAGS, "rate", "displacement", "signal")
+
+
+class Compiler:
+    """Makes closures of the nodes of one condition.
+
+    Attributes:
+        readers: What reads each signal that is named, by its name.
+        memories: What has to take in every state, in this order.
+        position: Where displacements are read from; None if there are none.
+        root: Whether the condition holds.
+    """
+
+    def __init__(self, scanned: Scanned, tree: ast.expr, plain: Plain) -> None:
+        self._scanned = scanned
+        self._plain = plain
+        self._durations = set(scanned.durations)
+        self._encoded = scanned.source.encode()
+        self.readers: dict[str, Read] = {}
+        self.memories: list[Memory] = []
+        self.position: PositionReader | None = None
+        self._require_shallow(tree)
+        self.root = self._condition(tree)
+        for place in self._durations:
+            self._refuse_at(place, "`for` follows a condition: put parentheses around both")
+        if not self.readers and self.position is None:
+            self._refuse_at(0, "no signal is named: it would hold always or never")
+
+    # -- conditions ----------------------------------------------------------------------------
+
+    def _condition(self, node: ast.expr) -> Holds:
+        if isinstance(node, ast.BoolOp):
+            parts = tuple(self._condition(value) for value in node.values)
+            return _all_of(parts) if isinstance(node.op, ast.And) else _any_of(parts)
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
+            return _not(self._condition(node.operand))
+        if isinstance(node, ast.Compare):
+            return self._comparison(node)
+        if isinstance(node, ast.Tuple):
+            return self._lasting(node)
+        if _function_of(node) in _GIVING_FLAGS:
+            return self._flag_of(cast("ast.Call", node))
+        if _is_signal(node):
+            return self._flag(node)
+        self._refuse(node, "this is a value; a condition compares it, as in `x < 1`")
+
+    def _comparison(self, node: ast.Compare) -> Holds:
+        sides = [node.left, *node.comparators]
+        for op in node.ops:
+            if type(op) not in _COMPARISONS:
+                self._refuse(node, "compare with < <= > >= == !=; there is no `in` and no `is`")
+        reads = [self._value(side) for side in sides]
+        steps = [
+            (read, self._compare(op, side))
+            for read, op, side in zip(reads[1:], node.ops, sides, strict=False)
+        ]
+        return _pair(reads[0], *steps[0]) if len(steps) == 1 else _chain(reads[0], tuple(steps))
+
+    def _compare(self, op: ast.cmpop, left: ast.expr) -> Compare:
+        sign, compare = _COMPARISONS[type(op)]
+        column = self._column(left)
+
+        def holds(a: Value, b: Value) -> bool:
+            if a is None or b is None:
+                return False
+            try:
+                return compare(a, b)
+            except TypeError:
+                raise self._failure(column, f"{_said(a)} {sign} {_said(b)}?") from None
+
+        return holds
+
+    def _lasting(self, node: ast.Tuple) -> Holds:
+        """A pair whose comma is a `for`; there are no other commas outside of calls."""
+        places = self._durations_between(node)
+        if not places:
+            self._refuse(node, "commas stand between the values of a function only")
+        if len(node.elts) != 2:
+            self._refuse_at(places[-1], "`for` takes one number of seconds; use parentheses")
+        self._durations.difference_update(places)
+        condition, seconds = node.elts
+        held = self._keep(Lasting(self._condition(condition), self._seconds(seconds, "for")))
+        return held.holds
+
+    def _durations_between(self, node: ast.Tuple) -> list[int]:
+        start, end = self._column(node), self._end_column(node)
+        inner = [(self._column(part), self._end_column(part)) for part in node.elts]
+        return sorted(
+            place
+            for place in self._durations
+            if start <= place < end and not any(a <= place < b for a, b in inner)
+        )
+
+    def _flag_of(self, node: ast.Call) -> Holds:
+        value = self._value(self._only(node))
+        if _function_of(node) == "missing":
+            return lambda state: value(state) is None
+        return self._keep(Changed(value)).holds
+
+    def _flag(self, node: ast.expr) -> Holds:
+        """A signal by itself: a flag that is true, or a number other than 0."""
+        read, column = self._signal(node), self._column(node)
+
+        def holds(state: State) -> bool:
+            value = read(state)
+            if value.__class__ is str:
+                raise self._failure(column, f"{_said(value)} by itself is no condition")
+            return bool(value)
+
+        return holds
+
+    # -- values --------------------------------------------------------------------------------
+
+    def _value(self, node: ast.expr) -> Read:
+        """A number, a flag, a text or None."""
+        if isinstance(node, ast.Name) and node.id in _FLAGS:
+            return _constant(_FLAGS[node.id])
+        if isinstance(node, ast.Constant):
+            return _constant(self._constant(node))
+        return self._signal(node) if _is_signal(node) else self._number(node)
+
+    def _number(self, node: ast.expr) -> ReadNumber:
+        if isinstance(node, ast.Constant):
+            value = self._constant(node)
+            return (
+                self._refuse(node, "a number is needed here")
+                if isinstance(value, (str, bool))
+                else _constant(value)
+            )
+        if _is_signal(node):
+            return self._number_of(self._signal(node), node)
+        if isinstance(node, ast.BinOp):
+            return self._arithmetic(node)
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
+            number = self._number(node.operand)
+            return number if isinstance(node.op, ast.UAdd) else _negative(number)
+        if isinstance(node, ast.Call):
+            return self._call(node)
+        self._refuse(node, "a number, a text or a signal is needed here")
+
+    def _number_of(self, read: Read, node: ast.expr) -> ReadNumber:
+        column = self._column(node)
+
+        def number(state: State) -> Number | None:
+            value = read(state)
+            if value.__class__ is str:
+                raise self._failure(column, f"{_said(value)} is no number")
+            return value  # pyright: ignore[reportReturnType]
+
+        return number
+
+    def _arithmetic(self, node: ast.BinOp) -> ReadNumber:
+        if type(node.op) not in _ARITHMETIC:
+            self._refuse(node, "there are + - * / only")
+        left, right = self._number(node.left), self._number(node.right)
+        apply = _ARITHMETIC[type(node.op)]
+
+        def number(state: State) -> Number | None:
+            a, b = left(state), right(state)
+            if a is None or b is None:
+                return None
+            try:
+                result = apply(a, b)
+            except (ZeroDivisionError, OverflowError):
+                return None
+            return result if -math.inf < result < math.inf else None
+
+        return number
+
+    def _call(self, node: ast.Call) -> ReadNumber:
+        name = _function_of(node)
+        if name in _GIVING_FLAGS:
+            self._refuse(node, f"{name}(...) is a condition, not a number")
+        if name == "rate":
+            return self._keep(Rate(self._number(self._only(node)))).read
+        if name == "displacement":
+            return self._displacement(self._only(node))
+        if name in _OF_NUMBERS:
+            return self._of_numbers(node, name)
+        self._refuse(node, self._unknown_function(node))
+
+    def _displacement(self, node: ast.expr) -> ReadNumber:
+        if self.position is None:
+            self.position = PositionReader(self._plain)
+        seconds = self._seconds(node, "displacement")
+        return self._keep(Displacement(self.position.read, seconds)).read
+
+    def _of_numbers(self, node: ast.Call, name: str) -> ReadNumber:
+        self._require_plain_call(node)
+        if (len(node.args) == 1) != (name == "abs") or not node.args:
+            count = "one value" if name == "abs" else "two or more values"
+            hint = "" if name == "abs" else f"; of a long array there is ranges.{name}"
+            self._refuse(node, f"{name} takes {count}{hint}")
+        numbers = tuple(self._number(each) for each in node.args)
+        return _applied(_OF_NUMBERS[name], numbers)
+
+    def _keep(self, memory: Any) -> Any:
+        """After those that it is made of: they are up to date when it is its turn."""
+        self.memories.append(memory)
+        return memory
+
+    # -- signals and constants -----------------------------------------------------------------
+
+    def _signal(self, node: ast.expr) -> Read:
+        name = self._name(node)
+        if len(name) > MAX_NAME_CHARACTERS:
+            self._refuse(node, f"a name has at most {MAX_NAME_CHARACTERS} characters")
+        if name not in self.readers:
+            self.readers[name] = reader(name, self._plain)
+        return self.readers[name]
+
+    def _name(self, node: ast.expr) -> str:
+        if isinstance(node, ast.Name):
+            return node.id
+        if isinstance(node, ast.Attribute):
+            return f"{self._name(node.value)}.{node.attr}"
+        if isinstance(node, ast.Subscript):
+            return f"{self._name(node.value)}.{self._item(node.slice)}"
+        if isinstance(node, ast.Call) and _function_of(node) == "signal":
+            return self._quoted_name(self._only(node))
+        self._refuse(node, "a signal is needed here")
+
+    def _quoted_name(self, node: ast.expr) -> str:
+        if isinstance(node, ast.Constant) and isinstance(node.value, str) and node.value:
+            return node.value
+        self._refuse(node, "signal() takes a name in quotes, as in signal('front left.x')")
+
+    def _item(self, node: ast.expr) -> str:
+        value = node.value if isinstance(node, ast.Constant) else None
+        if (type(value) is int or type(value) is str) and len(str(value)) < MAX_NAME_CHARACTERS:
+            return str(value)
+        self._refuse(node, "an item is a number from 0, or a key in quotes, as in front[2]")
+
+    def _constant(self, node: ast.Constant) -> Number | str:
+        value = node.value
+        if type(value) is str or type(value) is bool:
+            return value
+        if type(value) not in (int, float):
+            self._refuse(node, "it has no meaning here; for no value, write missing(x)")
+        number = cast("int | float", value)
+        if abs(number) > MAX_NUMBER:
+            self._refuse(node, f"numbers are up to {MAX_NUMBER:g}")
+        return number
+
+    def _seconds(self, node: ast.expr, of: str) -> float:
+        value = node.value if isinstance(node, ast.Constant) else None
+        if type(value) not in (int, float):
+            self._refuse(node, f"`{of}` takes a plain number of seconds, such as 0.5")
+        seconds = cast("int | float", value)
+        if not 0 < seconds <= MAX_DURATION_S:
+            self._refuse(node, f"seconds are above 0 and at most {MAX_DURATION_S:g}")
+        return float(seconds)
+
+    # -- refusals ------------------------------------------------------------------------------
+
+    def _only(self, node: ast.Call) -> ast.expr:
+        self._require_plain_call(node)
+        if len(node.args) != 1:
+            self._refuse(node, f"{_function_of(node)} takes one value, not {len(node.args)}")
+        return node.args[0]
+
+    def _require_plain_call(self, node: ast.Call) -> None:
+        if node.keywords or any(isinstance(each, ast.Starred) for each in node.args):
+            self._refuse(node, "a function takes values only, as in max(a, b)")
+
+    def _unknown_function(self, node: ast.Call) -> str:
+        name = _function_of(node)
+        if name is None:
+            return "only functions can be called: " + ", ".join(FUNCTIONS)
+        offer = ", ".join(f"{each}()" for each in nearest_first(name, FUNCTIONS))
+        return f"there is no {name}(); there are {offer}"
+
+    def _require_shallow(self, tree: ast.expr) -> None:
+        level: list[ast.AST] = [tree]
+        for _ in range(MAX_DEPTH):
+            level = [child for node in level for child in ast.iter_child_nodes(node)]
+        if level:
+            self._refuse_at(0, f"it is nested over {MAX_DEPTH} levels: make it simpler")
+
+    def _column(self, node: ast.expr) -> int:
+        return len(self._encoded[: node.col_offset].decode())
+
+    def _end_column(self, node: ast.expr) -> int:
+        return len(self._encoded[: node.end_col_offset].decode())
+
+    def _refuse(self, node: ast.expr, why: str) -> NoReturn:
+        self._refuse_at(self._column(node), why)
+
+    def _refuse_at(self, column: int, why: str) -> NoReturn:
+        raise refusal(self._scanned.original, column, why)
+
+    def _failure(self, column: int, why: str) -> ConditionFailedError:
+        text = self._scanned.original
+        return ConditionFailedError(f"condition {text!r}, column {column + 1}: {why}")
+
+
+def _is_signal(node: ast.expr) -> bool:
+    if isinstance(node, ast.Name):
+        return node.id not in _FLAGS
+    return isinstance(node, (ast.Attribute, ast.Subscript)) or _function_of(node) == "signal"
+
+
+def _function_of(node: ast.expr) -> str | None:
+    """The name of the function that is called; None where none is."""
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+        return node.func.id
+    return None
+
+
+def _said(value: Value) -> str:
+    if isinstance(value, bool):
+        return f"the flag {str(value).lower()}"
+    return f"the text {value[:50]!r}" if isinstance(value, str) else f"the number {value}"
+
+
+def _constant(value: Any) -> Callable[[State], Any]:
+    return lambda state: value
+
+
+def _negative(number: ReadNumber) -> ReadNumber:
+    def negative(state: State) -> Number | None:
+        value = number(state)
+        return None if value is None else -value
+
+    return negative
+
+
+def _applied(function: Callable[..., Any], numbers: tuple[ReadNumber, ...]) -> ReadNumber:
+    def applied(state: State) -> Number | None:
+        values = [number(state) for number in numbers]
+        return None if None in values else function(*values)
+
+    return applied
+
+
+def _pair(left: Read, right: Read, compare: Compare) -> Holds:
+    return lambda state: compare(left(state), right(state))
+
+
+def _chain(first: Read, steps: tuple[tuple[Read, Compare], ...]) -> Holds:
+    """`0 < x < 1`: each value is read once."""
+
+    def holds(state: State) -> bool:
+        left = first(state)
+        for read, compare in steps:
+            right = read(state)
+            if not compare(left, right):
+                return False
+            left = right
+        return True
+
+    return holds
+
+
+def _not(condition: Holds) -> Holds:
+    return lambda state: not condition(state)
+
+
+def _all_of(conditions: tuple[Holds, ...]) -> Holds:
+    return reduce(_both, conditions)
+
+
+def _any_of(conditions: tuple[Holds, ...]) -> Holds:
+    return reduce(_either, conditions)
+
+
+def _both(left: Holds, right: Holds) -> Holds:
+    return lambda state: left(state) and right(state)
+
+
+def _either(left: Holds, right: Holds) -> Holds:
+    return lambda state: left(state) or right(state)

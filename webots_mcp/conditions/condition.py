@@ -1,0 +1,141 @@
+"""A condition, and whether it holds as one state follows another."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from webots_mcp.conditions.compiling import Compiler
+from webots_mcp.conditions.memory import SAME_TIME_S
+from webots_mcp.conditions.reading import Plain, State
+from webots_mcp.conditions.scanning import Scanned, refusal, scan
+from webots_mcp.errors import InvalidConditionError
+from webots_mcp.naming import Value, nearest_first
+
+_MOST_OFFERED: Final = 3
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition of the language in docs/conditions.md.
+
+    Attributes:
+        text: Without the spaces around it.
+        signals: The names of those that it reads, in order, without the position's.
+        asks_position: Whether it asks where the robot is.
+    """
+
+    text: str
+    signals: tuple[str, ...]
+    asks_position: bool
+    _scanned: Scanned = field(repr=False, compare=False)
+    _tree: ast.expr = field(repr=False, compare=False)
+
+    def evaluator(self, plain: Plain = _as_it_is) -> Evaluator:
+        """Something that follows one robot from state to state.
+
+        Args:
+            plain: The counterpart that a row holds, in JSON's terms, of a value that is not plain
+                JSON; recorded rows hold no others.
+        """
+        return Evaluator(Compiler(self._scanned, self._tree, plain), plain)
+
+    def describe_unknown(self, known: Collection[str]) -> list[str]:
+        """A sentence for each of its signals that is not among the known ones."""
+        return [_unknown(name, known) for name in self.signals if name not in known]
+
+
+class Evaluator:
+    """Whether a condition holds, with each state that follows.
+
+    Attributes:
+        sim_time_s: Of the state that was taken in last; None at the begin of a run.
+    """
+
+    def __init__(self, compiled: Compiler, plain: Plain) -> None:
+        self._root = compiled.root
+        self._memories = tuple(compiled.memories)
+        self._readers = compiled.readers
+        self._position = compiled.position
+        self._plain = plain
+        self.sim_time_s: float | None = None
+
+    def holds(self, state: State, sim_time_s: float) -> bool:
+        """Take in the next state. A time that goes back begins a new run: all before is forgotten.
+
+        Raises:
+            ConditionFailedError: The values are not of the kinds that it can be asked of.
+        """
+        if self.sim_time_s is not None and sim_time_s < self.sim_time_s - SAME_TIME_S:
+            self.forget()
+        self.sim_time_s = sim_time_s
+        if state.__class__ is not dict:
+            state = self._as_dict(state)
+        for memory in self._memories:
+            memory.update(state, sim_time_s)
+        return self._root(state)
+
+    def forget(self) -> None:
+        """A new run begins."""
+        self.sim_time_s = None
+        for memory in self._memories:
+            memory.forget()
+
+    def values(self, state: State) -> dict[str, Value]:
+        """The signals of the condition as they are in a state; None where they are missing."""
+        state = self._as_dict(state)
+        names = self._position.names if self._position is not None else None
+        place = self._position.read(state) if self._position is not None else None
+        values = {name: read(state) for name, read in self._readers.items()}
+        return values | dict(zip(names, place or (None, None), strict=True)) if names else values
+
+    def _as_dict(self, state: State) -> dict[Any, Any]:
+        if state.__class__ is dict:
+            return state
+        plain = self._plain(state)
+        return plain if plain.__class__ is dict else {}
+
+
+def parse_condition(text: str) -> Condition:
+    """Read a condition.
+
+    Raises:
+        InvalidConditionError: It is not of the language; the text names the column and what would
+            be possible there.
+    """
+    scanned = scan(text)
+    tree = _parse(scanned)
+    compiled = Compiler(scanned, tree, _as_it_is)
+    return Condition(
+        scanned.original, tuple(compiled.readers), compiled.position is not None, scanned, tree
+    )
+
+
+def _parse(scanned: Scanned) -> ast.expr:
+    try:
+        return ast.parse(scanned.source, mode="eval").body
+    except SyntaxError as error:
+        column = error.offset - 1 if error.offset else len(scanned.original)
+        raise refusal(scanned.original, column, _why_unread(scanned, column, error)) from None
+    except (RecursionError, MemoryError, ValueError):
+        raise InvalidConditionError(f"condition {scanned.original!r} is nested too deep") from None
+
+
+def _why_unread(scanned: Scanned, column: int, error: SyntaxError) -> str:
+    if "never closed" in str(error.msg) or "unmatched" in str(error.msg):
+        return str(error.msg)
+    rest = scanned.original[column:].strip()
+    return f"not understood from {rest[:20]!r} on" if rest else "something is missing at the end"
+
+
+def _unknown(name: str, known: Collection[str]) -> str:
+    if not known:
+        return f"{name} is missing as long as it is not published; nothing is yet"
+    offer = ", ".join(nearest_first(name, known)[:_MOST_OFFERED])
+    return f"{name} is missing as long as it is not published; there is {offer}"

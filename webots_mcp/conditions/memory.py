@@ -1,0 +1,177 @@
+"""What a condition keeps of the states before: the last value, a rate, a way, since when it holds.
+
+All of it is brought up to date with every state, whatever `and` and `or` leave unasked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Final, Protocol
+
+from webots_mcp.conditions.reading import Read, State
+from webots_mcp.errors import ConditionFailedError
+from webots_mcp.naming import Value
+
+SAME_TIME_S: Final = 1e-6  # a clock that adds up steps is off by less
+_PLACES_KEPT: Final = 200  # of one displacement
+
+
+class Memory(Protocol):
+    """Something that is kept from state to state."""
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """Take in a state."""
+        ...
+
+    def forget(self) -> None:
+        """A new run has begun."""
+        ...
+
+
+class Changed:
+    """Whether a value is another than the last one that was there."""
+
+    def __init__(self, read: Read) -> None:
+        self._read = read
+        self._error: ConditionFailedError | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """What comes first is no change."""
+        self._last: Value = None
+        self._changed = False
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """A missing value is no change, and neither is its return as it was."""
+        self._error = None
+        try:
+            value = self._read(state)
+        except ConditionFailedError as error:
+            self._error = error
+            return
+        self._changed = value is not None and self._last is not None and value != self._last
+        if value is not None:
+            self._last = value
+
+    def holds(self, state: State) -> bool:
+        """As of the state that was taken in last."""
+        if self._error is not None:
+            raise self._error
+        return self._changed
+
+
+class Rate:
+    """How fast a value changes, per second, from one state that has it to the next."""
+
+    def __init__(self, read: Callable[[State], int | float | None]) -> None:
+        self._read = read
+        self._error: ConditionFailedError | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """There is a rate from the second value on."""
+        self._last: tuple[float, float] | None = None
+        self._rate: float | None = None
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """While time stands still the rate stays as it is."""
+        self._error = None
+        try:
+            value = self._read(state)
+        except ConditionFailedError as error:
+            self._error = error
+            return
+        if value is None:
+            self._rate = None
+        elif self._last is None:
+            self._last = (sim_time_s, value)
+        elif (passed_s := sim_time_s - self._last[0]) > SAME_TIME_S:
+            rate = (value - self._last[1]) / passed_s
+            self._rate = rate if -math.inf < rate < math.inf else None
+            self._last = (sim_time_s, value)
+
+    def read(self, state: State) -> float | None:
+        """As of the state that was taken in last."""
+        if self._error is not None:
+            raise self._error
+        return self._rate
+
+
+class Displacement:
+    """Metres between where the robot is and where it was so many seconds ago."""
+
+    def __init__(
+        self, place: Callable[[State], tuple[float, float] | None], seconds: float
+    ) -> None:
+        self._place = place
+        self._seconds = seconds
+        self._apart_s = seconds / _PLACES_KEPT
+        self.forget()
+
+    def forget(self) -> None:
+        """There is a displacement once the run has lasted for that time."""
+        self._places: deque[tuple[float, float, float]] = deque()
+        self._here: tuple[float, float] | None = None
+        self._sim_time_s = 0.0
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """Keeps 200 places at most; the one it compares with is older by half a percent at most."""
+        self._sim_time_s = sim_time_s
+        self._here = place = self._place(state)
+        if place is None:
+            return
+        places = self._places
+        if not places or sim_time_s - places[-1][0] >= self._apart_s:
+            places.append((sim_time_s, *place))
+            then_s = sim_time_s - self._seconds + SAME_TIME_S
+            while len(places) > 1 and places[1][0] <= then_s:
+                places.popleft()
+
+    def read(self, state: State) -> float | None:
+        """As of the state that was taken in last."""
+        if self._here is None:
+            return None
+        was_s, was_x, was_y = self._places[0]
+        age_s = self._sim_time_s - was_s
+        if not -SAME_TIME_S <= age_s - self._seconds <= self._seconds + SAME_TIME_S:
+            return None
+        return math.hypot(self._here[0] - was_x, self._here[1] - was_y)
+
+
+class Lasting:
+    """Whether a condition held in every state of at least so many seconds."""
+
+    def __init__(self, condition: Callable[[State], bool], seconds: float) -> None:
+        self._condition = condition
+        self._seconds = seconds
+        self._error: ConditionFailedError | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """It holds since no time at all."""
+        self._since_s: float | None = None
+        self._long_enough = False
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """Between two states in both of which it holds it counts as unbroken."""
+        self._error = None
+        try:
+            holds = self._condition(state)
+        except ConditionFailedError as error:
+            self._error = error
+            return
+        if not holds:
+            self._since_s = None
+            self._long_enough = False
+            return
+        if self._since_s is None:
+            self._since_s = sim_time_s
+        self._long_enough = sim_time_s - self._since_s >= self._seconds - SAME_TIME_S
+
+    def holds(self, state: State) -> bool:
+        """As of the state that was taken in last."""
+        if self._error is not None:
+            raise self._error
+        return self._long_enough

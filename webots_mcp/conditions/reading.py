@@ -1,0 +1,219 @@
+"""One value of a published state by its dotted name: as `flatten` of the recorded row gives it.
+
+A whole state is not flattened for that: a condition has two microseconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from typing import Any, Final, TypeAlias
+
+from webots_mcp.naming import (
+    FARTHEST_M,
+    INDEXES,
+    LONGEST_SPREAD_ARRAY,
+    REDUCTIONS,
+    Value,
+    find_position,
+    flatten,
+    mean_of,
+    reduce_array,
+)
+
+State: TypeAlias = Any  # what a controller publishes: usually a dict, with anything in it
+Read: TypeAlias = Callable[[State], Value]
+Plain: TypeAlias = Callable[[Any], Any]
+
+_LEAVES: Final = frozenset((float, int, str, bool, type(None)))
+_NUMBERS: Final = frozenset((float, int))
+_LONGEST_TEXT: Final = 10_000  # characters; a row may hold less of a longer one
+_LONGEST_ARRAY: Final = 4000  # items; a row may hold nothing of a longer one
+_MOST_NAMES: Final = 2000
+_LOOKS_APART: Final = 16
+_INFINITY: Final = math.inf
+_NUMERIC: Final = frozenset("-0123456789")
+_LONGEST_NUMBER: Final = 30  # characters
+_CONSTANT_KEYS: Final[dict[str, object]] = {"null": None, "true": True, "false": False}
+
+
+def reader(name: str, plain: Plain) -> Read:
+    """What reads the signal of that name from a state; None where it has no value.
+
+    NaN and the infinities are no values: a row holds null in their place.
+
+    Args:
+        name: Dotted.
+        plain: The counterpart that a row holds, in JSON's terms, of what is not plain JSON.
+    """
+    part, _, rest = name.partition(".")
+    deeper = reader(rest, plain) if rest else None
+    others = _other_keys(name)
+    index = INDEXES.index(part) if part in INDEXES else -1
+
+    def read(container: State) -> Value:
+        kind = container.__class__
+        if kind is dict:
+            if part not in container:
+                return whole(container) if is_unclear(container) else None
+            for other in others:
+                if other in container:
+                    return whole(container)
+            value = container[part]
+        elif (kind is list or kind is tuple) and len(container) <= LONGEST_SPREAD_ARRAY:
+            if not 0 <= index < len(container):
+                return None
+            value = container[index]
+        else:
+            return read_other(container)
+        if deeper is not None:
+            return deeper(value)
+        if value.__class__ is float:
+            return value if -_INFINITY < value < _INFINITY else None
+        return _leaf(value, plain)
+
+    def is_unclear(container: dict[Any, Any]) -> bool:
+        """Whether a key that holds a dot, or is no text, may give a value that name."""
+        try:
+            "".join(container)
+        except TypeError:
+            return True
+        for other in others:  # noqa: SIM110  (twice as fast as any())
+            if other in container:
+                return True
+        return False
+
+    def whole(container: dict[Any, Any]) -> Value:
+        """The slow way that is always right."""
+        return _leaf(flatten(plain(container)).get(name), plain)
+
+    def read_other(container: State) -> Value:
+        """Of a long array, of nothing that could have parts, or of what is not plain JSON."""
+        kind = container.__class__
+        if kind is list or kind is tuple:
+            return _reduced(container, name, plain) if name in REDUCTIONS else None
+        if kind in _LEAVES:
+            return None
+        container = plain(container)
+        return read(container) if container.__class__ in (dict, list) else None
+
+    return read
+
+
+def _other_keys(name: str) -> tuple[object, ...]:
+    """Keys of a dict that give its values the same name: one with a dot in it, or the number 1."""
+    parts = name.split(".")
+    texts = [".".join(parts[:count]) for count in range(1, len(parts) + 1)]
+    return (*texts[1:], *(key for text in texts for key in _keys_written(text)))
+
+
+def _keys_written(text: str) -> Iterable[object]:
+    """The key that is no text and that JSON writes like that."""
+    if text in _CONSTANT_KEYS:
+        yield _CONSTANT_KEYS[text]
+    if text[:1] in _NUMERIC and len(text) < _LONGEST_NUMBER:
+        with suppress(ValueError):
+            yield float(text)  # equals an integer key too
+
+
+def _leaf(value: Any, plain: Plain) -> Value:
+    """A value as a row holds it."""
+    kind = value.__class__
+    if kind is float:
+        return value if -_INFINITY < value < _INFINITY else None
+    if kind is bool or value is None:
+        return value
+    if kind is int:
+        return value if -(2**63) <= value < 2**63 else _nearest_float(value)
+    if kind is str and value.isascii() and len(value) <= _LONGEST_TEXT:
+        return value
+    if kind in (dict, list, tuple):
+        return None
+    value = plain(value)
+    if value.__class__ is float and not math.isfinite(value):
+        return None
+    return value if value.__class__ in _LEAVES else None
+
+
+def _nearest_float(number: int) -> float | None:
+    try:
+        return float(number)
+    except OverflowError:
+        return None
+
+
+def _reduced(array: list[Any] | tuple[Any, ...], reduction: str, plain: Plain) -> Value:
+    """One reduction of a long array; of nothing but ordinary numbers at the speed of C."""
+    if len(array) <= _LONGEST_ARRAY and _is_usual(array):
+        return _REDUCE[reduction](array)
+    as_in_row = plain(array)
+    if as_in_row.__class__ is not list:
+        return None
+    usable = [_leaf(item, plain) for item in as_in_row]
+    return reduce_array(usable)[REDUCTIONS.index(reduction)]
+
+
+def _is_usual(array: list[Any] | tuple[Any, ...]) -> bool:
+    """Whether it holds nothing but numbers that a row holds as they are."""
+    kinds = set(map(type, array))
+    if not kinds <= _NUMBERS:
+        return False
+    try:
+        finite = math.isfinite(sum(array))
+    except OverflowError:
+        return False
+    return finite and (int not in kinds or -(2.0**63) <= min(array) <= max(array) < 2.0**63)
+
+
+_REDUCE: Final[dict[str, Callable[[Any], Value]]] = {
+    "count": len,
+    "min": min,
+    "max": max,
+    "mean": mean_of,
+    "argmin": lambda array: array.index(min(array)),
+}
+
+
+class PositionReader:
+    """Reads where a robot is: from the signals that the tools take its position from."""
+
+    def __init__(self, plain: Plain) -> None:
+        self._plain = plain
+        self._keys: set[object] = set()
+        self._numeric: set[str] = set()
+        self._looks = 0
+        self._x: Read | None = None
+        self._y: Read | None = None
+        self.names: tuple[str, str] | None = None
+
+    def read(self, state: State) -> tuple[float, float] | None:
+        """X and y in metres; None where the state has no position."""
+        self._look(state)
+        if self._x is None or self._y is None:
+            return None
+        x: Any = self._x(state)
+        y: Any = self._y(state)
+        try:
+            near = -FARTHEST_M <= x <= FARTHEST_M and -FARTHEST_M <= y <= FARTHEST_M
+        except TypeError:  # a text, or no value
+            return None
+        return (x, y) if near else None
+
+    def _look(self, state: State) -> None:
+        """Find out the names, at first and when there are keys that were not there before."""
+        self._looks += 1
+        if self._looks % _LOOKS_APART != 1 or (self.names and self._keys.issuperset(state)):
+            return
+        if len(self._numeric) >= _MOST_NAMES or len(self._keys) >= _MOST_NAMES:
+            return
+        self._keys.update(state)
+        leaves = flatten(self._plain(state))
+        self._numeric.update(name for name, value in leaves.items() if _may_be_number(value))
+        if (names := find_position(self._numeric)) != self.names and names is not None:
+            self.names = names
+            self._x, self._y = (reader(name, self._plain) for name in names)
+
+
+def _may_be_number(value: Value) -> bool:
+    return value.__class__ is not str and value.__class__ is not bool

@@ -1,5 +1,5 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 4;
+PRAGMA user_version = 5;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
@@ -84,7 +84,7 @@ CREATE TABLE run (
 	end_reason TEXT /* finished, reset, reload, crashed, replaced */, 
 	rows INTEGER DEFAULT 0 NOT NULL /* state rows, as of last_wall_time_s */, 
 	label TEXT, 
-	note TEXT, keep INTEGER /* 1: retention deletes nothing of this run */ DEFAULT 0 NOT NULL, purged_rows INTEGER /* of the rows, those that retention has deleted */ DEFAULT 0 NOT NULL, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, rolled_state_id INTEGER DEFAULT 0 /* last state.id in the rollups, where beyond the watermark */ NOT NULL, 
+	note TEXT, keep INTEGER /* 1: retention deletes nothing of this run */ DEFAULT 0 NOT NULL, purged_rows INTEGER /* of the rows, those that retention has deleted */ DEFAULT 0 NOT NULL, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, rolled_state_id INTEGER DEFAULT 0 /* last state.id in the rollups, where beyond the watermark */ NOT NULL, coarse_end INTEGER /* buckets of coarse_rollup below it are complete; null before the first */ NULL, 
 	CONSTRAINT fk_run_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
 	CONSTRAINT fk_run_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE CASCADE
 );
@@ -376,4 +376,27 @@ SELECT (
   l.run_id, l.id AS log_id, l.sim_time_s,
   strftime('%Y-%m-%d %H:%M:%f', l.wall_time_s, 'unixepoch') AS utc, l.level, l.source, l.logger, l.message
 FROM log l;
-INSERT INTO alembic_version (version_num) VALUES ('0004');
+CREATE TABLE coarse_rollup (
+	run_id INTEGER NOT NULL, 
+	signal_id INTEGER NOT NULL /* signal.id, of the run's robot */, 
+	bucket INTEGER NOT NULL /* floor(sim_time_s / 500) */, 
+	rows INTEGER DEFAULT 0 NOT NULL /* state rows that held the signal */, 
+	present INTEGER DEFAULT 0 NOT NULL /* of them with a value */, 
+	changes INTEGER DEFAULT 0 NOT NULL /* of the values, those unlike the one before in the bucket */, 
+	first FLOAT /* of numbers and flags (0, 1); null for text, as all that follows */, 
+	first_sim_time_s FLOAT, 
+	last FLOAT, 
+	last_sim_time_s FLOAT, 
+	min FLOAT, 
+	min_sim_time_s FLOAT /* of the first such extreme */, 
+	max FLOAT, 
+	max_sim_time_s FLOAT /* of the first such extreme */, 
+	sum FLOAT, 
+	squares FLOAT /* sum of squared deviations from sum / count */, 
+	sines FLOAT /* angles only: sum of sines */, 
+	cosines FLOAT /* angles only: sum of cosines */, 
+	PRIMARY KEY (run_id, signal_id, bucket), 
+	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+)
+ WITHOUT ROWID;
+INSERT INTO alembic_version (version_num) VALUES ('0005');

@@ -157,6 +157,9 @@ class Run(SQLModel, table=True):
     purged_rows: int = _count("of the rows, those that retention has deleted")
     uuid: str | None = _text(_UUID)
     rolled_state_id: int = _count("last state.id in the rollups, where beyond the watermark")
+    coarse_end: int | None = _column(
+        Integer, "buckets of coarse_rollup below it are complete; null before the first"
+    )
 
 
 class State(SQLModel, table=True):
@@ -245,6 +248,16 @@ class RecentRollup(_Summary, table=True):
     run_id: int = _key("run")
     bucket: int = _key(None, "floor(sim_time_s / 10)")
     signal_id: int = _key(None, "signal.id, of the run's robot")
+
+
+class CoarseRollup(_Summary, table=True):
+    """500 s of one signal in one run: what its rollups of 10 s come to, for long recordings."""
+
+    __tablename__ = "coarse_rollup"  # pyright: ignore[reportAssignmentType]
+    __table_args__ = {"sqlite_with_rowid": False}
+    run_id: int = _key("run")
+    signal_id: int = _key(None, "signal.id, of the run's robot")
+    bucket: int = _key(None, "floor(sim_time_s / 500)")
 
 
 class Change(SQLModel, table=True):

@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Final, cast
 
+from webots_mcp.connection import is_about_a_value, is_damage
+
 MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
 MAX_SIM_TIME_S: Final = 1e10
 MAX_WALL_TIME_S: Final = 253_402_300_799.0  # the end of the year 9999
@@ -34,7 +36,12 @@ _REFERENCES: Final = {
     "run": (("session_id", "session"), ("robot_id", "robot")),
 }
 _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
-                  "signal", "rollup", "change", "watermark")  # fmt: skip
+                  "signal", "rollup", "coarse_rollup", "change", "watermark")  # fmt: skip
+# What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
+# be stored, a run that is not there.
+_UNSTORABLE: Final = (
+    TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
+)  # fmt: skip
 _COLUMNS: Final = 'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)'
 
 
@@ -55,6 +62,13 @@ class Unsound:
 
 
 _reading: ContextVar[Unsound | None] = ContextVar("reading past unsound rows", default=None)
+
+
+def is_over_a_value(error: Exception) -> bool:
+    """Whether work on rows failed over what no bridge writes, not over the file."""
+    if is_damage(error):
+        return False
+    return isinstance(error, _UNSTORABLE) or is_about_a_value(error)
 
 
 @contextmanager

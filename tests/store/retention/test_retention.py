@@ -21,7 +21,8 @@ from webots_mcp.schema import create_schema
 from webots_mcp.settlement import end_session
 from webots_mcp.store.retention import Limit, Retention, mark_kept, plan
 from webots_mcp.store.retention.purge import purge
-from webots_mcp.store.rollup.rolling import buckets, roll
+from webots_mcp.store.rollup.buckets import buckets
+from webots_mcp.store.rollup.rolling import roll
 
 TABLES = ("state", "rollup", "change", "log", "event", "image", "command", "run", "session")
 NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)
@@ -291,7 +292,7 @@ def test_rollups_stay_when_their_rows_go(recorded: Recorded) -> None:
     recorded.prune(states(rows=1))
     assert recorded.rows() == {2: 1}
     signals = dict(recorded.connection.execute("SELECT name, id FROM signal").fetchall())
-    summaries = [part for _, part in buckets(recorded.connection, 1, signals["x"], 0, 100)]
+    summaries = [part for _, part in buckets(recorded.connection, 1, signals["x"], range(100))]
     assert sum(part.rows for part in summaries) == 100
     assert max(part.max or 0 for part in summaries) == 99
     roll(recorded.connection)

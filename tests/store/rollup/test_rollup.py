@@ -24,7 +24,8 @@ from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import resolve_range
-from webots_mcp.store.rollup.rolling import BUCKET_S, forget, roll, watermark
+from webots_mcp.store.rollup.buckets import BUCKET_S
+from webots_mcp.store.rollup.rolling import forget, roll, watermark
 from webots_mcp.store.rollup.tables import Addition, held, store
 from webots_mcp.store.signals.catalogue import list_signals
 

@@ -20,7 +20,7 @@ from webots_mcp.store.analysis.features import (
     unwrap,
 )
 from webots_mcp.store.analysis.summary import Summary, summarise
-from webots_mcp.store.rollup.rolling import BUCKET_S
+from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.signals.registry import Signal
 
 STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it

@@ -16,7 +16,7 @@ from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.reading.rollups import Pieces, read_pieces
 from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
 from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.rollup.rolling import BUCKET_S
+from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.registry import Signal
 

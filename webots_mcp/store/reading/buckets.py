@@ -16,7 +16,7 @@ from webots_mcp.store.reading.gaps import Rhythm, rhythm_in, rhythm_of
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import read_pieces
 from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
-from webots_mcp.store.rollup.rolling import BUCKET_S
+from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.signals.registry import Signal
 
 Tier = Literal["rows", "raw", "rollup"]

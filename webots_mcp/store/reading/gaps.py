@@ -11,7 +11,7 @@ from itertools import pairwise
 from typing import Any, Final
 
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.rollup.rolling import BUCKET_S, bucket_of
+from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, Grain, bucket_of
 
 GAP_INTERVALS: Final = 3.0  # a gap is longer than so many median intervals
 _SAMPLE_ROWS: Final = 2000
@@ -28,7 +28,7 @@ _BEFORE: Final = (
 )
 # The signal that is in most rows tells how many a bucket has, and its first and last time.
 _BUCKETS: Final = (
-    "SELECT bucket, rows, first_sim_time_s, last_sim_time_s FROM all_rollup "
+    "SELECT bucket, rows, first_sim_time_s, last_sim_time_s FROM {table} "
     "WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = (SELECT id "
     "FROM signal s WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND EXISTS "
     "(SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = s.id) "
@@ -108,7 +108,7 @@ def _stretches(
     """Times in order: the ends of each bucket that is complete, all times of another."""
     run_id, reached_s, looked = segment.run_id, segment.start_s, 0
     span = range(bucket_of(segment.start_s) + 1, bucket_of(segment.end_s))
-    for bucket, rows, first_s, last_s in _counted(connection, run_id, span):
+    for bucket, rows, first_s, last_s in _counted(connection, run_id, FINE, span):
         start_s, end_s = bucket * BUCKET_S, (bucket + 1) * BUCKET_S
         if start_s > reached_s and (head := _times(connection, run_id, reached_s, start_s)):
             yield head, False
@@ -123,17 +123,19 @@ def _stretches(
         yield foot, False
 
 
-def rows_by_bucket(connection: sqlite3.Connection, run_id: int, span: range) -> dict[int, int]:
+def rows_by_bucket(
+    connection: sqlite3.Connection, run_id: int, grain: Grain, span: range
+) -> dict[int, int]:
     """How many rows each bucket has in the rollups: also of a signal that not all of them hold."""
-    return {bucket: rows for bucket, rows, *_ in _counted(connection, run_id, span)}
+    return {bucket: rows for bucket, rows, *_ in _counted(connection, run_id, grain, span)}
 
 
 def _counted(
-    connection: sqlite3.Connection, run_id: int, span: range
+    connection: sqlite3.Connection, run_id: int, grain: Grain, span: range
 ) -> list[tuple[int, int, Any, Any]]:
     """Bucket, rows, and the times of the first and last value; None where there is no value."""
     bounds = {"run": run_id, "first": span.start, "end": span.stop}
-    return connection.execute(_BUCKETS, bounds).fetchall()
+    return connection.execute(_BUCKETS.format(table=grain.table), bounds).fetchall()
 
 
 def _times(

@@ -19,7 +19,7 @@ from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import Pieces
 from webots_mcp.store.reading.rows import read_columns
-from webots_mcp.store.rollup.rolling import BUCKET_S
+from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.signals.registry import Signal
 
 MOSTLY: Final = 0.5  # of the rows

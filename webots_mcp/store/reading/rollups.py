@@ -1,7 +1,8 @@
-"""Any stretch of a run in pieces of 10 s: rollups where they are complete, rows at the edges.
+"""Any stretch of a run in pieces: rollups where they are complete, rows at the edges.
 
-However long the stretch, counts and extremes are exact: the rollups give the whole buckets inside,
-the state rows what is cut off at both ends, and what came after the watermark.
+However long the stretch, counts and extremes are exact: the rollups give the whole buckets inside
+(coarse ones where no finer pieces are asked for), the state rows what is cut off at both ends, and
+what came after the watermark.
 """
 
 from __future__ import annotations
@@ -20,7 +21,16 @@ from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rows import Columns, read_columns
-from webots_mcp.store.rollup.rolling import BUCKET_S, bucket_of, buckets, watermark
+from webots_mcp.store.rollup.buckets import (
+    BUCKET_S,
+    COARSE_S,
+    FINE,
+    Grain,
+    bucket_of,
+    buckets,
+    by_grain,
+)
+from webots_mcp.store.rollup.rolling import watermark
 from webots_mcp.store.signals.registry import Signal
 
 # By ids, from the watermark on: the + keeps SQLite from sorting all rows of the run instead.
@@ -39,13 +49,15 @@ _ROW_IN: Final = (
 
 
 class Pieces:
-    """A stretch of a run in buckets of 10 s; parts of a bucket are added in order of time.
+    """A stretch of a run in pieces of equal length; parts of a piece are added in order of time.
 
     Attributes:
+        piece_s: The length of a piece.
         cut_at_s: Where the deadline stopped the reading of rows; None if it did not.
     """
 
-    def __init__(self, signals: Sequence[Signal]) -> None:
+    def __init__(self, signals: Sequence[Signal], piece_s: float) -> None:
+        self.piece_s = piece_s
         self.cut_at_s: float | None = None
         self._signals = signals
         self._parts: dict[str, defaultdict[int, list[Summary]]] = {
@@ -55,47 +67,58 @@ class Pieces:
     def add_rows(self, columns: Columns) -> None:
         """Add state rows."""
         if columns.cut:
-            self.cut_at_s = columns.times[-1] if columns.times else math.inf
+            self._note_cut(columns.times[-1] if columns.times else math.inf)
         start = 0
-        for bucket, times in groupby(columns.times, bucket_of):
+        for piece, times in groupby(columns.times, self._piece_of):
             end = start + len(list(times))
             for signal in self._signals:
                 values = columns.values[signal.name][start:end]
                 summary = summarise(columns.times[start:end], values, angle=signal.kind == "angle")
-                self._parts[signal.name][bucket].append(summary)
+                self._parts[signal.name][piece].append(summary)
             start = end
 
     def add_rollups(
-        self, connection: sqlite3.Connection, run_id: int, span: range, deadline: Deadline
+        self,
+        connection: sqlite3.Connection,
+        run_id: int,
+        grain: Grain,
+        span: range,
+        deadline: Deadline,
     ) -> None:
         """Add the stored rollups of those buckets, signal by signal until the deadline.
 
         As with rows, all count: also those that do not hold the signal.
         """
-        rows = rows_by_bucket(connection, run_id, span)
+        rows = rows_by_bucket(connection, run_id, grain, span)
         for signal in self._signals:
             if signal.id is None:
                 continue
             if deadline.passed:
-                self.cut_at_s = span.start * BUCKET_S
+                self._note_cut(span.start * grain.bucket_s)
                 return
             parts = self._parts[signal.name]
             missing = dict(rows)
-            for bucket, summary in buckets(connection, run_id, signal.id, span.start, span.stop):
+            for bucket, summary in buckets(connection, run_id, signal.id, span, grain):
                 whole = max(summary.rows, missing.pop(bucket, 0))
                 counted = summary if whole == summary.rows else summary._replace(rows=whole)
-                parts[bucket].append(counted)
+                parts[self._piece_of(bucket * grain.bucket_s)].append(counted)
             for bucket, lacking in missing.items():
-                parts[bucket].append(Summary(lacking))
+                parts[self._piece_of(bucket * grain.bucket_s)].append(Summary(lacking))
 
     def of(self, name: str) -> list[tuple[int, Summary]]:
-        """The buckets of a signal that have rows, in order."""
-        return [(bucket, merge(parts)) for bucket, parts in sorted(self._parts[name].items())]
+        """The pieces of a signal that have rows, by their numbers, in order."""
+        return [(piece, merge(parts)) for piece, parts in sorted(self._parts[name].items())]
 
     def whole(self, name: str) -> Summary:
         """The summary of the whole stretch."""
         parts = [summary for _, summary in self.of(name)]
         return merge(parts) if parts else Summary()
+
+    def _note_cut(self, at_s: float) -> None:
+        self.cut_at_s = at_s if self.cut_at_s is None else min(self.cut_at_s, at_s)
+
+    def _piece_of(self, sim_time_s: float) -> int:
+        return bucket_of(sim_time_s, self.piece_s)
 
 
 def read_pieces(
@@ -103,9 +126,18 @@ def read_pieces(
     segment: Segment,
     signals: Sequence[Signal],
     deadline: Deadline,
+    piece_s: float = BUCKET_S,
 ) -> Pieces:
-    """Read a stretch of any length; only rows that are not in a whole rollup are looked at."""
-    pieces = Pieces(signals)
+    """Read a stretch of any length; only rows that are not in a whole rollup are looked at.
+
+    Args:
+        connection: Any.
+        segment: Which stretch.
+        signals: Which numbers of it.
+        deadline: After it nothing more is read, and the answer says where.
+        piece_s: How fine the pieces are: `BUCKET_S` or, from coarse rollups, `COARSE_S`.
+    """
+    pieces = Pieces(signals, piece_s)
     span = _whole_buckets(connection, segment)
     if not span:
         pieces.add_rows(read_columns(connection, segment, signals, deadline))
@@ -115,7 +147,9 @@ def read_pieces(
     middle = replace(segment, start_s=start_s, end_s=min(end_s, segment.end_s))
     mark = watermark(connection, segment.run_id)
     pieces.add_rows(read_columns(connection, head, signals, deadline))
-    pieces.add_rollups(connection, segment.run_id, span, deadline)
+    parts = [(FINE, span)] if piece_s < COARSE_S else by_grain(connection, segment.run_id, span)
+    for grain, part in parts:
+        pieces.add_rollups(connection, segment.run_id, grain, part, deadline)
     if (late := rows_after(connection, middle, mark)) is not None:
         pieces.add_rows(read_columns(connection, late, signals, deadline, after_id=mark))
     pieces.add_rows(read_columns(connection, foot, signals, deadline))

@@ -28,8 +28,8 @@ from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rollups import read_pieces, rows_after
 from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
-from webots_mcp.store.rollup.rolling import BUCKET_S, bucket_of, watermark
-from webots_mcp.store.rollup.tables import both
+from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, totals
+from webots_mcp.store.rollup.rolling import watermark
 from webots_mcp.store.signals.registry import Signal
 
 READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
@@ -42,14 +42,7 @@ LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
 _OF_SIGNAL: Final = (
     "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
 )
-_COUNTS_OF_EACH: Final = both(
-    "signal_id, sum(rows) AS rows, sum(present) AS present, sum(changes) AS changes",
-    "run_id = :run AND bucket >= :first AND bucket < :end GROUP BY signal_id",
-)
-_COUNTS: Final = (
-    "SELECT signal_id, sum(rows), sum(present), sum(changes) "
-    f"FROM {_COUNTS_OF_EACH} GROUP BY signal_id"
-)
+_COUNTS: Final = {"rows": "sum", "present": "sum"}
 _WIDTHS: Final = (  # also at its border with the bucket before
     "SELECT bucket, max(max - min, abs(first - lag(last, 1, first) OVER (ORDER BY bucket))) "
     f"{_OF_SIGNAL} AND first IS NOT NULL"
@@ -269,10 +262,10 @@ class LongView:
     @functools.cached_property
     def _totals(self) -> dict[int, Summary]:
         """Rows count also where they lack the signal: as many as of the one that is in most."""
-        span: dict[str, int] = dict(zip(("run", "first", "end"), self._span, strict=True))
-        found = self._connection.execute(_COUNTS, span).fetchall()
-        rows = max((counted for _, counted, *_ in found), default=0)
-        return {signal_id: Summary(rows, *counts) for signal_id, _, *counts in found}
+        run_id, first, end = self._span
+        found = totals(self._connection, run_id, range(first, end), _COUNTS)
+        rows = max((counted for counted, _ in found.values()), default=0)
+        return {signal_id: Summary(rows, present) for signal_id, (_, present) in found.items()}
 
     @functools.cached_property
     def _sample(self) -> Columns:

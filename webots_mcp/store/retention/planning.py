@@ -34,8 +34,8 @@ OLD_COMMANDS: Final = (
     f"WHERE robot_id = c.robot_id AND {KEPT} "
     "AND c.created_wall_time_s BETWEEN started_wall_time_s AND last_wall_time_s)"
 )
-ROLLED: Final = ("rollup", "change")
-_ROLLED_BYTES: Final = 150  # a row of those two, about
+ROLLED: Final = ("rollup", "coarse_rollup", "change")
+_ROLLED_BYTES: Final = 150  # a row of those, about
 _COMMAND_BYTES: Final = 400
 _GUESSES: Final = 12
 
@@ -45,7 +45,7 @@ class Step:
     """The oldest rows of one run in one table go.
 
     Attributes:
-        table: Of `rollup`, `change` and `run` all rows of the run go.
+        table: Of those in `ROLLED` and of `run` all rows of the run go.
         owner_id: The run; of commands the robot.
         rows: So many.
         size_bytes: About so much on the disk; of pictures their files.

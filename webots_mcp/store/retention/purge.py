@@ -40,7 +40,7 @@ _FIRST: Final = "SELECT id FROM {table} WHERE run_id = ? ORDER BY sim_time_s, id
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
 _IN_RUN: Final = "SELECT run_id, signal_id, {third} FROM {table} WHERE run_id = ? LIMIT ?"
 _OLD_COMMANDS: Final = f"SELECT id {OLD_COMMANDS} ORDER BY id LIMIT :limit"
-_THIRD_KEY: Final = {"rollup": "bucket", "change": "state_id"}
+_THIRD_KEY: Final = {"rollup": "bucket", "coarse_rollup": "bucket", "change": "state_id"}
 _DELETE: Final = {
     table: f"DELETE FROM {table} WHERE id = :id AND {_FREE_RUN}" for table in (*TABLES, "run")
 } | {

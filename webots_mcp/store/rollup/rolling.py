@@ -14,11 +14,12 @@ from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.connection import is_about_a_value, is_damage
 from webots_mcp.notice import warn
 from webots_mcp.store.analysis.summary import Summary, merge, summarise
 from webots_mcp.store.reading.rows import cleaned
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
+from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of
+from webots_mcp.store.rollup.coarse import merge_coarse
 from webots_mcp.store.rollup.tables import (
     Addition,
     Held,
@@ -30,11 +31,10 @@ from webots_mcp.store.rollup.tables import (
 )
 from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal, count, enter_signals, seen_now
-from webots_mcp.store.sound import Unsound, sound_rows
+from webots_mcp.store.sound import Unsound, is_over_a_value, sound_rows
 
-__all__ = ["BUCKET_S", "Rolled", "bucket_of", "buckets", "forget", "roll", "watermark"]
+__all__ = ["Rolled", "forget", "roll", "watermark"]
 
-BUCKET_S: Final = 10.0
 BATCH_ROWS: Final = 2000
 
 _WATERMARK: Final = "SELECT state_id FROM watermark WHERE name = 'rollup'"
@@ -52,10 +52,6 @@ _SOUND_ROWS: Final = (
     f"SELECT {_COLUMNS} FROM sound_state s JOIN sound_run r ON r.id = s.run_id "
     "WHERE s.id > ? AND s.id <= ? ORDER BY s.id"
 )
-_BUCKETS: Final = (
-    f"SELECT bucket, {', '.join(Summary._fields)} FROM all_rollup "
-    "WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ? ORDER BY bucket"
-)
 _LAST_CHANGE: Final = (
     "SELECT value FROM change WHERE run_id = ? AND signal_id = ? ORDER BY state_id DESC LIMIT 1"
 )
@@ -65,11 +61,6 @@ _EMPTIED: Final = (
     "AND (SELECT total(rows) FROM signal) > (SELECT total(rows) FROM recent_rollup) "
     "AND EXISTS (SELECT 1 FROM state WHERE id <= (SELECT state_id FROM watermark))"
 )
-# What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
-# be stored, a run that is not there.
-_UNSTORABLE: Final = (
-    TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
-)  # fmt: skip
 
 
 class Rolled(NamedTuple):
@@ -77,7 +68,7 @@ class Rolled(NamedTuple):
 
     Attributes:
         rows: State rows that it took in.
-        done: Whether it reached the newest row.
+        done: Whether it reached the newest row, and no rollups are left to merge.
     """
 
     rows: int
@@ -95,7 +86,8 @@ def roll(connection: sqlite3.Connection, budget_rows: int = 2000, pause_s: float
 
     Args:
         connection: Of a maintainer (the role "writer"), in autocommit mode.
-        budget_rows: Bounds the time of the call: about 50 us per row of 40 leaves.
+        budget_rows: Bounds the time of the call: about 50 us per row of 40 leaves. As many rollups
+            of 10 s are merged into coarse ones.
         pause_s: Between two steps, for others to write; 0 where nobody else does.
 
     Raises:
@@ -109,7 +101,8 @@ def roll(connection: sqlite3.Connection, budget_rows: int = 2000, pause_s: float
         done = rows is None
         taken += rows or 0
     move(connection, pause_s)
-    return Rolled(taken, done)
+    # Later, where rows are left: one of an old run would go into what was merged already.
+    return Rolled(taken, done and merge_coarse(connection, budget_rows, pause_s))
 
 
 def watermark(connection: sqlite3.Connection, run_id: int | None = None) -> int:
@@ -120,14 +113,6 @@ def watermark(connection: sqlite3.Connection, run_id: int | None = None) -> int:
     return int(row[0]) if row else 0
 
 
-def buckets(
-    connection: sqlite3.Connection, run_id: int, signal_id: int, first: int, end: int
-) -> Iterator[tuple[int, Summary]]:
-    """The rollups of a signal in buckets [first, end), in order; empty ones are left out."""
-    rows = connection.execute(_BUCKETS, (run_id, signal_id, first, end))
-    return ((row[0], Summary._make(row[1:])) for row in rows)
-
-
 def _roll_batch(connection: sqlite3.Connection, limit: int, pause_s: float) -> int | None:
     """The rows taken in: None if there are no more, 0 if another caller was faster."""
     after = watermark(connection)
@@ -136,19 +121,13 @@ def _roll_batch(connection: sqlite3.Connection, limit: int, pause_s: float) -> i
         ids = [row[0] for row in rows]
         stored = _take_in(connection, rows, pause_s)
     except Exception as error:
-        if not _is_over_a_value(error):
+        if not is_over_a_value(error):
             raise
         ids = [row[0] for row in connection.execute(_IDS, (after, limit))]
         stored = _take_in_sound(connection, after, ids[-1], pause_s)
     if stored and ids:
         connection.execute(_SET_WATERMARK, (ids[-1],))
     return (len(ids) if stored else 0) if ids else None
-
-
-def _is_over_a_value(error: Exception) -> bool:
-    if is_damage(error):
-        return False
-    return isinstance(error, _UNSTORABLE) or is_about_a_value(error)
 
 
 def _take_in_sound(connection: sqlite3.Connection, after: int, last: int, pause_s: float) -> bool:
@@ -168,7 +147,7 @@ def _take_in_halves(
     try:
         return _take_in(connection, rows, pause_s)
     except Exception as error:
-        if not _is_over_a_value(error):
+        if not is_over_a_value(error):
             raise
         if len(rows) == 1:
             unsound.note("state", rows[0][0], "data", "state")
@@ -253,8 +232,3 @@ def _changes(
         if (text := shown(value)) != before:
             yield (*key, state_id, time_s, text)
             before = text
-
-
-def bucket_of(sim_time_s: float) -> int:
-    """The number of the bucket that holds that time."""
-    return int(sim_time_s // BUCKET_S)  # exact, which floor of a rounded quotient is not

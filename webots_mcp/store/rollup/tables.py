@@ -13,19 +13,21 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import groupby
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeVar
 
 from webots_mcp.connection import LONGEST_WRITE_S, Step, transaction
 from webots_mcp.store.analysis.summary import Summary
+from webots_mcp.store.rollup.buckets import COARSE_BUCKETS
 from webots_mcp.store.signals.registry import Count
 
+Item = TypeVar("Item")
 Key = tuple[int, int]  # bucket, signal id
 
 _FIGURES: Final = ", ".join(Summary._fields)
 _COLUMNS: Final = f"run_id, bucket, signal_id, {_FIGURES}"
-_RUN_MARK: Final = (
+RUN_MARK: Final = (
     "SELECT max(iif(typeof(rolled_state_id) = 'integer', rolled_state_id, 0), "
     "coalesce((SELECT state_id FROM watermark WHERE name = 'rollup'), 0)) FROM run WHERE id = {}"
 )
@@ -39,7 +41,7 @@ _TEMPORARY: Final = {
 }
 _STORE: Final = Step(
     "store_rollups",
-    ("run_id", "mark", "recent_rows", "state_id"),
+    ("run_id", "mark", "recent_rows", "state_id", "first_coarse"),
     f"INSERT OR REPLACE INTO recent_rollup ({_COLUMNS}) "
     f"SELECT {_COLUMNS} FROM new_rollup WHERE NOT is_over",
     f"INSERT OR REPLACE INTO rollup ({_COLUMNS}) SELECT {_COLUMNS} FROM new_rollup WHERE is_over",
@@ -50,8 +52,9 @@ _STORE: Final = Step(
     "min = min(coalesce(signal.min, n.min), coalesce(n.min, signal.min)), "
     "max = max(coalesce(signal.max, n.max), coalesce(n.max, signal.max)) "
     "FROM new_count n WHERE signal.id = n.signal_id",
-    "UPDATE run SET rolled_state_id = NEW.state_id WHERE id = NEW.run_id",
-    unless=f"({_RUN_MARK.format('NEW.run_id')}) IS NOT NEW.mark "
+    "UPDATE run SET rolled_state_id = NEW.state_id, "
+    "coarse_end = min(coarse_end, NEW.first_coarse) WHERE id = NEW.run_id",
+    unless=f"({RUN_MARK.format('NEW.run_id')}) IS NOT NEW.mark "
     f"OR ({_RECENT_ROWS.format('NEW.run_id')}) <> NEW.recent_rows",
 )
 # A bucket is over when its run has a later one, or has ended.
@@ -71,30 +74,18 @@ _MOVE: Final = Step(
     f"INSERT OR REPLACE INTO rollup ({_COLUMNS}) SELECT {_COLUMNS} {_MOVED}",
     f"DELETE {_MOVED}",
 )
-_FIRST_MOVED: Final = 20  # about 10 us each: in `rollup` each has a page of its own
+_FIRST_AT_ONCE: Final = 20  # about 10 us each: in `rollup` each has a page of its own
+_NONE: Final = 2**62  # beyond all buckets
 _FORGET: Final = (
     "DELETE FROM watermark WHERE name = 'rollup'",
-    "UPDATE run SET rolled_state_id = 0 WHERE rolled_state_id > 0",
+    "UPDATE run SET rolled_state_id = 0, coarse_end = NULL "
+    "WHERE rolled_state_id > 0 OR coarse_end IS NOT NULL",
+    "DELETE FROM coarse_rollup",
     "DELETE FROM rollup",
     "DELETE FROM recent_rollup",
     "DELETE FROM change",
     "UPDATE signal SET rows = 0, null_rows = 0, odd_rows = 0, min = NULL, max = NULL",
 )
-
-
-def both(columns: str, where: str) -> str:
-    """What to sum up FROM: rows of both tables, or what each of them comes to.
-
-    From `all_rollup` a sum would take three times as long: SQLite copies all of its columns first.
-
-    Args:
-        columns: Those that are needed.
-        where: A condition with named parameters; may go on with GROUP BY.
-    """
-    parts = (
-        f"SELECT {columns} FROM {table} WHERE {where}" for table in ("rollup", "recent_rollup")
-    )
-    return f"({' UNION ALL '.join(parts)})"
 
 
 class Held(NamedTuple):
@@ -134,7 +125,7 @@ class Addition(NamedTuple):
 
 def run_mark(connection: sqlite3.Connection, run_id: int) -> int | None:
     """The id of the last state row of a run that the rollups hold; None without such a run."""
-    row = connection.execute(_RUN_MARK.format("?"), (run_id,)).fetchone()
+    row = connection.execute(RUN_MARK.format("?"), (run_id,)).fetchone()
     return int(row[0]) if row else None
 
 
@@ -148,7 +139,9 @@ def store(connection: sqlite3.Connection, before: Held, addition: Addition, stat
     """Store an addition, which holds the rows up to `state_id`; False where another was faster."""
     rows = (addition.rollups, addition.changes, addition.counts)
     _prepare(connection, dict(zip(_TEMPORARY, rows, strict=True)))
-    return _STORE.run(connection, before.run_id, before.mark, len(before.recent), state_id)
+    first_coarse = min((row[2] // COARSE_BUCKETS for row in addition.rollups), default=_NONE)
+    values = (before.run_id, before.mark, len(before.recent), state_id, first_coarse)
+    return _STORE.run(connection, *values)
 
 
 def _prepare(connection: sqlite3.Connection, rows: dict[str, Sequence[tuple[Any, ...]]]) -> None:
@@ -174,15 +167,31 @@ def move(connection: sqlite3.Connection, pause_s: float) -> None:
 def _move_bucket(
     connection: sqlite3.Connection, run_id: int, bucket: int, ids: list[int], pause_s: float
 ) -> None:
-    most, done = _FIRST_MOVED, 0
-    while done < len(ids):
-        some = ids[done : done + most]
+    def move_some(some: Sequence[int]) -> bool:
+        return _MOVE.run(connection, run_id, bucket, some[0], some[-1])
+
+    in_short_steps(ids, move_some, pause_s)
+
+
+def in_short_steps(
+    items: Sequence[Item], store: Callable[[Sequence[Item]], bool], pause_s: float
+) -> bool:
+    """Store items in order, as many at a time as half a millisecond takes.
+
+    Returns:
+        False once `store` returned that: the others are not stored.
+    """
+    most, done = _FIRST_AT_ONCE, 0
+    while done < len(items):
+        some = items[done : done + most]
         started_s = time.perf_counter()
-        _MOVE.run(connection, run_id, bucket, some[0], some[-1])
+        if not store(some):
+            return False
         took_s = time.perf_counter() - started_s
         done += len(some)
         most = max(1, round(len(some) * min(2.0, LONGEST_WRITE_S / 2 / took_s)))
         time.sleep(pause_s)
+    return True
 
 
 def forget(connection: sqlite3.Connection) -> None:

@@ -17,8 +17,8 @@ from webots_mcp.store.reading.rows import cleaned
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
+from webots_mcp.store.rollup.buckets import EVER, totals
 from webots_mcp.store.rollup.rolling import watermark
-from webots_mcp.store.rollup.tables import both
 from webots_mcp.store.signals.flatten import Kind, parse
 from webots_mcp.store.signals.registry import MAX_SIGNALS, Signal, by_name, registered, seen_now
 
@@ -29,19 +29,18 @@ _NEWEST_ROWS: Final = (
     "SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC"
 )
-_OLDEST_AFTER: Final = (  # by ids, from the watermark on: see `tiers`
+_OLDEST_AFTER: Final = (  # by ids, from the watermark on: see `reading.rollups`
     "SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE id > ? AND +run_id = ? "
     "ORDER BY id LIMIT ?"
 )
-_TOTALS_OF_EACH: Final = both(
-    "signal_id, sum(rows) AS rows, sum(present) AS present, min(first_sim_time_s) AS first_s, "
-    "max(last_sim_time_s) AS last_s, min(min) AS min, max(max) AS max",
-    "run_id = :run GROUP BY signal_id",
-)
-_TOTALS: Final = (
-    "SELECT signal_id, sum(rows), sum(present), min(first_s), max(last_s), min(min), max(max) "
-    f"FROM {_TOTALS_OF_EACH} GROUP BY signal_id"
-)
+_FIGURES: Final = {
+    "rows": "sum",
+    "present": "sum",
+    "first_sim_time_s": "min",
+    "last_sim_time_s": "max",
+    "min": "min",
+    "max": "max",
+}
 
 
 @dataclass(frozen=True)
@@ -256,13 +255,11 @@ def list_signals(
 
 def _stored(connection: sqlite3.Connection, run_id: int) -> dict[int | None, Summary]:
     """What the rollups of a run come to, by signal id, as far as a list shows it."""
-    totals: dict[int | None, Summary] = {}
-    for signal_id, rows, present, first_s, last_s, low, high in connection.execute(
-        _TOTALS, {"run": run_id}
-    ):
-        times = {"first_sim_time_s": first_s, "last_sim_time_s": last_s}
-        totals[signal_id] = Summary(rows, present, **times, min=low, max=high)
-    return totals
+    found = totals(connection, run_id, EVER, _FIGURES)
+    return {
+        signal_id: Summary(**dict(zip(_FIGURES, figures, strict=True)))
+        for signal_id, figures in found.items()
+    }
 
 
 def _late(

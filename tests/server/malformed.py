@@ -46,7 +46,7 @@ _WRONG_JSON: Final = (
 )  # fmt: skip
 
 
-KEYED: Final = ("rollup", "change")
+KEYED: Final = ("rollup", "coarse_rollup", "change")
 READING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_list_robots", {}),
     ("webots_get_world_info", {}),

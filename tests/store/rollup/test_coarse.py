@@ -21,6 +21,7 @@ from webots_mcp.store.analysis.summary import Summary, summarise
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import Pieces, read_pieces
+from webots_mcp.store.retention import Limit, Retention, prune
 from webots_mcp.store.rollup.buckets import COARSE, COARSE_BUCKETS, COARSE_S, FINE, by_grain
 from webots_mcp.store.rollup.rolling import forget, roll
 from webots_mcp.store.signals.registry import registered
@@ -225,6 +226,36 @@ def test_a_rollup_that_no_server_wrote_costs_itself_and_not_the_maintenance(
     assert f"rollup 1/1/3: {column} is no sound" in capsys.readouterr().err
     assert empty.execute("SELECT * FROM coarse_rollup WHERE bucket > 0").fetchall() == before
     assert empty.execute("SELECT coarse_end FROM run").fetchone() == (5,)
+
+
+def test_an_end_that_no_server_wrote_is_found_anew(empty: sqlite3.Connection) -> None:
+    recorded = record(empty, STEPS)
+    finish(empty)
+    empty.execute("UPDATE run SET coarse_end = 'far'")
+    check(empty, recorded, 0.0, 3000.0)
+    finish(empty)
+    assert empty.execute("SELECT coarse_end FROM run").fetchone() == (5,)
+
+
+def test_purging_a_run_takes_its_coarse_rollups_and_purging_its_rows_does_not(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "webots.db"
+    with closing(connect(file, "writer", create=True)) as connection:
+        create_schema(connection)
+        recorded = record(connection, STEPS)
+        second = Recorder(connection)
+        second.run(second.session(1, "y"), 1)
+        second.publish(0.0, {"time": 0.0})
+        finish(connection)
+        prune(connection, tmp_path, Retention(state=Limit(rows=1), outlive=0), rest=False)
+        assert connection.execute("SELECT count(*) FROM state").fetchone() == (1,)
+        whole = read(connection, 0.0, 3000.0).whole("time")
+        assert same(whole, summary_of("time", recorded))
+        prune(connection, tmp_path, Retention(rollup=Limit(rows=10), outlive=0), rest=False)
+        for table in ("rollup", "coarse_rollup", "change"):
+            counted = connection.execute(f"SELECT count(*) FROM {table} WHERE run_id = 1")
+            assert counted.fetchone() == (0,)
 
 
 def test_rollups_that_are_rebuilt_are_merged_again(empty: sqlite3.Connection) -> None:

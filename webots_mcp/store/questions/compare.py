@@ -21,6 +21,7 @@ from webots_mcp.store.reading.rollups import read_pieces
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.robots import resolve_robot
+from webots_mcp.store.rollup.buckets import COARSE_S
 from webots_mcp.store.runs import fetch_run
 from webots_mcp.store.signals.catalogue import catalogue, resolve_signals
 from webots_mcp.store.signals.registry import Signal
@@ -215,7 +216,7 @@ def _summarise(
 ) -> dict[str, Summary]:
     """Each signal that the run has over its compared stretch."""
     own = [part.known[signal.name] for signal in signals if signal.name in part.known]
-    pieces = read_pieces(connection, part.segment, own, deadline)
+    pieces = read_pieces(connection, part.segment, own, deadline, COARSE_S)
     return {signal.name: pieces.whole(signal.name) for signal in own}
 
 

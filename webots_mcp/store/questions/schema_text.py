@@ -15,7 +15,8 @@ _COMMENT: Final = re.compile(r'^\s*"?(\w+)"?\s[^\n]*?/\* (.*?) \*/', re.MULTILIN
 _RULES: Final = (
     "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
     "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "
-    "fast by run_id and sim_time_s; for a long one use all_rollup (10 s buckets)."
+    "fast by run_id and sim_time_s; for a long one use all_rollup (10 s buckets) "
+    "or coarse_rollup (500 s)."
 )
 
 

@@ -20,7 +20,6 @@ from webots_mcp.store.analysis.features import (
     unwrap,
 )
 from webots_mcp.store.analysis.summary import Summary, summarise
-from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.signals.registry import Signal
 
 STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
@@ -49,7 +48,7 @@ class Trend:
             the nearest of several things does: its turns cannot be counted.
         monotonic: "rising", "falling" (never the other way, and not constant), or None.
         crossings: Of the mean, by more than noise.
-        fast: It varies so fast that the means of 10 s do not show its course.
+        fast: It varies so fast that the means of buckets do not show its course.
         flat_since_s: Since when it rests; None if it does not.
         spikes: Values that stand out from both neighbours; None where rows were not looked at.
         missing_share: Rows without a value.
@@ -87,6 +86,7 @@ def judge(
     numbers: Sequence[float],
     spikes: list[Spike] | None,
     inner_variance: float = 0.0,
+    resolution_s: float = 0.0,
 ) -> Trend:
     """Put together what the summary tells and what the course of the numbers tells.
 
@@ -98,6 +98,7 @@ def judge(
         spikes: None where only buckets were looked at.
         inner_variance: That of the values within the buckets. Where more of it lies there than
             between them, a course of their means is not that of the values (it may be an alias).
+        resolution_s: The length of the buckets.
     """
     of_rows = spikes is not None
     turn = signal.turn if of_rows or signal.kind == "angle" else None
@@ -138,7 +139,7 @@ def judge(
         change=_change(times, course, inner) * slow * _relative_range(summary),
         says="",
     )
-    return replace(trend, says="; ".join(_remarks(trend)))
+    return replace(trend, says="; ".join(_remarks(trend, resolution_s)))
 
 
 def _slow_share(means: Summary, inner_variance: float, *, angle: bool) -> float:
@@ -241,13 +242,13 @@ def _relative_range(summary: Summary) -> float:
     return (summary.max - summary.min) / largest if largest else 0.0
 
 
-def _remarks(trend: Trend) -> Iterator[str]:
+def _remarks(trend: Trend, resolution_s: float) -> Iterator[str]:
     summary, unit = trend.summary, f" {trend.unit}" if trend.unit else ""
     yield _course(trend, unit)
     if trend.leaps:
         yield "changes by more than a quarter turn at once: turns are not counted"
     elif trend.fast:
-        yield f"varies faster than {BUCKET_S:g} s: ask for a shorter range"
+        yield f"varies faster than {resolution_s:g} s: ask for a shorter range"
     if trend.flat_since_s is not None and trend.shape != "constant":
         yield f"flat at {summary.last:.4g} since {trend.flat_since_s:.6g} s"
     if trend.spikes:

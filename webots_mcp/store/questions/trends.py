@@ -6,6 +6,7 @@ import sqlite3
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 from webots_mcp.store.analysis.features import find_spikes
 from webots_mcp.store.analysis.summary import summarise, usable_numbers
@@ -13,12 +14,13 @@ from webots_mcp.store.questions.trend import Trend, judge
 from webots_mcp.store.reading.changes import change_points, longest_values
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
-from webots_mcp.store.reading.rollups import Pieces, read_pieces
+from webots_mcp.store.reading.rollups import Pieces, piece_length_s, read_pieces
 from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
 from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.registry import Signal
+
+LEAST_PIECES: Final = 100  # of a long range, whose means tell its course
 
 
 @dataclass(frozen=True)
@@ -112,10 +114,11 @@ def run_trends(
     numbers = [signal for signal in signals if signal.is_number]
     found: list[Trend | None]
     if exceeds(connection, segment):
-        pieces = read_pieces(connection, segment, numbers, deadline)
+        piece_s = piece_length_s(connection, segment, LEAST_PIECES)
+        pieces = read_pieces(connection, segment, numbers, deadline, piece_s)
         found = [_trend_of_pieces(signal, pieces) for signal in numbers]
         rows = max((pieces.whole(signal.name).rows for signal in numbers), default=0)
-        resolution_s, cut_at_s = BUCKET_S, pieces.cut_at_s
+        resolution_s, cut_at_s = piece_s, pieces.cut_at_s
     else:
         columns = read_columns(connection, segment, numbers, deadline)
         found = [_trend_of_rows(signal, columns) for signal in numbers]
@@ -161,7 +164,7 @@ def _trend_of_pieces(signal: Signal, pieces: Pieces) -> Trend | None:
             means.append(centre)
             inner.append((part.circular_deviation if angle else part.deviation) or 0.0)
     variance = statistics.fmean(deviation**2 for deviation in inner)
-    return judge(signal, summary, middles, means, None, variance)
+    return judge(signal, summary, middles, means, None, variance, pieces.piece_s)
 
 
 def _state_trends(

@@ -14,9 +14,8 @@ from webots_mcp.store.analysis.summary import Summary, merge, summarise
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import Rhythm, rhythm_in, rhythm_of
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.reading.rollups import read_pieces
+from webots_mcp.store.reading.rollups import piece_length_s, read_pieces
 from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
-from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.signals.registry import Signal
 
 Tier = Literal["rows", "raw", "rollup"]
@@ -29,8 +28,8 @@ class Table:
     """Buckets of equal length that begin at multiples of it; in the tier "rows" one per row.
 
     Attributes:
-        tier: "rows" (a bucket is a row), "raw" (made from rows), "rollup" (from 10 s rollups, and
-            from rows at both ends).
+        tier: "rows" (a bucket is a row), "raw" (made from rows), "rollup" (from rollups, and from
+            rows at both ends).
         step_s: Length of a bucket; None in the tier "rows".
         starts: Begin of each bucket.
         cells: Per signal one summary per bucket.
@@ -141,27 +140,28 @@ def _from_rollups(
     deadline: Deadline,
     least_step_s: float,
 ) -> Table:
-    pieces = read_pieces(connection, segment, signals, deadline)
+    unit_s = piece_length_s(connection, segment, max_points, least_step_s)
+    pieces = read_pieces(connection, segment, signals, deadline, unit_s)
     found = {signal.name: pieces.of(signal.name) for signal in signals}
-    numbers = [bucket for buckets in found.values() for bucket, _ in buckets]
+    numbers = [piece for of_signal in found.values() for piece, _ in of_signal]
     rhythm = rhythm_in(connection, segment)
     if not numbers:
-        return Table("rollup", BUCKET_S, [], {}, None, rhythm, None, pieces.cut_at_s)
+        return Table("rollup", unit_s, [], {}, None, rhythm, None, pieces.cut_at_s)
     first, last = min(numbers), max(numbers)
-    bounds = (first * BUCKET_S, last * BUCKET_S)
-    step_s = _step(*bounds, max_points, unit_s=BUCKET_S, least_s=least_step_s)
-    width = round(step_s / BUCKET_S)
+    bounds = (first * unit_s, last * unit_s)
+    step_s = _step(*bounds, max_points, unit_s=unit_s, least_s=least_step_s)
+    width = round(step_s / unit_s)
     indexes = range(first // width, last // width + 1)
     starts = [index * step_s for index in indexes]
-    cells = {name: _widened(buckets, width, indexes) for name, buckets in found.items()}
+    cells = {name: _widened(pieces, width, indexes) for name, pieces in found.items()}
     rows = max(sum(cell.rows for cell in column) for column in cells.values())
     return Table("rollup", step_s, starts, cells, rows, rhythm, None, pieces.cut_at_s)
 
 
-def _widened(buckets: list[tuple[int, Summary]], width: int, indexes: range) -> list[Summary]:
-    """Buckets of 10 s merged into buckets of `width` times that, with the empty ones."""
+def _widened(pieces: list[tuple[int, Summary]], width: int, indexes: range) -> list[Summary]:
+    """Pieces merged into buckets of `width` times their length, with the empty ones."""
     merged = {
         index: merge([summary for _, summary in group])
-        for index, group in groupby(buckets, lambda bucket: bucket[0] // width)
+        for index, group in groupby(pieces, lambda piece: piece[0] // width)
     }
     return [merged.get(index, Summary()) for index in indexes]

@@ -6,7 +6,7 @@ import math
 import sqlite3
 import statistics
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final
 
@@ -27,12 +27,21 @@ _BEFORE: Final = (
     "ORDER BY sim_time_s DESC LIMIT ?"
 )
 # The signal that is in most rows tells how many a bucket has, and its first and last time.
+_IN_MOST_ROWS: Final = (
+    "FROM {table} WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = "
+    "(SELECT id FROM signal s WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) "
+    "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = s.id) "
+    "ORDER BY s.rows - s.null_rows DESC LIMIT 1)"
+)
 _BUCKETS: Final = (
-    "SELECT bucket, rows, first_sim_time_s, last_sim_time_s FROM {table} "
-    "WHERE run_id = :run AND bucket >= :first AND bucket < :end AND signal_id = (SELECT id "
-    "FROM signal s WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND EXISTS "
-    "(SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = s.id) "
-    "ORDER BY s.rows - s.null_rows DESC LIMIT 1) ORDER BY bucket"
+    f"SELECT bucket, rows, first_sim_time_s, last_sim_time_s {_IN_MOST_ROWS} ORDER BY bucket"
+)
+_THERE: Final = f"SELECT bucket {_IN_MOST_ROWS.format(table=FINE.table)} ORDER BY bucket"
+# A gap between two buckets reaches half its length into one of them.
+_LACKING: Final = (
+    f"SELECT bucket {_IN_MOST_ROWS.format(table=FINE.table)} AND (rows < :least "
+    f"OR first_sim_time_s IS NULL OR first_sim_time_s - bucket * {BUCKET_S} > :margin_s "
+    f"OR (bucket + 1) * {BUCKET_S} - last_sim_time_s > :margin_s) ORDER BY bucket"
 )
 
 
@@ -93,13 +102,52 @@ def rhythm_in(connection: sqlite3.Connection, segment: Segment) -> Rhythm:
     interval_s = rhythm_of(sample).interval_s
     if interval_s is None:
         return Rhythm(None, ())
-    gaps: list[Gap] = []
+    irregular = _irregular(connection, segment, interval_s)
+    parts = [segment] if len(irregular) > _MOST_BUCKETS else irregular
+    gaps = [gap for part in parts for gap in _gaps(connection, part, interval_s)]
+    return Rhythm(interval_s, tuple(dict.fromkeys(gaps)))
+
+
+def _irregular(
+    connection: sqlite3.Connection, segment: Segment, interval_s: float
+) -> list[Segment]:
+    """The parts in which a gap may be: around buckets that lack rows, or one at their border."""
+    run_id, span = segment.run_id, range(bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
+    values = {
+        **_bounds(run_id, span),
+        "least": BUCKET_S / interval_s - 2,
+        "margin_s": GAP_INTERVALS / 2 * interval_s,
+    }
+    there = [bucket for (bucket,) in connection.execute(_THERE, values)]
+    lacking = [(bucket, bucket) for (bucket,) in connection.execute(_LACKING, values)]
+    missing = [(a, b) for a, b in pairwise(there) if b - a > 1]
+    edges = [
+        (span.start, min(there, default=span.stop)),
+        (max(there, default=span.start), span.stop),
+    ]
+    return [
+        replace(segment, start_s=max(segment.start_s, a), end_s=min(segment.end_s, b))
+        for a, b in _joined(sorted([*lacking, *missing, *edges]))
+    ]
+
+
+def _joined(buckets: Sequence[tuple[int, int]]) -> Iterator[tuple[float, float]]:
+    """From and up to when each lies, with two more at both ends; those that then touch are one."""
+    start, end = buckets[0]
+    for first, last in buckets[1:]:
+        if first - end > 4:
+            yield (start - 2) * BUCKET_S, (end + 3) * BUCKET_S
+            start = first
+        end = max(end, last)
+    yield (start - 2) * BUCKET_S, (end + 3) * BUCKET_S
+
+
+def _gaps(connection: sqlite3.Connection, segment: Segment, interval_s: float) -> Iterator[Gap]:
     before: Sequence[float] = ()
     for times, complete in _stretches(connection, segment, interval_s):
-        gaps += _wider((*before[-1:], times[0]), interval_s)
-        gaps += () if complete else _wider(times, interval_s)
+        yield from _wider((*before[-1:], times[0]), interval_s)
+        yield from () if complete else _wider(times, interval_s)
         before = times
-    return Rhythm(interval_s, tuple(gaps))
 
 
 def _stretches(
@@ -134,8 +182,12 @@ def _counted(
     connection: sqlite3.Connection, run_id: int, grain: Grain, span: range
 ) -> list[tuple[int, int, Any, Any]]:
     """Bucket, rows, and the times of the first and last value; None where there is no value."""
-    bounds = {"run": run_id, "first": span.start, "end": span.stop}
-    return connection.execute(_BUCKETS.format(table=grain.table), bounds).fetchall()
+    query = _BUCKETS.format(table=grain.table)
+    return connection.execute(query, _bounds(run_id, span)).fetchall()
+
+
+def _bounds(run_id: int, span: range) -> dict[str, float]:
+    return {"run": run_id, "first": span.start, "end": span.stop}
 
 
 def _times(

@@ -19,7 +19,7 @@ from webots_mcp.store.analysis.summary import Summary, merge, summarise
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.moments import shown_time
-from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.ranges import Segment, recorded_bounds
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.rollup.buckets import (
     BUCKET_S,
@@ -119,6 +119,22 @@ class Pieces:
 
     def _piece_of(self, sim_time_s: float) -> int:
         return bucket_of(sim_time_s, self.piece_s)
+
+
+def piece_length_s(
+    connection: sqlite3.Connection, segment: Segment, pieces: int, least_s: float = 0.0
+) -> float:
+    """How long pieces are: as coarse rollups, where a stretch has so many of them, else 10 s.
+
+    Args:
+        connection: Any.
+        segment: The stretch.
+        pieces: How many it is to have at least.
+        least_s: Coarse ones do as well where pieces are to be that long.
+    """
+    first_s, last_s = recorded_bounds(connection, segment.run_id) or (0.0, 0.0)
+    length_s = min(segment.end_s, last_s) - max(segment.start_s, first_s)
+    return COARSE_S if max(length_s / pieces, least_s) >= COARSE_S else BUCKET_S
 
 
 def read_pieces(

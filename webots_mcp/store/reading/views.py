@@ -42,7 +42,7 @@ LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
 _OF_SIGNAL: Final = (
     "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
 )
-_COUNTS: Final = {"rows": "sum", "present": "sum"}
+_COUNTS: Final = {"rows": "sum", "present": "sum", "changes": "sum"}
 _WIDTHS: Final = (  # also at its border with the bucket before
     "SELECT bucket, max(max - min, abs(first - lag(last, 1, first) OVER (ORDER BY bucket))) "
     f"{_OF_SIGNAL} AND first IS NOT NULL"
@@ -264,8 +264,8 @@ class LongView:
         """Rows count also where they lack the signal: as many as of the one that is in most."""
         run_id, first, end = self._span
         found = totals(self._connection, run_id, range(first, end), _COUNTS)
-        rows = max((counted for counted, _ in found.values()), default=0)
-        return {signal_id: Summary(rows, present) for signal_id, (_, present) in found.items()}
+        rows = max((counted for counted, *_ in found.values()), default=0)
+        return {signal_id: Summary(rows, *counts) for signal_id, (_, *counts) in found.items()}
 
     @functools.cached_property
     def _sample(self) -> Columns:

@@ -20,10 +20,11 @@ from webots_mcp.store.sound import MAX_SIM_TIME_S, is_over_a_value, sound_rows
 
 _FIGURES: Final = ", ".join(Summary._fields)
 _COLUMNS: Final = f"run_id, bucket, signal_id, {_FIGURES}"
+_COARSE_END: Final = "iif(typeof(coarse_end) = 'integer', coarse_end, NULL)"
 _PENDING: Final = (
-    "SELECT id, robot_id, coarse_end, last_sim_time_s FROM run "
+    f"SELECT id, robot_id, {_COARSE_END}, last_sim_time_s FROM run "
     f"WHERE typeof(last_sim_time_s) IN ('real', 'integer') AND last_sim_time_s < {MAX_SIM_TIME_S} "
-    f"AND last_sim_time_s >= (coalesce(coarse_end, 0) + 1) * {COARSE_S}"
+    f"AND last_sim_time_s >= (coalesce({_COARSE_END}, 0) + 1) * {COARSE_S}"
 )
 _FIRST_RECENT: Final = "SELECT min(bucket) FROM recent_rollup WHERE run_id = ?"
 _FIRST: Final = (  # signal by signal, each by the primary key
@@ -42,7 +43,7 @@ _STORE: Final = Step(
     f"INSERT OR REPLACE INTO coarse_rollup ({_COLUMNS}) SELECT {_COLUMNS} FROM new_coarse",
     "UPDATE run SET coarse_end = NEW.new_end WHERE id = NEW.run_id",
     unless=f"({RUN_MARK.format('NEW.run_id')}) IS NOT NEW.mark "
-    "OR (SELECT coarse_end FROM run WHERE id = NEW.run_id) IS NOT NEW.coarse_end",
+    f"OR (SELECT {_COARSE_END} FROM run WHERE id = NEW.run_id) IS NOT NEW.coarse_end",
 )
 _LOWEST: Final = -(2**62)
 _ANGLES: Final = Summary._fields.index("sines")  # the figures from there on only angles have

@@ -1,0 +1,43 @@
+"""Gaps of a long recording are found from its rollups as they are from its rows."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.memory import memory_connection
+from tests.recordings.rover import Recorder
+from webots_mcp.store.reading.gaps import rhythm_in, rhythm_of
+from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.rollup.rolling import roll
+
+
+@pytest.mark.parametrize("interval_s", [0.5, 1.9, 3.2])
+@settings(max_examples=30, deadline=None)
+@given(
+    gaps=st.dictionaries(st.integers(1, 299), st.floats(2.0, 200.0), max_size=8),
+    start=st.floats(0, 0.5),
+    end=st.floats(0.5, 1.2),
+)
+def test_gaps_are_those_of_the_rows(
+    interval_s: float, gaps: dict[int, float], start: float, end: float
+) -> None:
+    steps = [gaps.get(step, 1.0) * interval_s for step in range(300)]
+    times = [round(time_s, 6) for time_s in accumulate(steps)]
+    with memory_connection() as connection:
+        recorder = Recorder(connection)
+        robot_id = recorder.robot("r")
+        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        for time_s in times:
+            recorder.publish(time_s, {"x": 1.0})
+        recorder.end_run("finished")
+        roll(connection, 100_000)
+        segment = Segment(1, start * times[-1], end * times[-1])
+        within = [time_s for time_s in times if segment.start_s <= time_s < segment.end_s]
+        found = rhythm_in(connection, segment)
+        expected = rhythm_of(within)
+        assert found.interval_s == pytest.approx(expected.interval_s)
+        assert found.gaps == expected.gaps

@@ -47,23 +47,23 @@ class BuiltInAction(NamedTuple):
 
     Attributes:
         needs_supervisor: Only a Supervisor can do it.
-        interrupts_steps: A `step` command that is still at work ends with it.
+        ends_steps: A `step` command that is still at work ends with it.
         runs_user_code: It calls functions of the controller, which may take their time.
     """
 
     needs_supervisor: bool = True
-    interrupts_steps: bool = False
+    ends_steps: bool = False
     runs_user_code: bool = False
 
 
 # The one list of them. What each does is the function of that name in `bridge.actions`.
 BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
-    "pause": BuiltInAction(interrupts_steps=True),
-    "resume": BuiltInAction(interrupts_steps=True),
-    "fast": BuiltInAction(interrupts_steps=True),
-    "step": BuiltInAction(interrupts_steps=True),
-    "reset": BuiltInAction(interrupts_steps=True),
-    "reload": BuiltInAction(interrupts_steps=True),
+    "pause": BuiltInAction(ends_steps=True),
+    "resume": BuiltInAction(ends_steps=True),
+    "fast": BuiltInAction(ends_steps=True),
+    "step": BuiltInAction(ends_steps=True),
+    "reset": BuiltInAction(ends_steps=True),
+    "reload": BuiltInAction(ends_steps=True),
     "screenshot": BuiltInAction(),
     "reset_state": BuiltInAction(needs_supervisor=False, runs_user_code=True),
 }

@@ -88,7 +88,7 @@ class Backlog:
         self.save()
         while len(self._rows) > MAX_WAITING_ROWS or self._bytes > MAX_WAITING_BYTES:
             self._remove_oldest()
-            self._counts.lose(1, self.why)
+            self._counts.drop(1, self.why)
 
     def save(self) -> None:
         """Move the rows in memory to the file, as far as it takes them."""
@@ -140,7 +140,7 @@ class Backlog:
         """Nothing will take them any more."""
         while self._rows:
             self._remove_oldest()
-            self._counts.lose(1, why)
+            self._counts.drop(1, why)
 
     def close(self) -> str | None:
         """Close the file; where it holds entries, it stays, and is named."""

@@ -89,8 +89,8 @@ class Control:
             if built_in is None:
                 self._succeed(command, self.handlers.run(command))
             else:
-                if built_in.interrupts_steps:
-                    self._interrupt_steps(command)
+                if built_in.ends_steps:
+                    self._end_steps(command)
                 self._under_way[command] = actions.begin(self._context, command)
         except BaseException as error:
             self._fail(command, error)  # whatever a handler raises is the answer
@@ -128,7 +128,7 @@ class Control:
             if not isinstance(error, Exception):
                 raise
 
-    def _interrupt_steps(self, by: Command) -> None:
+    def _end_steps(self, by: Command) -> None:
         for command in [c for c in self._under_way if c.action == "step"]:
             progress = self._under_way.pop(command)
             try:

@@ -34,8 +34,8 @@ class LoopStatus(NamedTuple):
     sim_time_s: float
     last_poll_wall_time_s: float | None
     moved_wall_time_s: float | None
-    hold: str | None
-    hold_mode: str | None
+    command: str | None
+    mode_before: str | None
 
 
 class RecordingStatus(NamedTuple):
@@ -56,6 +56,6 @@ def write_heartbeat(
     """Write session and run as they are now, inside a transaction of the caller."""
     now = time.time()
     seen = (now, time.monotonic(), loop.last_poll_wall_time_s, loop.moved_wall_time_s)
-    how = (loop.sim_time_s, loop.hold, loop.hold_mode)
+    how = (loop.sim_time_s, loop.command, loop.mode_before)
     connection.execute(_BEAT_SESSION, (*seen, *how, *recording, session_id))
     connection.execute(_BEAT_RUN, (now, loop.sim_time_s, run.rows, run.id))

@@ -33,7 +33,7 @@ class Journal:
         self._recorder.record("state", clock.run, row)
         if encoded.odd:
             self.values_replaced += len(encoded.odd) - bool(encoded.unnamed) + encoded.unnamed
-            self._say_lost(encoded.odd)
+            self._log_lost(encoded.odd)
 
     def log(self, level: str, source: str, message: str, logger: str | None = None) -> None:
         """Record a line, or its beginning."""
@@ -50,8 +50,8 @@ class Journal:
         row = (self._clock.sim_time_s, time.time(), kind, name, text)
         self._recorder.record("event", self._clock.run, row)
 
-    def _say_lost(self, odd: dict[str, str]) -> None:
-        """Named in `odd` all the same; a value that is not in the row is said once a path."""
+    def _log_lost(self, odd: dict[str, str]) -> None:
+        """Named in `odd` all the same; a value that is not in the row is logged once a path."""
         for path, kind in odd.items():
             if kind in _NOT_LOST or path in self._lost or len(self._lost) >= _MOST_LOST_PATHS:
                 continue

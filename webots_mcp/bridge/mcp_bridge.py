@@ -249,7 +249,7 @@ class MCPBridge:
         return BridgeStats(
             rows_written=recorder.counts.written,
             rows_waiting=recorder.rows_waiting,
-            rows_dropped=recorder.counts.lost,
+            rows_dropped=recorder.counts.dropped,
             publish_calls=throttle.calls,
             publish_throttled=throttle.skipped,
             values_replaced=self._session.context.journal.values_replaced,

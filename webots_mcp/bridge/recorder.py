@@ -48,7 +48,7 @@ class Recorder:
 
     Attributes:
         session: The connection, the session and the current run.
-        counts: Rows that were written and lost.
+        counts: Rows that were written and dropped.
         errors: What went wrong.
     """
 
@@ -136,7 +136,7 @@ class Recorder:
         if not self._writer.is_ready(run):
             return
         connection, registration = self.session.opened
-        status = RecordingStatus(self.rows_waiting, self.counts.lost, self.errors.last_error)
+        status = RecordingStatus(self.rows_waiting, self.counts.dropped, self.errors.last_error)
         ids = (registration.session_id, run)
         patiently(
             lambda: together(connection, lambda: write_heartbeat(connection, loop, status, *ids))
@@ -158,7 +158,7 @@ class Recorder:
         """Run and session are over; what is recorded until `close` still belongs to them."""
         self.end_run(reason, sim_time_s)
         times = {"now": time.time(), "monotonic": time.monotonic()}
-        status = {"dropped": self.counts.lost, "error": self.errors.last_error}
+        status = {"dropped": self.counts.dropped, "error": self.errors.last_error}
         self.record("session end", None, {"reason": reason, **times, **status})
 
     def close(self, reason: str, sim_time_s: float) -> None:
@@ -193,7 +193,7 @@ class Recorder:
         return WaitingFile(path, self.session.describe_session)
 
     def _leave_waiting(self) -> None:
-        """What waits in the file stays there; what waits in memory is lost."""
+        """What waits in the file stays there; what waits in memory is dropped."""
         why = self._backlog.why
         self._backlog.save()
         self._backlog.drop_rows_in_memory(why)

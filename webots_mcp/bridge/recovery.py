@@ -120,7 +120,7 @@ class Recovery:
         self._backlog.rename_run(before, run.uuid)
         moment = (self._clock.newest_s(run), time.time())
         self._backlog.keep(Row("event", run, (*moment, "storage", None, json.dumps({"why": why}))))
-        self._counts.lose_unconfirmed(why)
+        self._counts.drop_unconfirmed(why)
         self._errors.warn("storage", f"{why}; recording goes on in a new database")
 
     def _replace_damaged(self, why: str) -> bool:

@@ -1,4 +1,4 @@
-"""How many rows were written, and how many never will be."""
+"""How many rows were written, and how many were dropped."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from webots_mcp.bridge.error_report import ErrorReport
 
 
 class RowCounts:
-    """Counts what was written and what was lost; the losses are warned of and told as an event.
+    """Counts what was written and what was dropped; that is warned of and told as an event.
 
     Attributes:
         written: Rows that the database took.
-        lost: Rows that will never be in it.
+        dropped: Rows that will never be in it.
         untold: Of those, the ones that the database does not know of yet.
     """
 
@@ -21,12 +21,12 @@ class RowCounts:
         self._why = ""
         self._confirmed = 0
         self.written = 0
-        self.lost = 0
+        self.dropped = 0
         self.untold = 0
 
-    def lose(self, rows: int, why: str) -> None:
-        """Count rows as lost; in strict mode that raises."""
-        self.lost += rows
+    def drop(self, rows: int, why: str) -> None:
+        """Count rows as dropped; in strict mode that raises."""
+        self.dropped += rows
         self.untold += rows
         self._why = why
         self._errors.warn(f"dropped: {why}", f"rows are being dropped: {why}")
@@ -35,13 +35,13 @@ class RowCounts:
         """The files were seen in their place: what was written to them is there."""
         self._confirmed = self.written
 
-    def lose_unconfirmed(self, why: str) -> None:
+    def drop_unconfirmed(self, why: str) -> None:
         """The files are gone, and with them what was written since they were last seen."""
         rows, self.written = self.written - self._confirmed, self._confirmed
         if rows:
-            self.lose(rows, why)
+            self.drop(rows, why)
 
     def tell(self) -> str:
-        """What an event says of the losses that the database does not know of yet."""
+        """What an event says of the dropped rows that the database does not know of yet."""
         rows, self.untold = self.untold, 0
         return json.dumps({"rows": rows, "why": self._why})

@@ -82,7 +82,7 @@ class RowWriter:
             return False
         if self._backlog.waits:
             return False
-        self._tell_losses()
+        self._tell_dropped()
         return not self._backlog.waits
 
     def _is_behind(self, run: Run | None) -> bool:
@@ -97,14 +97,14 @@ class RowWriter:
 
     def _write_failed(self, row: Row, error: Exception) -> None:
         if is_unfit(error):
-            self._counts.lose(1, str(error))
+            self._counts.drop(1, str(error))
         else:
             self._keep(row)
             self._recovery.put_off(error)
 
     def _keep(self, row: Row) -> None:
         if self._recovery.off is not None:
-            self._counts.lose(1, self._recovery.off)
+            self._counts.drop(1, self._recovery.off)
         else:
             self._backlog.keep(row)
 
@@ -123,9 +123,9 @@ class RowWriter:
         self._counts.written += sum(entry.kind != "run" for entry in taken.written)
         run.rows += sum(e.kind == "state" and e.run == run.uuid for e in taken.written)
         for why in taken.unfit:
-            self._counts.lose(1, why)
+            self._counts.drop(1, why)
 
-    def _tell_losses(self) -> None:
+    def _tell_dropped(self) -> None:
         if self._counts.untold:
             run, text = self._session.run, self._counts.tell()
             now = (self._clock.newest_s(run), time.time())

@@ -73,7 +73,7 @@ def test_events_tell_since_when_it_was_stuck(say: Say) -> None:
     assert line_with(text, "gap", "89.9")
     beyond = say("events", "--run", "1", "--signal", "pose.0", "--above", "7.9", "--for", "2")
     assert len(beyond.splitlines()) == 3
-    assert "nothing of these kinds" in say("events", "--kind", "stuck")
+    assert "looked for and absent: stuck" in say("events", "--kind", "stuck")
 
 
 def test_compare_says_what_differs(say: Say) -> None:

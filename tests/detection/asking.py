@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from tests.detection.labelled import Measure
-from webots_mcp.store.detection.event import KINDS, Event, EventOptions, Kind
+from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import resolve_range
@@ -18,28 +18,18 @@ from webots_mcp.store.reading.ranges import resolve_range
 UNHURRIED_S: Final = 300.0
 _ALL: Final = 1_000_000
 
-# The kinds of events that tell each measure; those that do not exist are left out.
+# The kinds of events that tell each measure.
 _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
     "standstill": ("still", "stuck"),
     "stuck": ("stuck",),
     "silent": ("silent",),
     "flat": ("flat",),
-    "dropout": ("jump", "dropout", "spike"),
-    "leap": ("jump", "leap"),
+    "dropout": ("jump",),
+    "leap": ("jump",),
     "swing": ("oscillation",),
     "gap": ("gap",),
 }
-# Words of a note that admits that something of a measure may have been missed.
-_WORDS: Final[dict[Measure, tuple[str, ...]]] = {
-    "standstill": ("still", "stuck"),
-    "stuck": ("still", "stuck"),
-    "silent": ("silent", "silence"),
-    "flat": ("flat",),
-    "dropout": ("jump", "dropout", "spike"),
-    "leap": ("jump", "leap"),
-    "swing": ("oscillation", "swing"),
-    "gap": ("gap",),
-}
+_OTHER_SIGNALS: Final = "not in "  # why some are never searched
 _OF_ROBOT: Final = frozenset[Measure]({"standstill", "stuck", "leap", "gap"})
 
 
@@ -69,11 +59,12 @@ class Answer:
     """What a question was answered.
 
     Attributes:
+        not_searched: By kind of event, what was not looked for and why.
         took_s: Wall time.
     """
 
     claims: tuple[Claim, ...]
-    notes: tuple[str, ...]
+    not_searched: dict[str, str]
     took_s: float
 
     def of(self, measure: Measure, run_id: int) -> list[Claim]:
@@ -81,9 +72,9 @@ class Answer:
         return [each for each in self.claims if (each.measure, each.run_id) == (measure, run_id)]
 
     def admits(self, measure: Measure) -> bool:
-        """Whether a note says that something of that kind may have been missed."""
-        words = ("time was over", *_WORDS[measure])
-        return any(word in note.lower() for note in self.notes for word in words)
+        """Whether it says that something of that kind may have been missed."""
+        reasons = [self.not_searched.get(kind, "") for kind in _KINDS[measure]]
+        return any(reason and not reason.startswith(_OTHER_SIGNALS) for reason in reasons)
 
 
 def ask_run(
@@ -107,8 +98,7 @@ def ask_since(
 def _asked(
     connection: sqlite3.Connection, measures: Sequence[Measure], **bounds: float | None
 ) -> Answer:
-    named = {kind for measure in measures for kind in _KINDS[measure]}
-    kinds: tuple[Kind, ...] = tuple(kind for kind in KINDS if kind in named)
+    kinds = tuple({kind for measure in measures for kind in _KINDS[measure]})
     started_s = time.perf_counter()
     time_range = resolve_range(connection, **bounds)  # pyright: ignore[reportArgumentType]
     told = find_events(
@@ -121,7 +111,7 @@ def _asked(
     )
     took_s = time.perf_counter() - started_s
     claims = [each for measure in measures for each in claims_of(told.events, measure)]
-    return Answer(tuple(claims), told.notes, took_s)
+    return Answer(tuple(claims), told.verdicts.not_searched, took_s)
 
 
 def claims_of(events: Iterable[Event], measure: Measure) -> list[Claim]:

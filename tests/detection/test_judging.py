@@ -111,7 +111,7 @@ def test_a_leap_of_the_robot_and_a_jump_of_a_sensor_are_two_things() -> None:
     assert [each.name for each in claims_of(events, "dropout")] == ["front"]
 
 
-def test_a_note_admits_what_it_names() -> None:
-    answer = Answer((), ("stuck was not searched: no position is published",), 0.0)
+def test_an_answer_admits_what_it_says_it_did_not_search() -> None:
+    answer = Answer((), {"stuck": "no position is known"}, 0.0)
     assert answer.admits("stuck") and answer.admits("standstill") and not answer.admits("swing")
-    assert Answer((), ("the time was over: searched up to 3 s only",), 0.0).admits("swing")
+    assert not Answer((), {"oscillation": "not in 3 of 4 signals"}, 0.0).admits("swing")

@@ -120,7 +120,7 @@ async def test_one_name_is_taken_for_a_list_of_one(connect: Connect, recorded: R
             assert answer["raw"]["signals"] == {"pose.x": [1]}
         assert "not [1]" in await fail(client, "webots_compare_runs", run_ids=1)
         answer = await ask(client, "webots_find_events", kinds="run")
-        assert answer["totals"] == {"run": 1}
+        assert answer["verdicts"]["found"] == {"run": 1}
 
 
 async def test_a_misspelt_signal_is_answered_with_the_nearest_names(

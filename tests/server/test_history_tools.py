@@ -13,6 +13,8 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import ask, fail, pictures_of, text_of
 from tests.server.story import WAYS, Way, client_on, copy_of, rows_of, write_story
 from webots_mcp.connection import connect
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.rollup.rolling import roll
 
 pytestmark = pytest.mark.anyio
@@ -170,7 +172,7 @@ async def test_events_tell_what_nobody_noted(story: Path) -> None:
     assert found["oscillation", "heading"]["details"]["period_s"] == pytest.approx(2.0, rel=0.05)
     assert found["jump", "ir"]["start_s"] == 70.0
     assert [event["start_s"] for event in events] == sorted(event["start_s"] for event in events)
-    assert sum(answer["totals"].values()) == len(events)
+    assert sum(answer["verdicts"]["found"].values()) == len(events)
 
 
 async def test_a_threshold_holds_for_at_least_so_long(story: Path) -> None:
@@ -178,7 +180,7 @@ async def test_a_threshold_holds_for_at_least_so_long(story: Path) -> None:
     both = await tell(story, "webots_find_events", **asked, for_s=2)
     assert [row["start_s"] for row in rows_of(both["events"])] == [39.6, 95.6]
     none = await tell(story, "webots_find_events", **asked, for_s=60)
-    assert "webots_get_trends" in none["hint"]
+    assert "pose.0 was beyond it for" in none["verdicts"]["absent"]["threshold"]
     assert "need signals" in await refuse(story, "webots_find_events", above=1)
 
 
@@ -191,7 +193,7 @@ async def test_the_timeline_goes_on_page_by_page(story: Path) -> None:
             seen += [(r["kind"], r.get("name"), r["start_s"]) for r in rows_of(page["events"])]
             if not (cursor := page.get("cursor", "")):
                 break
-    assert len(seen) == len(set(seen)) == sum(page["totals"].values())
+    assert len(seen) == len(set(seen)) == sum(page["verdicts"]["found"].values())
     assert [at for _, _, at in seen] == sorted(at for _, _, at in seen)
     assert ("command", "set_speed", 20.0) in seen
     assert ("image", "cam", 30.0) in seen
@@ -309,7 +311,7 @@ async def test_the_schema_is_told_before_anything_was_recorded(tmp_path: Path) -
         ("webots_get_trends", {"since": 1700000100, "until": 1.7e9}, "until=1700000000"),
         ("webots_query_history", {"signals": ["mode"], "max_points": 10**9}, "less than or equal"),
         ("webots_find_events", {"kinds": ["threshold"]}, "above or below"),
-        ("webots_find_events", {"kinds": ["explosion"]}, "must be 'run'"),
+        ("webots_find_events", {"kinds": ["explosion"]}, "must be one of run, gap"),
         ("webots_get_timeline", {"cursor": "xyz"}, "no cursor"),
         ("webots_compare_runs", {"run_ids": [1]}, "2 to 10"),
         ("webots_compare_runs", {"run_ids": [1, 99]}, "no run 99"),
@@ -368,11 +370,25 @@ async def test_empty_answers_say_why_and_what_to_try(story: Path) -> None:
         ("webots_get_trends", {"start_s": 500}, "leave the range out"),
         ("webots_query_history", {"signals": ["*"], "start_s": 500}, "leave the range out"),
         ("webots_get_trends", {"since": "2035-01-01"}, "webots_list_runs"),
-        ("webots_find_events", {"kinds": ["stuck"]}, "widen the range"),
-        ("webots_get_timeline", {"kinds": ["gap"]}, "widen the range"),
         ("webots_query_sql", {"sql": "SELECT 1 WHERE 0"}, "webots_list_signals"),
     ):
         assert words in (await tell(story, tool, **arguments))["hint"], tool
+
+
+async def test_of_each_kind_it_is_told_whether_it_was_found_is_absent_or_was_not_searched(
+    story: Path,
+) -> None:
+    for kinds in (["stuck", "gap"], ["jump", "silent", "flat", "oscillation"], None):
+        told = (await tell(story, "webots_find_events", kinds=kinds))["verdicts"]
+        named = {*told.get("found", ()), *told.get("absent", ())}
+        named |= {kind for kinds in told.get("not_searched", ()) for kind in kinds.split(", ")}
+        assert named == {*(kinds or (kind.name for kind in asked_kinds(EventOptions())))}
+    (answer,) = [await tell(story, "webots_find_events", kinds=["still"], signals=["mode"])]
+    assert "still" in answer["verdicts"]["absent"] or answer["verdicts"]["found"]["still"]
+    blind = await tell(story, "webots_find_events", kinds=["silent"], signals=["mode"])
+    assert blind["verdicts"] == {
+        "not_searched": {"silent": "no number was published, or none of these names"}
+    }
 
 
 async def test_answers_are_the_same_before_and_after_rolling_up(
@@ -410,4 +426,4 @@ async def test_what_find_events_does_not_show_is_named_by_time_and_a_cursor_show
                 break
             assert all(" from " in each for each in answer["not_shown"].values())
             asked["cursor"] = answer["cursor"]
-    assert told == Counter(answer["totals"]) and "image" not in told
+    assert told == Counter(answer["verdicts"]["found"]) and "image" not in told

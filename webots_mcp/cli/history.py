@@ -28,6 +28,7 @@ from webots_mcp.errors import InvalidInputError
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.spread import Spread
     from webots_mcp.store.detection.event import EventOptions
+    from webots_mcp.store.detection.verdict import Verdicts
     from webots_mcp.store.questions.compare import Comparison
     from webots_mcp.store.questions.series import RunHistory
     from webots_mcp.store.questions.trends import RunTrends, StateTrend
@@ -167,8 +168,14 @@ def events(arguments: argparse.Namespace) -> None:
         for kind, each in found.left_out.items()
     ]
     left_out += [f"--after '{found.cursor}' shows them, -n more at once"] if found.cursor else []
-    none = [] if rows else ["nothing of these kinds in that range"]
-    print_notes([*found.notes, *left_out, *none])
+    print_notes([*_verdicts(found.verdicts), *found.notes, *left_out])
+
+
+def _verdicts(verdicts: Verdicts) -> list[str]:
+    """What became of the kinds that are not in the table, or not all."""
+    absent = [f"{kind} ({near})" if near else kind for kind, near in verdicts.absent.items()]
+    unsearched = [f"not looked for: {kinds}: {why}" for kinds, why in verdicts.gaps.items()]
+    return [f"looked for and absent: {', '.join(absent)}"] * bool(absent) + unsearched
 
 
 @question(
@@ -237,13 +244,13 @@ def scope_of(arguments: argparse.Namespace) -> Scope:
 
 
 def _options(arguments: argparse.Namespace) -> EventOptions:
-    from webots_mcp.store.detection.event import USUAL_KINDS, EventOptions
-    from webots_mcp.store.detection.thresholds import thresholds_on
+    from webots_mcp.store.detection.event import EventOptions
+    from webots_mcp.store.detection.threshold import thresholds_on
 
     limits = thresholds_on(
         arguments.signal or (), arguments.above, arguments.below, arguments.for_s
     )
-    kinds = tuple(arguments.kind or (("threshold",) if limits else USUAL_KINDS))
+    kinds = tuple(arguments.kind or ("threshold",) * bool(limits))
     return EventOptions(kinds=kinds, signals=tuple(arguments.signal or "*"), thresholds=limits)
 
 

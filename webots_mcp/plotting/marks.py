@@ -4,38 +4,49 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
 from webots_mcp.plotting.parts import Part
 from webots_mcp.plotting.spans import Lane, Span
-from webots_mcp.store.detection.event import Event, EventOptions, Kind
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.registry import drawn_kinds
+from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.questions.events import Events, find_events
 
 MOST_EVENTS: Final = 500
 MOST_LANES: Final = 5
-# What a person would look for first. Changes and gaps are drawn otherwise.
-_KINDS: Final[tuple[Kind, ...]] = (
-    "stuck", "jump", "silent", "oscillation", "log", "command", "noticed", "flat", "still",
-)  # fmt: skip
 
 
 def event_lanes(
     connection: sqlite3.Connection, part: Part, names: Sequence[str]
 ) -> tuple[list[Lane], list[str]]:
     """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole."""
-    options = EventOptions(kinds=_KINDS, signals=tuple(names))
+    drawn = tuple(kind.name for kind in drawn_kinds())
+    options = EventOptions(kinds=drawn, signals=tuple(names))
     found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=(), group=False)
-    kinds: list[str] = [
-        kind for kind in _KINDS if any(event.kind == kind for event in found.events)
-    ]
+    kinds = [kind for kind in drawn if any(event.kind == kind for event in found.events)]
     lanes = [_lane(kind, found, part) for kind in kinds[:MOST_LANES]]
     notes = [note for note in found.notes if note not in part.notes]
+    notes += _not_looked_for(found.verdicts)
     if found.left_out:
         kind, rest = max(found.left_out.items(), key=lambda item: item[1].count)
         notes.append(f"{rest.count} events of kind {kind} up to {rest.last_s:.3f} s are not drawn")
     if left_out := kinds[MOST_LANES:]:
         notes.append(f"events left out: {', '.join(left_out)}")
     return lanes, notes
+
+
+def _not_looked_for(verdicts: Verdicts) -> list[str]:
+    """Where a picture shows no number, there is none to be judged: that is no news."""
+    of_numbers = [kind.name for kind in drawn_kinds() if kind.of_numbers]
+    told = {
+        kind: why
+        for kind, why in verdicts.not_searched.items()
+        if kind not in of_numbers or verdicts.unlooked(kind) is None
+    }
+    gaps = replace(verdicts, not_searched=told).gaps
+    return [f"not looked for: {kinds}: {why}" for kinds, why in gaps.items()]
 
 
 def _lane(kind: str, found: Events, part: Part) -> Lane:

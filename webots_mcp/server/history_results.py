@@ -127,15 +127,28 @@ class TrendsAnswer(NotedAnswer):
     runs: list[RunTrendTables] | None = None
 
 
+class KindVerdicts(BaseModel):
+    """What became of each kind that was asked for."""
+
+    found: dict[str, int] | None = Field(
+        default=None, description="How many there are in the range, shown or not."
+    )
+    absent: dict[str, str] | None = Field(
+        default=None, description="Looked for, and there is none; what came nearest, if known."
+    )
+    not_searched: dict[str, str] | None = Field(
+        default=None,
+        description="Not looked for, or not everywhere: why, and what to ask instead.",
+    )
+
+
 class EventsAnswer(NotedAnswer):
     """What happened in a range, in order of time."""
 
     events: Table | None = Field(
         default=None, description="Columns with @ hold that signal's value when the event began."
     )
-    totals: dict[str, int] | None = Field(
-        default=None, description="How many there are of each kind, shown or not."
-    )
+    verdicts: KindVerdicts | None = None
     not_shown: dict[str, str] | None = Field(
         default=None,
         description="How many of each kind there are beside these, and when they began.",
@@ -149,9 +162,7 @@ class TimelineAnswer(NotedAnswer):
     """A page of what happened, in order of time."""
 
     events: Table | None = None
-    totals: dict[str, int] | None = Field(
-        default=None, description="How many there are of each kind in the whole range."
-    )
+    verdicts: KindVerdicts | None = None
     cursor: str | None = Field(
         default=None, description="Ask again with this cursor for later ones."
     )
@@ -169,9 +180,7 @@ class MonitorAnswer(NotedAnswer):
     events: Table | None = Field(
         default=None, description="Columns with @ hold that signal's value when the event began."
     )
-    totals: dict[str, int] | None = Field(
-        default=None, description="How many events there are of each kind, shown or not."
-    )
+    verdicts: KindVerdicts | None = None
     not_shown: dict[str, str] | None = Field(
         default=None,
         description="How many of each kind there are beside these, and when they began.",

@@ -7,10 +7,16 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field
 
 from webots_mcp import contract
-from webots_mcp.store.detection.event import Kind
+from webots_mcp.store.detection.registry import KINDS, kind_names
 
 # Clients put a call aside after two minutes; some of this time is for a busy database.
 MAX_WAIT_S: Final = 90
+
+
+def _as_kind(name: str) -> str:
+    if name not in kind_names():
+        raise ValueError(f"be one of {', '.join(kind_names())}")
+    return name
 
 
 def _as_id(value: int) -> int:
@@ -84,9 +90,21 @@ MaxPoints = Annotated[
         description="At most so many buckets (with raw: rows); by default as many as fit.",
     ),
 ]
+Kind = Annotated[
+    str,
+    AfterValidator(_as_kind),
+    Field(json_schema_extra={"enum": [*kind_names()]}),
+]
 Kinds = Annotated[
     list[Kind] | None,
-    Field(description="Only these; by default all (of the timeline: all that were stored)."),
+    Field(
+        description="Only these; by default all but image. "
+        f"{'; '.join(f'{kind.name}: {kind.means}' for kind in KINDS if kind.means)}."
+    ),
+]
+TimelineKinds = Annotated[
+    list[Kind] | None,
+    Field(description="Only these; by default all that were stored; see webots_find_events."),
 ]
 ShownLimit = Annotated[
     int | None,

@@ -13,8 +13,8 @@ from webots_mcp.connection import Role, connect
 from webots_mcp.contract import LOG_LEVELS, Database
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.schema import schema_version
-from webots_mcp.store.detection.event import USUAL_KINDS, EventOptions, Kind
 from webots_mcp.store.detection.event import Event as FoundEvent
+from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.events import Event, newest_events
 from webots_mcp.store.logs import LogFilter, LogLine, newest_lines
 from webots_mcp.store.questions.events import find_events
@@ -110,7 +110,7 @@ class Recording:
             found = newest_events(connection, subject.run_id, _NO_LIMIT)
         return [event for event in found if kind in (None, event.kind)]
 
-    def find_events(self, *kinds: Kind, **options: Any) -> list[FoundEvent]:
+    def find_events(self, *kinds: str, **options: Any) -> list[FoundEvent]:
         """What the values of the run show: when it was stuck, where a signal jumped, and the like.
 
         Args:
@@ -120,12 +120,17 @@ class Recording:
 
         Raises:
             InvalidInputError: There is no such kind.
+            NothingRecordedError: A named kind could not be looked for: without a position, say,
+                nobody knows whether the robot was stuck, and an empty list would claim to.
         """
         self._roll_up()
-        wanted = EventOptions(kinds=kinds or USUAL_KINDS, **options)
+        wanted = EventOptions(kinds=kinds, **options)
         with self._subject() as (connection, subject):
             whole = find_range(connection, Scope(), subject)
             found = find_events(connection, whole, wanted, limit=sys.maxsize, deadline_s=math.inf)
+        for kind in kinds:
+            if (why := found.verdicts.unlooked(kind)) is not None:
+                raise NothingRecordedError(f"{kind} could not be looked for: {why}")
         return list(found.events)
 
     def logs(self, level: str = "debug", text: str = "") -> list[LogLine]:

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import WALL_START_S, Recorder
-from webots_mcp.store.detection.event import Event, EventOptions, Kind, Threshold
+from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import resolve_range
 from webots_mcp.store.rollup.rolling import roll
@@ -40,7 +40,7 @@ def standing(empty: sqlite3.Connection, tier: str) -> sqlite3.Connection:
     return empty
 
 
-def told(connection: sqlite3.Connection, kind: Kind, **bounds: Any) -> list[Event]:
+def told(connection: sqlite3.Connection, kind: str, **bounds: Any) -> list[Event]:
     low = (Threshold("battery_v", below=5.0, for_s=2.0),)
     name = {"silent": "front_m", "flat": "heading_deg", "change": "mode"}.get(kind, "*")
     options = EventOptions(kinds=(kind,), signals=(name,), thresholds=low)
@@ -52,7 +52,7 @@ def told(connection: sqlite3.Connection, kind: Kind, **bounds: Any) -> list[Even
     ("start_s", "end_s"), [(250.0, 255.0), (250.0, 250.5), (150.0, 250.0), (295.0, 350.0)]
 )
 def test_a_range_that_holds_a_part_tells_the_true_begin_and_end(
-    standing: sqlite3.Connection, kind: Kind, start_s: float, end_s: float
+    standing: sqlite3.Connection, kind: str, start_s: float, end_s: float
 ) -> None:
     (event,) = told(standing, kind, start_s=start_s, end_s=end_s)
     assert event.start_s == pytest.approx(STOPS_S, abs=0.9)
@@ -63,7 +63,7 @@ def test_a_range_that_holds_a_part_tells_the_true_begin_and_end(
 
 @pytest.mark.parametrize("kind", ["stuck", "threshold", "silent", "flat"])
 def test_what_was_over_before_the_range_is_not_in_it(
-    standing: sqlite3.Connection, kind: Kind
+    standing: sqlite3.Connection, kind: str
 ) -> None:
     assert told(standing, kind, start_s=302.0, end_s=330.0) == []
     assert told(standing, kind, start_s=150.0, end_s=198.0) == []

@@ -16,7 +16,9 @@ from tests.recordings.rover import WALL_START_S, Recorder
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.analysis.jumps import find_jumps
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
-from webots_mcp.store.detection.search import Detection
+from webots_mcp.store.detection.extent import Detection
+from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import resolve_range
@@ -31,7 +33,7 @@ def ask(connection: sqlite3.Connection, kind: Any, *, bounds: Any = None, **opti
 
 def is_unrolled(events: Events) -> bool:
     """A long range without rollups is not searched for these, and the answer admits it."""
-    return any("not rolled up yet" in note for note in events.notes)
+    return any("not rolled up yet" in why for why in events.verdicts.not_searched.values())
 
 
 def spans(events: Events) -> list[tuple[float, float]]:
@@ -229,12 +231,10 @@ def test_a_cursor_of_find_events_that_is_none_is_refused(rover: sqlite3.Connecti
 
 def test_what_there_was_no_time_for_is_named(rover: sqlite3.Connection, tier: str) -> None:
     found = resolve_range(rover, run_id=1)
-    events = find_events(rover, found, deadline_s=0.0)
-    (note,) = (note for note in events.notes if "not looked for" in note and "jump" in note)
-    for kind in ("stuck", "silent", "flat", "jump", "oscillation"):
-        assert kind in note and kind not in events.totals
-    (note,) = (note for note in events.notes if "not looked for: run" in note)
-    assert "log" in note and "change" in note and not events.events
+    told = find_events(rover, found, deadline_s=0.0)
+    assert not told.events and not told.verdicts.absent and not told.verdicts.found
+    for kind in asked_kinds(EventOptions()):
+        assert "ask for this kind alone" in told.verdicts.not_searched[kind.name]
 
 
 def test_between_two_signals_the_time_is_looked_at(
@@ -242,17 +242,14 @@ def test_between_two_signals_the_time_is_looked_at(
 ) -> None:
     ticks = count()
     time_range = resolve_range(rover, run_id=1)
-    detection = Detection(
-        rover,
-        known_signals(rover, time_range),
-        EventOptions(kinds=("jump",)),
-        Deadline(12.0, lambda: next(ticks)),
-        *(0.0, 119.9),
-    )
-    notes: list[str] = []
-    detection.events_touching(time_range.segments[0], notes)
-    told = " ".join(notes)
-    assert re.search(r"jump was not searched in \d+ signals", told), told
+    options, ledger = EventOptions(kinds=("jump",)), Ledger()
+    kinds = asked_kinds(options)
+    deadline = Deadline(12.0, lambda: next(ticks))
+    known = known_signals(rover, time_range)
+    detection = Detection(rover, known, kinds, options, deadline, ledger)
+    found = detection.events_touching(time_range.segments[0])
+    told = ledger.verdicts(kinds, found).not_searched["jump"]
+    assert re.search(r"the time was over before \d+ signals: ask for", told), told
 
 
 def test_a_run_that_is_only_cruising_has_no_trouble(rover: sqlite3.Connection) -> None:
@@ -263,7 +260,7 @@ def test_a_run_that_is_only_cruising_has_no_trouble(rover: sqlite3.Connection) -
 
 def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
     with pytest.raises(InvalidInputError, match="kind"):
-        EventOptions(kinds=("stcuk",))  # pyright: ignore[reportArgumentType]
+        ask(rover, "stcuk")
     with pytest.raises(InvalidInputError, match="above or below"):
         Threshold("ir")
     with pytest.raises(InvalidInputError, match="stuck_s"):
@@ -372,7 +369,7 @@ def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Co
     recorder.run(recorder.session(robot_id, "x"), robot_id)
     for step in range(300):
         recorder.publish(step * 0.1, {"gps": {"x": step * 0.03, "y": 0}})
-    assert "it came 0.9 m far" in ask(empty, "stuck").notes[0]
+    assert "0.9 m in 3 s" in ask(empty, "stuck").verdicts.absent["stuck"]
 
 
 def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
@@ -391,7 +388,8 @@ def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(
     robot_id = recorder.robot("r")
     recorder.run(recorder.session(robot_id, "x"), robot_id)
     recorder.publish(0.0, {"mode": "drive", "range": 1.0})
-    assert "no position is published" in ask(empty, "stuck", bounds={"run_id": 1}).notes[0]
+    told = ask(empty, "stuck", bounds={"run_id": 1}).verdicts
+    assert "no position is known" in told.not_searched["stuck"] and not told.absent
 
 
 def test_a_wall_range_over_several_runs_knows_the_signals_of_each(

@@ -21,7 +21,7 @@ from webots_mcp.server.budget import (
     without_empty,
 )
 from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.history_results import EventsAnswer
+from webots_mcp.server.history_results import EventsAnswer, KindVerdicts
 from webots_mcp.server.parameters import (
     AnyNames,
     Kinds,
@@ -30,8 +30,9 @@ from webots_mcp.server.parameters import (
     TextCursor,
 )
 from webots_mcp.server.results import Table
-from webots_mcp.store.detection.event import USUAL_KINDS, Event, EventOptions, Kind, Threshold
-from webots_mcp.store.detection.thresholds import thresholds_on
+from webots_mcp.store.detection.event import Event, EventOptions, Threshold
+from webots_mcp.store.detection.threshold import thresholds_on
+from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.questions.events import Events, Found, search_events
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
@@ -69,11 +70,8 @@ def webots_find_events(
 ) -> EventsAnswer:
     """What happened in a stretch of time, by default the whole run, with begin and duration.
 
-    Changed modes and flags, still (it stood), stuck (it stood and should have moved; evidence
-    says why), oscillation, jumps, thresholds, silent or flat sensors, recording gaps, runs,
-    commands, log lines: "since when, how often, in which mode". Many jumps, silences or flat
-    times of one signal are one event with count and says. Pictures only with kinds=["image"].
-    What is not shown is counted; cursor shows it.
+    Many alike events of one signal are told as one, counted. verdicts: what was found, what
+    is absent, what was not looked for and why. What is not shown is counted; cursor shows it.
     """
     thresholds = thresholds_on(signals or (), above, below, for_s)
     options = EventOptions(
@@ -92,11 +90,11 @@ def webots_find_events(
         )
 
 
-def _kinds(kinds: Sequence[Kind] | None, thresholds: Sequence[Threshold]) -> tuple[Kind, ...]:
+def _kinds(kinds: Sequence[str] | None, thresholds: Sequence[Threshold]) -> tuple[str, ...]:
     """Who gives a threshold asks about that, unless other kinds are named."""
     if kinds and "threshold" in kinds and not thresholds:
         raise InvalidInputError("kinds=['threshold'] needs signals, and above or below")
-    return tuple(kinds) if kinds else ("threshold",) if thresholds else USUAL_KINDS
+    return tuple(kinds or ()) or ("threshold",) * bool(thresholds)
 
 
 def _found(
@@ -106,10 +104,11 @@ def _found(
     budget = BUDGET if limit is None else LARGE_BUDGET
     told, events = fitting_events(found, limit or DEFAULT_LIMIT, budget, view)
     hints = ["ask again with this cursor for what is not shown"] if told.cursor else []
-    hints += [] if events else [_why_none(options, cursor, bool(found.totals))]
+    if cursor and found.verdicts.found and not events:
+        hints.append("nothing was left out before that cursor")
     return {
         "events": events,
-        "totals": found.totals or None,
+        "verdicts": verdicts_of(found.verdicts),
         "not_shown": not_shown_of(told),
         "cursor": told.cursor,
         "notes": notes_of(found.notes),
@@ -129,6 +128,15 @@ def fitting_events(
             return told, made
         shown_now = len(told.events)
         limit = max(1, min(shown_now - 1, int(shown_now * budget / size)))
+
+
+def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
+    """What became of each kind, as it is shown."""
+    return KindVerdicts(
+        found=verdicts.found or None,
+        absent=verdicts.absent or None,
+        not_searched=verdicts.gaps or None,
+    )
 
 
 def not_shown_of(told: Events) -> dict[str, str] | None:
@@ -159,11 +167,3 @@ def events_table(events: Sequence[Event], view: View) -> Table | None:
     ]
     columns = [*EVENT_COLUMNS, *(f"@{short_name(name)}" for name in around)]
     return without_empty(columns, rows)
-
-
-def _why_none(options: EventOptions, cursor: str, any_before: bool) -> str:
-    if cursor and any_before:
-        return "nothing was left out before that cursor"
-    if options.thresholds:
-        return "never beyond the threshold that long: webots_get_trends tells the extremes"
-    return "nothing of these kinds in that range: widen the range, or leave kinds and signals out"

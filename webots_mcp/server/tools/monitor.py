@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections import Counter
 from typing import Annotated, Any, Final
 
 import anyio
@@ -16,7 +15,7 @@ from webots_mcp.server.budget import BUDGET, answer_about, notes_of
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import MonitorAnswer
 from webots_mcp.server.parameters import MAX_WAIT_S, RobotName
-from webots_mcp.server.tools.events import fitting_events, not_shown_of
+from webots_mcp.server.tools.events import fitting_events, not_shown_of, verdicts_of
 from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
 from webots_mcp.server.watching import Window, movement, window_from
 from webots_mcp.store.detection.event import Event
@@ -99,14 +98,15 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     budget = BUDGET // 2 // max(len(told), 1)
     found = search_events(view.connection, window.around)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
-    shown, events = fitting_events(found.only(happened), _SHOWN_EVENTS, BUDGET // 2, view)
+    in_window = found.only(happened)
+    shown, events = fitting_events(in_window, _SHOWN_EVENTS, BUDGET // 2, view)
     rows = sum(run.rows for run in told)
     return {
         "rows": rows,
         "movement": movement(view, window.rows) if recorded else None,
         "trends": [trend_tables(run, _SHOWN_SIGNALS, budget) for run in told] or None,
         "events": events,
-        "totals": dict(Counter(event.kind for event in happened)) or None,
+        "verdicts": verdicts_of(in_window.verdicts),
         "not_shown": not_shown_of(shown),
         "notes": notes_of(tuple(dict.fromkeys((*window.rows.notes, *found.notes)))),
         "hint": _hint(rows, bool(shown.left_out), wall_start_s, view),

@@ -10,14 +10,15 @@ from webots_mcp.server.budget import BUDGET, LARGE_BUDGET, answer_about, notes_o
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import TimelineAnswer
 from webots_mcp.server.parameters import (
-    Kinds,
     LogLevel,
     ShownLimit,
     TextCursor,
+    TimelineKinds,
 )
-from webots_mcp.server.tools.events import events_table
+from webots_mcp.server.tools.events import events_table, verdicts_of
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.timeline import STORED, timeline
+from webots_mcp.store.detection.registry import stored_kinds
+from webots_mcp.store.questions.timeline import timeline
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
@@ -28,7 +29,7 @@ DEFAULT_LIMIT: Final = 50
 def webots_get_timeline(
     recording: Recording,
     scope: Scope,
-    kinds: Kinds = None,
+    kinds: TimelineKinds = None,
     log_level: LogLevel = "info",
     limit: ShownLimit = None,
     cursor: TextCursor = "",
@@ -39,7 +40,7 @@ def webots_get_timeline(
     """
     if "threshold" in (kinds or ()):
         raise InvalidInputError("a threshold has no place here: ask webots_find_events(above)")
-    options = EventOptions(kinds=tuple(kinds or STORED), log_level=log_level)
+    options = EventOptions(kinds=tuple(kinds or stored_kinds()), log_level=log_level)
     with recording.view(scope.robot, scope.run_id) as view:
         return answer_about(
             view,
@@ -63,14 +64,8 @@ def _found(
         entries = max(1, int(entries * 0.95 * budget / size))
     return {
         "events": events,
-        "totals": page.totals or None,
+        "verdicts": verdicts_of(page.verdicts),
         "cursor": page.cursor,
         "notes": notes_of(page.notes),
-        "hint": None if events else _why_none(cursor, bool(page.totals)),
+        "hint": "nothing after that cursor" if cursor and not events else None,
     }
-
-
-def _why_none(cursor: str, any_before: bool) -> str:
-    if cursor and any_before:
-        return "nothing after that cursor"
-    return "nothing of these kinds in that range: widen the range, or leave kinds out"

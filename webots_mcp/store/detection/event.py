@@ -4,19 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final
 
 from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import Value
 
-Kind = Literal[
-    "run", "gap", "change", "still", "stuck", "threshold", "silent", "flat", "jump", "oscillation",
-    "command", "log", "noticed", "image",
-]  # fmt: skip
-KINDS: Final[tuple[Kind, ...]] = get_args(Kind)
-# What is looked for unless kinds are named: a picture is no news, and there may be thousands.
-USUAL_KINDS: Final[tuple[Kind, ...]] = tuple(kind for kind in KINDS if kind != "image")
 LEVELS: Final = LOG_LEVELS
 
 
@@ -25,9 +18,7 @@ class Event:
     """Something that happened in a run.
 
     Attributes:
-        kind: run (it began or ended), gap (no rows), change (of a text or flag), still (it stood),
-            stuck (it stood and should have moved), threshold, silent (no value), flat, jump,
-            oscillation; command, log, noticed (by the bridge), image.
+        kind: The name of one of `registry.KINDS`.
         end_s: Equal to the start for what has no duration; of a change when the value ended.
         ongoing: It lasts up to the newest row of a run that goes on; of a command, it is not
             finished.
@@ -36,7 +27,7 @@ class Event:
         around: Values of a few signals when it began.
     """
 
-    kind: Kind
+    kind: str
     run_id: int
     start_s: float
     end_s: float
@@ -75,7 +66,8 @@ class EventOptions:
     """What counts as an event.
 
     Attributes:
-        kinds: Which kinds are looked for; pictures only where they are named.
+        kinds: Names of the kinds that are looked for; without any the usual ones, which pictures
+            and thresholds are not.
         signals: Names, with `*`, of the signals that are looked at.
         position: The two signals of the position in metres; None finds them by name (`pose.0`
             and `pose.1`, `position.x` and `position.y`, `gps.0` and so on).
@@ -98,7 +90,7 @@ class EventOptions:
         log_level: Log lines of this level and above.
     """
 
-    kinds: tuple[Kind, ...] = USUAL_KINDS
+    kinds: tuple[str, ...] = ()
     signals: tuple[str, ...] = ("*",)
     position: tuple[str, str] | None = None
     mode: str | None = None
@@ -117,9 +109,6 @@ class EventOptions:
     log_level: str = "warning"
 
     def __post_init__(self) -> None:
-        unknown = [kind for kind in self.kinds if kind not in KINDS]
-        if unknown:
-            raise InvalidInputError(f"unknown kind {unknown[0]!r}; there is {', '.join(KINDS)}")
         if self.log_level not in LEVELS:
             raise InvalidInputError(
                 f"unknown log level {self.log_level!r}; there is {', '.join(LEVELS)}"

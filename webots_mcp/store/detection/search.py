@@ -1,160 +1,152 @@
-"""Events that values tell: those that a segment touches, each with its true begin and end."""
+"""One search in a stretch of a run: what a detector may look at, and what it tells."""
 
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
-from operator import attrgetter
-from typing import Final
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Final
 
-from webots_mcp.store.analysis.motion import find_motion
-from webots_mcp.store.detection.detectors import DETECTED, DETECTORS, OF_NUMBERS, Search
-from webots_mcp.store.detection.event import Event, EventOptions, Kind, Threshold
+from webots_mcp.store.analysis.motion import Motion, find_motion
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.ranges import Segment, just_after
-from webots_mcp.store.reading.views import view_of
+from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
+from webots_mcp.store.reading.views import View, view_of
 from webots_mcp.store.signals.catalogue import resolve_signals
 from webots_mcp.store.signals.registry import Signal
 
-LASTING: Final = frozenset[Kind]({"still", "stuck", "threshold", "silent", "flat"})
-FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
-JUMP_REACH_S: Final = 2.0  # before and after a segment: whether a value comes back shows there
+if TYPE_CHECKING:
+    from webots_mcp.store.detection.standing import Standings
 
-_ROWS_BEFORE_AND_AFTER: Final = (
-    "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?), "
-    "EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s > ? AND sim_time_s < ?)"
+_RUN_START: Final = "SELECT started_wall_time_s FROM run WHERE id = ?"
+_WALL_AT: Final = (
+    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
 
 
-@dataclass(frozen=True)
-class Detection:
-    """What is looked for in a run that was recorded from `first_s` to `newest_s`."""
+@dataclass
+class Search:
+    """What is looked for in a segment of one run.
+
+    Attributes:
+        known: The signals of the robot.
+        kinds: All that are looked for in it.
+        only: Names of the signals that matter, where it is about the ends of some events; else
+            None.
+        ledger: What could not be looked at, and what came near to an event.
+    """
 
     connection: sqlite3.Connection
+    segment: Segment
     known: dict[str, Signal]
+    kinds: Sequence[EventKind]
     options: EventOptions
     deadline: Deadline
-    first_s: float
-    newest_s: float
+    ledger: Ledger = field(default_factory=Ledger)
+    only: frozenset[str] | None = None
 
-    def events_touching(self, segment: Segment, notes: list[str]) -> list[Event]:
-        """The events that lie in the segment, or reach into it.
+    @cached_property
+    def bounds(self) -> tuple[float, float] | None:
+        """First and last simulation time of the run's rows; None where it has none."""
+        return recorded_bounds(self.connection, self.segment.run_id)
 
-        What has no begin or no end where was looked is followed out of it: at first as far as the
-        shortest time that counts, then each time 8 times as far.
-        """
-        kinds: list[Kind] = [kind for kind in DETECTED if kind in self.options.kinds]
-        reach_s = self._least_s(kinds)
-        looked_at = self._around(segment, reach_s)
-        found = self._events_in(looked_at, kinds, notes)
-        events = [each for each in found if _reaches_into(each, segment)]
-        while cut := [each for each in events if self._is_cut(each, looked_at)]:
-            if self.deadline.passed:
-                notes.append("the time was over: what touches an end of the range may be longer")
-                break
-            reach_s = FARTHER * max(reach_s, 1.0)
-            looked_at = self._around(segment, reach_s)
-            of_cut = self._only_for(cut)
-            whole = of_cut._events_in(looked_at, list({each.kind for each in cut}), [])
-            events = [_longer(each, whole) if each in cut else each for each in events]
-        return list({(*_subject(each), each.start_s): each for each in events}.values())
+    @property
+    def began_s(self) -> float:
+        """The run's first row."""
+        return self.bounds[0] if self.bounds else self.segment.start_s
 
-    def _only_for(self, events: Sequence[Event]) -> Detection:
-        """The same for nothing but what these events are about."""
-        names = tuple({event.name for event in events if event.name is not None})
-        thresholds = tuple(
-            Threshold(event.name or "", event.details.get("above"), event.details.get("below"))
-            for event in events
-            if event.kind == "threshold"
-        )
-        options = replace(self.options, signals=names or ("*",), thresholds=thresholds)
-        return replace(self, options=options)
+    @property
+    def ended_s(self) -> float:
+        """The run's newest row."""
+        return self.bounds[1] if self.bounds else self.segment.end_s
 
-    def _least_s(self, kinds: Sequence[Kind]) -> float:
-        """How long something of these kinds has to last; a shorter segment holds none."""
-        options = self.options
-        for_s = max((threshold.for_s for threshold in options.thresholds), default=0.0)
-        least_s: dict[Kind, float] = {
-            "still": options.stuck_s,
-            "stuck": options.stuck_s,
-            "silent": options.silent_s,
-            "flat": options.flat_s,
-            "jump": JUMP_REACH_S,
-            "threshold": for_s,
-        }
-        return max((least_s.get(kind, 0.0) for kind in kinds), default=0.0)
+    @cached_property
+    def recorded(self) -> Segment | None:
+        """The part of the segment that was recorded; None where nothing was."""
+        if self.bounds is None:
+            return None
+        (first_s, newest_s), here = self.bounds, self.segment
+        if newest_s < here.start_s or first_s >= here.end_s:
+            return None
+        start_s, end_s = max(here.start_s, first_s), min(here.end_s, just_after(newest_s))
+        return replace(here, start_s=start_s, end_s=end_s)
 
-    def _around(self, segment: Segment, reach_s: float) -> Segment:
-        """The segment with so much before and after it, as far as there is something."""
-        start_s = max(self.first_s, segment.start_s - reach_s)
-        end_s = min(just_after(self.newest_s), segment.end_s + reach_s)
-        if (start_s, end_s) == (segment.start_s, segment.end_s):
-            return segment
-        return Segment(segment.run_id, start_s, end_s)
+    @cached_property
+    def motion(self) -> Motion:
+        """The signals that tell how the robot moves."""
+        return find_motion(self.known, self.options)
 
-    def _events_in(self, segment: Segment, kinds: Sequence[Kind], notes: list[str]) -> list[Event]:
-        """The events in a segment, cut off at its ends."""
-        if not kinds:
-            return []
-        motion = find_motion(self.known, self.options)
+    @cached_property
+    def signals(self) -> list[Signal]:
+        """Those that are looked at."""
         matching = resolve_signals(self.known, self.options.signals) if self.known else []
-        numbers = [signal for signal in matching if signal.is_number and set(kinds) & OF_NUMBERS]
+        return [each for each in matching if self.only is None or each.name in self.only]
+
+    @cached_property
+    def numbers(self) -> list[Signal]:
+        """Of the signals the numeric ones, where any of the kinds looks at them."""
+        wanted = any(kind.of_numbers for kind in self.kinds)
+        return [signal for signal in self.signals if signal.is_number and wanted]
+
+    def required_numbers(self) -> list[Signal]:
+        """The numeric signals.
+
+        Raises:
+            NotSearchableError: There are none.
+        """
+        if not self.numbers:
+            raise NotSearchableError("no number was published, or none of these names")
+        return self.numbers
+
+    @cached_property
+    def view(self) -> View:
+        """The values of all signals that the kinds look at; read at the first use."""
         limits = [
             signal
             for threshold in self.options.thresholds
             for signal in resolve_signals(self.known, [threshold.signal])
         ]
-        needed = {signal.name: signal for signal in (*numbers, *motion.evidence, *limits)}
-        view = view_of(self.connection, segment, list(needed.values()), self.deadline)
-        common = (self.known, numbers, motion, self.options, view, self.newest_s, self.deadline)
-        search = Search(self.connection, segment, *common)
-        found: list[Event] = []
-        missed: list[Kind] = []
-        for kind in kinds:
-            if self.deadline.passed:
-                missed.append(kind)
-            else:
-                found += DETECTORS[kind](search)
-        notes += view.notes
-        notes += [not_looked_for(missed)] if missed else []
-        return found
+        needed = {each.name: each for each in (*self.numbers, *self.motion.evidence, *limits)}
+        return view_of(self.connection, self.segment, list(needed.values()), self.deadline)
 
-    def _is_cut(self, event: Event, looked_at: Segment) -> bool:
-        """Whether it reaches the first or last row that was looked at, and others follow there."""
-        if event.kind not in LASTING:
+    @cached_property
+    def standings(self) -> Standings:
+        """The standstills, found once for all kinds that tell them; numpy is imported here."""
+        from webots_mcp.store.detection.standing import find_standings
+
+        return find_standings(self)
+
+    def event(
+        self, kind: str, start_s: float, end_s: float, name: str | None, **details: Any
+    ) -> Event:
+        """An event of this run; what has a duration and reaches the newest row goes on."""
+        run_id = self.segment.run_id
+        wall_s = wall_time_at(self.connection, run_id, start_s)
+        ongoing = end_s >= self.ended_s > start_s
+        return Event(kind, run_id, start_s, end_s, wall_s, name, details, ongoing)
+
+    def not_searched(self, kind: str, *reasons: str) -> None:
+        """Note why a kind was not looked for, or where it was not."""
+        self.ledger.not_searched(kind, *reasons)
+
+    def came_near(self, kind: str, share: float, what: str) -> None:
+        """Note what came near to an event, as a share of what would be one."""
+        self.ledger.came_near(kind, share, what)
+
+    def is_over(self, kind: str, left: Sequence[Signal]) -> bool:
+        """Whether the time is over; then it is noted which signals were not searched."""
+        if not self.deadline.passed:
             return False
-        before = (event.run_id, looked_at.start_s, event.start_s)
-        after = (event.run_id, event.end_s, looked_at.end_s)
-        has_begin, has_end = self.connection.execute(
-            _ROWS_BEFORE_AND_AFTER, (*before, *after)
-        ).fetchone()
-        began_before = looked_at.start_s > self.first_s and not has_begin
-        goes_on = looked_at.end_s <= self.newest_s and not has_end
-        return began_before or goes_on
+        names = ", ".join(signal.name for signal in left[:3]) + (", ..." if left[3:] else "")
+        self.not_searched(kind, f"the time was over before {len(left)} signals: ask for {names}")
+        return True
 
 
-def not_looked_for(what: Iterable[str]) -> str:
-    """The note on what there was no time for."""
-    asked = "ask for fewer kinds, signals or seconds"
-    return f"the time was over, not looked for: {', '.join(what)}; {asked}"
-
-
-def _reaches_into(event: Event, segment: Segment) -> bool:
-    return event.start_s < segment.end_s and event.end_s >= segment.start_s
-
-
-def _subject(event: Event) -> tuple[object, ...]:
-    """What it is about: two of one subject that overlap are the same."""
-    return event.kind, event.name, event.details.get("above"), event.details.get("below")
-
-
-def _longer(event: Event, others: Sequence[Event]) -> Event:
-    """Together with the one of the others that it is a part of; itself where there is none."""
-    for other in others:
-        alike = _subject(other) == _subject(event)
-        if alike and other.start_s <= event.end_s and event.start_s <= other.end_s:
-            first = min(event, other, key=attrgetter("start_s"))
-            last = max(other, event, key=attrgetter("end_s"))
-            return replace(first, end_s=last.end_s, ongoing=last.ongoing, details=other.details)
-    return event
+def wall_time_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float:
+    """Wall time of the run's last row at or before a simulation time; else of the run's start."""
+    row = connection.execute(_WALL_AT, (run_id, sim_time_s)).fetchone()
+    return float(row[0] if row else connection.execute(_RUN_START, (run_id,)).fetchone()[0])

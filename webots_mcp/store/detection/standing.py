@@ -15,15 +15,17 @@ from webots_mcp.store.analysis.track import Track
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.evidence import Evidence, Flags, turned_rad, usual, weigh
 from webots_mcp.store.detection.habits import MovedIn
+from webots_mcp.store.detection.kind import NotSearchableError
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.registry import Signal
 
 if TYPE_CHECKING:
-    from webots_mcp.store.detection.detectors import Search
+    from webots_mcp.store.detection.search import Search
 
 BRIDGED_S: Final = 0.5  # evidence that is missing for less goes on
 NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
 READ_WHOLE_S: Final = 60.0  # of a longer standstill in a long range both ends are read
+SHORTEST_SHARE: Final = 4.0  # of the shortest standstill: shorter ones came nowhere near
 MARGIN_S: Final = 8.0  # before and after it that are read
 
 
@@ -44,20 +46,37 @@ class Standing:
     within_s: float = 0.0
 
 
-def standing_events(search: Search) -> list[Event]:
-    """All standstills of a segment, as `still` and as `stuck`."""
+@dataclass(frozen=True)
+class Standings:
+    """All standstills of a segment, as `still` and as `stuck`.
+
+    Attributes:
+        not_searched: What could not be looked at.
+        nearest: What came near to a standstill: its share of the shortest, and in words.
+    """
+
+    events: list[Event]
+    not_searched: list[str]
+    nearest: tuple[float, str] | None = None
+
+
+def find_standings(search: Search) -> Standings:
+    """Find them once for all kinds that tell of them."""
     position = search.motion.position
     if position is None:
-        search.view.notes.append(
-            "still and stuck were not looked for: no position is published (pose.0, ...)"
+        raise NotSearchableError(
+            "no position is known: publish pose: [x, y], position: {x, y} or gps in metres"
         )
-        return []
+    columns = search.view.places(search.motion.evidence, search.options.stuck_s)
+    tracks = _tracks(search, position, columns)
+    found = _standings(search, tracks, columns)
     moved_in = MovedIn(search.connection, search.segment.run_id, search.motion, search.deadline)
     events: list[Event] = []
-    for standing in _standings(search, position):
+    for standing in found:
         evidence = weigh(standing.columns, search.motion, search.options, moved_in)
         events += _told(search, standing, evidence)
-    return events
+    nearest = None if found else _nearest(search, tracks)
+    return Standings(events, search.view.taken_notes(), nearest)
 
 
 def _told(search: Search, standing: Standing, evidence: Evidence) -> Iterator[Event]:
@@ -71,7 +90,7 @@ def _told(search: Search, standing: Standing, evidence: Evidence) -> Iterator[Ev
         and standing.end_s - standing.columns.times[end - 1] < least_s
         for start, end in spans
     )
-    if not covered or "stuck" not in search.options.kinds:
+    if not covered or all(kind.name != "stuck" for kind in search.kinds):
         details = _details(search, standing, standing.columns)
         details["not_stuck"] = "; ".join(evidence.against) or "only for moments should it move"
         ends = (standing.start_s, standing.end_s)
@@ -104,29 +123,25 @@ def _details(search: Search, standing: Standing, rows: Columns) -> dict[str, Any
     return details | ({"within_s": standing.within_s} if standing.within_s else {})
 
 
-def _standings(search: Search, position: tuple[Signal, Signal]) -> Iterator[Standing]:
-    """From all rows; of a long segment first from samples, then from the rows about each."""
-    view, options = search.view, search.options
-    columns = view.places(search.motion.evidence, options.stuck_s)
+def _tracks(search: Search, position: tuple[Signal, Signal], columns: Columns) -> list[Track]:
+    """The way of the robot."""
     if missing := [each.name for each in position if each.name not in columns.values]:
-        view.notes.append(f"still and stuck were not looked for: {missing[0]} is not in every row")
-        return
-    noise_m = position_noise(view.sample(position), position) if view.sampled_s else None
+        raise NotSearchableError(f"{missing[0]} is not in every row: ask for less time")
+    sampled = search.view.sampled_s > 0
+    noise_m = position_noise(search.view.sample(position), position) if sampled else None
     tracks = tracks_in(columns, position, noise_m)
     if not tracks:
         names = " and ".join(signal.name for signal in position)
-        view.notes.append(
-            f"still and stuck were not looked for: {names} have no value in run "
-            f"{search.segment.run_id} there"
-        )
-        return
-    least_s = max(options.stuck_s - 2 * view.sampled_s, options.stuck_s / 2)
+        raise NotSearchableError(f"{names} have no value in run {search.segment.run_id} there")
+    return tracks
+
+
+def _standings(search: Search, tracks: Sequence[Track], columns: Columns) -> list[Standing]:
+    """From all rows; of a long segment first from samples, then from the rows about each."""
+    sampled_s, stuck_s = search.view.sampled_s, search.options.stuck_s
+    least_s = max(stuck_s - 2 * sampled_s, stuck_s / 2)
     found = [each for track in tracks for each in _in_track(search, track, columns, least_s)]
-    if view.sampled_s:
-        found = [fine for each in found for fine in _from_rows(search, each)]
-    if not found and (nearest := _went_least(tracks, options.stuck_s)):
-        view.notes.append(f"no standstill of {options.stuck_s:g} s: {nearest}")
-    yield from found
+    return [fine for each in found for fine in _from_rows(search, each)] if sampled_s else found
 
 
 def _in_track(search: Search, track: Track, columns: Columns, least_s: float) -> Iterator[Standing]:
@@ -139,7 +154,7 @@ def _in_track(search: Search, track: Track, columns: Columns, least_s: float) ->
 def _from_rows(search: Search, rough: Standing) -> list[Standing]:
     """What the rows about a standstill that samples show tell of it."""
     if search.deadline.passed:
-        search.view.notes.append("the time was over: begin and end of standstills are not exact")
+        search.view.notes.append("the time was over: not exactly where they begin and end")
         return [replace(rough, within_s=search.view.sampled_s)]
     start_s, end_s = rough.start_s - MARGIN_S, rough.end_s + MARGIN_S
     if rough.end_s - rough.start_s <= READ_WHOLE_S:
@@ -187,18 +202,30 @@ def _spans(standing: Standing, flags: Flags, least_s: float) -> list[tuple[int, 
     return [(start, end) for start, end in spans if times[end - 1] - times[start] >= least_s]
 
 
-def _went_least(tracks: Sequence[Track], least_s: float) -> str | None:
-    """What came nearest to a standstill."""
-    ways: list[tuple[float, float]] = []
-    for track in tracks:
-        later = np.searchsorted(track.times, track.times + least_s)
-        starts = np.flatnonzero(later < len(track.times))
-        if len(starts):
-            ends = later[starts]
-            way_m = np.hypot(track.x[ends] - track.x[starts], track.y[ends] - track.y[starts])
-            least = int(way_m.argmin())
-            ways.append((float(way_m[least]), float(track.times[starts[least]])))
+def _nearest(search: Search, tracks: Sequence[Track]) -> tuple[float, str] | None:
+    """The longest time for which it stood, else where it went least."""
+    least_s, radius_m = search.options.stuck_s, search.options.stuck_m
+    short = [
+        (float(track.times[each.last] - track.times[each.start]), float(track.times[each.start]))
+        for track in tracks
+        for each in find_standstills(track, radius_m, least_s / SHORTEST_SHARE)
+    ]
+    if short:
+        lasted_s, start_s = max(short)
+        return lasted_s / least_s, f"stood for {lasted_s:.2g} s at most, from {start_s:.1f} s on"
+    ways = [each for track in tracks for each in _ways(track, least_s)]
     if not ways:
         return None
     way_m, start_s = min(ways)
-    return f"where it went least, from {start_s:.1f} s on, it came {way_m:.2g} m far"
+    return 0.0, f"went least from {start_s:.1f} s on: {way_m:.2g} m in {least_s:g} s"
+
+
+def _ways(track: Track, within_s: float) -> Iterator[tuple[float, float]]:
+    """The shortest way of a track in so many seconds, and when it began."""
+    later = np.searchsorted(track.times, track.times + within_s)
+    starts = np.flatnonzero(later < len(track.times))
+    if len(starts):
+        ends = later[starts]
+        way_m = np.hypot(track.x[ends] - track.x[starts], track.y[ends] - track.y[starts])
+        least = int(way_m.argmin())
+        yield float(way_m[least]), float(track.times[starts[least]])

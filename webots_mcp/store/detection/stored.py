@@ -5,17 +5,17 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any, Final
 
-from webots_mcp.store.detection.event import LEVELS, Event, EventOptions
+from webots_mcp.store.detection.event import LEVELS, Event
+from webots_mcp.store.detection.kind import EventKind, NotSearchableError, only_if_named
+from webots_mcp.store.detection.search import Search, wall_time_at
 from webots_mcp.store.reading.changes import change_points
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rhythm_in, rhythm_of, with_rows_around
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rows import exceeds, read_columns
-from webots_mcp.store.signals.registry import Signal
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
 MOST_CHANGES: Final = 500  # newest change points of one signal that become events
@@ -52,21 +52,12 @@ _SIM_AT_WALL: Final = (
     "SELECT sim_time_s FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
     "AND wall_time_s <= ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
-_WALL_AT: Final = (
-    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
 
 
-def wall_time_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float:
-    """Wall time of the run's last row at or before a simulation time; else of the run's start."""
-    row = connection.execute(_WALL_AT, (run_id, sim_time_s)).fetchone()
-    return float(row[0] if row else connection.execute(_RUN, (run_id,)).fetchone()[1])
-
-
-def run_events(connection: sqlite3.Connection, segment: Segment) -> Iterator[Event]:
+def run_events(search: Search) -> Iterator[Event]:
     """Begin and end of the run, where the segment holds them."""
-    start_s, start_wall_s, start, end_s, end_wall_s, end = connection.execute(
+    segment = search.segment
+    start_s, start_wall_s, start, end_s, end_wall_s, end = search.connection.execute(
         _RUN, (segment.run_id,)
     ).fetchone()
     if segment.holds_from_s <= start_s and segment.wall_start_s <= start_wall_s:
@@ -77,89 +68,107 @@ def run_events(connection: sqlite3.Connection, segment: Segment) -> Iterator[Eve
         yield Event("run", segment.run_id, end_s, end_s, end_wall_s, None, details)
 
 
-def gap_events(connection: sqlite3.Connection, segment: Segment, deadline: Deadline) -> list[Event]:
+def _recorded(search: Search) -> Segment:
+    """The part of the segment that has rows."""
+    if search.recorded is None:
+        raise NotSearchableError(f"no row in run {search.segment.run_id} there")
+    return search.recorded
+
+
+def gap_events(search: Search) -> Iterator[Event]:
     """Where rows are missing: gaps that the segment touches, also all around it."""
-    around = with_rows_around(connection, segment)
-    if exceeds(connection, around):
-        rhythm = rhythm_in(connection, around)
+    segment = _recorded(search)
+    around = with_rows_around(search.connection, segment)
+    if exceeds(search.connection, around):
+        rhythm = rhythm_in(search.connection, around)
     else:
-        rhythm = rhythm_of(read_columns(connection, around, (), deadline).times)
+        rhythm = rhythm_of(read_columns(search.connection, around, (), search.deadline).times)
     details = {"usual_interval_s": rhythm.interval_s}
-    return [
-        Event("gap", segment.run_id, gap.start_s, gap.end_s, wall_s, None, details)
-        for gap in rhythm.gaps
-        if gap.end_s > segment.start_s and gap.start_s < segment.end_s
-        for wall_s in [wall_time_at(connection, segment.run_id, gap.start_s)]
-    ]
+    for gap in rhythm.gaps:
+        if gap.end_s > segment.start_s and gap.start_s < segment.end_s:
+            wall_s = wall_time_at(search.connection, segment.run_id, gap.start_s)
+            yield Event("gap", segment.run_id, gap.start_s, gap.end_s, wall_s, None, details)
 
 
-def change_events(
-    connection: sqlite3.Connection,
-    segment: Segment,
-    newest_s: float,
-    signals: Sequence[Signal],
-    deadline: Deadline,
-) -> Iterator[Event]:
+def change_events(search: Search) -> Iterator[Event]:
     """Changes of text and flags, each as long as the new value lasted, up to the newest row."""
-    states = [signal for signal in signals if not signal.is_number]
+    segment, newest_s = _recorded(search), search.ended_s
+    states = [signal for signal in search.signals if not signal.is_number]
+    if not states:
+        raise NotSearchableError("no text or flag was published, or none of these names")
     # From just before on: what changed exactly at the start had another value until then.
     before_s = math.nextafter(segment.start_s, -math.inf)
     whole = Segment(segment.run_id, before_s, just_after(newest_s))
-    for name, points in change_points(connection, whole, states, deadline).items():
+    for name, points in change_points(search.connection, whole, states, search.deadline).items():
         ends_s = [*(point.sim_time_s for point in points[2:]), None]
         changes = [
             (before, point, end_s)
             for (before, point), end_s in zip(pairwise(points), ends_s, strict=False)
             if segment.start_s <= point.sim_time_s < segment.end_s
         ]
+        if len(changes) > MOST_CHANGES:
+            until_s = changes[-MOST_CHANGES][1].sim_time_s
+            why = (
+                f"{name} up to {until_s:.3f} s, where it changes too often: ask end_s={until_s:.3f}"
+            )
+            search.not_searched("change", why)
         for before, point, end_s in changes[-MOST_CHANGES:]:
             place = (segment.run_id, point.sim_time_s, newest_s if end_s is None else end_s)
-            wall_s = wall_time_at(connection, segment.run_id, point.sim_time_s)
+            wall_s = wall_time_at(search.connection, segment.run_id, point.sim_time_s)
             details = {"before": before.value, "after": point.value}
             yield Event("change", *place, wall_s, name, details, ongoing=end_s is None)
 
 
-def log_events(
-    connection: sqlite3.Connection, segment: Segment, options: EventOptions
-) -> Iterator[Event]:
+def log_events(search: Search) -> Iterator[Event]:
     """Log lines of the level and above."""
-    levels = LEVELS[LEVELS.index(options.log_level) :]
-    marks = ", ".join("?" * len(levels))
-    query = f"{_LOGS} AND level IN ({marks}) {_NEWEST}"
-    for time_s, wall_s, level, source, message in connection.execute(
-        query, (*_bounds(segment), *levels, MOST_OF_A_KIND)
-    ):
+    levels = LEVELS[LEVELS.index(search.options.log_level) :]
+    query = f"{_LOGS} AND level IN ({', '.join('?' * len(levels))}) "
+    for time_s, wall_s, level, source, message in _newest(search, "log", query, *levels):
         details = {"source": source, "message": message}
-        yield Event("log", segment.run_id, time_s, time_s, wall_s, level, details)
+        yield Event("log", search.segment.run_id, time_s, time_s, wall_s, level, details)
 
 
-def noticed_events(connection: sqlite3.Connection, segment: Segment) -> Iterator[Event]:
+def noticed_events(search: Search) -> Iterator[Event]:
     """What the bridge noticed and stored: pause, resume, dropped rows, trouble with storage."""
-    rows = connection.execute(_NOTICED + _NEWEST, (*_bounds(segment), MOST_OF_A_KIND))
-    for time_s, wall_s, kind, name, data in rows:
+    for time_s, wall_s, kind, name, data in _newest(search, "noticed", _NOTICED):
         details: dict[str, Any] = {"what": kind}
         if data:
             details["data"] = json.loads(data)
-        yield Event("noticed", segment.run_id, time_s, time_s, wall_s, name, details)
+        yield Event("noticed", search.segment.run_id, time_s, time_s, wall_s, name, details)
 
 
-def image_events(connection: sqlite3.Connection, segment: Segment) -> Iterator[Event]:
+def image_events(search: Search) -> Iterator[Event]:
     """Camera frames and screenshots."""
-    rows = connection.execute(_IMAGES + _NEWEST, (*_bounds(segment), MOST_OF_A_KIND))
-    for time_s, wall_s, kind, device, path, image_id in rows:
+    for time_s, wall_s, kind, device, path, image_id in _newest(search, "image", _IMAGES):
         details = {"kind": kind, "path": path, "image_id": image_id}
-        yield Event("image", segment.run_id, time_s, time_s, wall_s, device, details)
+        yield Event("image", search.segment.run_id, time_s, time_s, wall_s, device, details)
 
 
-def command_events(connection: sqlite3.Connection, segment: Segment) -> Iterator[Event]:
+def _newest(search: Search, kind: str, query: str, *values: object) -> list[Any]:
+    """The newest rows of a table in the segment; that there are older ones is noted."""
+    parameters = (*_bounds(search.segment), *values, MOST_OF_A_KIND)
+    rows = search.connection.execute(f"{query}{_NEWEST}", parameters).fetchall()
+    _note_older(search, kind, len(rows))
+    return rows
+
+
+def _note_older(search: Search, kind: str, count: int) -> None:
+    if count == MOST_OF_A_KIND:
+        search.not_searched(kind, f"only the newest {count} are counted: ask for an earlier end_s")
+
+
+def command_events(search: Search) -> Iterator[Event]:
     """Commands, from when they were claimed (or created, if never) to when they were finished."""
+    connection, segment = search.connection, search.segment
     start_wall_s, end_wall_s = connection.execute(_RUN_WALLS, (segment.run_id,)).fetchone()
     walls = {
         "start_wall": max(start_wall_s, segment.wall_start_s),
         "end_wall": min(end_wall_s, segment.wall_end_s),
     }
-    rows = connection.execute(_COMMANDS, {"run": segment.run_id, "limit": MOST_OF_A_KIND, **walls})
-    for row in rows.fetchall():
+    asked = {"run": segment.run_id, "limit": MOST_OF_A_KIND, **walls}
+    rows = connection.execute(_COMMANDS, asked).fetchall()
+    _note_older(search, "command", len(rows))
+    for row in rows:
         event = _command(connection, segment, row)
         if event is not None:
             yield event
@@ -192,3 +201,20 @@ def _command(
 def _bounds(segment: Segment) -> tuple[float, ...]:
     walls = (segment.wall_start_s, segment.wall_end_s)
     return (segment.run_id, segment.holds_from_s, segment.holds_to_s, *walls)
+
+
+RUN: Final = EventKind("run", "it began or ended", run_events, stored=True, counted=False)
+GAP: Final = EventKind("gap", "no rows", gap_events, stored=True)
+CHANGE: Final = EventKind("change", "of a text or flag", change_events, stored=True, routine=True)
+COMMAND: Final = EventKind("command", "", command_events, stored=True, drawn=5)
+LOG: Final = EventKind("log", "", log_events, stored=True, drawn=4)
+NOTICED: Final = EventKind("noticed", "by the bridge", noticed_events, stored=True, drawn=6)
+IMAGE: Final = EventKind(
+    "image",
+    "",
+    image_events,
+    stored=True,
+    usual=only_if_named,
+    routine=True,
+    counted=False,
+)

@@ -5,40 +5,30 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from importlib import import_module
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import Value, flatten
 from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.analysis.motion import find_motion
-from webots_mcp.store.detection.event import Event, EventOptions, Kind
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.grouping import grouped
-from webots_mcp.store.detection.search import Detection, not_looked_for
-from webots_mcp.store.detection.stored import (
-    MOST_CHANGES,
-    MOST_OF_A_KIND,
-    change_events,
-    command_events,
-    gap_events,
-    image_events,
-    log_events,
-    noticed_events,
-    run_events,
-)
+from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.registry import asked_kinds, kind_named
+from webots_mcp.store.detection.verdict import Ledger, Verdicts
 from webots_mcp.store.questions.places import Place, placed, read_place
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.reading.ranges import Segment, TimeRange, just_after, recorded_bounds
+from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import known_signals, resolve_signals
 from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
 MOST_AROUND: Final = 6  # values that are told with an event
-# What happens all the time: shown in the room that all other kinds leave.
-ROUTINE: Final = frozenset[Kind]({"change", "image"})
 
 _IS_OPEN: Final = "SELECT id, session_id, ended_wall_time_s IS NULL FROM run WHERE id = ?"
 _ROW_AT: Final = (
@@ -62,18 +52,23 @@ class Events:
 
     Attributes:
         events: In the order of wall time; at most `limit` of all that were found.
-        totals: How many of each kind were found.
+        verdicts: What became of each kind: found, absent, or not looked for and why.
         left_out: Those that are told neither here nor on the pages before.
         cursor: Give it as `after` for those that are left out; None where none are.
-        notes: What was not searched, and where the range leaves the recording.
+        notes: Where the range leaves the recording, and the like.
     """
 
     robot: str
     events: tuple[Event, ...]
-    totals: dict[Kind, int]
-    left_out: dict[Kind, LeftOut]
+    verdicts: Verdicts
+    left_out: dict[str, LeftOut]
     cursor: str | None
     notes: tuple[str, ...]
+
+    @property
+    def totals(self) -> dict[str, int]:
+        """How many of each kind were found."""
+        return self.verdicts.found
 
 
 @dataclass(frozen=True)
@@ -88,7 +83,7 @@ class Found:
 
     robot: str
     entries: tuple[tuple[Place, Event], ...]
-    totals: dict[Kind, int]
+    verdicts: Verdicts
     notes: tuple[str, ...]
     context: tuple[Signal, ...]
     borders: dict[str, Place | None] = field(default_factory=dict[str, "Place | None"])
@@ -102,7 +97,8 @@ class Found:
         """The same of these events alone."""
         wanted = {id(event) for event in events}
         entries = tuple(entry for entry in self.entries if id(entry[1]) in wanted)
-        return replace(self, entries=entries, totals=dict(Counter(e.kind for e in events)))
+        counts = dict(Counter(event.kind for event in events))
+        return replace(self, entries=entries, verdicts=replace(self.verdicts, found=counts))
 
     def told(self, connection: sqlite3.Connection, limit: int) -> Events:
         """An answer of at most `limit` events: see `choose`."""
@@ -112,7 +108,7 @@ class Found:
         return Events(
             self.robot,
             tuple(_with_values(connection, event, self.context) for _, event in told),
-            self.totals,
+            self.verdicts,
             _left_out([event for _, event in rest]),
             _cursor(told, rest, self.borders),
             self.notes,
@@ -175,13 +171,13 @@ def search_events(
     borders = _read_cursor(after) if after else None
     known = known_signals(connection, time_range)
     context = _context(known, options, around)
-    found, notes = collect(connection, time_range, options, deadline_s)
-    found = grouped(found, known) if group else found
+    collected = collect(connection, time_range, options, deadline_s)
+    found = grouped(collected.events, known) if group else collected.events
     return Found(
         time_range.robot,
         tuple(entry for entry in placed(found) if _is_left(entry[0], borders)),
-        dict(Counter(event.kind for event in found)),
-        tuple(dict.fromkeys(notes)),
+        collected.ledger.verdicts(collected.kinds, found),
+        collected.notes,
         tuple(context),
         borders or {},
     )
@@ -195,32 +191,46 @@ def _is_left(place: Place, borders: dict[str, Place | None] | None) -> bool:
     return place[3] in borders and (border is None or place < border)
 
 
+@dataclass(frozen=True)
+class Collected:
+    """All events of a range, in no order and without values around them.
+
+    Attributes:
+        kinds: Those that were asked for.
+        ledger: What could not be looked at.
+    """
+
+    events: list[Event]
+    kinds: Sequence[EventKind]
+    ledger: Ledger
+    notes: tuple[str, ...]
+
+
 @in_one_snapshot
 def collect(
     connection: sqlite3.Connection,
     time_range: TimeRange,
     options: EventOptions,
     deadline_s: float = QUESTION_DEADLINE_S,
-) -> tuple[list[Event], list[str]]:
-    """All events of a range, in no order and without values around them; and the notes.
+) -> Collected:
+    """Look for all kinds that were asked for.
 
     Raises:
         UnknownSignalError: A name in the options meets nothing.
+        InvalidInputError: There is no such kind.
     """
+    kinds = asked_kinds(options)
     known = known_signals(connection, time_range)
     import_module("numpy")  # once per process, before the time counts
-    deadline = Deadline(deadline_s)
-    notes = list(time_range.notes)
-    found: list[Event] = []
-    for segment in time_range.segments:
-        found += _stored(connection, segment, known, options, deadline, notes)
-        recorded = _recorded(connection, segment)
-        if recorded is not None:
-            detection = Detection(connection, known, options, deadline, *recorded.bounds)
-            found += detection.events_touching(recorded.segment, notes)
+    ledger = Ledger(notes=list(time_range.notes))
+    detection = Detection(connection, known, kinds, options, Deadline(deadline_s), ledger)
+    found = [event for each in time_range.segments for event in detection.events_touching(each)]
+    if not time_range.segments:
+        for kind in kinds:
+            ledger.not_searched(kind.name, "nothing was recorded in that range")
     over = _runs_over(connection, [segment.run_id for segment in time_range.segments])
     ended = [replace(e, ongoing=False) if e.ongoing and e.run_id in over else e for e in found]
-    return ended, notes
+    return Collected(ended, kinds, ledger, tuple(dict.fromkeys(ledger.notes)))
 
 
 def _runs_over(connection: sqlite3.Connection, run_ids: Sequence[int]) -> set[int]:
@@ -238,76 +248,15 @@ def _context(
     return resolve_signals(known, around)[:MOST_AROUND] if around else []
 
 
-def _stored(
-    connection: sqlite3.Connection,
-    segment: Segment,
-    known: dict[str, Signal],
-    options: EventOptions,
-    deadline: Deadline,
-    notes: list[str],
-) -> list[Event]:
-    """Events of the kinds that tables tell; the notes name what there was no time for."""
-    recorded = _recorded(connection, segment)
-    signals = resolve_signals(known, options.signals) if known else []
-    finders: dict[Kind, Callable[[], Iterable[Event]]] = {
-        "run": lambda: run_events(connection, segment),
-        "command": lambda: command_events(connection, segment),
-        "log": lambda: log_events(connection, segment, options),
-        "noticed": lambda: noticed_events(connection, segment),
-        "image": lambda: image_events(connection, segment),
-    }
-    if recorded is not None:
-        part, newest_s = recorded.segment, recorded.bounds[1]
-        finders["gap"] = lambda: gap_events(connection, part, deadline)
-        finders["change"] = lambda: change_events(connection, part, newest_s, signals, deadline)
-    found: list[Event] = []
-    missed: list[str] = []
-    for kind, find in finders.items():
-        if kind in options.kinds and deadline.passed:
-            missed.append(kind)
-        elif kind in options.kinds:
-            found += find()
-    notes += [not_looked_for(missed)] if missed else []
-    notes += _bounded(found)
-    return found
-
-
-def _bounded(events: Sequence[Event]) -> Iterable[str]:
-    """Notes on kinds of which only the newest were read."""
-    names = Counter(event.name for event in events if event.kind == "change")
-    kinds = Counter(event.kind for event in events if event.kind != "change")
-    for name, count in names.items():
-        if count >= MOST_CHANGES:
-            yield f"only the newest {count} changes of {name} are counted: ask an earlier end_s"
-    for kind, count in kinds.items():
-        if count >= MOST_OF_A_KIND:
-            yield f"only the newest {count} of kind {kind} are counted: ask for an earlier end_s"
-
-
-class _Recorded(NamedTuple):
-    """The part of a segment that was recorded, and the simulation times of the whole recording."""
-
-    segment: Segment
-    bounds: tuple[float, float]
-
-
-def _recorded(connection: sqlite3.Connection, segment: Segment) -> _Recorded | None:
-    """None where nothing of a segment was recorded."""
-    bounds = recorded_bounds(connection, segment.run_id)
-    if bounds is None or bounds[1] < segment.start_s or bounds[0] >= segment.end_s:
-        return None
-    start_s, end_s = max(segment.start_s, bounds[0]), min(segment.end_s, just_after(bounds[1]))
-    return _Recorded(replace(segment, start_s=start_s, end_s=end_s), bounds)
-
-
 def choose(events: Sequence[Event], limit: int) -> list[Event]:
     """At most `limit` of the events, in their order: rare kinds whole, of the others the newest.
 
     What happens all the time (changes, pictures) gets the room that the other kinds leave.
     """
-    matter = [event for event in events if event.kind not in ROUTINE]
+    matter = [event for event in events if not kind_named(event.kind).routine]
+    routine = [event for event in events if kind_named(event.kind).routine]
     kept = _shared_out(matter, limit)
-    kept |= _shared_out([event for event in events if event.kind in ROUTINE], limit - len(kept))
+    kept |= _shared_out(routine, limit - len(kept))
     return [event for event in events if id(event) in kept]
 
 
@@ -324,9 +273,9 @@ def _shared_out(events: Sequence[Event], limit: int) -> set[int]:
     return kept
 
 
-def _left_out(events: Sequence[Event]) -> dict[Kind, LeftOut]:
+def _left_out(events: Sequence[Event]) -> dict[str, LeftOut]:
     """By kind; the events are in order."""
-    by_kind: dict[Kind, list[Event]] = {}
+    by_kind: dict[str, list[Event]] = {}
     for event in events:
         by_kind.setdefault(event.kind, []).append(event)
     return {

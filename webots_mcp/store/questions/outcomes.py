@@ -11,7 +11,8 @@ from typing import Final, NamedTuple
 
 from webots_mcp.store.analysis.motion import Motion, path_length, position_noise
 from webots_mcp.store.analysis.spread import Spread, spread_of, verdicts_on
-from webots_mcp.store.detection.event import Event, EventOptions, Kind
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import collect
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.reading.changes import change_points, longest_values
@@ -23,10 +24,6 @@ from webots_mcp.store.signals.registry import Signal
 
 NOISE_ROWS: Final = 2000  # of a long run, that tell the noise of its position
 SAMPLE_S: Final = 0.5  # between the positions from which a long run's distance is summed
-COUNTED: Final[tuple[Kind, ...]] = (
-    "gap", "change", "still", "stuck", "silent", "flat", "jump", "oscillation", "command", "log",
-    "noticed",
-)  # fmt: skip
 _SHARE: Final = "share of "
 
 
@@ -72,7 +69,7 @@ def measures_of(
     found = [[_outcome(connection, part, options, deadline) for part in group] for group in groups]
     runs = [run for group in found for run in group]
     names = dict.fromkeys(name for run in runs for name in run.figures)
-    kinds: list[Kind] = list(dict.fromkeys(kind for run in runs for kind in run.events))
+    kinds: list[str] = list(dict.fromkeys(kind for run in runs for kind in run.events))
     tests = len(names) + len(kinds)
     measures = [
         _measure(name, [[run.figure(name) for run in group] for group in found], tests)
@@ -114,14 +111,14 @@ class _Outcome(NamedTuple):
 
     duration_s: float
     figures: dict[str, float | None]
-    events: Counter[Kind]
+    events: Counter[str]
     complete: bool
 
     def figure(self, name: str) -> float | None:
         """A mode in which it never was took no time."""
         return self.figures.get(name, 0.0 if name.startswith(_SHARE) else None)
 
-    def per_min(self, kind: Kind) -> float | None:
+    def per_min(self, kind: str) -> float | None:
         """Events of a kind per minute, where they are known."""
         return 60 * self.events[kind] / self.duration_s if self.complete else None
 
@@ -139,7 +136,7 @@ def _outcome(
     for mode, seconds in _mode_times(connection, part, deadline).items():
         figures[f"{_SHARE}{mode}"] = seconds / duration_s
     found = _events(connection, part, options, deadline)
-    events: Counter[Kind] = Counter(event.kind for event in found)
+    events: Counter[str] = Counter(event.kind for event in found)
     return _Outcome(duration_s, figures, events, not purged and not deadline.passed)
 
 
@@ -185,6 +182,6 @@ def _mode_times(
 def _events(
     connection: sqlite3.Connection, part: RunPart, options: EventOptions, deadline: Deadline
 ) -> list[Event]:
-    kinds = tuple(kind for kind in COUNTED if kind in options.kinds)
+    kinds = tuple(kind.name for kind in asked_kinds(options) if kind.counted)
     whole = TimeRange(part.robot_id, "", (part.segment,), "simulation")
-    return collect(connection, whole, replace(options, kinds=kinds), deadline.left_s)[0]
+    return collect(connection, whole, replace(options, kinds=kinds), deadline.left_s).events

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections import Counter
 from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.detection.event import Event, EventOptions, Kind
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.registry import stored_kinds
+from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.questions.events import collect
 from webots_mcp.store.questions.places import Place, placed, read_place
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 
-STORED: Final[tuple[Kind, ...]] = ("run", "gap", "change", "command", "log", "noticed", "image")
 MOST_ENTRIES: Final = 500
 
 
@@ -26,13 +26,13 @@ class Timeline:
 
     Attributes:
         cursor: Give it as `after` for the next page; None after the last event.
-        totals: How many of each kind the whole range has.
+        verdicts: What became of each kind in the whole range.
     """
 
     robot: str
     events: tuple[Event, ...]
     cursor: str | None
-    totals: dict[Kind, int]
+    verdicts: Verdicts
     notes: tuple[str, ...]
 
 
@@ -62,17 +62,17 @@ def timeline(
     """
     if not 1 <= limit <= MOST_ENTRIES:
         raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_ENTRIES}")
-    options = options or EventOptions(kinds=STORED, log_level="info")
-    found, notes = collect(connection, time_range, options, deadline_s)
-    entries = placed(found)
+    options = options or EventOptions(kinds=stored_kinds(), log_level="info")
+    found = collect(connection, time_range, options, deadline_s)
+    entries = placed(found.events)
     left = [entry for entry in entries if entry[0] > _read_cursor(after)] if after else entries
     page = left[:limit]
     return Timeline(
         robot=time_range.robot,
         events=tuple(event for _, event in page),
         cursor=json.dumps(page[-1][0]) if len(left) > limit else None,
-        totals=dict(Counter(event.kind for event in found)),
-        notes=tuple(dict.fromkeys(notes)),
+        verdicts=found.ledger.verdicts(found.kinds, found.events),
+        notes=found.notes,
     )
 
 

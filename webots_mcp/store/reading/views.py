@@ -47,6 +47,7 @@ _WIDTHS: Final = (  # also at its border with the bucket before
     "SELECT bucket, max(max - min, abs(first - lag(last, 1, first) OVER (ORDER BY bucket))) "
     f"{_OF_SIGNAL} AND first IS NOT NULL"
 )
+_FIRST_ROW: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
 _RESTS: Final = f"SELECT EXISTS (SELECT 1 {_OF_SIGNAL} AND min = max AND present = rows)"
 
 
@@ -66,9 +67,13 @@ class Course:
 class View(Protocol):
     """What a detector may ask."""
 
-    notes: list[str]
+    notes: list[str]  # what could not be looked at, of what was asked since they were taken
     shortest_rest_s: float  # a shorter one may be missed
     sampled_s: float  # between the rows of `places`; 0 where these are all
+
+    def taken_notes(self) -> list[str]:
+        """What could not be looked at since the notes were last taken; and what never can."""
+        ...
 
     def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
         """Rows close enough to see a stay of that length."""
@@ -119,11 +124,16 @@ class RowView:
 
     def __init__(self, columns: Columns) -> None:
         self.notes: list[str] = []
+        self._lasting: list[str] = []
         if columns.cut:
-            reached_s = columns.times[-1] if columns.times else 0.0
-            self.notes.append(f"the time was over: searched up to {reached_s:g} s only")
+            after = f"after {columns.times[-1]:.3f} s" if columns.times else "at all"
+            self._lasting.append(f"the time was over: not read {after}; ask for less time")
         self._columns = columns
         self._summaries: dict[str, Summary] = {}
+
+    def taken_notes(self) -> list[str]:
+        """Of rows only that not all were read."""
+        return self._lasting
 
     def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
         """All rows."""
@@ -178,24 +188,30 @@ class LongView:
         self._signals = [signal for signal in signals if signal.is_number]
         self._span = (segment.run_id, bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
         late = rows_after(connection, segment, watermark(connection, segment.run_id))
+        self._late_s = None
         if late is not None and segment.end_s - late.start_s > LATE_S:
-            since = f"rows from {late.start_s:g} s on are not rolled up yet"
-            self.notes.append(f"{since}: not searched for silent, flat and jumps")
+            self._late_s = late.start_s
+
+    def taken_notes(self) -> list[str]:
+        """Each is told once."""
+        taken, self.notes = list(dict.fromkeys(self.notes)), []
+        return taken
 
     def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
         """A row every fifth of the stay; fewer where that would be too many."""
+        self._note_purged()
         span_s = self._segment.end_s - self._segment.start_s
         every_s = max(stay_s / SAMPLES_PER_STAY, span_s / MOST_SAMPLES)
         self.sampled_s = every_s
         if every_s > stay_s / 2:
-            self.notes.append(f"still or stuck for less than {2 * every_s:.3g} s may be missed")
+            self.notes.append(f"not those of less than {2 * every_s:.3g} s: ask for less time")
         plain = [signal for signal in signals if signal.is_plain]
         found = read_sampled(self._connection, self._segment, plain, every_s, self._deadline)
         self._add_newest(found, plain, every_s)
         if found.cut:
             reached_s = found.times[-1] if found.times else self._segment.start_s
             self.notes.append(
-                f"the time was over: still and stuck looked for up to {reached_s:g} s only"
+                f"the time was over: not after {reached_s:.3f} s; ask start_s={reached_s:.3f}"
             )
         return found
 
@@ -212,11 +228,13 @@ class LongView:
 
     def summary(self, signal: Signal) -> Summary:
         """Counts from the rollups."""
+        self._note_late()
         rows = max((each.rows for each in self._totals.values()), default=0)
         return self._totals.get(signal.id or 0, Summary(rows))
 
     def spans(self, signal: Signal, condition: Condition) -> list[Span]:
         """From rollups, and rows where they leave it open."""
+        self._note_late()
         if condition.lasting and not self._rests(signal):
             return []
         if self._deadline.passed:
@@ -233,13 +251,15 @@ class LongView:
 
     def courses(self, signal: Signal) -> Iterator[Course]:
         """The few buckets whose range is unusual, each with the rows just before and after it."""
+        self._note_late()
+        self._note_purged()
         values = (self._span[0], signal.id, *self._span[1:])
         widths = self._connection.execute(_WIDTHS, values).fetchall()
         usual = statistics.median(size for _, size in widths) if widths else 0.0
         wide = [(size, bucket) for bucket, size in widths if size > JUMP_RANGE * usual]
         if len(wide) > JUMP_BUCKETS:
             self.notes.append(
-                f"jumps of {signal.name} were searched in the {JUMP_BUCKETS} widest of {len(wide)} "
+                f"of {signal.name} only in the {JUMP_BUCKETS} widest of {len(wide)} "
                 "stretches of 10 s: ask for less time to see the others"
             )
         for _, bucket in sorted(sorted(wide, reverse=True)[:JUMP_BUCKETS], key=_bucket):
@@ -250,11 +270,13 @@ class LongView:
 
     def newest(self, signals: Sequence[Signal]) -> Columns:
         """The newest rows."""
+        self._note_purged()
         part = newest_part(self._connection, self._segment)
         columns = read_columns(self._connection, part, signals, self._deadline)
         if columns.times and columns.times[0] > self._segment.start_s:
-            since = f"from {columns.times[0]:g} s on only"
-            self.notes.append(f"oscillation and jumps of the position were searched {since}")
+            since_s = columns.times[0]
+            if since_s > (self._purged_until_s or -math.inf):
+                self.notes.append(f"not before {since_s:.3f} s; ask end_s={since_s:.3f}")
         if columns.cut:
             self._cut()
         return columns
@@ -292,6 +314,22 @@ class LongView:
         found.walls += newest.walls
         for signal in signals:
             found.values[signal.name] += newest.values[signal.name]
+
+    def _note_late(self) -> None:
+        if self._late_s is not None:
+            self.notes.append(f"not after {self._late_s:.3f} s, which is not rolled up yet")
+
+    @functools.cached_property
+    def _purged_until_s(self) -> float | None:
+        """When the first row is that is left, where older ones of the segment were purged."""
+        first_s = self._connection.execute(_FIRST_ROW, self._span[:1]).fetchone()[0]
+        if first_s is None:
+            return self._segment.end_s
+        return first_s if first_s > self._segment.start_s else None
+
+    def _note_purged(self) -> None:
+        if self._purged_until_s is not None:
+            self.notes.append(f"not before {self._purged_until_s:.3f} s, whose rows were purged")
 
     def _cut(self) -> None:
         self.notes.append("the time was over before all was searched: ask for less time or kinds")

@@ -1,0 +1,87 @@
+"""A kind of event is made known in one place, and everything that tells of events knows it."""
+
+from __future__ import annotations
+
+import ast
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import webots_mcp
+from tests.recordings.rover import Recorder
+from webots_mcp.plotting.marks import event_lanes
+from webots_mcp.plotting.parts import parts_of
+from webots_mcp.store.detection import registry
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.search import Search
+from webots_mcp.store.questions.compare import compare_runs
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.questions.timeline import timeline
+from webots_mcp.store.reading.ranges import resolve_range
+
+
+def tilted(search: Search) -> Iterator[Event]:
+    columns = search.view.newest([search.known["tilt"]])
+    for time_s, tilt in zip(columns.times, columns.values["tilt"], strict=True):
+        if isinstance(tilt, float) and tilt > 1:
+            yield search.event("tilted", time_s, time_s, "tilt", tilt=tilt)
+
+
+@pytest.fixture
+def tilting(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
+    """Two runs in which the robot leant over twice, and a kind of event that tells so."""
+    kind = EventKind("tilted", "it leant over", tilted, of_numbers=True, drawn=0, stored=True)
+    monkeypatch.setattr(registry, "KINDS", [*registry.KINDS, kind])
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    session_id = recorder.session(robot_id, "a" * 64)
+    for reason in ("start", "reset"):
+        recorder.run(session_id, robot_id, reason)
+        for step in range(600):
+            recorder.publish(step * 0.1, {"tilt": 1.5 if step in (200, 400) else 0.01 * (step % 7)})
+    return empty
+
+
+def test_a_kind_that_is_entered_once_is_found_compared_told_and_drawn(
+    tilting: sqlite3.Connection,
+) -> None:
+    whole = resolve_range(tilting)
+    assert find_events(tilting, whole).verdicts.found["tilted"] == 2
+    assert timeline(tilting, whole).verdicts.found["tilted"] == 2
+    (measure,) = (
+        each for each in compare_runs(tilting, [1, 2]).measures if each.name == "tilted per min"
+    )
+    assert [spread and round(spread.median, 1) for spread in measure.spread] == [2.0, 2.0]
+    (part,) = parts_of(tilting, [whole], ["tilt"])
+    lanes, _ = event_lanes(tilting, part, ["tilt"])
+    assert lanes[0].name == "tilted" and len(lanes[0].spans) == 2
+
+
+def test_nothing_but_its_own_file_and_the_registry_names_a_kind() -> None:
+    """`log`, `run` and the like are words of other things too."""
+    names = {"oscillation", "silent", "jump", "threshold", "flat"}
+    folder = Path(webots_mcp.__file__).parent
+    own = {f"{name}.py" for name in names}
+    naming = {
+        path.relative_to(folder).as_posix(): named
+        for path in folder.rglob("*.py")
+        if path.name not in own and (named := names & set(strings_in(path)))
+    }
+    # A threshold is what the asker gives: the tool and the command line refuse or imply the kind.
+    allowed = {"server/tools/events.py", "server/tools/timeline.py", "cli/history.py"}
+    assert {path: named for path, named in naming.items() if path not in allowed} == {}
+
+
+def strings_in(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def test_options_name_kinds_of_the_registry() -> None:
+    names = [kind.name for kind in registry.asked_kinds(EventOptions())]
+    assert "image" not in names and "threshold" not in names and "stuck" in names
+    assert len(set(registry.kind_names())) == len(registry.KINDS)

@@ -1,0 +1,144 @@
+"""Finding the events of each kind in a range, each with its true begin and end."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from operator import attrgetter
+from typing import Final
+
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.registry import kind_named
+from webots_mcp.store.detection.search import Search
+from webots_mcp.store.detection.verdict import Ledger
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import Segment, just_after
+from webots_mcp.store.signals.registry import Signal
+
+FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
+
+_ROWS_BEFORE_AND_AFTER: Final = (
+    "SELECT EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?), "
+    "EXISTS (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s > ? AND sim_time_s < ?)"
+)
+
+
+@dataclass(frozen=True)
+class Detection:
+    """What is looked for, in one segment after the other."""
+
+    connection: sqlite3.Connection
+    known: dict[str, Signal]
+    kinds: Sequence[EventKind]
+    options: EventOptions
+    deadline: Deadline
+    ledger: Ledger
+
+    def events_touching(self, segment: Segment) -> list[Event]:
+        """The events that lie in the segment, or reach into it.
+
+        What has no begin or no end where was looked is followed out of it: at first as far as the
+        shortest time that counts, then each time 8 times as far.
+        """
+        stored = [kind for kind in self.kinds if kind.stored]
+        judged = [kind for kind in self.kinds if not kind.stored]
+        found = self._found(self._search(segment, stored))
+        here = self._search(segment, judged)
+        if here.recorded is not None:
+            return found + self._with_ends(here, here.recorded)
+        for kind in judged:
+            why = f"no row in run {segment.run_id} there"
+            self.ledger.not_searched(kind.name, why)
+        return found
+
+    def _with_ends(self, search: Search, segment: Segment) -> list[Event]:
+        """The judged events that touch a recorded segment, as long as they are."""
+        reach_s = max((kind.least_s(self.options) for kind in search.kinds), default=0.0)
+        looked_at = _around(search, segment, reach_s)
+        found = self._found(replace(search, segment=looked_at))
+        events = [each for each in found if _reaches_into(each, segment)]
+        while cut := [each for each in events if self._is_cut(each, looked_at, search)]:
+            if self.deadline.passed:
+                for each in cut:
+                    why = f"the time was over: that of {each.start_s:.3f} s may be longer"
+                    self.ledger.not_searched(each.kind, why)
+                break
+            reach_s = FARTHER * max(reach_s, 1.0)
+            looked_at = _around(search, segment, reach_s)
+            whole = self._whole(cut, looked_at)
+            events = [_longer(each, whole) if each in cut else each for each in events]
+        return list({(*_subject(each), each.start_s): each for each in events}.values())
+
+    def _search(self, segment: Segment, kinds: Sequence[EventKind]) -> Search:
+        return Search(
+            self.connection, segment, self.known, kinds, self.options, self.deadline, self.ledger
+        )
+
+    def _whole(self, cut: Sequence[Event], segment: Segment) -> list[Event]:
+        """Events of the same kinds and signals in a longer segment; what it lacks is known."""
+        kinds = [kind_named(name) for name in dict.fromkeys(each.kind for each in cut)]
+        names = frozenset(each.name for each in cut if each.name is not None)
+        search = replace(self._search(segment, kinds), ledger=Ledger(), only=names or None)
+        return self._found(search)
+
+    def _found(self, search: Search) -> list[Event]:
+        """The events in the segment of a search, cut off at its ends."""
+        return [event for kind in search.kinds for event in self._found_of(kind, search)]
+
+    def _found_of(self, kind: EventKind, search: Search) -> list[Event]:
+        if self.deadline.passed:
+            search.not_searched(kind.name, "the time was over: ask for this kind alone")
+            return []
+        try:
+            found = list(kind.find(search))
+        except NotSearchableError as error:
+            search.not_searched(kind.name, str(error))
+            return []
+        search.ledger.searched.add(kind.name)
+        if not kind.stored:
+            search.not_searched(kind.name, *search.view.taken_notes())
+        return found
+
+    def _is_cut(self, event: Event, looked_at: Segment, search: Search) -> bool:
+        """Whether it reaches the first or last row that was looked at, and others follow there."""
+        if not kind_named(event.kind).lasts:
+            return False
+        before = (event.run_id, looked_at.start_s, event.start_s)
+        after = (event.run_id, event.end_s, looked_at.end_s)
+        has_begin, has_end = self.connection.execute(
+            _ROWS_BEFORE_AND_AFTER, (*before, *after)
+        ).fetchone()
+        began_before = looked_at.start_s > search.began_s and not has_begin
+        goes_on = looked_at.end_s <= search.ended_s and not has_end
+        return began_before or goes_on
+
+
+def _around(search: Search, segment: Segment, reach_s: float) -> Segment:
+    """The segment with so much before and after it, as far as there is something."""
+    start_s = max(search.began_s, segment.start_s - reach_s)
+    end_s = min(just_after(search.ended_s), segment.end_s + reach_s)
+    if (start_s, end_s) == (segment.start_s, segment.end_s):
+        return segment
+    return Segment(segment.run_id, start_s, end_s)
+
+
+def _reaches_into(event: Event, segment: Segment) -> bool:
+    return event.start_s < segment.end_s and event.end_s >= segment.start_s
+
+
+def _subject(event: Event) -> tuple[object, ...]:
+    """What it is about: two of one subject that overlap are the same."""
+    return event.kind, event.name, event.details.get("above"), event.details.get("below")
+
+
+def _longer(event: Event, others: Sequence[Event]) -> Event:
+    """Together with the one of the others that it is a part of; itself where there is none."""
+    for other in others:
+        alike = _subject(other) == _subject(event)
+        if alike and other.start_s <= event.end_s and event.start_s <= other.end_s:
+            first = min(event, other, key=attrgetter("start_s"))
+            last = max(other, event, key=attrgetter("end_s"))
+            return replace(first, end_s=last.end_s, ongoing=last.ongoing, details=other.details)
+    return event

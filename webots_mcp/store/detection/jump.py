@@ -1,0 +1,86 @@
+"""`jump`: a value, or the position, changed at once by much more than it usually does."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
+from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.search import Search
+from webots_mcp.store.signals.registry import Signal
+
+REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
+_ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to the same value
+
+
+def jump_events(search: Search) -> Iterator[Event]:
+    """Dropouts and spikes that come back, steps that stay, and leaps of the position."""
+    position = search.motion.position or ()
+    numbers = search.numbers if position else search.required_numbers()
+    signals = [s for s in numbers if s.kind != "angle" and s not in position]
+    for index, signal in enumerate(signals):
+        if search.is_over("jump", signals[index:]):
+            break
+        jumps = [
+            jump
+            for course in search.view.courses(signal)
+            for jump in find_jumps(
+                course.times, course.numbers, search.options.jump_score, course.usual_steps
+            )
+        ]
+        if are_usual(jumps, search.view.summary(signal).present):
+            many = f"not in {signal.name}: {len(jumps)} large steps are how it is"
+            search.not_searched("jump", many)
+            continue
+        yield from (_jump(search, signal, jump) for jump in jumps)
+    yield from _leaps(search)
+
+
+def _jump(search: Search, signal: Signal, jump: Jump) -> Event:
+    end_s = jump.sim_time_s if jump.back_s is None else jump.back_s
+    details = {"before": jump.before, "after": jump.after}
+    return search.event("jump", jump.sim_time_s, end_s, signal.name, **details)
+
+
+def _leaps(search: Search) -> Iterator[Event]:
+    """The position changed by more than driving explains."""
+    if search.motion.position is None:
+        return
+    columns = search.view.newest(search.motion.signals)
+    x, y = (columns.values[signal.name] for signal in search.motion.position)
+    rows = [
+        (time_s, (float(a), float(b)))
+        for time_s, a, b in zip(columns.times, x, y, strict=True)
+        if isinstance(a, (int, float)) and isinstance(b, (int, float))
+    ]
+    times, places = [time_s for time_s, _ in rows], [place for _, place in rows]
+    for time_s, length_m in find_leaps(times, places, search.options.jump_m):
+        yield search.event("jump", time_s, time_s, "position", distance_m=length_m)
+
+
+def _alike(events: Sequence[Event], unit: str) -> str:
+    """Dropouts, spikes or steps, and to where."""
+    if "distance_m" in events[0].details:
+        lengths = [event.details["distance_m"] for event in events]
+        return f"leaps of {min(lengths):.3g} to {max(lengths):.3g} m"
+    after = [float(event.details["after"]) for event in events]
+    sizes = [abs(event.details["after"] - event.details["before"]) for event in events]
+    if events[0].end_s == events[0].start_s:
+        return f"steps of {min(sizes):.4g} to {max(sizes):.4g}{unit}"
+    if max(after) - min(after) > _ALIKE_SHARE * max(sizes):
+        return f"spikes to values from {min(after):.4g} to {max(after):.4g}{unit}"
+    name = "dropouts" if after[0] < events[0].details["before"] else "spikes"
+    return f"{name} to {sorted(after)[len(after) // 2]:.4g}{unit}"
+
+
+JUMP: Final = EventKind(
+    "jump",
+    "leap or dropout",
+    jump_events,
+    least_s=lambda options: REACH_S,
+    of_numbers=True,
+    drawn=1,
+    says_alike=_alike,
+)

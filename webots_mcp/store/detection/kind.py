@@ -1,0 +1,68 @@
+"""What a kind of event is: how it is found, told, counted and drawn, all in one place."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.store.detection.event import Event, EventOptions
+
+if TYPE_CHECKING:
+    from webots_mcp.store.detection.search import Search
+
+
+class NotSearchableError(NothingRecordedError):
+    """Nothing was recorded in which a kind could be looked for; the text says what is missing."""
+
+
+def _no_time(options: EventOptions) -> float:
+    return 0.0
+
+
+def _always(options: EventOptions) -> bool:
+    return True
+
+
+def only_if_named(options: EventOptions) -> bool:
+    """For a kind that is no news, and of which there may be thousands."""
+    return False
+
+
+@dataclass(frozen=True)
+class EventKind:
+    """A kind of event. One of these, entered in `registry.KINDS`, is all that a new kind takes.
+
+    Attributes:
+        name: As it is asked for and told.
+        means: What the name leaves open, in a few words; empty where it leaves nothing open.
+        find: Finds the events in the segment of a search. It tells the search what it could not
+            look at (`not_searched`) and what came nearest to an event (`came_near`), and raises
+            `NotSearchableError` where it cannot look at all.
+        stored: It was stored when it happened: nothing is judged, and a timeline tells it.
+        usual: Whether it is looked for where no kinds are named.
+        lasts: It has a begin and an end, which are followed out of the range.
+        least_s: How long it has to last; a shorter range has to be widened by as much.
+        of_numbers: The numeric signals are looked at.
+        routine: It happens all the time; it is shown in the room that all other kinds leave.
+        counted: Comparisons of runs count it.
+        drawn: Its place among the rows below a plot, the least first; None if it has none there.
+        says_alike: What many alike events of one signal are, given with the unit of the signal;
+            None where each is always told by itself.
+        of_arrays: What several items of one array did at once is one event.
+    """
+
+    name: str
+    means: str
+    find: Callable[[Search], Iterable[Event]]
+    stored: bool = False
+    usual: Callable[[EventOptions], bool] = _always
+    lasts: bool = False
+    least_s: Callable[[EventOptions], float] = _no_time
+    of_numbers: bool = False
+    routine: bool = False
+    counted: bool = True
+    drawn: int | None = None
+    says_alike: Callable[[Sequence[Event], str], str] | None = None
+    of_arrays: bool = False

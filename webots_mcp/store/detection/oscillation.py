@@ -1,0 +1,66 @@
+"""`oscillation`: a signal that a robot moves with went to and fro regularly."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Final
+
+from webots_mcp.store.analysis.features import unwrap
+from webots_mcp.store.analysis.summary import usable_numbers
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.search import Search
+from webots_mcp.store.reading.rows import Columns
+from webots_mcp.store.signals.registry import Signal
+
+# What a robot swings with; sensors swing by nature while it drives.
+_SWINGING: Final = re.compile(
+    r"(^|[._])(heading|yaw|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"
+    r"|left|right|cmd|command\w*|error)([._]|$)",
+    re.IGNORECASE,
+)
+
+
+def oscillation_events(search: Search) -> Iterator[Event]:
+    """Of heading, wheels, speed, position and the like, and of what is asked for."""
+    asked = search.options.signals != EventOptions.signals
+    signals = [each for each in search.required_numbers() if asked or _SWINGING.search(each.name)]
+    left = len(search.numbers) - len(signals)
+    if left:
+        search.not_searched(
+            "oscillation",
+            f"not in {left} of {len(search.numbers)} signals, whose names are not of what a robot "
+            "swings with: name them in signals",
+        )
+    columns = search.view.newest(signals)
+    for index, signal in enumerate(signals):
+        if search.is_over("oscillation", signals[index:]):
+            return
+        yield from _swings(search, signal, columns)
+
+
+def _swings(search: Search, signal: Signal, columns: Columns) -> Iterator[Event]:
+    import numpy as np  # at the first question, not at the start of the server
+
+    from webots_mcp.store.analysis.swings import find_swings
+
+    times, numbers = usable_numbers(columns.times, columns.values[signal.name])
+    for swing in find_swings(
+        np.asarray(times, np.float64),
+        np.asarray(unwrap(numbers, signal.turn) if signal.turn else numbers, np.float64),
+        least_half_swings=search.options.oscillation_turns,
+        longest_period_s=search.options.oscillation_period_s,
+    ):
+        details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
+        ends = (swing.start_s, swing.end_s)
+        yield search.event("oscillation", *ends, signal.name, turns=swing.half_swings, **details)
+
+
+OSCILLATION: Final = EventKind(
+    "oscillation",
+    "of heading, wheels, ...",
+    oscillation_events,
+    of_numbers=True,
+    drawn=3,
+)

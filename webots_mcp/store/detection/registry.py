@@ -1,0 +1,76 @@
+"""The registry of event kinds: whoever tells, counts or draws events reads it.
+
+A new kind is a file that holds an `EventKind`, and a line here.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.detection import (
+    flat,
+    jump,
+    oscillation,
+    silent,
+    still,
+    stored,
+    threshold,
+)
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.kind import EventKind
+
+KINDS: Final[list[EventKind]] = [
+    stored.RUN,
+    stored.GAP,
+    stored.CHANGE,
+    still.STILL,
+    still.STUCK,
+    threshold.THRESHOLD,
+    silent.SILENT,
+    flat.FLAT,
+    jump.JUMP,
+    oscillation.OSCILLATION,
+    stored.COMMAND,
+    stored.LOG,
+    stored.NOTICED,
+    stored.IMAGE,
+]
+
+
+def kind_named(name: str) -> EventKind:
+    """The kind of that name.
+
+    Raises:
+        InvalidInputError: There is none.
+    """
+    found = next((kind for kind in KINDS if kind.name == name), None)
+    if found is None:
+        raise InvalidInputError(f"unknown kind {name!r}; there is {', '.join(kind_names())}")
+    return found
+
+
+def kind_names() -> list[str]:
+    """The names of all kinds."""
+    return [kind.name for kind in KINDS]
+
+
+def asked_kinds(options: EventOptions) -> list[EventKind]:
+    """The kinds that the options name, in the order of the registry; else the usual ones.
+
+    Raises:
+        InvalidInputError: There is no kind of such a name.
+    """
+    wanted = {kind_named(name).name for name in options.kinds}
+    return [kind for kind in KINDS if (kind.name in wanted if wanted else kind.usual(options))]
+
+
+def stored_kinds() -> tuple[str, ...]:
+    """The names of the kinds that were stored when they happened."""
+    return tuple(kind.name for kind in KINDS if kind.stored)
+
+
+def drawn_kinds() -> list[EventKind]:
+    """Those that have a row below a plot: what a person would look for first comes first."""
+    drawn = [(kind.drawn, kind) for kind in KINDS if kind.drawn is not None]
+    return [kind for _, kind in sorted(drawn, key=lambda each: each[0])]

@@ -1,0 +1,45 @@
+"""`still` and `stuck`: the robot stayed where it was, and should have moved besides."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.search import Search
+
+
+def stuck_events(search: Search) -> Iterator[Event]:
+    """It should have moved and stayed where it was."""
+    return _of_kind(search, "stuck")
+
+
+def still_events(search: Search) -> Iterator[Event]:
+    """It stayed where it was."""
+    return _of_kind(search, "still")
+
+
+def _of_kind(search: Search, kind: str) -> Iterator[Event]:
+    found = search.standings
+    search.not_searched(kind, *found.not_searched)
+    if found.nearest is not None:
+        search.came_near(kind, *found.nearest)
+    return (event for event in found.events if event.kind == kind)
+
+
+def _least_s(options: EventOptions) -> float:
+    return options.stuck_s
+
+
+STILL: Final = EventKind(
+    "still", "the robot stood", still_events, lasts=True, least_s=_least_s, drawn=8
+)
+STUCK: Final = EventKind(
+    "stuck",
+    "it stood and should have moved",
+    stuck_events,
+    lasts=True,
+    least_s=_least_s,
+    drawn=0,
+)

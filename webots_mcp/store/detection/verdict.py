@@ -1,0 +1,77 @@
+"""What became of each kind that was asked for: found, absent, or not looked for and why."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+
+from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.kind import EventKind
+
+
+@dataclass(frozen=True)
+class Verdicts:
+    """What the answer says of each kind that was asked for; none of them is passed over.
+
+    Attributes:
+        found: How many there are.
+        absent: Kinds that were looked for and of which there is none, each with what came nearest,
+            or with an empty text.
+        not_searched: Kinds that were not looked for, or not everywhere, with why, and with what to
+            ask to have them looked for. One that is also found or absent is so in the rest.
+    """
+
+    found: dict[str, int] = field(default_factory=dict[str, int])
+    absent: dict[str, str] = field(default_factory=dict[str, str])
+    not_searched: dict[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def gaps(self) -> dict[str, str]:
+        """What was not searched, with the kinds that share a reason under one key."""
+        sharing: dict[str, list[str]] = {}
+        for kind, why in self.not_searched.items():
+            sharing.setdefault(why, []).append(kind)
+        return {", ".join(kinds): why for why, kinds in sharing.items()}
+
+    def unlooked(self, kind: str) -> str | None:
+        """Why a kind was not looked for anywhere; None if it was, at least in a part."""
+        looked = kind in self.found or kind in self.absent
+        return None if looked else self.not_searched.get(kind)
+
+
+@dataclass
+class Ledger:
+    """What was noted of each kind while it was looked for.
+
+    Attributes:
+        searched: Kinds that were looked for at least in a part.
+        notes: Remarks that are about no kind.
+    """
+
+    searched: set[str] = field(default_factory=set[str])
+    notes: list[str] = field(default_factory=list[str])
+    _reasons: dict[str, dict[str, None]] = field(default_factory=dict[str, dict[str, None]])
+    _nearest: dict[str, tuple[float, str]] = field(default_factory=dict[str, tuple[float, str]])
+
+    def not_searched(self, kind: str, *reasons: str) -> None:
+        """Note why a kind was not looked for, or where it was not."""
+        self._reasons.setdefault(kind, {}).update(dict.fromkeys(reasons))
+
+    def came_near(self, kind: str, share: float, what: str) -> None:
+        """Note what came near to an event, as a share of what would be one; the most counts."""
+        self._nearest[kind] = max(self._nearest.get(kind, (0.0, "")), (share, what))
+
+    def verdicts(self, kinds: Sequence[EventKind], events: Iterable[Event]) -> Verdicts:
+        """On each of the kinds, in their order, given all that was found."""
+        counts = Counter(event.kind for event in events)
+        names = [kind.name for kind in kinds]
+        return Verdicts(
+            {name: counts[name] for name in names if counts[name]},
+            {
+                name: self._nearest.get(name, (0.0, ""))[1]
+                for name in names
+                if name in self.searched and not counts[name]
+            },
+            {name: "; ".join(self._reasons[name]) for name in names if self._reasons.get(name)},
+        )

@@ -155,7 +155,17 @@ def test_what_the_values_show_can_be_asked_for(
     assert stuck.ongoing
     assert webots_recording.find_events("jump", "silent") == []
     with pytest.raises(InvalidInputError, match="unknown kind 'stucked'"):
-        webots_recording.find_events("stucked")  # pyright: ignore[reportArgumentType]
+        webots_recording.find_events("stucked")
+
+
+def test_what_could_not_be_looked_for_is_not_told_to_be_absent(
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
+) -> None:
+    for step in range(20):
+        webots_robot.step(96)
+        webots_bridge.publish({"mode": "cruise", "step": step})
+    with pytest.raises(NothingRecordedError, match="stuck could not be looked for: no position"):
+        webots_recording.find_events("stuck")
 
 
 def test_a_command_is_followed_from_sending_to_its_answer(

@@ -55,7 +55,12 @@ TAKE_LEASE: Final = (
     "OR (:holder LIKE 'server %' AND holder LIKE 'bridge %')"
 )
 GIVE_LEASE_BACK: Final = "DELETE FROM lease WHERE name = 'maintainer' AND holder = ?"
-_HOLDER: Final = "SELECT holder, until_wall_time_s FROM lease WHERE name = 'maintainer'"
+# Another program may have written anything there: an end that is no time has passed.
+_LEASE: Final = (
+    "SELECT holder = :holder, holder LIKE 'bridge %', "
+    "iif(typeof(until_wall_time_s) IN ('real', 'integer'), until_wall_time_s, 0) "
+    "FROM lease WHERE name = 'maintainer'"
+)
 
 
 Kind = Literal["server", "bridge", "prune"]
@@ -150,13 +155,14 @@ class Maintainer(threading.Thread):
     def _hold_lease(self, connection: sqlite3.Connection) -> bool:
         """Renew at half time only, so that most ticks write nothing."""
         now = time.time()
-        holder, until_s = connection.execute(_HOLDER).fetchone() or ("", 0.0)
-        if holder == self._holder and LEASE_S / 2 < until_s - now <= LEASE_S:
+        lease = connection.execute(_LEASE, {"holder": self._holder}).fetchone()
+        is_ours, is_bridges, until_s = lease or (False, False, 0.0)
+        if is_ours and LEASE_S / 2 < until_s - now <= LEASE_S:
             return True
-        outranked = holder.startswith("bridge ") and self._holder.startswith("server ")
-        if holder != self._holder and now <= until_s <= now + _LATEST_S and not outranked:
+        outranked = is_bridges and self._holder.startswith("server ")
+        if not is_ours and now <= until_s <= now + _LATEST_S and not outranked:
             return False
-        if not holder:  # it was free: there is no checkpoint of another's to wait for
+        if lease is None:  # it was free: there is no checkpoint of another's to wait for
             self._held_before = True
         return self._take_lease(connection, now)
 

@@ -129,6 +129,18 @@ def test_import_makes_a_recording_where_there_is_none(
     ]
 
 
+@pytest.mark.parametrize("log", [None, "[99:00:00] b\n"])
+def test_a_folder_that_cannot_be_imported_leaves_no_database(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], log: str | None
+) -> None:
+    peer = Peer(tmp_path / "peer")
+    peer.folder.mkdir(exist_ok=True)
+    if log is not None:
+        peer.write("logs/controller.log", log)
+    complaint(capsys, "import", str(peer.folder), "--data-dir", str(tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_bad_folder_is_one_line_and_exit_code_2(
     database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -17,10 +17,13 @@ DAMAGES = (
     Damage("event", "data", "[1]"),
     Damage("session", "actions", "nonsense"),
     Damage("log", "wall_time_s", b"\x00"),
+    Damage("state", "odd", "[1]"),
+    Damage("run", "rows", "many"),
 )
 ASKED = (
     ("status",), ("status", "--json"), ("runs",), ("events",), ("trends",), ("history", "pose.0"),
-    ("compare", "1", "2"), ("tail", "--no-follow"),
+    ("compare", "1", "2"), ("tail", "--no-follow"), ("export",), ("export", "--format", "jsonl"),
+    ("prune", "--dry-run"), ("prune", "--dry-run", "--keep-states", "10rows"),
 )  # fmt: skip
 
 
@@ -32,6 +35,23 @@ def test_every_question_is_answered_past_a_wrong_value(tmp_path: Path, damage: D
         damage.apply(connection)
     ended = {asked: main([*asked, "--database", str(file)]) for asked in ASKED}
     assert [asked for asked, code in ended.items() if code] == []
+
+
+def test_an_export_is_whole_but_for_the_row_that_cannot_be_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, table = tmp_path / "webots.db", tmp_path / "rows.jsonl"
+    record(file)
+    with closing(sqlite3.connect(file)) as connection, connection:
+        rows = connection.execute("SELECT count(*) FROM state WHERE run_id = 2").fetchone()[0]
+        connection.execute("UPDATE state SET odd = '[1]' WHERE id = (SELECT max(id) FROM state)")
+        connection.execute(
+            "UPDATE state SET data = CAST(x'7b22ff' AS TEXT) "
+            "WHERE id = (SELECT max(id) - 5 FROM state)"
+        )
+    assert main(["export", "--database", str(file), "-o", str(table)]) == 0
+    assert len(table.read_text().splitlines()) == rows - 1
+    assert "data is no sound JSON" in capsys.readouterr().err
 
 
 def test_what_was_left_out_is_said_on_stderr(

@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rows import Recorded
+from tests.recordings.rows import Recorded, insert
 from tests.server.malformed import NOT_UTF8, Damage
 from webots_mcp.adoption import adopt
 from webots_mcp.entries import FORMAT
+from webots_mcp.maintenance import Maintainer
 from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.retention import Limit, Retention, plan
 from webots_mcp.store.retention.purge import prune
@@ -144,3 +145,23 @@ def test_an_entry_that_no_controller_has_written_costs_only_itself(recorded: Rec
     path.write_text("".join(json.dumps(line) + "\n" for line in lines))
     assert adopt(recorded.connection, recorded.database) == 1
     assert recorded.connection.execute("SELECT run_id FROM state").fetchall() == [(robot.run_id,)]
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("until_wall_time_s", "tomorrow"), ("until_wall_time_s", BLOB), ("holder", BLOB)],
+    ids=str,
+)
+def test_a_lease_that_nobody_of_ours_wrote_is_taken(
+    recorded: Recorded, tmp_path: Path, column: str, value: Any
+) -> None:
+    lease = {"name": "maintainer", "holder": "server 1 ab", "until_wall_time_s": 0.0}
+    insert(recorded.connection, "lease", lease | {column: value})
+    maintainer = Maintainer(tmp_path / "webots.db", "server")
+    try:
+        assert maintainer.tick()
+        assert maintainer.tick()
+    finally:
+        maintainer.stop()
+    held = recorded.connection.execute("SELECT holder, until_wall_time_s FROM lease").fetchone()
+    assert held[0].startswith("server ") and held[1] > 1e9

@@ -76,27 +76,29 @@ def question(
     def register(run: Callable[[argparse.Namespace], None]) -> Callable[..., None]:
         @functools.wraps(run)
         def ask(arguments: argparse.Namespace) -> None:
-            try:
-                run(arguments)
-            except Exception as error:
-                if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
-                    raise
-            else:
-                return
-            _ask_past_unsound_rows(run, arguments)
+            past_wrong_values(functools.partial(run, arguments))
 
         return command(name, *arguments)(ask)
 
     return register
 
 
-def _ask_past_unsound_rows(
-    run: Callable[[argparse.Namespace], None], arguments: argparse.Namespace
-) -> None:
-    from webots_mcp.store.sound import past_unsound_rows
+def past_wrong_values(run: Callable[[], None]) -> None:
+    """Run what only reads; where it fails over a value, again past the rows that are not sound."""
+    try:
+        return run()
+    except Exception as error:
+        if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
+            raise
+    past_unsound_rows(run)
 
-    with past_unsound_rows() as unsound:
-        run(arguments)
+
+def past_unsound_rows(run: Callable[[], None]) -> None:
+    """Run what only reads past the rows that are not sound, which are named on stderr."""
+    from webots_mcp.store import sound
+
+    with sound.past_unsound_rows() as unsound:
+        run()
     for said in unsound.described():
         print(f"webots-mcp: left out: {said}", file=sys.stderr)
 

@@ -11,7 +11,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command, open_recording, reading
+from webots_mcp.cli.command import (
+    DATA_DIR,
+    DATABASE,
+    argument,
+    command,
+    open_recording,
+    past_unsound_rows,
+    past_wrong_values,
+    reading,
+)
 from webots_mcp.cli.history import RANGE, range_of
 from webots_mcp.cli.limits import LIMITS, limits_of
 from webots_mcp.cli.progress import shown_progress
@@ -50,14 +59,19 @@ def export(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"{file} is the recording itself: choose another file")
     if file is None and form == "parquet" and sys.stdout.isatty():
         raise InvalidInputError("Parquet is not for a terminal: give a file with -o")
-    with reading(arguments) as connection, shown_progress("exporting") as progress:
-        wanted, safe = range_of(connection, arguments), arguments.safe_cells
-        if file is None:
-            write(connection, wanted, form, sys.stdout.buffer, progress, safe_cells=safe)
-        else:
-            rows = export_file(connection, wanted, form, file, progress, safe_cells=safe)
-            print(f"{file}: {rows} rows")
-    print_notes(wanted.notes, sys.stderr)  # stdout may be the table
+
+    def run() -> None:
+        with reading(arguments) as connection, shown_progress("exporting") as progress:
+            wanted, safe = range_of(connection, arguments), arguments.safe_cells
+            if file is None:
+                write(connection, wanted, form, sys.stdout.buffer, progress, safe_cells=safe)
+            else:
+                rows = export_file(connection, wanted, form, file, progress, safe_cells=safe)
+                print(f"{file}: {rows} rows")
+        print_notes(wanted.notes, sys.stderr)  # stdout may be the table
+
+    # What went to stdout cannot be taken back: there each row is looked at first.
+    past_unsound_rows(run) if file is None else past_wrong_values(run)
 
 
 @command(
@@ -73,8 +87,9 @@ def import_(arguments: argparse.Namespace) -> None:
     All of it is imported or, if a file is damaged, nothing. Such a folder has no simulation times:
     they are counted in seconds of wall time from its earliest entry.
     """
-    from webots_mcp.store.json_folder import import_folder
+    from webots_mcp.store.json_folder import import_folder, read_folder
 
+    read_folder(Path(arguments.folder))  # first: no database is made for what cannot be imported
     with _writable(arguments, create=True) as (recording, connection):
         with shown_progress("importing") as progress:
             made = import_folder(
@@ -106,11 +121,15 @@ def prune(arguments: argparse.Namespace) -> None:
     from webots_mcp.store.retention.stock import file_sizes
 
     limits = limits_of(arguments)
-    if arguments.dry_run:
+
+    def look() -> None:
         with reading(arguments) as connection:
-            wanted = plan(connection, in_force(connection, limits))
-            _print_plan(wanted, "would go")
-            return _print_disk(wanted, file_sizes(connection))
+            wanted, sizes = plan(connection, in_force(connection, limits)), file_sizes(connection)
+        _print_plan(wanted, "would go")
+        _print_disk(wanted, sizes)
+
+    if arguments.dry_run:
+        return past_wrong_values(look)
     with _writable(arguments) as (recording, connection):
         set_limits(connection, limits, "prune")
         retention = in_force(connection)

@@ -35,8 +35,8 @@ _SET: Final = (
 )
 _RESET: Final = "DELETE FROM retention_limit WHERE kind = ?"
 _SERVER: Final = (
-    "SELECT holder FROM lease WHERE name = 'maintainer' AND holder LIKE 'server %' "
-    "AND until_wall_time_s > ?"
+    "SELECT CAST(holder AS BLOB) FROM lease WHERE name = 'maintainer' AND holder LIKE 'server %' "
+    "AND typeof(until_wall_time_s) IN ('real', 'integer') AND until_wall_time_s > ?"
 )
 
 
@@ -168,9 +168,9 @@ def _text(value: Limit | float) -> str:
 def _another_server(connection: sqlite3.Connection) -> bool:
     """Whether a server that runs maintains the database; one that was killed holds its lease on."""
     now_s = time.time()
-    holders: Iterable[tuple[str]] = connection.execute(_SERVER, (now_s,)).fetchall()
-    pids = [holder.split()[1] for (holder,) in holders]
-    return any(pid.isdecimal() and _lives(int(pid), now_s) for pid in pids)
+    holders: Iterable[tuple[bytes]] = connection.execute(_SERVER, (now_s,)).fetchall()
+    pids = [pid for (holder,) in holders for pid in holder.split()[1:2]]
+    return any(pid.isdigit() and _lives(int(pid), now_s) for pid in pids)
 
 
 def _lives(pid: int, now_s: float) -> bool:

@@ -95,7 +95,7 @@ class Maintainer(threading.Thread):
         self._interval_s = HURRIED_INTERVAL_S
         self._data_version = -1
         self._log_bytes = 0  # after the last checkpoint
-        self._complained = ""
+        self._warned_of = ""
         self.failures = 0  # rounds that were not finished
 
     def run(self) -> None:
@@ -110,8 +110,8 @@ class Maintainer(threading.Thread):
         except Exception as error:  # noqa: BLE001  (`work` is anybody's)
             self._disconnect()
             self.failures += 1
-            if not is_busy(error) and repr(error) != self._complained:
-                self._complained = repr(error)
+            if not is_busy(error) and repr(error) != self._warned_of:
+                self._warned_of = repr(error)
                 warn(f"maintenance waits: {_described(error)}")
 
     def stop(self) -> None:
@@ -119,6 +119,8 @@ class Maintainer(threading.Thread):
         self._ending.set()
         if self.is_alive():
             self.join(timeout=2)
+        elif self.ident is None:  # never started: whoever called `tick` had no thread end for it
+            self._give_back()
 
     def tick(self) -> bool:
         """One round of work; True if this maintainer holds the lease."""

@@ -39,11 +39,11 @@ class RowWriter:
     def write(self, kind: Kind, run: Run | None, values: Values) -> int | None:
         """How many rows the statement changed, or None where it was put off."""
         session = self._session
-        if not self.is_ready(run):
+        if self._is_behind(run) and not self.catch_up(run):
             self._keep(Row(kind, run, values))
             return None
-        _, registration = session.opened
-        bound = bind(run.id if run else None, registration.session_id, values)
+        assert session.registration is not None
+        bound = bind(run.id if run else None, session.registration.session_id, values)
         try:
             changed = session.execute(STATEMENTS[kind], bound)
         except Exception as error:  # noqa: BLE001  (see `is_busy`)

@@ -100,7 +100,8 @@ class SessionConnection:
 
     def execute(self, statement: str, values: Values) -> int:
         """Run a statement, trying again for a moment while another writer has the lock."""
-        connection, _ = self.opened
+        connection = self.connection
+        assert connection is not None
         try:
             return connection.execute(statement, values).rowcount
         except sqlite3.OperationalError as error:

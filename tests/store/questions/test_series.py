@@ -184,3 +184,24 @@ def test_integers_beyond_64_bits_stay_what_they_are_in_rows(empty: sqlite3.Conne
     for step, number in enumerate(numbers):
         recorder.publish(float(step), {"ticks": number})
     assert list(query_rows(empty, resolve_range(empty), ["ticks"]).values["ticks"]) == numbers
+
+
+@pytest.mark.parametrize(("name", "turn"), [("heading_deg", 360.0), ("yaw", math.tau)])
+@pytest.mark.parametrize("around", [0.0, 0.25, 0.5])
+def test_the_mean_of_an_angle_is_circular_in_degrees_as_in_radians(
+    empty: sqlite3.Connection, tier: str, name: str, turn: float, around: float
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(200):
+        share = around + (0.02 if step % 2 else -0.02)
+        value = share % 1.0 if name == "heading_deg" else math.remainder(share, 1.0)
+        recorder.publish(float(step), {name: value * turn})
+    if tier == "rollups":
+        roll(empty, 1000)
+    angle = column(ask(empty, name, max_points=10), name)
+    for mean in (*angle.mean, angle.whole.centre(turn)):
+        assert mean is not None
+        assert math.remainder(mean / turn - around, 1.0) == pytest.approx(0.0, abs=1e-9)
+        assert 0.0 <= mean <= turn or name == "yaw"

@@ -180,7 +180,7 @@ def _number_series(
             "min_at_s": seconds(whole.min_sim_time_s),
             "max": figure(whole.max),
             "max_at_s": seconds(whole.max_sim_time_s),
-            "mean": figure(whole.direction if columns.kind == "angle" else whole.mean),
+            "mean": figure(whole.centre(columns.turn)),
         },
         replaced=replaced,
     )

@@ -27,8 +27,8 @@ class Summary(NamedTuple):
         present: Of them with a value.
         changes: Values unlike the one before, within the stretch.
         squares: Sum of squared deviations from the mean.
-        sines: Sum of sines, of an angle.
-        cosines: Sum of cosines, of an angle.
+        sines: Sum of sines, of an angle in whatever unit.
+        cosines: Sum of cosines, of an angle in whatever unit.
     """
 
     rows: int = 0
@@ -54,10 +54,23 @@ class Summary(NamedTuple):
 
     @property
     def direction(self) -> float | None:
-        """The circular mean, of an angle."""
+        """The circular mean, of an angle, in radians."""
         if self.sines is None or self.cosines is None:
             return None
         return circular_mean(self.sines, self.cosines, self.present)
+
+    def centre(self, turn: float | None) -> float | None:
+        """The mean; of an angle the circular one, in its unit: below 0 only where its values are.
+
+        Args:
+            turn: A whole turn in its unit; None of what is no angle.
+        """
+        if turn is None or self.sines is None:
+            return self.mean
+        if (direction := self.direction) is None:
+            return None
+        centre = direction * turn / math.tau
+        return centre + turn if centre < 0 <= (self.min or 0.0) else centre
 
     @property
     def deviation(self) -> float | None:
@@ -68,7 +81,7 @@ class Summary(NamedTuple):
 
     @property
     def circular_deviation(self) -> float | None:
-        """Of an angle sqrt(-2 ln R) with the mean resultant length R.
+        """Of an angle sqrt(-2 ln R) with the mean resultant length R, in radians.
 
         K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.3.1.
         """

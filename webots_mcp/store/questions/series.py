@@ -6,7 +6,6 @@ import sqlite3
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from operator import attrgetter
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
@@ -34,6 +33,7 @@ class NumberColumns:
     """A numeric signal: one item per bucket in each list, None where the bucket has no value.
 
     Attributes:
+        turn: A whole turn in its unit, of an angle; else None.
         mean: Of an angle the circular mean.
         whole: The same for the whole range, with the times of its extremes.
         odd: How often a value stood there that JSON cannot hold ("nan", "inf"); None if the
@@ -43,6 +43,7 @@ class NumberColumns:
     name: str
     kind: str
     unit: str | None
+    turn: float | None
     min: list[float | None]
     min_sim_time_s: list[float | None]
     max: list[float | None]
@@ -194,16 +195,16 @@ def _run_history(
 
 def _columns(signal: Signal, table: Table) -> NumberColumns:
     cells = table.cells.get(signal.name, [])
-    centre = attrgetter("direction" if signal.kind == "angle" else "mean")
     return NumberColumns(
         name=signal.name,
         kind=signal.kind,
         unit=signal.unit,
+        turn=signal.turn,
         min=[cell.min for cell in cells],
         min_sim_time_s=[cell.min_sim_time_s for cell in cells],
         max=[cell.max for cell in cells],
         max_sim_time_s=[cell.max_sim_time_s for cell in cells],
-        mean=[centre(cell) for cell in cells],
+        mean=[cell.centre(signal.turn) for cell in cells],
         last=[cell.last for cell in cells],
         count=[cell.present for cell in cells],
         whole=merge(cells) if cells else Summary(),

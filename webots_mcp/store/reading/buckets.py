@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import count, groupby, pairwise
 from typing import Final, Literal
 
-from webots_mcp.store.analysis.summary import Summary, merge, summarise
+from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import Rhythm, rhythm_in, rhythm_of
 from webots_mcp.store.reading.ranges import Segment
@@ -85,8 +85,7 @@ def _from_rows(
     spans = list(pairwise(edges))
     cells = {
         signal.name: [
-            summarise(times[a:b], columns.values[signal.name][a:b], angle=signal.kind == "angle")
-            for a, b in spans
+            signal.summarise(times[a:b], columns.values[signal.name][a:b]) for a, b in spans
         ]
         for signal in signals
     }

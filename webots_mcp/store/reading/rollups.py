@@ -15,7 +15,7 @@ from dataclasses import replace
 from itertools import groupby
 from typing import Final
 
-from webots_mcp.store.analysis.summary import Summary, merge, summarise
+from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.moments import shown_time
@@ -73,7 +73,7 @@ class Pieces:
             end = start + len(list(times))
             for signal in self._signals:
                 values = columns.values[signal.name][start:end]
-                summary = summarise(columns.times[start:end], values, angle=signal.kind == "angle")
+                summary = signal.summarise(columns.times[start:end], values)
                 self._parts[signal.name][piece].append(summary)
             start = end
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.notice import warn
-from webots_mcp.store.analysis.summary import Summary, merge, summarise
+from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.reading.rows import cleaned
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
 from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of
@@ -207,7 +207,7 @@ def _rollups(
     while (start := end) < len(times):
         bucket = bucket_of(times[start])
         end = bisect_left(times, (bucket + 1) * BUCKET_S, start)
-        summary = summarise(times[start:end], values[start:end], angle=signal.kind == "angle")
+        summary = signal.summarise(times[start:end], values[start:end])
         known, is_over = before.find(connection, (bucket, signal.id))
         if known is not None:
             summary = merge([_of_kind(signal, known), summary])

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.store.analysis.summary import usable_numbers
+from webots_mcp.naming import Value
+from webots_mcp.store.analysis.summary import Summary, summarise, usable_numbers
 from webots_mcp.store.rollup.batch import BatchColumn
 from webots_mcp.store.signals.flatten import (
     Kind,
@@ -66,6 +68,16 @@ class Signal:
     def turn(self) -> float | None:
         """A whole turn of an angle, in its unit; None of what is no angle."""
         return turn_of(self.name, self.kind)
+
+    def summarise(self, times: Sequence[float], values: Sequence[Value]) -> Summary:
+        """What values of it come to; of angles in degrees as well with the sums of sines."""
+        summary = summarise(times, values, angle=self.kind == "angle")
+        if self.turn is None or summary.sum is None or summary.sines is not None:
+            return summary
+        _, numbers = usable_numbers(times, values)
+        angles = [number * math.tau / self.turn for number in numbers]
+        sines, cosines = (math.fsum(map(each, angles)) for each in (math.sin, math.cos))
+        return summary._replace(sines=sines, cosines=cosines)
 
     @property
     def is_number(self) -> bool:

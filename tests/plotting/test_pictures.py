@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -53,8 +54,8 @@ QUESTIONS: dict[str, Ask] = {
 
 def ask(connection: sqlite3.Connection, **question: Any) -> Picture:
     question.setdefault("run_ids", [1])
-    bounds = {name: question.pop(name) for name in ("start_s", "end_s") if name in question}
-    return plot(connection, **question, scope=Scope(**bounds))
+    asked = {each.name: question.pop(each.name, None) for each in fields(Scope)}
+    return plot(connection, **question, scope=Scope(**asked))
 
 
 def words(picture: Picture) -> set[str]:

@@ -162,7 +162,7 @@ async def test_odd_values_are_recognisable(connect: Connect, recorded: Recorded)
     assert answer["sensors"]["lidar"]["inf"] == 40
     assert answer["replaced"]["front"] == "nan"
     assert "x" not in answer["sensors"]
-    assert answer["unnamed_devices"] == {"eye": "Camera"}
+    assert answer["not_published_by_device_name"] == "eye (Camera)"
 
 
 async def test_a_state_without_sensors_says_where_to_look(

@@ -76,7 +76,7 @@ class RunSeries(BaseModel):
         default=None, description="[from, to] where no row was recorded."
     )
     gap_count: int | None = Field(default=None, description="How many, if not all are shown.")
-    cut_at_s: float | None = Field(
+    rows_missing_from_s: float | None = Field(
         default=None, description="Reading took too long: from here on rows are missing."
     )
 
@@ -107,16 +107,14 @@ class RunTrendTables(BaseModel):
     start_s: float | None
     end_s: float | None
     rows: int
-    resolution_s: float | None = Field(
-        default=None, description="Shape, slope and crossings come from means of so many seconds."
+    from_means_of_s: float | None = Field(
+        default=None, description="Courses and slopes come from means of so many seconds."
     )
     numbers: Table | None = Field(default=None, description="What changed most is first.")
-    total: int = Field(description="Numeric signals with values.")
-    constant: int | None = Field(default=None, description="How many of all never changed.")
-    states: Table | None = Field(default=None, description="Text and flags.")
-    states_total: int | None = None
+    states: Table | None = Field(default=None, description="Text and flags that changed.")
+    constant: str | None = Field(default=None, description="What never changed, with its value.")
     silent: str | None = Field(default=None, description="Signals without a value in the range.")
-    cut_at_s: float | None = Field(
+    rows_missing_from_s: float | None = Field(
         default=None, description="Reading took too long: from here on rows are missing."
     )
 
@@ -191,8 +189,7 @@ class SqlAnswer(Answer):
     """What a SELECT returned."""
 
     result: Table | None = None
-    truncated: str | None = Field(default=None, description="Why rows are missing.")
-    shortened: int | None = Field(default=None, description="Values that were cut.")
+    truncated: str | None = Field(default=None, description="Why rows or parts are missing.")
 
 
 class RunsAnswer(Answer):

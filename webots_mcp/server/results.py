@@ -50,8 +50,8 @@ class SensorsAnswer(Answer):
     replaced: dict[str, str] | None = Field(
         default=None, description="Values that JSON cannot hold: path to nan, inf, ..."
     )
-    unnamed_devices: dict[str, str] | None = Field(
-        default=None, description="Sensor devices by whose name nothing is published."
+    not_published_by_device_name: str | None = Field(
+        default=None, description="Sensor devices, with their class."
     )
     shortened: str | None = None
 

@@ -15,6 +15,7 @@ DETAIL_BUDGET: Final = 320
 
 _DIGITS: Final = 4
 _DECIMALS: Final = 3
+_DUST: Final = 1e-12
 _ODD_NUMBERS: Final = ("nan", "inf", "-inf")
 
 
@@ -82,8 +83,11 @@ def compact_json(value: Any) -> str:
 def round_number(value: float) -> float:
     """A number with 4 significant digits, but never coarser than a thousandth.
 
-    So a time of 1234.567 s and a position far from the origin keep what moves.
+    So a time of 1234.567 s and a position far from the origin keep what moves. What adding leaves
+    of a sum, as 2.25e-16, is the 0 that it means.
     """
+    if abs(value) < _DUST:
+        return 0.0
     return round(value, _DECIMALS) if abs(value) >= 1 else float(f"{value:.{_DIGITS}g}")
 
 

@@ -199,6 +199,31 @@ def test_what_swung_and_rests_is_said_to_have_swung(empty: sqlite3.Connection) -
     assert trend.says == "swung by 0.3 about 0 every 2 s from 70.1 to 82.1 s; flat at 0 since 82 s"
 
 
+def test_the_least_value_of_what_falls_is_told_where_it_is_not_its_end(
+    empty: sqlite3.Connection,
+) -> None:
+    def front(time_s: float) -> float:
+        near_s = abs(time_s - 41.2)
+        return 2.1 - 0.018 * time_s - max(0.0, 1.2384 * (1 - near_s / 2))
+
+    record(empty, rows=1001, interval_s=0.1, front_m=front, ramp=lambda time_s: time_s)
+    assert one(empty, "front_m").says.startswith("falls from 2.1 to 0.3 m (-0.0")
+    assert one(empty, "front_m").says.endswith("; min 0.12 at 41.2 s")
+    assert "min" not in one(empty, "ramp").says and "max" not in one(empty, "ramp").says
+
+
+def test_what_adding_leaves_is_no_change_and_no_value(empty: sqlite3.Connection) -> None:
+    record(
+        empty,
+        rows=100,
+        interval_s=0.1,
+        wheel=lambda time_s: 6.0 + 5e-15 * (time_s > 4),
+        yaw=lambda time_s: 0.6 if 4 < time_s < 6 else -4.857e-17,
+    )
+    assert one(empty, "wheel").says == "constant at 6"
+    assert "e-17" not in one(empty, "yaw").says
+
+
 def test_what_fell_rested_and_rose_twice_does_not_swing(empty: sqlite3.Connection) -> None:
     record(empty, rows=1300, interval_s=0.1, front=lambda t: 1.0 if t % 60 < 30 else 0.05)
     assert one(empty, "front").oscillation is None

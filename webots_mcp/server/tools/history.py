@@ -147,7 +147,7 @@ def _run_series(run: RunHistory) -> RunSeries:
         rows=run.rows,
         gaps=[[seconds(gap.start_s), seconds(gap.end_s)] for gap in run.gaps[:_SHOWN_GAPS]] or None,
         gap_count=len(run.gaps) if len(run.gaps) > _SHOWN_GAPS else None,
-        cut_at_s=seconds(run.cut_at_s),
+        rows_missing_from_s=seconds(run.cut_at_s),
     )
 
 

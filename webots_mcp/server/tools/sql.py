@@ -59,8 +59,7 @@ async def webots_query_sql(
     return SqlAnswer(
         **header,
         result=Table(columns=columns, rows=rows),
-        truncated=found.truncated,
-        shortened=found.shortened or None,
+        truncated=_truncated(found),
         hint=f"only the first {_MOST_COLUMNS} columns are shown" if more else _none(rows),
     )
 
@@ -106,6 +105,11 @@ async def _turn() -> AsyncGenerator[None]:
 def _cell(cell: Cell) -> Cell:
     """A value that JSON can hold."""
     return str(cell) if isinstance(cell, float) and not math.isfinite(cell) else cell
+
+
+def _truncated(found: Result) -> str | None:
+    cut = f"{found.shortened} long values are cut" if found.shortened else None
+    return "; ".join(filter(None, (found.truncated, cut))) or None
 
 
 def _none(rows: list[list[Cell]]) -> str | None:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, cast
 from pydantic import Field
 
 from webots_mcp.errors import NothingRecordedError
+from webots_mcp.server.budget import some
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import RobotName, RunId
 from webots_mcp.server.results import FullStateAnswer, SensorsAnswer, StateAnswer, Table
@@ -77,12 +78,13 @@ def webots_get_sensors(
         state = view.state.value()
         sensors = sensor_part(state, view.robot.devices)
         short = shorten(sensors)
-        missing = unnamed_devices(sensors, view.robot.devices)
+        unnamed = unnamed_devices(sensors, view.robot.devices)
+        missing = [f"{name} ({kind})" for name, kind in unnamed.items()]
         return SensorsAnswer(
             **view.header(),
             sensors=short.value,
             replaced=_replaced_in(view.state, sensors),
-            unnamed_devices=dict(list(missing.items())[:_SHOWN_DEVICES]) or None,
+            not_published_by_device_name=some(missing, _SHOWN_DEVICES) or None,
             shortened=short.rule,
             hint=None if sensors else _no_sensors(state),
         )

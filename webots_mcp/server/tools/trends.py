@@ -17,7 +17,7 @@ from webots_mcp.server.budget import (
     short_name,
     shown,
     some,
-    without_empty,
+    table,
 )
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import RunTrendTables, TrendsAnswer
@@ -25,22 +25,21 @@ from webots_mcp.server.parameters import (
     AnyNames,
     ShownLimit,
 )
-from webots_mcp.server.shortening import cut_text
+from webots_mcp.server.shortening import compact_json, cut_text
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
-TREND_COLUMNS: Final = (
-    "signal", "says", "shape", "first", "last", "min", "min_at_s", "max", "max_at_s", "mean",
-    "deviation", "slope_per_s", "r2", "crossings", "spikes", "missing_share",
-)  # fmt: skip
+TREND_COLUMNS: Final = ("signal", "says", "last", "mean", "deviation")
 STATE_COLUMNS: Final = ("signal", "changes", "last", "since_s", "time_by_value_s")
 DEFAULT_LIMIT: Final = 20
 MOST_SIGNALS: Final = 500
 _STATES_SHARE: Final = 0.25  # of the budget
 _LONGEST_SAYING: Final = 200
+_NO_ROW: Final = "no row in that range: leave the range out, or see notes"
 _SHOWN_VALUES: Final = 6
+_SHOWN_CONSTANTS: Final = 20
 
 
 @tool("Get the trends", READS)
@@ -66,56 +65,62 @@ def webots_get_trends(
 def _found(view: View, asked: TimeRange, names: Sequence[str], limit: int | None) -> dict[str, Any]:
     found = trends(view.connection, asked, names, limit=MOST_SIGNALS)
     budget = (BUDGET if limit is None else LARGE_BUDGET) // max(len(found.runs), 1)
-    runs = [trend_tables(run, limit or DEFAULT_LIMIT, budget) for run in found.runs if run.rows]
+    recorded = [run for run in found.runs if run.rows]
+    runs = [trend_tables(run, limit or DEFAULT_LIMIT, budget) for run in recorded]
     return {
         "runs": runs or None,
         "notes": notes_of(found.notes),
-        "hint": _hint(runs) if runs else "no row in that range: leave the range out, or see notes",
+        "hint": _hint(recorded, runs)
+        if runs
+        else "no row in that range: leave the range out, or see notes",
     }
 
 
 def trend_tables(run: RunTrends, limit: int, budget: int) -> RunTrendTables:
     """The trends of a run as tables that fit the budget, in characters."""
-    states = fitting([state_row(state) for state in run.states], int(budget * _STATES_SHARE))
-    moving = [trend for trend in run.numbers if trend.shape != "constant"]
-    asked = moving or run.numbers
-    rows = fitting([trend_row(trend) for trend in asked[:limit]], int(budget * (1 - _STATES_SHARE)))
+    changed = [state for state in run.states if state.changes]
+    states = fitting([state_row(state) for state in changed], int(budget * _STATES_SHARE))
+    moving = _moving(run)
+    rows = fitting(
+        [trend_row(trend) for trend in moving[:limit]], int(budget * (1 - _STATES_SHARE))
+    )
     return RunTrendTables(
         run_id=run.run_id,
         start_s=seconds(run.start_s),
         end_s=seconds(run.end_s),
         rows=run.rows,
-        resolution_s=run.resolution_s,
-        numbers=without_empty(TREND_COLUMNS, rows),
-        total=run.total,
-        constant=len(run.numbers) - len(moving) or None,
-        states=without_empty(STATE_COLUMNS, states),
-        states_total=len(run.states) if len(run.states) > len(states) else None,
-        silent=some(run.silent) if run.silent else None,
-        cut_at_s=seconds(run.cut_at_s),
+        from_means_of_s=run.resolution_s,
+        numbers=table(TREND_COLUMNS, rows),
+        states=table(STATE_COLUMNS, states),
+        constant=some(_constants(run), _SHOWN_CONSTANTS) or None,
+        silent=some(run.silent) or None,
+        rows_missing_from_s=seconds(run.cut_at_s),
     )
 
 
+def _moving(run: RunTrends) -> list[Trend]:
+    return [trend for trend in run.numbers if trend.shape != "constant"]
+
+
+def _constants(run: RunTrends) -> list[str]:
+    """What never changed, each with its value."""
+    numbers = [
+        f"{trend.name} {figure(trend.summary.last):g}{f' {trend.unit}' if trend.unit else ''}"
+        for trend in run.numbers
+        if trend.shape == "constant"
+    ]
+    states = [f"{each.name} {compact_json(each.last)}" for each in run.states if not each.changes]
+    return numbers + states
+
+
 def trend_row(trend: Trend) -> list[Any]:
-    """A number as a row under `TREND_COLUMNS`."""
-    summary = trend.summary
+    """A number as a row under `TREND_COLUMNS`: extremes with their times are in what it says."""
     return [
         short_name(trend.name),
         cut_text(trend.says, _LONGEST_SAYING),
-        trend.shape,
-        figure(summary.first),
-        figure(summary.last),
-        figure(summary.min),
-        seconds(summary.min_sim_time_s),
-        figure(summary.max),
-        seconds(summary.max_sim_time_s),
+        figure(trend.summary.last),
         figure(trend.mean),
         figure(trend.deviation),
-        figure(trend.slope_per_s),
-        figure(trend.r2),
-        trend.crossings or None,
-        len(trend.spikes or ()) or None,
-        figure(trend.missing_share) or None,
     ]
 
 
@@ -133,11 +138,20 @@ def state_row(state: StateTrend) -> list[Any]:
     ]
 
 
-def _hint(runs: Sequence[RunTrendTables]) -> str | None:
+def _hint(found: Sequence[RunTrends], runs: Sequence[RunTrendTables]) -> str | None:
+    counts = [
+        (run.run_id, len(run.numbers.rows) if run.numbers else 0, _changed(each))
+        for each, run in zip(found, runs, strict=True)
+    ]
     hints = [
-        f"run {run.run_id}: {told} of {run.total - (run.constant or 0)} signals that changed; "
-        "signals=['...'] asks for others, limit for more"
-        for run in runs
-        if (told := len(run.numbers.rows) if run.numbers else 0) < run.total - (run.constant or 0)
+        f"run {run_id}: {told} of {changed} numbers that changed; signals=['...'] asks for others, "
+        "limit for more"
+        for run_id, told, changed in counts
+        if told < changed
     ]
     return "; ".join(hints) or None
+
+
+def _changed(run: RunTrends) -> int:
+    """How many numbers changed, also beyond those that were read."""
+    return run.total - (len(run.numbers) - len(_moving(run)))

@@ -25,6 +25,8 @@ from webots_mcp.store.signals.registry import Signal
 STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
 TOLD_MISSING_SHARE: Final = 0.001
 SWINGING_SHARE: Final = 0.6  # of the range: what swung for less did something else as well
+TOLD_BEYOND_ENDS: Final = 0.05  # of the range: extremes nearer to the ends are as good as them
+_DUST: Final = 1e-12  # of a value: what adding leaves of it
 _HALF_TURN_VARIANCE: Final = -2 * math.log(2 / math.pi)  # of angles spread over half a turn
 
 Shape = Literal["constant", "rising", "falling", "oscillating", "resting", "varying"]
@@ -225,7 +227,7 @@ def _shape(
     rest_s: float | None,
     whole_s: float,
 ) -> Shape:
-    if summary.min == summary.max:
+    if _is_constant(summary):
         return "constant"
     if swing is not None and swing.end_s - swing.start_s >= SWINGING_SHARE * whole_s:
         return "oscillating"
@@ -234,6 +236,12 @@ def _shape(
     if line is not None and line.r2 >= STRAIGHT_R2:
         return "rising" if line.slope_per_s > 0 else "falling"
     return "resting" if rest_s is not None else "varying"
+
+
+def _is_constant(summary: Summary) -> bool:
+    """Whether it never changed but for what adding leaves: 6.000000000000005 is 6."""
+    low, high = summary.min or 0.0, summary.max or 0.0
+    return high - low <= _DUST * max(abs(low), abs(high))
 
 
 def _relative_range(summary: Summary) -> float:
@@ -249,8 +257,9 @@ def _remarks(trend: Trend, resolution_s: float) -> Iterator[str]:
         yield "changes by more than a quarter turn at once: turns are not counted"
     elif trend.fast:
         yield f"varies faster than {resolution_s:g} s: ask for a shorter range"
+    yield from _beyond_ends(trend)
     if trend.flat_since_s is not None and trend.shape != "constant":
-        yield f"flat at {summary.last:.4g} since {trend.flat_since_s:.6g} s"
+        yield f"flat at {_told(summary.last, summary)} since {trend.flat_since_s:.6g} s"
     if trend.spikes:
         largest = max(trend.spikes, key=lambda spike: abs(spike.value - (trend.mean or 0.0)))
         yield (
@@ -276,8 +285,31 @@ def _course(trend: Trend, unit: str) -> str:
         if trend.turned is not None:
             return f"turns by {trend.turned:.3g}{unit}{slope}"
         verb = "rises" if trend.shape == "rising" else "falls"
-        return f"{verb} from {summary.first:.4g} to {summary.last:.4g}{unit}{slope}"
-    low, high = f"{summary.min:.4g}", f"{summary.max:.4g}"
+        first, last = _told(summary.first, summary), _told(summary.last, summary)
+        return f"{verb} from {first} to {last}{unit}{slope}"
+    low, high = _told(summary.min, summary), _told(summary.max, summary)
     return f"between {low} (at {summary.min_sim_time_s:.6g} s) and {high}{unit} " + (
         f"(at {summary.max_sim_time_s:.6g} s)"
     )
+
+
+def _beyond_ends(trend: Trend) -> Iterator[str]:
+    """The extremes of what rises or falls that are not its ends: it went the other way in between.
+
+    They are told where the spikes do not tell them.
+    """
+    summary = trend.summary
+    if trend.shape not in ("rising", "falling") or trend.turned is not None or trend.spikes:
+        return
+    ends = (summary.first or 0.0, summary.last or 0.0)
+    span = TOLD_BEYOND_ENDS * ((summary.max or 0.0) - (summary.min or 0.0))
+    if summary.min is not None and min(ends) - summary.min > span:
+        yield f"min {_told(summary.min, summary)} at {summary.min_sim_time_s:.6g} s"
+    if summary.max is not None and summary.max - max(ends) > span:
+        yield f"max {_told(summary.max, summary)} at {summary.max_sim_time_s:.6g} s"
+
+
+def _told(value: float | None, summary: Summary) -> str:
+    """A value with four digits; 0 where it is only what adding leaves beside the extremes."""
+    largest = max(abs(summary.min or 0.0), abs(summary.max or 0.0))
+    return f"{value:.4g}" if value is not None and abs(value) > _DUST * largest else "0"

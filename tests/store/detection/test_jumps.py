@@ -71,3 +71,18 @@ def test_a_signal_that_the_asker_names_is_searched_for_swings(empty: sqlite3.Con
     assert "not in 1 of 1 signals" in unasked.verdicts.not_searched["oscillation"]
     (swing,) = find_events(empty, whole, asked).events
     assert swing.details["period_s"] == pytest.approx(2.0, rel=0.02)
+
+
+def test_a_value_that_is_back_only_after_a_gap_did_not_drop_out(empty: sqlite3.Connection) -> None:
+    """Nobody knows what it did in between."""
+    record(empty, lambda t: {"steer": 0.2 * (94.9 <= t < 95) + 0.1 * (40 <= t < 60)}, gap=True)
+    assert jumps(empty) == []
+
+
+def test_a_jump_exactly_at_the_begin_of_a_range_is_in_it(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, lambda t: {"temp_c": 20 + 0.01 * t + (50 if t >= 100 else 0)})
+    for start_s, end_s, count in ((100.0, 150.0, 1), (50.0, 100.0, 0), (99.9, 100.0, 0)):
+        asked = resolve_range(empty, start_s=start_s, end_s=end_s)
+        assert len(find_events(empty, asked, EventOptions(kinds=("jump",))).events) == count

@@ -24,7 +24,7 @@ from webots_mcp.store.reading.ranges import resolve_range
 
 
 def tilted(search: Search) -> Iterator[Event]:
-    columns = search.view.newest([search.known["tilt"]])
+    (columns,) = search.view.stretches([search.known["tilt"]], 1.0)
     for time_s, tilt in zip(columns.times, columns.values["tilt"], strict=True):
         if isinstance(tilt, float) and tilt > 1:
             yield search.event("tilted", time_s, time_s, "tilt", tilt=tilt)

@@ -50,7 +50,7 @@ def find_jumps(
         usual: The sizes of steps to compare with; empty for those of the values themselves.
     """
     steps = [abs(after - before) for before, after in pairwise(values)]
-    backs = _come_back(values, steps)
+    backs = _come_back(times, values, steps)
     there_and_back = {row for left, back in backs.items() for row in range(left, back)}
     sizes = sorted(
         size
@@ -78,14 +78,20 @@ def are_usual(jumps: Sequence[Jump], rows: int) -> bool:
     return len(jumps) > max(3, MOST_JUMPS_SHARE * rows)
 
 
-def _come_back(values: Sequence[float], steps: Sequence[float]) -> dict[int, int]:
-    """Rows after which a value that had rested left, and rows in which it was back soon after."""
+def _come_back(
+    times: Sequence[float], values: Sequence[float], steps: Sequence[float]
+) -> dict[int, int]:
+    """Rows after which a value that had rested left, and rows in which it was back soon after.
+
+    What was recorded on the other side of a gap is not soon after.
+    """
+    gaps_s = {gap.end_s for gap in rhythm_of(times).gaps}
     backs: dict[int, int] = {}
     for row in range(1, len(steps)):
         if steps[row] > 0 and steps[row - 1] == 0 and _step(values[row], values[row + 1]) > 0:
             soon = range(row + 2, min(row + 2 + LONGEST_EXCURSION, len(values)))
             back = next((later for later in soon if values[later] == values[row]), None)
-            if back is not None:
+            if back is not None and not gaps_s.intersection(times[row + 1 : back + 1]):
                 backs[row] = back
     return backs
 

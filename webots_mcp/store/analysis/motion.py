@@ -6,7 +6,7 @@ numpy is imported at the first use: the start of a server does not wait for it.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
@@ -71,25 +71,35 @@ class Motion:
         return [*(self.position or ()), *others, *self.wheels]
 
 
-def find_motion(known: dict[str, Signal], options: EventOptions) -> Motion:
+def find_motion(
+    known: dict[str, Signal], options: EventOptions, here: Collection[str] | None = None
+) -> Motion:
     """Find the signals of motion: those that the options name, else by their names.
+
+    Args:
+        known: All signals of the robot.
+        options: Names in them count whatever was published.
+        here: What is published in the run: other runs may have had other names. None where that
+            does not matter.
 
     Raises:
         UnknownSignalError: The options name a signal that does not exist.
         InvalidInputError: A name in them means several.
     """
+    own = known if here is None else {name: known[name] for name in known if name in here}
     mode = _named(known, options.mode)
-    mode = mode or _first(known, _MODE, ("text",)) or _first(known, _STATE, ("text",))
-    commanded = _named(known, options.commanded) or _first(known, _COMMANDED, ("num",))
-    speed = None if commanded else _first(known, _SPEED, ("num",), _is_no_wheel)
+    mode = mode or _first(own, _MODE, ("text",)) or _first(own, _STATE, ("text",))
+    commanded = _named(known, options.commanded) or _first(own, _COMMANDED, ("num",))
+    speed = None if commanded else _first(own, _SPEED, ("num",), _is_no_wheel)
     wheels = tuple(
         signal
-        for name, signal in known.items()
+        for name, signal in own.items()
         if signal.kind == "num" and _WHEEL.search(name) and not _NO_SPEED.search(name)
         if signal.unit not in ("rad", "deg", "m") and signal not in (commanded, speed)
     )
-    position = _position(known, options.position)
-    return Motion(position, commanded, speed, mode, _heading(known, position), wheels)
+    position = _position(known, options.position) if options.position else _position(own, None)
+    position = position or _position(known, None)  # it may be missing in the rows that were seen
+    return Motion(position, commanded, speed, mode, _heading(own, position), wheels)
 
 
 def _is_no_wheel(name: str) -> bool:

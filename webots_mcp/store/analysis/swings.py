@@ -8,7 +8,7 @@ asking for more time never finds less.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
@@ -89,6 +89,27 @@ def find_swings(
             swings[0] = _as_one(found.pop(), swings[0])
         found += swings
     return found
+
+
+def joined_swings(found: Iterable[Swing]) -> list[Swing]:
+    """Swings of stretches that overlap, in order: what two stretches tell of one is one."""
+    joined: list[Swing] = []
+    for swing in sorted(found, key=lambda each: each.start_s):
+        before = joined[-1] if joined else None
+        if before is None or swing.start_s >= before.end_s:
+            joined.append(swing)
+        elif swing.end_s > before.end_s:
+            joined[-1] = _together(before, swing)
+    return joined
+
+
+def _together(before: Swing, after: Swing) -> Swing:
+    """Two that overlap; where their periods are unlike, the one that was seen longer is told."""
+    if _ratio(before.period_s, after.period_s) > ALIKE[0]:
+        return max(before, after, key=lambda each: each.half_swings * each.explained)
+    whole = _as_one(before, after)
+    count = round(2 * (after.end_s - before.start_s) / whole.period_s)
+    return replace(whole, half_swings=count)
 
 
 def _goes_on(before: Swing, after: Swing, times: Array) -> bool:

@@ -9,9 +9,11 @@ from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_le
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
+from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.registry import Signal
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
+LEAPS_SHARE: Final = 0.3  # of the time that is left: the kinds after it need some as well
 _ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to the same value
 
 
@@ -48,16 +50,24 @@ def _leaps(search: Search) -> Iterator[Event]:
     """The position changed by more than driving explains."""
     if search.motion.position is None:
         return
-    columns = search.view.newest(search.motion.signals)
-    x, y = (columns.values[signal.name] for signal in search.motion.position)
+    leaps: dict[float, float] = {}
+    for columns in search.view.stretches(search.motion.position, LEAPS_SHARE):
+        leaps |= _leaps_in(columns, search.motion.position, search.options.jump_m)
+    for time_s in sorted(leaps):
+        yield search.event("jump", time_s, time_s, "position", distance_m=leaps[time_s])
+
+
+def _leaps_in(
+    columns: Columns, position: tuple[Signal, Signal], at_least_m: float
+) -> dict[float, float]:
+    x, y = (columns.values[signal.name] for signal in position)
     rows = [
         (time_s, (float(a), float(b)))
         for time_s, a, b in zip(columns.times, x, y, strict=True)
         if isinstance(a, (int, float)) and isinstance(b, (int, float))
     ]
     times, places = [time_s for time_s, _ in rows], [place for _, place in rows]
-    for time_s, length_m in find_leaps(times, places, search.options.jump_m):
-        yield search.event("jump", time_s, time_s, "position", distance_m=length_m)
+    return dict(find_leaps(times, places, at_least_m))
 
 
 def _alike(events: Sequence[Event], unit: str) -> str:

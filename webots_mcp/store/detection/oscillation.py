@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.analysis.summary import usable_numbers
@@ -13,6 +13,9 @@ from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.registry import Signal
+
+if TYPE_CHECKING:
+    from webots_mcp.store.analysis.swings import Swing
 
 # What a robot swings with; sensors swing by nature while it drives.
 _SWINGING: Final = re.compile(
@@ -24,6 +27,8 @@ _SWINGING: Final = re.compile(
 
 def oscillation_events(search: Search) -> Iterator[Event]:
     """Of heading, wheels, speed, position and the like, and of what is asked for."""
+    from webots_mcp.store.analysis.swings import joined_swings  # numpy: not at the server's start
+
     asked = search.options.signals != EventOptions.signals
     signals = [each for each in search.required_numbers() if asked or _SWINGING.search(each.name)]
     left = len(search.numbers) - len(signals)
@@ -33,34 +38,42 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             f"not in {left} of {len(search.numbers)} signals, whose names are not of what a robot "
             "swings with: name them in signals",
         )
-    columns = search.view.newest(signals)
-    for index, signal in enumerate(signals):
-        if search.is_over("oscillation", signals[index:]):
-            return
-        yield from _swings(search, signal, columns)
+    found: dict[str, list[Swing]] = {}
+    for columns in search.view.stretches(signals, 1.0):
+        for index, signal in enumerate(signals):
+            if search.is_over("oscillation", signals[index:]):
+                break
+            found.setdefault(signal.name, []).extend(_swings(search, signal, columns))
+    for name, swings in found.items():
+        for swing in joined_swings(swings):
+            details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
+            ends = (swing.start_s, swing.end_s)
+            yield search.event("oscillation", *ends, name, turns=swing.half_swings, **details)
 
 
-def _swings(search: Search, signal: Signal, columns: Columns) -> Iterator[Event]:
-    import numpy as np  # at the first question, not at the start of the server
+def _swings(search: Search, signal: Signal, columns: Columns) -> list[Swing]:
+    import numpy as np
 
     from webots_mcp.store.analysis.swings import find_swings
 
     times, numbers = usable_numbers(columns.times, columns.values[signal.name])
-    for swing in find_swings(
+    return find_swings(
         np.asarray(times, np.float64),
         np.asarray(unwrap(numbers, signal.turn) if signal.turn else numbers, np.float64),
         least_half_swings=search.options.oscillation_turns,
         longest_period_s=search.options.oscillation_period_s,
-    ):
-        details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
-        ends = (swing.start_s, swing.end_s)
-        yield search.event("oscillation", *ends, signal.name, turns=swing.half_swings, **details)
+    )
+
+
+def _least_s(options: EventOptions) -> float:
+    return options.oscillation_turns * options.oscillation_period_s / 2
 
 
 OSCILLATION: Final = EventKind(
     "oscillation",
     "of heading, wheels, ...",
     oscillation_events,
+    least_s=_least_s,
     of_numbers=True,
     drawn=3,
 )

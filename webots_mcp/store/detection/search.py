@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
+from webots_mcp.naming import flatten
 from webots_mcp.store.analysis.motion import Motion, find_motion
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
@@ -16,11 +17,19 @@ from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.views import View, view_of
 from webots_mcp.store.signals.catalogue import resolve_signals
+from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
 if TYPE_CHECKING:
     from webots_mcp.store.detection.standing import Standings
 
+_ENDS: Final = (
+    "SELECT data FROM state WHERE id IN ("
+    "(SELECT id FROM state WHERE run_id = :run AND sim_time_s >= :start "
+    "ORDER BY sim_time_s, id LIMIT 1), "
+    "(SELECT id FROM state WHERE run_id = :run AND sim_time_s < :end "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1))"
+)
 _RUN_START: Final = "SELECT started_wall_time_s FROM run WHERE id = ?"
 _WALL_AT: Final = (
     "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
@@ -77,8 +86,15 @@ class Search:
 
     @cached_property
     def motion(self) -> Motion:
-        """The signals that tell how the robot moves."""
-        return find_motion(self.known, self.options)
+        """The signals that tell how the robot moves; other runs may have had others."""
+        return find_motion(self.known, self.options, self._here)
+
+    @cached_property
+    def _here(self) -> set[str]:
+        """Names that the first or the newest row of the segment has."""
+        run_id, start_s, end_s = self.segment.run_id, self.segment.start_s, self.segment.end_s
+        rows = self.connection.execute(_ENDS, {"run": run_id, "start": start_s, "end": end_s})
+        return {name for (data,) in rows.fetchall() for name in flatten(parse(data))}
 
     @cached_property
     def signals(self) -> list[Signal]:

@@ -223,8 +223,12 @@ def collect(
     known = known_signals(connection, time_range)
     import_module("numpy")  # once per process, before the time counts
     ledger = Ledger(notes=list(time_range.notes))
-    detection = Detection(connection, known, kinds, options, Deadline(deadline_s), ledger)
-    found = [event for each in time_range.segments for event in detection.events_touching(each)]
+    deadline, segments = Deadline(deadline_s), time_range.segments
+    found: list[Event] = []
+    for index, segment in enumerate(segments):  # each run gets its share of the time
+        part = deadline.part(1 / (len(segments) - index))
+        detection = Detection(connection, known, kinds, options, part, ledger)
+        found += detection.events_touching(segment)
     if not time_range.segments:
         for kind in kinds:
             ledger.not_searched(kind.name, "nothing was recorded in that range")

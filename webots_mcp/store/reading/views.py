@@ -37,6 +37,8 @@ JUMP_BUCKETS: Final = 20  # of each signal of a long segment that are read
 JUMP_RANGE: Final = 3.0  # times the usual range of a bucket: there may be a jump in it
 SAMPLES_PER_STAY: Final = 5
 SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
+STRETCH_ROWS: Final = 10_000  # at once, of all rows of a long segment
+ACROSS_S: Final = 20.0  # of the next stretch: longer than six half swings of the longest period
 LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
 
 _OF_SIGNAL: Final = (
@@ -99,8 +101,11 @@ class View(Protocol):
         """Where a jump may be."""
         ...
 
-    def newest(self, signals: Sequence[Signal]) -> Columns:
-        """Rows one after the other: all, or the newest."""
+    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Columns]:
+        """All rows in stretches, the newest first, as many as a share of the time allows.
+
+        Each reaches so far into the one after it that what lies across the border is whole in one.
+        """
         ...
 
 
@@ -163,9 +168,9 @@ class RowView:
         """All of it."""
         yield Course(*usable_numbers(self._columns.times, self._columns.values[signal.name]))
 
-    def newest(self, signals: Sequence[Signal]) -> Columns:
-        """All rows."""
-        return self._columns
+    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Columns]:
+        """All rows at once."""
+        yield self._columns
 
 
 class LongView:
@@ -268,18 +273,25 @@ class LongView:
                 return
             yield Course(*self._numbers(signal, bucket), self._usual_steps(signal))
 
-    def newest(self, signals: Sequence[Signal]) -> Columns:
-        """The newest rows."""
+    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Columns]:
+        """What there is no time for is noted."""
         self._note_purged()
-        part = newest_part(self._connection, self._segment)
-        columns = read_columns(self._connection, part, signals, self._deadline)
-        if columns.times and columns.times[0] > self._segment.start_s:
-            since_s = columns.times[0]
-            if since_s > (self._purged_until_s or -math.inf):
-                self.notes.append(f"not before {since_s:.3f} s; ask end_s={since_s:.3f}")
-        if columns.cut:
-            self._cut()
-        return columns
+        deadline = self._deadline.part(share)
+        first_s = max(self._segment.start_s, self._purged_until_s or -math.inf)
+        left = self._segment
+        while left.end_s > first_s:
+            part = newest_part(self._connection, left, STRETCH_ROWS)
+            if deadline.passed:
+                reached_s = left.end_s
+                self.notes.append(
+                    f"not before {reached_s:.3f} s, the time was over; ask end_s={reached_s:.3f}"
+                )
+                return
+            end_s = min(self._segment.end_s, part.end_s + ACROSS_S)
+            yield read_columns(self._connection, replace(part, end_s=end_s), signals, deadline)
+            if part.start_s <= first_s:
+                return
+            left = replace(left, end_s=part.start_s)
 
     @functools.cached_property
     def _totals(self) -> dict[int, Summary]:

@@ -1,0 +1,85 @@
+"""Asking about more time never finds less, and what there was no time for is told by time."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from itertools import count
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import Recorder
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.extent import Detection
+from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.verdict import Ledger
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading import rows, views
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.signals.catalogue import known_signals
+
+SWING_S = (100.0, 130.0)
+BORDER_S = 349.0  # of two stretches: the swing about it is whole in the older one only
+LEAP_S = 60.0
+
+
+@pytest.fixture
+def long(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
+    """500 s that are long: a leap and a swing are in the oldest part, another at a border."""
+    monkeypatch.setattr(rows, "RAW_ROWS", 1000)
+    monkeypatch.setattr(views, "STRETCH_ROWS", 1500)
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    for step in range(5000):
+        recorder.publish(step * 0.1, state(step * 0.1))
+    roll(empty, 100_000)
+    return empty
+
+
+def state(time_s: float) -> dict[str, Any]:
+    swings = SWING_S[0] <= time_s < SWING_S[1] or BORDER_S - 6 <= time_s < BORDER_S + 6
+    x = 0.2 * time_s + (2.0 if time_s >= LEAP_S else 0.0)
+    return {"pose": [x, 0.0], "steering": 0.3 * math.sin(math.pi * time_s) * swings}
+
+
+def test_swings_and_leaps_are_searched_in_the_whole_of_a_long_run(long: sqlite3.Connection) -> None:
+    found = find_events(long, resolve_range(long), EventOptions(kinds=("jump", "oscillation")))
+    swings = [each for each in found.events if each.kind == "oscillation"]
+    assert [(round(each.start_s), round(each.end_s)) for each in swings] == [(100, 130), (343, 355)]
+    (leap,) = (each for each in found.events if each.kind == "jump")
+    assert leap.start_s == pytest.approx(LEAP_S)
+    assert "not before" not in str(found.verdicts.not_searched)
+
+
+def test_what_there_was_no_time_for_is_told_by_time(long: sqlite3.Connection) -> None:
+    ticks = count()
+    asked = resolve_range(long)
+    options, ledger = EventOptions(kinds=("oscillation",), signals=("steering",)), Ledger()
+    kinds, deadline = asked_kinds(options), Deadline(9.0, lambda: next(ticks))
+    detection = Detection(long, known_signals(long, asked), kinds, options, deadline, ledger)
+    found = detection.events_touching(asked.segments[0])
+    why = ledger.verdicts(kinds, found).not_searched["oscillation"]
+    until_s = float(why.rpartition("ask end_s=")[2])
+    assert 100 < until_s < 500
+    rest = resolve_range(long, end_s=until_s)
+    assert find_events(long, rest, options).events[0].start_s == pytest.approx(100, abs=0.5)
+
+
+def test_the_position_of_a_run_is_the_one_that_it_published(empty: sqlite3.Connection) -> None:
+    """Another run of the robot named it otherwise, after an edit."""
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    for name in ("pose", "gps"):
+        recorder.run(recorder.session(robot_id, name[0] * 64), robot_id)
+        for step in range(300):
+            recorder.publish(step * 0.1, {name: [min(step, 200) * 0.02, 0.0]})
+    roll(empty, 100_000)
+    for run_id in (1, 2):
+        found = find_events(
+            empty, resolve_range(empty, run_id=run_id), EventOptions(kinds=("still",))
+        )
+        assert [round(each.start_s) for each in found.events] == [20], run_id

@@ -25,13 +25,14 @@ ALLOWED = {
     "notice": set[str](),
     "naming": set[str](),
     "conditions": {"conditions", "errors", "naming"},
+    "parameter": {"errors", "naming"},
     "settlement": {"contract", "entries", "liveness"},
     "entries": set[str](),
     "adoption": {"connection", "entries", "errors", "notice"},
     "maintenance": {"adoption", "connection", "errors", "notice", "schema"},
     "standin": {"standin", "bundled"},
 }
-ENTRIES = {"bundled", "conditions", "maintenance", "naming", "settlement"}
+ENTRIES = {"bundled", "conditions", "maintenance", "naming", "parameter", "settlement"}
 STDLIB = {
     *ENTRIES,
     *ALLOWED["maintenance"],

@@ -23,6 +23,7 @@ SCREENSHOT_FOLDER: Final = "screenshots"
 DATA_DIR_VARIABLE: Final = "WEBOTS_MCP_DATA_DIR"
 STRICT_VARIABLE: Final = "WEBOTS_MCP_STRICT"
 THROTTLE_VARIABLE: Final = "WEBOTS_MCP_THROTTLE_INTERVAL"
+PARAMETERS_VARIABLE: Final = "WEBOTS_MCP_PARAMETERS"
 
 PRIVATE_FOLDER: Final = 0o700  # recordings hold pictures and logs: they are their owner's alone
 PRIVATE_FILE: Final = 0o600
@@ -66,6 +67,7 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "reload": BuiltInAction(ends_steps=True),
     "screenshot": BuiltInAction(),
     "reset_state": BuiltInAction(needs_supervisor=False, runs_user_code=True),
+    "set_parameters": BuiltInAction(needs_supervisor=False),
 }
 
 COMMAND_TIME_TO_LIVE_S: Final = 10.0

@@ -33,6 +33,9 @@ Kind = Literal[
     "run end",
     "session end",
     "actions",
+    "parameter",
+    "parameter values",
+    "parameter next",
     "command issued",
     "command finished",
     "reload confirmed",
@@ -78,6 +81,32 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "rows_dropped = :dropped, last_error = :error WHERE id = :session"
     ),
     "actions": "UPDATE session SET actions = :actions WHERE id = :session",
+    # What a session declared that ended before another began does not count any more.
+    "parameter": (
+        "INSERT INTO parameter (robot_id, session_id, name, kind, default_value, low, high, "
+        "choices, doc, unit, declared_wall_time_s) SELECT robot_id, id, :name, :kind, :default, "
+        ":low, :high, :choices, :doc, :unit, :now FROM session WHERE id = :session "
+        "ON CONFLICT (robot_id, name) DO UPDATE SET session_id = excluded.session_id, "
+        "kind = excluded.kind, default_value = excluded.default_value, low = excluded.low, "
+        "high = excluded.high, choices = excluded.choices, doc = excluded.doc, "
+        "unit = excluded.unit, declared_wall_time_s = excluded.declared_wall_time_s, "
+        "next_value = NULL WHERE excluded.session_id >= parameter.session_id"
+    ),
+    # Many at once, all or none: each of `rows` is name, value, is it the default, by whom, command.
+    "parameter values": (
+        "INSERT INTO parameter_value (run_id, name, sim_time_s, wall_time_s, value, is_default, "
+        "set_by, command_id) SELECT :run, json_extract(r.value, '$[0]'), :sim_time, :now, "
+        "json_extract(r.value, '$[1]'), json_extract(r.value, '$[2]'), "
+        "json_extract(r.value, '$[3]'), (SELECT id FROM command "
+        "WHERE id = json_extract(r.value, '$[4]') AND session_id = :session) "
+        "FROM json_each(:rows) r"
+    ),
+    "parameter next": (
+        "UPDATE parameter SET next_value = r.next_value FROM (SELECT "
+        "json_extract(value, '$[0]') AS name, json_extract(value, '$[1]') AS next_value "
+        "FROM json_each(:rows)) AS r WHERE parameter.name = r.name AND session_id = :session "
+        "AND robot_id = (SELECT robot_id FROM session WHERE id = :session)"
+    ),
     "command issued": (
         "UPDATE command SET issued_wall_time_s = :now "
         "WHERE id = :command AND status = 'claimed' AND session_id = :session"

@@ -399,4 +399,43 @@ CREATE TABLE coarse_rollup (
 	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
  WITHOUT ROWID;
+CREATE TABLE parameter (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	robot_id INTEGER NOT NULL, 
+	session_id INTEGER NOT NULL /* session.id of the controller that did */, 
+	name TEXT NOT NULL, 
+	kind TEXT NOT NULL /* float, int, bool or str */, 
+	default_value TEXT NOT NULL /* JSON value */, 
+	low FLOAT /* least value */, 
+	high FLOAT /* greatest value */, 
+	choices TEXT /* JSON array: the only values that it may have */, 
+	doc TEXT NOT NULL, 
+	unit TEXT, 
+	next_value TEXT /* JSON value that it takes with the next reset of the world */, 
+	declared_wall_time_s FLOAT NOT NULL, 
+	CONSTRAINT fk_parameter_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
+	CONSTRAINT uq_parameter_robot_id UNIQUE (robot_id, name)
+);
+CREATE TABLE parameter_value (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	name TEXT NOT NULL, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	value TEXT NOT NULL /* JSON value */, 
+	is_default INTEGER NOT NULL /* 1 where the code declared it */, 
+	set_by TEXT NOT NULL /* code, environment, command or trial */, 
+	command_id INTEGER /* command.id that set it, which may have been deleted since */, 
+	CONSTRAINT fk_parameter_value_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_parameter_value_run_id_name_id ON parameter_value (run_id, name, id);
+CREATE VIEW robot_parameter AS
+/* The values that parameters had in each run, each from a time on; true and false as text. */
+SELECT r.name AS robot, v.run_id, v.name,
+  CASE json_type(v.j) WHEN 'true' THEN 'true' WHEN 'false' THEN 'false'
+    ELSE json_extract(v.j, '$') END AS value,
+  p.unit, v.sim_time_s AS since_s, strftime('%Y-%m-%d %H:%M:%f', v.wall_time_s, 'unixepoch') AS utc, v.is_default, v.set_by, v.command_id
+FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
+JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
+LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
 INSERT INTO alembic_version (version_num) VALUES ('0005');

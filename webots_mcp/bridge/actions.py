@@ -9,10 +9,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from webots_mcp.bridge.commands import Command
 from webots_mcp.bridge.context import Context
+from webots_mcp.bridge.parameters import SETTERS, Setter
 from webots_mcp.bridge.pictures import complete_png_size
 from webots_mcp.bridge.text import describe
 from webots_mcp.contract import BUILT_IN_ACTIONS, MAX_STEPS, SCREENSHOT_FOLDER
@@ -158,6 +159,27 @@ def reset_state(context: Context, command: Command) -> Progress:
             f"{len(errors)} of {len(outcomes)} callbacks failed: {'; '.join(errors)}"
         )
     return {"callbacks": len(outcomes)}
+    yield
+
+
+@_built_in
+def set_parameters(context: Context, command: Command) -> Progress:
+    """Set parameters, all or none: `when` "now", or "reset" for the next reset of the world."""
+    params, clock, parameters = command.params, context.clock, context.parameters
+    values, when, by = params.get("values"), params.get("when", "now"), params.get("by", "command")
+    if not isinstance(values, dict) or not values or when not in ("now", "reset"):
+        raise InvalidInputError(
+            'give values, such as {"kp": 3.0}, and when: "now" or "reset" (from the next on)'
+        )
+    setter = Setter(by if by in SETTERS else "command", command.id)
+    given = cast("dict[str, object]", values)
+    if when == "reset":
+        waiting = parameters.set_from_reset(given, setter)
+        shown = {name: {"now": now, "next": then} for name, (now, then) in waiting.items()}
+        return {"values": shown, "since": "the next reset"}
+    changed = parameters.set_now(given, setter)
+    shown = {name: {"old": old, "new": new} for name, (old, new) in changed.items()}
+    return {"values": shown, "since_sim_time_s": clock.sim_time_s, "run_id": clock.run.id}
     yield
 
 

@@ -8,6 +8,7 @@ from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.commands import CommandQueue
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
@@ -29,3 +30,4 @@ class Context(NamedTuple):
     reloads: Reloads
     queue: CommandQueue
     pause: Pause
+    parameters: Parameters

@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
@@ -15,6 +15,7 @@ from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.handlers import Handler
 from webots_mcp.bridge.open_bridges import OpenBridge
+from webots_mcp.bridge.parameters import Parameter, V
 from webots_mcp.bridge.session import Session
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.stats import BridgeStats
@@ -29,6 +30,7 @@ from webots_mcp.contract import (
     find_log_level,
     resolve_database,
 )
+from webots_mcp.parameter import declare
 
 if TYPE_CHECKING:
     import logging
@@ -212,6 +214,48 @@ class MCPBridge:
             TypeError: The name is no text, or the handler is not a plain function.
         """
         self._session.control.handlers.register(action, handler)
+
+    def parameter(
+        self,
+        name: str,
+        default: V,
+        *,
+        low: float | None = None,
+        high: float | None = None,
+        choices: Sequence[V] | None = None,
+        doc: str = "",
+        unit: str | None = None,
+    ) -> Parameter[V]:
+        """Declare a value that an assistant may tune while the controller runs.
+
+            kp = bridge.parameter("kp", 2.0, low=0.0, high=10.0, doc="steering gain")
+            while robot.step(time_step) != -1:
+                motor.setVelocity(kp.value * error)
+                bridge.get_command()
+
+        It begins with what the environment variable `WEBOTS_MCP_PARAMETERS` says (a JSON object
+        of names and values), else with `default`. It changes only inside `get_command()` and when
+        the world is reset; each value is recorded with its time. A reset keeps the values, a
+        reload begins with the first ones again. Declaring a name again brings it up to date.
+
+        Args:
+            name: Up to 100 characters, without a space or `=`; `arm.kp` is fine.
+            default: A float, int, bool or str, which decides the type.
+            low: The least value of a number; None without a bound.
+            high: The greatest value of a number; None without a bound.
+            choices: The only values that it may have.
+            doc: What it does, for the assistant.
+            unit: Of a number, such as `m/s`.
+
+        Raises:
+            TypeError: An argument is of a type that it cannot have.
+            ValueError: One is out of bounds, they contradict each other, or there are 500
+                parameters already.
+        """
+        declaration = declare(
+            name, default, low=low, high=high, choices=choices, doc=doc, unit=unit
+        )
+        return self._session.context.parameters.declare(declaration)
 
     def on_reload(self, callback: Callable[[], object]) -> None:
         """Call `callback` once for each reload or reset of the world, and on `reset_state`.

@@ -5,6 +5,7 @@ from __future__ import annotations
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.reloads import Reloads
 
@@ -19,12 +20,14 @@ class Runs:
         journal: Journal,
         heartbeat: Heartbeat,
         reloads: Reloads,
+        parameters: Parameters,
     ) -> None:
         self._clock = clock
         self._recorder = recorder
         self._journal = journal
         self._heartbeat = heartbeat
         self._reloads = reloads
+        self._parameters = parameters
 
     def look(self, *, came_round: bool = False) -> None:
         """Begin a run if simulation time went back since the last look.
@@ -46,6 +49,7 @@ class Runs:
         self._recorder.session.run = self._clock.run
         self._reloads.happened()
         self._journal.event("reset")
+        self._parameters.begin_run()
         self._reloads.fire()
         self._heartbeat.beat()
 

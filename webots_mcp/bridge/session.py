@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.parameters import CODE, Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.publisher import Publisher
@@ -23,8 +25,10 @@ from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.reloads import Reloads
 from webots_mcp.bridge.runs import Runs
 from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.start_values import StartValues
 from webots_mcp.bridge.throttle import Throttle
-from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.contract import PARAMETERS_VARIABLE, Database, MemoryDatabase
+from webots_mcp.errors import WebotsMCPError
 from webots_mcp.maintenance import Maintainer
 
 _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long stands still
@@ -55,7 +59,10 @@ class Session:
         recorder = Recorder(database, self._identity, clock, errors)
         journal, heartbeat = Journal(recorder, clock), Heartbeat(recorder, clock)
         reloads = Reloads(errors.failed)
-        self.runs = Runs(clock, recorder, journal, heartbeat, reloads)
+        given = os.environ.get(PARAMETERS_VARIABLE)
+        start_values = StartValues(given, self._identity.robot_name, errors)
+        parameters = Parameters(clock, recorder, start_values, self._set_parameter)
+        self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters)
         self.context = Context(
             simulation=simulation,
             clock=clock,
@@ -67,6 +74,7 @@ class Session:
             reloads=reloads,
             queue=CommandQueue(recorder),
             pause=Pause(simulation, journal, heartbeat, self.runs.look_after_step),
+            parameters=parameters,
         )
         self.control = Control(self.context)
         self.publisher = Publisher(self.context, self.runs)
@@ -99,11 +107,29 @@ class Session:
         self.runs.look(came_round=True)
         if simulation.over:
             return None
+        self._take_wanted_parameters()
         command = self.control.serve()
         self.context.heartbeat.poll()
         if simulation.over:
             self._end()
         return command
+
+    def _take_wanted_parameters(self) -> None:
+        try:
+            self.context.parameters.take_wanted()
+        except WebotsMCPError as error:
+            self.context.recorder.errors.failed("Parameter.set", error)
+
+    def _set_parameter(self, name: str, value: object) -> None:
+        """The controller's code sets a parameter: now in a handler, else with `get_command()`."""
+        parameters = self.context.parameters
+        if self.control.handlers.running:
+            parameters.set_now({name: value}, CODE)
+            return
+        try:
+            parameters.want(name, value)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self.context.recorder.errors.failed("Parameter.set", error)
 
     def close(self, reason: str | None) -> None:
         """Write what waits and end; for the reason given, or as far as it is known."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
@@ -23,7 +23,7 @@ from webots_mcp.bridge.registration import (
 from webots_mcp.bridge.run import Run
 from webots_mcp.connection import identify_files, is_busy
 from webots_mcp.contract import Database, new_uuid
-from webots_mcp.entries import STATEMENTS, Values, bind
+from webots_mcp.entries import STATEMENTS, Kind, Values, bind
 
 Result = TypeVar("Result")
 
@@ -40,6 +40,8 @@ class SessionConnection:
     Attributes:
         run: The run that is being recorded.
         actions: Docstrings of the registered custom actions, by name.
+        standing: Gives what else a database has to be told that does not know the session: the
+            kind, whether it belongs to the run, and the values.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class SessionConnection:
         self.uuid = new_uuid()
         self.run = run
         self.actions: dict[str, str] = {}
+        self.standing: Callable[[], Iterable[tuple[Kind, bool, Values]]] = tuple
         self.connection: sqlite3.Connection | None = None
         self.registration: Registration | None = None
         self._identity = identity

@@ -353,6 +353,43 @@ class Image(SQLModel, table=True):
     bytes: int = _column(Integer, "size of the file", nullable=False)
 
 
+class Parameter(SQLModel, table=True):
+    """A parameter as a robot's controller declared it last."""
+
+    __table_args__ = (UniqueConstraint("robot_id", "name"), _KEEP_IDS)
+    id: int | None = _id()
+    robot_id: int = _to("robot")
+    session_id: int = _column(Integer, "session.id of the controller that did", nullable=False)
+    name: str = _text(nullable=False)
+    kind: str = _text("float, int, bool or str", nullable=False)
+    default_value: str = _text("JSON value", nullable=False)
+    low: float | None = _number("least value")
+    high: float | None = _number("greatest value")
+    choices: str | None = _text("JSON array: the only values that it may have")
+    doc: str = _text(nullable=False)
+    unit: str | None = _text()
+    next_value: str | None = _text("JSON value that it takes with the next reset of the world")
+    declared_wall_time_s: float = _number(nullable=False)
+
+
+class ParameterValue(SQLModel, table=True):
+    """A value that a parameter had in a run, from this time on; the first is its start value."""
+
+    __tablename__: ClassVar[Any] = "parameter_value"
+    __table_args__ = (Index(None, "run_id", "name", "id"), _KEEP_IDS)
+    id: int | None = _id()
+    run_id: int = _to("run")
+    name: str = _text(nullable=False)
+    sim_time_s: float = _number(nullable=False)
+    wall_time_s: float = _number(nullable=False)
+    value: str = _text("JSON value", nullable=False)
+    is_default: bool = _column(Integer, "1 where the code declared it", nullable=False)
+    set_by: str = _text("code, environment, command or trial", nullable=False)
+    command_id: int | None = _column(
+        Integer, "command.id that set it, which may have been deleted since"
+    )
+
+
 class Lease(SQLModel, table=True):
     """Who alone may do a job (today: `maintainer`) until when."""
 

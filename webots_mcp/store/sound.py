@@ -29,14 +29,18 @@ _OBJECTS: Final = frozenset(
      "event.data", "command.params"}
 )  # fmt: skip
 _OF_TEXTS: Final = frozenset({"robot.devices", "session.actions", "state.odd"})
-_VALUES: Final = frozenset({"command.result"})
+_VALUES: Final = frozenset(
+    {"command.result", "parameter.default_value", "parameter.choices", "parameter.next_value",
+     "parameter_value.value"}
+)  # fmt: skip
 # A row that refers to one that is not sound would lead there.
 _REFERENCES: Final = {
     "session": (("robot_id", "robot"),),
     "run": (("session_id", "session"), ("robot_id", "robot")),
 }
 _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
-                  "signal", "rollup", "coarse_rollup", "change", "watermark")  # fmt: skip
+                  "signal", "rollup", "coarse_rollup", "change", "watermark",
+                  "parameter", "parameter_value")  # fmt: skip
 # What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
 # be stored, a run that is not there.
 _UNSTORABLE: Final = (

@@ -1,0 +1,161 @@
+"""Rollups of 500 s beside those of 10 s: a long recording is read fast as a whole.
+
+They are made from those of 10 s while the server maintains the database, also of older recordings.
+
+And parameters that a controller declares, and the values that they had in each run.
+
+Revision ID: 0005
+Revises: 0004
+"""
+
+import sqlalchemy as sa
+from alembic import op
+
+revision = "0005"
+down_revision = "0004"
+
+COUNTS = {
+    "rows": "state rows that held the signal",
+    "present": "of them with a value",
+    "changes": "of the values, those unlike the one before in the bucket",
+}
+NUMBERS = {
+    "first": "of numbers and flags (0, 1); null for text, as all that follows",
+    "first_sim_time_s": None,
+    "last": None,
+    "last_sim_time_s": None,
+    "min": None,
+    "min_sim_time_s": "of the first such extreme",
+    "max": None,
+    "max_sim_time_s": "of the first such extreme",
+    "sum": None,
+    "squares": "sum of squared deviations from sum / count",
+    "sines": "angles only: sum of sines",
+    "cosines": "angles only: sum of cosines",
+}
+NOW_UTC = "strftime('%Y-%m-%d %H:%M:%f', v.wall_time_s, 'unixepoch')"
+ROBOT_PARAMETER = f"""
+CREATE VIEW robot_parameter AS
+/* The values that parameters had in each run, each from a time on; true and false as text. */
+SELECT r.name AS robot, v.run_id, v.name,
+  CASE json_type(v.j) WHEN 'true' THEN 'true' WHEN 'false' THEN 'false'
+    ELSE json_extract(v.j, '$') END AS value,
+  p.unit, v.sim_time_s AS since_s, {NOW_UTC} AS utc, v.is_default, v.set_by, v.command_id
+FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
+JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
+LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name"""
+
+
+def upgrade() -> None:
+    op.add_column(
+        "run",
+        sa.Column(
+            "coarse_end",
+            sa.Integer(),
+            comment="buckets of coarse_rollup below it are complete; null before the first",
+        ),
+    )
+    create_coarse_rollup()
+    create_parameter()
+    create_parameter_value()
+    if op.get_context().dialect.name == "sqlite":
+        op.get_bind().exec_driver_sql(ROBOT_PARAMETER.strip())
+        op.execute("PRAGMA user_version = 5")
+
+
+def create_coarse_rollup() -> None:
+    zero = sa.text("0")
+    op.create_table(
+        "coarse_rollup",
+        sa.Column("run_id", sa.Integer(), nullable=False),
+        sa.Column(
+            "signal_id", sa.Integer(), nullable=False, comment="signal.id, of the run's robot"
+        ),
+        sa.Column("bucket", sa.Integer(), nullable=False, comment="floor(sim_time_s / 500)"),
+        *(
+            sa.Column(name, sa.Integer(), server_default=zero, nullable=False, comment=comment)
+            for name, comment in COUNTS.items()
+        ),
+        *(sa.Column(name, sa.Float(), comment=comment) for name, comment in NUMBERS.items()),
+        sa.ForeignKeyConstraint(
+            ["run_id"], ["run.id"], name=op.f("fk_coarse_rollup_run_id"), ondelete="CASCADE"
+        ),
+        sa.PrimaryKeyConstraint("run_id", "signal_id", "bucket"),
+        sqlite_with_rowid=False,
+    )
+
+
+def create_parameter() -> None:
+    op.create_table(
+        "parameter",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("robot_id", sa.Integer(), nullable=False),
+        sa.Column(
+            "session_id",
+            sa.Integer(),
+            nullable=False,
+            comment="session.id of the controller that did",
+        ),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("kind", sa.Text(), nullable=False, comment="float, int, bool or str"),
+        sa.Column("default_value", sa.Text(), nullable=False, comment="JSON value"),
+        sa.Column("low", sa.Float(), comment="least value"),
+        sa.Column("high", sa.Float(), comment="greatest value"),
+        sa.Column("choices", sa.Text(), comment="JSON array: the only values that it may have"),
+        sa.Column("doc", sa.Text(), nullable=False),
+        sa.Column("unit", sa.Text()),
+        sa.Column(
+            "next_value",
+            sa.Text(),
+            comment="JSON value that it takes with the next reset of the world",
+        ),
+        sa.Column("declared_wall_time_s", sa.Float(), nullable=False),
+        sa.ForeignKeyConstraint(
+            ["robot_id"], ["robot.id"], name=op.f("fk_parameter_robot_id"), ondelete="CASCADE"
+        ),
+        sa.PrimaryKeyConstraint("id"),
+        sa.UniqueConstraint("robot_id", "name", name=op.f("uq_parameter_robot_id")),
+        sqlite_autoincrement=True,
+    )
+
+
+def create_parameter_value() -> None:
+    op.create_table(
+        "parameter_value",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("run_id", sa.Integer(), nullable=False),
+        sa.Column("name", sa.Text(), nullable=False),
+        sa.Column("sim_time_s", sa.Float(), nullable=False),
+        sa.Column("wall_time_s", sa.Float(), nullable=False),
+        sa.Column("value", sa.Text(), nullable=False, comment="JSON value"),
+        sa.Column(
+            "is_default", sa.Integer(), nullable=False, comment="1 where the code declared it"
+        ),
+        sa.Column(
+            "set_by", sa.Text(), nullable=False, comment="code, environment, command or trial"
+        ),
+        sa.Column(
+            "command_id",
+            sa.Integer(),
+            comment="command.id that set it, which may have been deleted since",
+        ),
+        sa.ForeignKeyConstraint(
+            ["run_id"], ["run.id"], name=op.f("fk_parameter_value_run_id"), ondelete="CASCADE"
+        ),
+        sa.PrimaryKeyConstraint("id"),
+        sqlite_autoincrement=True,
+    )
+    op.create_index(
+        op.f("ix_parameter_value_run_id_name_id"), "parameter_value", ["run_id", "name", "id"]
+    )
+
+
+def downgrade() -> None:
+    if op.get_context().dialect.name == "sqlite":
+        op.execute("DROP VIEW robot_parameter")
+    op.drop_table("parameter_value")
+    op.drop_table("parameter")
+    op.drop_table("coarse_rollup")
+    op.drop_column("run", "coarse_end")
+    if op.get_context().dialect.name == "sqlite":
+        op.execute("PRAGMA user_version = 4")

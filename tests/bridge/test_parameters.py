@@ -1,0 +1,615 @@
+"""Parameters: declared in a controller, set from outside, and recorded with each run."""
+
+from __future__ import annotations
+
+import enum
+import json
+import math
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.bridge.conftest import STEP_MS, Recording, catch_up, eager, heartbeat_now
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.bridge.parameters import MOST_CHANGES
+from webots_mcp.connection import connect
+from webots_mcp.contract import PARAMETERS_VARIABLE
+from webots_mcp.parameter import LARGEST_INT, MOST_PARAMETERS
+from webots_mcp.standin import InProcessSupervisor
+
+VALUES = (
+    "SELECT run_id, name, value, is_default, set_by, command_id FROM parameter_value ORDER BY id"
+)
+Drive = Callable[[int], None]
+
+
+class Gait(enum.Enum):
+    TROT = "trot"
+
+
+@pytest.fixture
+def lenient(
+    robot: InProcessSupervisor, database: MemoryDatabase, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[MCPBridge]:
+    """A bridge as in a user's controller: what goes wrong is warned of."""
+    monkeypatch.delenv("WEBOTS_MCP_STRICT", raising=False)
+    with MCPBridge(robot, throttle_interval=1, database=database) as bridge:
+        yield bridge
+
+
+def ask(recording: Recording, bridge: MCPBridge, **params: Any) -> tuple[str, Any, str | None]:
+    """Send `set_parameters`, let the bridge serve it, and return its fate."""
+    sent = recording.send("set_parameters", **params)
+    eager(bridge)
+    return recording.fate(sent)
+
+
+# -- declaring ---------------------------------------------------------------------------------
+
+
+def test_a_declaration_is_recorded_with_all_that_it_says(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    kp = bridge.parameter("kp", 2.0, low=0, high=10.0, doc="steering gain", unit="1/s")
+    gait = bridge.parameter("gait", "trot", choices=["trot", "walk"])
+    assert (kp.value, gait.value) == (2.0, "trot")
+    sql = "SELECT name, kind, default_value, low, high, choices, doc, unit FROM parameter"
+    assert recording.rows(f"{sql} ORDER BY id") == [
+        ("kp", "float", "2.0", 0.0, 10.0, None, "steering gain", "1/s"),
+        ("gait", "str", '"trot"', None, None, '["trot", "walk"]', "", None),
+    ]
+    assert recording.rows(VALUES) == [
+        (1, "kp", "2.0", 1, "code", None),
+        (1, "gait", '"trot"', 1, "code", None),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("default", "kind", "held"),
+    [
+        (2, "int", 2),
+        (True, "bool", True),
+        (np.float32(0.5), "float", 0.5),
+        (np.int64(7), "int", 7),
+        (np.bool_(True), "bool", True),
+        (np.array(1.5), "float", 1.5),
+        (np.str_("a"), "str", "a"),
+        (enum.IntEnum("Gear", {"LOW": 1}).LOW, "int", 1),
+    ],
+)
+def test_the_default_decides_the_type_as_a_plain_python_value(
+    bridge: MCPBridge, recording: Recording, default: Any, kind: str, held: Any
+) -> None:
+    parameter = bridge.parameter("p", default)
+    assert (type(parameter.value), parameter.value) == (type(held), held)
+    assert recording.rows("SELECT kind FROM parameter") == [kind]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "said"),
+    [
+        ({"default": None}, TypeError, "the default is a float, int, bool or str, not None"),
+        ({"default": [1.0]}, TypeError, "not [1.0] (list)"),
+        ({"default": np.array([1.0, 2.0])}, TypeError, "ndarray"),
+        ({"default": math.nan}, ValueError, "is a number, not nan"),
+        ({"default": math.inf}, ValueError, "is a number, not inf"),
+        ({"default": 2**53 + 1}, ValueError, "at most 53 bits"),
+        ({"default": 10**5000}, ValueError, "without words"),
+        ({"default": 1.0, "low": 2}, ValueError, "is a number from 2, not 1.0"),
+        ({"default": 1.0, "low": 3, "high": 2}, ValueError, "low=3 is greater than high=2"),
+        ({"default": 1.0, "low": math.nan}, ValueError, "a bound is a finite number"),
+        ({"default": 1.0, "low": math.inf}, ValueError, "a bound is a finite number"),
+        ({"default": 1.0, "low": "0"}, TypeError, "a bound is a number, not '0'"),
+        ({"default": 1, "low": True}, TypeError, "a bound is a number, not True"),
+        ({"default": "a", "low": 1}, TypeError, "a str has no bounds"),
+        ({"default": True, "high": 1}, TypeError, "a bool has no bounds"),
+        ({"default": "a", "choices": "abc"}, TypeError, "choices is a list of values"),
+        ({"default": "a", "choices": []}, ValueError, "give 1 to 100 choices, not 0"),
+        ({"default": "a", "choices": ["b"]}, ValueError, "is one of 'b', not 'a'"),
+        ({"default": 1, "choices": [1, "2"]}, ValueError, "not '2'"),
+        ({"default": 9, "choices": [1, 9], "high": 5}, ValueError, "up to 5, not 9"),
+        ({"default": "\ud800"}, ValueError, "is a text"),
+        ({"default": "a\0b"}, ValueError, "is a text"),
+        ({"default": "x" * 1001}, ValueError, "at most 1000 characters"),
+        ({"default": 1.0, "unit": 3}, TypeError, "the unit is a short text"),
+        ({"name": "", "default": 1.0}, ValueError, "needs another name"),
+        ({"name": "a b", "default": 1.0}, ValueError, "needs another name"),
+        ({"name": "a=b", "default": 1.0}, ValueError, "needs another name"),
+        ({"name": "x" * 101, "default": 1.0}, ValueError, "needs another name"),
+        ({"name": "a\ud800", "default": 1.0}, ValueError, "needs another name"),
+        ({"name": 7, "default": 1.0}, TypeError, "the name of a parameter is a text, not 7"),
+    ],
+)
+def test_a_wrong_declaration_is_refused_where_it_stands(
+    bridge: MCPBridge,
+    recording: Recording,
+    arguments: dict[str, Any],
+    error: type[Exception],
+    said: str,
+) -> None:
+    with pytest.raises(error) as raised:
+        bridge.parameter(**{"name": "p", **arguments})
+    assert said in str(raised.value)
+    assert recording.rows("SELECT name FROM parameter") == []
+
+
+def test_infinity_as_a_bound_means_none(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.parameter("p", 1.0, low=-math.inf, high=math.inf)
+    assert recording.rows("SELECT low, high FROM parameter") == [(None, None)]
+
+
+def test_declaring_again_the_same_writes_nothing_and_gives_the_same_parameter(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    first = bridge.parameter("kp", 2.0, low=0)
+    assert bridge.parameter("kp", 2.0, low=0) is first
+    assert recording.rows("SELECT count(*) FROM parameter_value") == [1]
+
+
+def test_a_changed_declaration_brings_its_default_unless_the_value_came_from_outside(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    kp, ki = bridge.parameter("kp", 2.0), bridge.parameter("ki", 0.5)
+    ask(recording, bridge, values={"ki": 0.25})
+    assert bridge.parameter("kp", 3.0) is kp
+    assert bridge.parameter("ki", 0.75, high=1.0) is ki
+    assert (kp.value, ki.value) == (3.0, 0.25)
+    assert recording.rows("SELECT default_value, high FROM parameter ORDER BY id") == [
+        ("3.0", None),
+        ("0.75", 1.0),
+    ]
+
+
+def test_a_value_that_a_changed_declaration_excludes_gives_way_to_the_default(
+    lenient: MCPBridge, recording: Recording, capfd: pytest.CaptureFixture[str]
+) -> None:
+    kp = lenient.parameter("kp", 2.0)
+    ask(recording, lenient, values={"kp": 9.0})
+    lenient.parameter("kp", 2.0, high=5.0)
+    assert kp.value == 2.0
+    assert "up to 5, not 9.0" in capfd.readouterr().err
+
+
+def test_so_many_parameters_and_no_more(bridge: MCPBridge, recording: Recording) -> None:
+    for number in range(MOST_PARAMETERS):
+        bridge.parameter(f"p{number}", 1.0)
+    with pytest.raises(ValueError, match=f"would be number {MOST_PARAMETERS + 1}: "):
+        bridge.parameter("one.more", 1.0)
+    assert bridge.parameter("p7", 2.0).value == 2.0
+    assert recording.rows("SELECT count(*) FROM parameter") == [MOST_PARAMETERS]
+
+
+def test_the_value_can_only_be_read(bridge: MCPBridge) -> None:
+    kp = bridge.parameter("kp", 2.0)
+    with pytest.raises(AttributeError, match=r"call set\(\)"):
+        kp.value = 3.0
+    assert repr(kp) == "<parameter kp = 2.0>"
+
+
+# -- setting -----------------------------------------------------------------------------------
+
+
+def test_a_command_sets_several_at_once_and_each_is_recorded_with_its_time(
+    bridge: MCPBridge, recording: Recording, drive: Drive
+) -> None:
+    kp, gait = bridge.parameter("kp", 2.0), bridge.parameter("gait", "trot")
+    drive(3)
+    sent = recording.send("set_parameters", values={"kp": 3, "gait": "walk"})
+    bridge.publish({"x": 1})
+    assert kp.value == 2.0  # not before get_command()
+    drive(1)
+    assert (kp.value, gait.value) == (3.0, "walk")
+    assert recording.fate(sent)[:2] == (
+        "done",
+        {
+            "values": {"kp": {"old": 2.0, "new": 3.0}, "gait": {"old": "trot", "new": "walk"}},
+            "since_sim_time_s": pytest.approx(0.064),
+            "run_id": 1,
+        },
+    )
+    assert recording.rows(VALUES)[2:] == [
+        (1, "kp", "3.0", 0, "command", sent),
+        (1, "gait", '"walk"', 0, "command", sent),
+    ]
+    changed_s = recording.rows("SELECT sim_time_s FROM parameter_value WHERE set_by = 'command'")
+    assert changed_s == [pytest.approx(0.064)] * 2
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"kp": 11}, "'kp' is a number from 0 up to 10, not 11 (int)"),
+        ({"kp": -0.001}, "is a number from 0 up to 10, not -0.001"),
+        ({"kp": "3"}, "is a number from 0 up to 10, not '3' (str)"),
+        ({"kp": True}, "not True (bool)"),
+        ({"kp": None}, "not None"),
+        ({"kp": [1]}, "not [1] (list)"),
+        ({"kp": 10**400}, "(int)"),
+        ({"n": 1.5}, "'n' is a whole number of at most 53 bits, not 1.5"),
+        ({"n": LARGEST_INT + 1}, "not 9007199254740993"),
+        ({"n": False}, "not False (bool)"),
+        ({"on": 1}, "'on' is true or false, not 1 (int)"),
+        ({"gait": "fly"}, "'gait' is one of 'trot', 'walk', not 'fly'"),
+        ({"gait": 1}, "not 1 (int)"),
+        ({"kpp": 1.0}, "no parameter 'kpp'; of the 4 that the controller declares the nearest are"),
+        ({}, "give values"),
+        ([1], "give values"),
+    ],
+)
+def test_a_wrong_value_fails_the_command_and_none_is_set(
+    bridge: MCPBridge, recording: Recording, values: Any, said: str
+) -> None:
+    kp, n = bridge.parameter("kp", 2.0, low=0, high=10), bridge.parameter("n", 3)
+    on = bridge.parameter("on", True)
+    gait = bridge.parameter("gait", "trot", choices=("trot", "walk"))
+    given = {"n": 4, **values} if isinstance(values, dict) and values else values
+    status, _, error = ask(recording, bridge, values=given)
+    assert status == "failed"
+    assert error is not None and said in error
+    assert (kp.value, n.value, on.value, gait.value) == (2.0, 3, True, "trot")
+    assert recording.rows("SELECT count(*) FROM parameter_value") == [4]
+
+
+@pytest.mark.parametrize("text", ['{"values": {"kp": NaN}}', '{"values": {"kp": Infinity}}'])
+def test_a_command_that_brings_no_finite_number_fails(
+    bridge: MCPBridge, recording: Recording, text: str
+) -> None:
+    kp = bridge.parameter("kp", 2.0)
+    connection_params = json.loads(text)
+    assert ask(recording, bridge, **connection_params)[0] == "failed"
+    assert kp.value == 2.0
+
+
+def test_a_whole_number_may_come_as_a_float(bridge: MCPBridge, recording: Recording) -> None:
+    n = bridge.parameter("n", 3)
+    ask(recording, bridge, values={"n": 4.0})
+    assert (type(n.value), n.value) == (int, 4)
+
+
+def test_a_value_that_stays_the_same_is_no_change(bridge: MCPBridge, recording: Recording) -> None:
+    bridge.parameter("kp", 2.0)
+    status, result, _ = ask(recording, bridge, values={"kp": 2})
+    assert (status, result["values"]) == ("done", {"kp": {"old": 2.0, "new": 2.0}})
+    assert recording.rows("SELECT count(*) FROM parameter_value") == [1]
+
+
+def test_a_controller_without_parameters_says_how_to_declare_one(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    status, _, error = ask(recording, bridge, values={"kp": 1.0})
+    assert status == "failed"
+    assert error is not None and 'kp = bridge.parameter("kp", 2.0' in error
+
+
+def test_it_is_set_while_the_simulation_is_paused(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, drive: Drive
+) -> None:
+    kp = bridge.parameter("kp", 2.0)
+    drive(2)
+    sent = [recording.send("pause"), recording.send("set_parameters", values={"kp": 4.0})]
+    sent.append(recording.send("resume"))
+    drive(2)
+    assert [recording.fate(each)[0] for each in sent] == ["done"] * 3
+    paused_s = recording.fate(sent[0])[1]["sim_time_s"]
+    assert recording.fate(sent[1])[1]["since_sim_time_s"] == paused_s
+    assert kp.value == 4.0
+
+
+def test_it_is_set_while_a_step_command_is_at_work(
+    bridge: MCPBridge, recording: Recording, drive: Drive
+) -> None:
+    kp = bridge.parameter("kp", 2.0)
+    steps = recording.send("step", steps=4)
+    drive(2)
+    sent = recording.send("set_parameters", values={"kp": 4.0})
+    drive(1)
+    assert (recording.fate(sent)[0], recording.fate(steps)[0]) == ("done", "claimed")
+    assert kp.value == 4.0
+
+
+def test_changes_of_one_run_are_so_many_at_most(
+    lenient: MCPBridge, recording: Recording, capfd: pytest.CaptureFixture[str]
+) -> None:
+    kp = lenient.parameter("kp", 0)
+    lenient._session.context.parameters._changes = MOST_CHANGES - 1  # pyright: ignore[reportPrivateUsage]
+    kp.set(1)
+    lenient.get_command()
+    kp.set(2)
+    lenient.get_command()
+    assert kp.value == 1
+    assert "changes of parameters are recorded of one run" in capfd.readouterr().err
+
+
+# -- from the next reset on --------------------------------------------------------------------
+
+
+def test_values_that_wait_for_the_reset_come_with_it_and_stay(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, drive: Drive
+) -> None:
+    kp, ki = bridge.parameter("kp", 2.0), bridge.parameter("ki", 0.5)
+    drive(2)
+    status, result, _ = ask(recording, bridge, values={"kp": 3.0}, when="reset")
+    assert (status, result) == (
+        "done",
+        {"values": {"kp": {"now": 2.0, "next": 3.0}}, "since": "the next reset"},
+    )
+    ask(recording, bridge, values={"kp": 5.0, "ki": 1.0}, when="reset", by="trial")
+    assert recording.rows("SELECT next_value FROM parameter ORDER BY id") == ["5.0", "1.0"]
+    assert (kp.value, ki.value) == (2.0, 0.5)
+    robot.simulationReset()
+    drive(2)
+    assert (kp.value, ki.value) == (5.0, 1.0)
+    robot.simulationReset()
+    drive(2)
+    assert (kp.value, ki.value) == (5.0, 1.0)
+    assert recording.rows("SELECT next_value FROM parameter ORDER BY id") == [None, None]
+    assert recording.rows(VALUES)[2:] == [
+        (2, "kp", "5.0", 0, "trial", 2),
+        (2, "ki", "1.0", 0, "trial", 2),
+        (3, "kp", "5.0", 0, "trial", 2),
+        (3, "ki", "1.0", 0, "trial", 2),
+    ]
+    assert (
+        recording.rows("SELECT sim_time_s FROM parameter_value WHERE run_id = 2")
+        == [pytest.approx(0.016)] * 2
+    )
+
+
+def test_a_reset_finds_the_new_values_when_its_callbacks_run(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, drive: Drive
+) -> None:
+    kp = bridge.parameter("kp", 2.0)
+    seen: list[float] = []
+    bridge.on_reload(lambda: seen.append(kp.value))
+    drive(3)
+    ask(recording, bridge, values={"kp": 3.0}, when="reset")
+    robot.simulationReset()
+    drive(1)
+    assert seen == [3.0]
+
+
+def test_a_wrong_value_for_the_next_reset_is_refused_at_once(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    bridge.parameter("kp", 2.0, high=10)
+    assert ask(recording, bridge, values={"kp": 11}, when="reset")[0] == "failed"
+    assert ask(recording, bridge, values={"kp": 1}, when="later")[0] == "failed"
+    assert recording.rows("SELECT next_value FROM parameter") == [None]
+
+
+def test_a_new_process_begins_with_the_code_again(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    with MCPBridge(InProcessSupervisor("rover"), database=database) as bridge:
+        bridge.parameter("kp", 2.0)
+        bridge.parameter("gone", 1.0)
+        ask(recording, bridge, values={"kp": 3.0})
+        ask(recording, bridge, values={"kp": 4.0}, when="reset")
+    with MCPBridge(InProcessSupervisor("rover"), database=database) as bridge:
+        assert bridge.parameter("kp", 2.5).value == 2.5
+    sql = "SELECT name, session_id, default_value, next_value FROM parameter ORDER BY id"
+    assert recording.rows(sql) == [("kp", 2, "2.5", None), ("gone", 1, "1.0", None)]
+
+
+# -- from the controller's code ----------------------------------------------------------------
+
+
+def test_the_controllers_own_code_sets_with_the_next_get_command(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    kp = bridge.parameter("kp", 2.0)
+    kp.set(3)
+    bridge.publish({"x": 1})
+    assert kp.value == 2.0
+    bridge.get_command()
+    assert (type(kp.value), kp.value) == (float, 3.0)
+    assert recording.rows(VALUES)[-1] == (1, "kp", "3.0", 0, "code", None)
+
+
+def test_a_wrong_value_of_the_code_is_warned_of_once_and_the_loop_goes_on(
+    lenient: MCPBridge, capfd: pytest.CaptureFixture[str]
+) -> None:
+    kp = lenient.parameter("kp", 2.0, high=5)
+    for wrong in (7, 8):
+        kp.set(wrong)
+        lenient.get_command()
+    assert kp.value == 2.0
+    assert capfd.readouterr().err.count("Parameter.set failed") == 1
+    assert lenient.stats().failures == 2
+
+
+def test_a_handler_sets_at_once_and_is_told_what_is_wrong(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    kp = bridge.parameter("kp", 2.0, high=5)
+
+    def tune(command: dict[str, Any]) -> float:
+        kp.set(command["kp"])
+        return kp.value
+
+    bridge.register_command("tune", tune)
+    good, bad = recording.send("tune", kp=4), recording.send("tune", kp=6)
+    eager(bridge)
+    eager(bridge)
+    assert recording.fate(good)[:2] == ("done", 4.0)
+    status, _, error = recording.fate(bad)
+    assert (status, kp.value) == ("failed", 4.0)
+    assert error is not None and "up to 5, not 6" in error
+
+
+# -- start values from the environment ---------------------------------------------------------
+
+
+def test_the_environment_wins_over_the_code(
+    robot: InProcessSupervisor,
+    database: MemoryDatabase,
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv(PARAMETERS_VARIABLE, '{"kp": 3, "ki": 1.0, "rover": {"ki": 0.25}}')
+    with MCPBridge(robot, database=database) as bridge:
+        kp, ki = bridge.parameter("kp", 2.0), bridge.parameter("ki", 0.5)
+        bridge.get_command()
+        assert (kp.value, ki.value) == (3.0, 0.25)
+        assert bridge.stats().last_error is None
+    assert recording.rows(VALUES) == [
+        (1, "kp", "3.0", 0, "environment", None),
+        (1, "ki", "0.25", 0, "environment", None),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("kp=3", "it is no JSON"),
+        ("[3]", "it is a list, not an object"),
+        ("[" * 100_000, "it is no JSON"),
+        ('{"kp": 11}', "'kp' is a number up to 10, not 11 (int); it begins with 2.0"),
+        ('{"kp": "3"}', "not '3' (str)"),
+        ('{"kp": NaN}', "not nan"),
+        ('{"kp": {"deep": 1}}', "not {'deep': 1} (dict)"),
+        ('{"rover": {"kp": null}}', "not None"),
+        ('{"kq": 3.0}', "the controller declares no parameter 'kq'"),
+    ],
+)
+def test_what_the_environment_says_wrong_is_warned_of_once_and_the_code_counts(
+    robot: InProcessSupervisor,
+    database: MemoryDatabase,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+    text: str,
+    said: str,
+) -> None:
+    monkeypatch.setenv(PARAMETERS_VARIABLE, text)
+    with MCPBridge(robot, database=database) as bridge:
+        kp = bridge.parameter("kp", 2.0, high=10)
+        ki = bridge.parameter("ki", 0.5)
+        for _ in range(3):
+            robot.step(STEP_MS)
+            eager(bridge)
+        assert (kp.value, ki.value) == (2.0, 0.5)
+    lines = capfd.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert PARAMETERS_VARIABLE in lines[0] and said in lines[0]
+
+
+def test_a_controller_without_parameters_does_not_mind_the_environment(
+    robot: InProcessSupervisor,
+    database: MemoryDatabase,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv(PARAMETERS_VARIABLE, "no JSON")
+    with MCPBridge(robot, database=database) as bridge:
+        bridge.get_command()
+    assert capfd.readouterr().err == ""
+
+
+def test_robots_of_one_process_have_parameters_of_their_own(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    robots = [InProcessSupervisor(name) for name in ("rover", "writer")]
+    bridges = [MCPBridge(robot, database=database) for robot in robots]
+    ours, theirs = (bridge.parameter("kp", 2.0) for bridge in bridges)
+    ours.set(3.0)
+    bridges[0].get_command()
+    assert (ours.value, theirs.value) == (3.0, 2.0)
+    sql = "SELECT robot, run_id, name, value, set_by FROM robot_parameter ORDER BY run_id, since_s"
+    assert recording.rows(sql) == [
+        ("rover", 1, "kp", 2.0, "code"),
+        ("rover", 1, "kp", 3.0, "code"),
+        ("writer", 2, "kp", 2.0, "code"),
+    ]
+    for bridge in bridges:
+        bridge.close()
+
+
+# -- trouble -----------------------------------------------------------------------------------
+
+
+def test_a_database_that_was_replaced_is_told_of_all_parameters(
+    robot: InProcessSupervisor, file: Path, filed: Recording
+) -> None:
+    with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
+        bridge.parameter("kp", 2.0, high=10)
+        ask(filed, bridge, values={"kp": 3.0})
+        ask(filed, bridge, values={"kp": 4.0}, when="reset")
+        for path in file.parent.glob(f"{file.name}*"):
+            path.unlink()
+        heartbeat_now(bridge)
+        catch_up(bridge)
+        robot.step(STEP_MS)
+        bridge.publish({"x": 1})
+        assert filed.rows("SELECT name, high, next_value FROM parameter") == [("kp", 10.0, "4.0")]
+        assert filed.rows(VALUES) == [(1, "kp", "3.0", 0, "command", None)]
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from webots_mcp import MCPBridge
+from webots_mcp.bridge import recorder
+from webots_mcp.standin import InProcessSupervisor
+
+robot = InProcessSupervisor("rover")
+bridge = MCPBridge(robot, throttle_interval=1, database=sys.argv[1])
+kp = bridge.parameter("kp", 2.0)
+record = recorder.Recorder.record
+
+def die_with_the_answer(self, kind, run, values):
+    if kind == "command finished":
+        os.kill(os.getpid(), signal.SIGKILL)
+    return record(self, kind, run, values)
+
+recorder.Recorder.record = die_with_the_answer
+print("ready", flush=True)
+while robot.step(16) != -1:
+    bridge.publish({"kp": kp.value})
+    bridge.get_command()
+"""
+
+
+def test_a_kill_between_a_change_and_its_answer_leaves_the_change_and_a_lost_command(
+    file: Path, filed: Recording
+) -> None:
+    line = [sys.executable, "-c", KILLED, str(file)]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        sent = filed.send("set_parameters", time_to_live_s=60, values={"kp": 3.0})
+        assert process.wait(60) == -signal.SIGKILL
+    with MCPBridge(InProcessSupervisor("rover"), database=file) as bridge:
+        assert bridge.parameter("kp", 2.0).value == 2.0
+    assert filed.fate(sent)[0] == "lost"
+    assert filed.rows(VALUES) == [
+        (1, "kp", "2.0", 1, "code", None),
+        (1, "kp", "3.0", 0, "command", sent),
+        (2, "kp", "2.0", 1, "code", None),
+    ]
+
+
+def test_rows_that_wait_are_taken_in_with_the_values_in_order(
+    robot: InProcessSupervisor, file: Path, filed: Recording
+) -> None:
+    with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
+        kp = bridge.parameter("kp", 2.0)
+        writer = connect(file, "writer")
+        writer.execute("BEGIN IMMEDIATE")
+        kp.set(3.0)
+        bridge.get_command()
+        bridge.parameter("late", 1.0)
+        assert bridge.stats().rows_waiting == 3
+        writer.execute("COMMIT")
+        writer.close()
+        catch_up(bridge)
+    assert [row[1:3] for row in filed.rows(VALUES)] == [
+        ("kp", "2.0"),
+        ("kp", "3.0"),
+        ("late", "1.0"),
+    ]

@@ -1,0 +1,281 @@
+"""The parameters of a controller: declared in it, set from outside between two computations."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, Final, Generic, NamedTuple, TypeVar
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.start_values import StartValues
+from webots_mcp.entries import Kind, Values
+from webots_mcp.errors import CommandRefusedError, WebotsMCPError
+from webots_mcp.parameter import (
+    MOST_PARAMETERS,
+    Declaration,
+    Value,
+    require_known,
+)
+
+MOST_CHANGES: Final = 10_000  # in one run; each is a row of the database
+
+V = TypeVar("V", float, int, bool, str)
+
+
+class Parameter(Generic[V]):
+    """A value that an assistant may set; made by `MCPBridge.parameter`.
+
+    Attributes:
+        name: Its name.
+        value: The value now. Reading it costs what any attribute does. It changes only inside
+            `get_command()` and when the world is reset, never within a round of the loop.
+    """
+
+    __slots__ = ("_set", "name", "value")
+
+    name: str
+    value: V
+
+    def __init__(self, name: str, value: V, set_later: Callable[[str, object], None]) -> None:
+        for attribute, held in (("name", name), ("value", value), ("_set", set_later)):
+            object.__setattr__(self, attribute, held)
+
+    def set(self, value: V) -> None:
+        """Set it from the controller's own code: with the next `get_command()`.
+
+        In a handler of `register_command` at once; there a value that is wrong is an error, which
+        becomes that of the command. Elsewhere it is warned of, and the value stays.
+        """
+        self._set(self.name, value)
+
+    def __setattr__(self, attribute: str, value: object) -> None:
+        raise AttributeError(
+            f"{attribute} of parameter {self.name!r} cannot be assigned to: call set(), which "
+            "takes effect with the next get_command()"
+        )
+
+    def __repr__(self) -> str:
+        return f"<parameter {self.name} = {self.value!r}>"
+
+
+class Setter(NamedTuple):
+    """Who set a value: `code`, `environment`, `command` or `trial`, and by which command."""
+
+    kind: str
+    command_id: int | None = None
+
+
+class _Held:
+    """A declared parameter, and who set its value."""
+
+    __slots__ = ("declaration", "parameter", "setter")
+
+    def __init__(self, declaration: Declaration, parameter: Any, setter: Setter) -> None:
+        self.declaration = declaration
+        self.parameter = parameter
+        self.setter = setter
+
+    @property
+    def value(self) -> Value:
+        return self.parameter.value
+
+    def set(self, value: Value, setter: Setter) -> None:
+        object.__setattr__(self.parameter, "value", value)
+        self.setter = setter
+
+    def row(self) -> tuple[object, ...]:
+        """As the statement "parameter values" takes it."""
+        is_default = self.value == self.declaration.default
+        value = json.dumps(self.value, ensure_ascii=False)
+        return (self.declaration.name, value, int(is_default), *self.setter)
+
+
+SETTERS: Final = ("command", "trial")  # as which a command may set parameters
+CODE: Final = Setter("code")
+_ENVIRONMENT: Final = Setter("environment")
+
+
+class Parameters:
+    """Holds the declared parameters, changes them where that is allowed, and records them.
+
+    Args:
+        clock: Tells the run and the time of each change.
+        recorder: Takes the rows.
+        start_values: Those from the environment.
+        set_later: What `Parameter.set` calls, with the name and the value.
+    """
+
+    def __init__(
+        self,
+        clock: Clock,
+        recorder: Recorder,
+        start_values: StartValues,
+        set_later: Callable[[str, object], None],
+    ) -> None:
+        self._clock = clock
+        self._recorder = recorder
+        self._start_values = start_values
+        self._set_later = set_later
+        self._held: dict[str, _Held] = {}
+        self._wanted: dict[str, Value] = {}
+        self._from_reset: dict[str, tuple[Value, Setter]] = {}
+        self._changes = 0
+        recorder.session.standing = self._standing
+
+    def declare(self, declaration: Declaration) -> Parameter[Any]:
+        """The parameter of that name, made or brought up to what is declared now.
+
+        Raises:
+            ValueError: It would be one more than a controller may have.
+        """
+        held = self._held.get(declaration.name)
+        if held is None:
+            held = self._enter(declaration)
+        elif held.declaration != declaration:
+            self._redeclare(held, declaration)
+        else:
+            return held.parameter
+        self._recorder.record("parameter", None, _described(declaration))
+        self._record_values([held])
+        return held.parameter
+
+    def set_now(
+        self, values: Mapping[str, object], setter: Setter
+    ) -> dict[str, tuple[Value, Value]]:
+        """Set several, all or none; each with its value before and now.
+
+        Raises:
+            InvalidInputError: A name is unknown or a value wrong; then none is set.
+            CommandRefusedError: There were too many changes in this run.
+        """
+        checked = self._checked(values)
+        before = {name: self._held[name].value for name in checked}
+        changed = [name for name, value in checked.items() if value != before[name]]
+        if self._changes + len(changed) > MOST_CHANGES:
+            raise CommandRefusedError(
+                f"{MOST_CHANGES} changes of parameters are recorded of one run: reset the world, "
+                "which begins the next"
+            )
+        self._changes += len(changed)
+        for name in changed:
+            self._held[name].set(checked[name], setter)
+        self._record_values([self._held[name] for name in changed])
+        return {name: (before[name], value) for name, value in checked.items()}
+
+    def set_from_reset(
+        self, values: Mapping[str, object], setter: Setter
+    ) -> dict[str, tuple[Value, Value]]:
+        """Set several, all or none, when the world is reset next; each value now and then.
+
+        Raises:
+            InvalidInputError: As `set_now`.
+        """
+        checked = self._checked(values)
+        self._from_reset |= {name: (value, setter) for name, value in checked.items()}
+        self._record_next(checked)
+        return {name: (self._held[name].value, value) for name, value in checked.items()}
+
+    def want(self, name: str, value: object) -> None:
+        """Have the controller's code set one with the next `get_command()`.
+
+        Raises:
+            InvalidInputError: As `set_now`.
+        """
+        self._wanted |= self._checked({name: value})
+
+    def take_wanted(self) -> None:
+        """Set what the controller's code asked for, now that values may change.
+
+        Raises:
+            InvalidInputError, CommandRefusedError: As `set_now`.
+        """
+        if self._held:
+            self._start_values.warn_of_unknown(self._held)
+        if self._wanted:
+            wanted, self._wanted = self._wanted, {}
+            self.set_now(wanted, CODE)
+
+    def begin_run(self) -> None:
+        """The world was reset: what waited for that takes effect, and all values are recorded."""
+        self._changes = 0
+        waiting, self._from_reset = self._from_reset, {}
+        for name, (value, setter) in waiting.items():
+            self._held[name].set(value, setter)
+        self._record_values(list(self._held.values()))
+        self._record_next(dict.fromkeys(waiting))
+
+    def _standing(self) -> Iterable[tuple[Kind, bool, Values]]:
+        """What a database has to be told that knows nothing of this session: kind, of the run?"""
+        held = tuple(self._held.values())
+        for each in held:
+            yield "parameter", False, _described(each.declaration)
+        if held:
+            yield "parameter values", True, self._values_of(held)
+        if waiting := dict(self._from_reset):
+            yield "parameter next", False, _next({name: each[0] for name, each in waiting.items()})
+
+    def _enter(self, declaration: Declaration) -> _Held:
+        if len(self._held) >= MOST_PARAMETERS:
+            raise ValueError(
+                f"parameter {declaration.name!r} would be number {MOST_PARAMETERS + 1}: a "
+                f"controller has {MOST_PARAMETERS} at most; what is no setting belongs into a file"
+            )
+        value, setter = declaration.default, CODE
+        given = self._start_values.take(declaration)
+        if given is not None:
+            value, setter = given, _ENVIRONMENT
+        parameter = Parameter[Any](declaration.name, value, self._set_later)
+        held = self._held[declaration.name] = _Held(declaration, parameter, setter)
+        return held
+
+    def _redeclare(self, held: _Held, declaration: Declaration) -> None:
+        """A value from outside outlives a new declaration that allows it."""
+        is_default = held.setter is CODE and held.value == held.declaration.default
+        held.declaration = declaration
+        self._from_reset.pop(declaration.name, None)
+        self._wanted.pop(declaration.name, None)
+        if is_default:
+            held.set(declaration.default, CODE)
+            return
+        try:
+            held.set(declaration.checked(held.value), held.setter)
+        except WebotsMCPError as error:
+            why = f"{error}: the declaration was changed, its default counts"
+            held.set(declaration.default, CODE)
+            self._recorder.errors.warn(f"parameter {declaration.name}", why)
+
+    def _checked(self, values: Mapping[str, object]) -> dict[str, Value]:
+        require_known(list(values), list(self._held))
+        return {name: self._held[name].declaration.checked(each) for name, each in values.items()}
+
+    def _record_values(self, held: list[_Held]) -> None:
+        if held:
+            self._recorder.record("parameter values", self._clock.run, self._values_of(held))
+
+    def _values_of(self, held: Iterable[_Held]) -> dict[str, Any]:
+        rows = json.dumps([each.row() for each in held], ensure_ascii=False)
+        return {"sim_time": self._clock.sim_time_s, "now": time.time(), "rows": rows}
+
+    def _record_next(self, values: Mapping[str, Value | None]) -> None:
+        if values:
+            self._recorder.record("parameter next", None, _next(values))
+
+
+def _described(declaration: Declaration) -> dict[str, Any]:
+    """The values of the statement "parameter"."""
+    described = declaration._asdict()
+    described["default"] = json.dumps(declaration.default, ensure_ascii=False)
+    if declaration.choices is not None:
+        described["choices"] = json.dumps(declaration.choices, ensure_ascii=False)
+    return {**described, "now": time.time()}
+
+
+def _next(values: Mapping[str, Value | None]) -> dict[str, Any]:
+    """The values of the statement "parameter next"."""
+    rows = [
+        (name, None if value is None else json.dumps(value, ensure_ascii=False))
+        for name, value in values.items()
+    ]
+    return {"rows": json.dumps(rows, ensure_ascii=False)}

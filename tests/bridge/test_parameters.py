@@ -133,8 +133,9 @@ def test_a_wrong_declaration_is_refused_where_it_stands(
     error: type[Exception],
     said: str,
 ) -> None:
+    given: dict[str, Any] = {"name": "p", **arguments}
     with pytest.raises(error) as raised:
-        bridge.parameter(**{"name": "p", **arguments})
+        bridge.parameter(**given)
     assert said in str(raised.value)
     assert recording.rows("SELECT name FROM parameter") == []
 

@@ -37,6 +37,9 @@ class Recorded(Recorder):
                     "log", **self.at(time_s), level="info", source="controller", message="line"
                 )
         self.add_picture(run_id)
+        self.insert(
+            "parameter_value", **self.at(0.0), name="kp", value="2.0", is_default=1, set_by="code"
+        )
         self.at(rows * ROW_S * 2)
         if end:
             self.connection.execute(
@@ -77,7 +80,7 @@ class Recorded(Recorder):
     def of_runs(self, run_ids: list[int]) -> list[Any]:
         """Everything that is recorded of these runs."""
         marks = ",".join(map(str, run_ids)) or "NULL"
-        tables = ("state", "rollup", "change", "log", "event", "image")
+        tables = ("state", "rollup", "change", "log", "event", "image", "parameter_value")
         found: list[Any] = [
             self.connection.execute(f"SELECT * FROM {table} WHERE run_id IN ({marks})").fetchall()
             for table in tables

@@ -280,7 +280,7 @@ def test_what_is_left_of_a_run_outlives_its_rows_ten_times(recorded: Recorded) -
     assert recorded.rows() == {13: 10}
     for table in ("run", "session", "command"):
         assert recorded.connection.execute(f"SELECT min(id) FROM {table}").fetchone() == (3,)
-    for table in ("rollup", "change", "log", "event", "image"):
+    for table in ("rollup", "change", "log", "event", "image", "parameter_value"):
         sql = f"SELECT count(DISTINCT run_id), min(run_id) FROM {table}"
         assert recorded.connection.execute(sql).fetchone() == (11, 3)
     assert recorded.connection.execute("PRAGMA foreign_key_check").fetchall() == []

@@ -12,34 +12,34 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.plotting.conftest import Record, whole
-from webots_mcp.plotting.canvas import Sheet
+from webots_mcp.plotting.canvas import MOST_PANELS, Sheet
 from webots_mcp.plotting.curves import Curve
-from webots_mcp.plotting.palette import AREAS, OTHER, area_colours
-from webots_mcp.plotting.panels import MOST_CURVES, MOST_PANELS, by_scale, by_signal
+from webots_mcp.plotting.palette import MERGED, MOST_VALUES, area_styles
+from webots_mcp.plotting.panels import MOST_CURVES, by_scale, by_signal
 from webots_mcp.plotting.path import Path, Place, headings, thinned
-from webots_mcp.plotting.signals import compose_timeline
-from webots_mcp.plotting.timeline import Timeline
-from webots_mcp.plotting.trajectory import compose_ground
+from webots_mcp.plotting.signal_axes import SignalAxes
+from webots_mcp.plotting.signals import compose_signals
+from webots_mcp.plotting.trajectory import compose_trajectory
 
 
-def timeline_of(connection: sqlite3.Connection, *names: str, **limits: Any) -> Timeline:
-    return compose_timeline(connection, [whole(connection, **limits)], names)[0]
+def signals_of_run(connection: sqlite3.Connection, *names: str, **limits: Any) -> SignalAxes:
+    return compose_signals(connection, [whole(connection, **limits)], names)[0]
 
 
-def only_curve(timeline: Timeline) -> Curve:
-    ((curve,),) = [panel.curves for panel in timeline.panels]
+def only_curve(axes: SignalAxes) -> Curve:
+    ((curve,),) = [panel.curves for panel in axes.panels]
     return curve
 
 
 def test_one_odd_row_among_a_thousand_is_in_the_band(rover: sqlite3.Connection) -> None:
-    curve = only_curve(timeline_of(rover, "ir"))
+    curve = only_curve(signals_of_run(rover, "ir"))
     (spike,) = [point for point in curve.points if point[3] == 5.0]
     assert spike[0] == pytest.approx(70, abs=0.5)
     assert spike[1] < 2
 
 
 def test_a_line_is_broken_where_rows_or_values_are_missing(rover: sqlite3.Connection) -> None:
-    curve = only_curve(timeline_of(rover, "sensors.front"))
+    curve = only_curve(signals_of_run(rover, "sensors.front"))
     assert sum(math.isnan(time) for time, *_ in curve.points) == 2
     assert not [t for t, *_ in curve.points if 90.5 < t < 94.5 or 100.5 < t < 103.5]
 
@@ -47,7 +47,7 @@ def test_a_line_is_broken_where_rows_or_values_are_missing(rover: sqlite3.Connec
 def test_an_angle_that_goes_round_is_no_line_across_the_picture(
     rover: sqlite3.Connection,
 ) -> None:
-    curve = only_curve(timeline_of(rover, "heading", start_s=60, end_s=66))
+    curve = only_curve(signals_of_run(rover, "heading", start_s=60, end_s=66))
     means = [mean for _, mean, *_ in curve.points]
     drawn = pairwise(means)
     assert all(abs(after - before) < math.pi for before, after in drawn if before < 9 > after)
@@ -56,36 +56,40 @@ def test_an_angle_that_goes_round_is_no_line_across_the_picture(
 
 def test_a_value_that_stands_alone_is_not_lost(record: Record) -> None:
     connection = record(lambda t: {"n": 1.0 if t < 2 or round(t, 1) == 7 else None})
-    curve = only_curve(timeline_of(connection, "n"))
+    curve = only_curve(signals_of_run(connection, "n"))
     assert [point[0] for point in curve.lone_points] == pytest.approx([7.0])
 
 
 def test_modes_stand_behind_the_curves_and_not_where_nothing_was_recorded(
     rover: sqlite3.Connection,
 ) -> None:
-    bands = timeline_of(rover, "pose.0").bands
+    bands = signals_of_run(rover, "pose.0").bands
     assert bands is not None
-    assert [(span.value, round(span.start_s), round(span.end_s)) for span in bands.spans] == [
+    assert [(i.value, round(i.start_s), round(i.end_s)) for i in bands.intervals] == [
         ("cruise", 0, 52), ("back_up", 52, 60), ("avoid", 60, 90), ("cruise", 95, 120),
     ]  # fmt: skip
 
 
-def test_more_modes_than_colours_share_a_name(record: Record) -> None:
-    connection = record(lambda t: {"mode": f"m{int(t)}", "x": t}, 200)
-    bands = timeline_of(connection, "x").bands
-    assert bands is not None
-    assert len(bands.values) == 8
-    assert bands.values[-1] == "others"
+def test_more_modes_than_can_be_told_apart_share_a_name_and_a_note_lists_them(
+    record: Record,
+) -> None:
+    connection = record(lambda t: {"mode": f"m{int(t)}", "x": t, "y": t}, 200)
+    axes, notes = compose_signals(connection, [whole(connection)], ["x"])
+    assert axes.bands is not None
+    assert (len(axes.bands.values), axes.bands.values[-1]) == (16, "others")
+    merged = "mode has 5 more values than colours, drawn as others: m15, m16, m17, m18, m19"
+    assert merged in notes
+    assert merged in compose_trajectory(connection, [whole(connection)])[1]
 
 
 def test_events_are_of_the_drawn_signals_and_of_the_robot(rover: sqlite3.Connection) -> None:
-    timeline = timeline_of(rover, "ir")
-    events = {lane.name: [span.value for span in lane.spans] for lane in timeline.events}
+    axes = signals_of_run(rover, "ir")
+    events = {lane.name: [interval.value for interval in lane.intervals] for lane in axes.events}
     assert events["jump"] == ["ir", "position"]
     assert events["command"] == ["set_speed"]
     assert events["log"] == ["warning", "error"]
     assert set(events.get("oscillation", ["ir"])) == {"ir"}  # the heading swings too, undrawn
-    (stuck,) = next(lane.spans for lane in timeline.events if lane.name == "stuck")
+    (stuck,) = next(lane.intervals for lane in axes.events if lane.name == "stuck")
     assert (stuck.start_s, stuck.end_s) == pytest.approx((40, 52), abs=0.3)
 
 
@@ -93,15 +97,15 @@ def test_of_an_event_that_reaches_out_of_the_range_the_part_in_it_is_drawn(
     rover: sqlite3.Connection,
 ) -> None:
     part = whole(rover, start_s=45, end_s=50)
-    timeline, _ = compose_timeline(rover, [part], ["pose.0"])
-    (stuck,) = next(lane.spans for lane in timeline.events if lane.name == "stuck")
-    assert (stuck.start_s, stuck.end_s) == timeline.x_range == (45, 50)
+    axes, _ = compose_signals(rover, [part], ["pose.0"])
+    (stuck,) = next(lane.intervals for lane in axes.events if lane.name == "stuck")
+    assert (stuck.start_s, stuck.end_s) == axes.x_range == (45, 50)
 
 
 def test_the_same_data_looks_the_same_in_a_short_and_in_a_long_run(record: Record) -> None:
     connection = record(lambda t: {"wave": math.sin(2 * math.pi * t)}, 600, 3000)
     runs = [whole(connection, 1), whole(connection, 2)]
-    (panel,) = compose_timeline(connection, runs, ["wave"])[0].panels
+    (panel,) = compose_signals(connection, runs, ["wave"])[0].panels
     short, long = (curve.points for curve in panel.curves)
     assert len(long) >= 200
     assert short[:-1] == long[: len(short) - 1]
@@ -112,7 +116,7 @@ def test_a_wider_picture_shows_more(record: Record) -> None:
     points = [
         len(
             only_curve(
-                compose_timeline(connection, [whole(connection)], ["wave"], sheet=sheet)[0]
+                compose_signals(connection, [whole(connection)], ["wave"], sheet=sheet)[0]
             ).points
         )
         for sheet in (Sheet(500), Sheet(1600))
@@ -121,8 +125,8 @@ def test_a_wider_picture_shows_more(record: Record) -> None:
 
 
 def test_a_unit_is_an_axis_and_so_is_a_scale(rover: sqlite3.Connection) -> None:
-    timeline = timeline_of(rover, "pose", "battery_v", "heading")
-    panels = [(panel.unit, panel.names) for panel in timeline.panels]
+    axes = signals_of_run(rover, "pose", "battery_v", "heading")
+    panels = [(panel.unit, panel.names) for panel in axes.panels]
     assert panels == [
         (None, ["pose.0", "pose.1"]), ("V", ["battery_v"]), ("rad", ["heading"]),
     ]  # fmt: skip
@@ -145,7 +149,7 @@ def curves_of_runs(draw: st.DrawFn) -> list[Curve]:
 
 @given(curves_of_runs())
 def test_every_curve_is_drawn_once_or_named_as_left_out(curves: list[Curve]) -> None:
-    panels, left_out = by_scale(curves)
+    panels, left_out = by_scale(curves, MOST_PANELS)
     drawn = [curve for panel in panels for curve in panel.curves]
     assert sorted([*(curve.name for curve in drawn), *left_out]) == sorted(c.name for c in curves)
     assert len(panels) <= MOST_PANELS
@@ -156,19 +160,19 @@ def test_every_curve_is_drawn_once_or_named_as_left_out(curves: list[Curve]) -> 
 
 @given(curves_of_runs())
 def test_runs_share_a_panel_per_signal(curves: list[Curve]) -> None:
-    panels, left_out = by_signal(curves)
+    panels, left_out = by_signal(curves, MOST_PANELS)
     assert [panel.names for panel in panels] == [[panel.names[0]] for panel in panels]
     assert {name for panel in panels for name in panel.names} | set(left_out) == {
         curve.name for curve in curves
     }
 
 
-@given(st.lists(st.text(), max_size=12))
-def test_values_have_colours_of_their_own_as_long_as_there_are_any(values: list[str]) -> None:
-    colours = area_colours(values)
-    assert colours == area_colours(reversed(values))
-    own = [colour for colour in colours.values() if colour != OTHER]
-    assert len(own) == len(set(own)) == min(len(colours), len(AREAS))
+@given(st.lists(st.text(), max_size=24))
+def test_values_have_styles_of_their_own_as_long_as_there_are_any(values: list[str]) -> None:
+    styles = area_styles(values)
+    assert styles == area_styles(reversed(values))
+    own = [style for style in styles.values() if style != MERGED]
+    assert len(own) == len(set(own)) == min(len(styles), MOST_VALUES)
 
 
 PLACES = st.lists(st.tuples(NUMBERS, NUMBERS), min_size=1, max_size=60).map(
@@ -195,20 +199,22 @@ def test_the_pieces_of_a_path_are_all_of_it(places: list[Place], breaks: frozens
 
 
 def test_a_path_is_broken_at_a_gap_and_at_a_leap(rover: sqlite3.Connection) -> None:
-    ground, _ = compose_ground(rover, [whole(rover)])
-    path = ground.tracks[0].path
+    axes, _ = compose_trajectory(rover, [whole(rover)])
+    path = axes.tracks[0].path
     assert [round(path.places[index].time_s) for index in sorted(path.breaks)] == [95, 110]
 
 
 def test_trouble_is_marked_where_it_was(rover: sqlite3.Connection) -> None:
-    ground, _ = compose_ground(rover, [whole(rover)])
-    (track,) = ground.tracks
-    places = {mark.name: [track.path.at(s.start_s)[1:] for s in mark.spans] for mark in track.marks}
+    axes, _ = compose_trajectory(rover, [whole(rover)])
+    (track,) = axes.tracks
+    places = {
+        mark.name: [track.path.at(i.start_s)[1:] for i in mark.intervals] for mark in track.marks
+    }
     assert places == {
         "stuck over 3 s": [pytest.approx((8, 0), abs=0.05)],
         "sensors.bumper": [pytest.approx((8, 0))],
     }
-    without, _ = compose_ground(rover, [whole(rover)], events=False)
+    without, _ = compose_trajectory(rover, [whole(rover)], events=False)
     assert not without.tracks[0].marks
 
 

@@ -29,10 +29,11 @@ from webots_mcp.errors import (
 )
 from webots_mcp.plotting import Picture, Sheet, image_format_of, plot, plot_signals
 from webots_mcp.plotting.canvas import draw
-from webots_mcp.plotting.ground import paint_ground
-from webots_mcp.plotting.signals import compose_timeline
-from webots_mcp.plotting.timeline import paint_timeline
-from webots_mcp.plotting.trajectory import compose_ground
+from webots_mcp.plotting.fonts import fit_fonts
+from webots_mcp.plotting.signal_axes import paint_signals
+from webots_mcp.plotting.signals import compose_signals
+from webots_mcp.plotting.trajectory import compose_trajectory
+from webots_mcp.plotting.trajectory_axes import paint_trajectory
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.rollup.rolling import roll
 
@@ -100,7 +101,7 @@ def test_a_picture_names_what_it_shows(rover: sqlite3.Connection) -> None:
         "rover, run 1, 0 to 119.9 s", "pose.0", "heading [rad]", "mode:", "cruise", "back_up",
         "avoid", "nothing recorded", "stuck", "oscillation", "log", "error", "command", "set_speed",
     }  # fmt: skip
-    steps = "simulation time [s]      line: mean, band: minimum to maximum of every 0.6 s"
+    steps = "simulation time [s]; line: mean, band: minimum to maximum of every 0.6 s"
     assert " ".join(steps.split()) in {" ".join(word.split()) for word in words(picture)}
     assert picture.caption == "rover, run 1, 0 to 119.9 s: pose.0, heading over mode"
 
@@ -108,7 +109,7 @@ def test_a_picture_names_what_it_shows(rover: sqlite3.Connection) -> None:
 def test_what_could_not_be_drawn_is_said(rover: sqlite3.Connection) -> None:
     picture = ask(rover, signals=["*"])
     (left_out,) = [note for note in picture.notes if note.startswith("left out")]
-    assert "battery_v" in left_out and "at most 3 panels" in left_out
+    assert "battery_v" in left_out and "panels 3, rows 4" in left_out
     assert "sensors.front in run 1 was nan 40 times: not drawn" in picture.notes
     blind = ask(rover, signals=["sensors.front", "ir"], start_s=100.5, end_s=103)
     assert "without a value in run 1: sensors.front" in blind.notes
@@ -128,11 +129,11 @@ def test_runs_are_laid_over_each_other_from_their_starts_and_named_by_their_labe
         [(500 + n / 10, f'{{"mode": "go", "x_m": {n / 5}}}') for n in range(100)],
     )
     ranges = [whole(connection, 1), whole(connection, 2)]
-    timeline, _ = compose_timeline(connection, ranges, ["x_m"])
-    assert timeline.x_range == pytest.approx((0, 9.9))
-    assert [curve.points[0][:2] for curve in timeline.panels[0].curves] == [(0, 0), (0, 0)]
-    assert timeline.bands is None
-    assert [lane.name for lane in timeline.lanes] == ["mode, run 1 “softer turns”", "mode, run 2"]
+    axes, _ = compose_signals(connection, ranges, ["x_m"])
+    assert axes.x_range == pytest.approx((0, 9.9))
+    assert [curve.points[0][:2] for curve in axes.panels[0].curves] == [(0, 0), (0, 0)]
+    assert axes.bands is None
+    assert [lane.name for lane in axes.lanes] == ["mode, run 1 “softer turns”", "mode, run 2"]
     picture = plot(connection, "signals", ["x_m"], run_ids=[1, 2], image_format="svg")
     assert words(picture) >= {"run 1 “softer turns”", "run 2", "x_m [m]"}
 
@@ -149,7 +150,7 @@ def test_the_other_run_of_a_trajectory_is_told_apart_and_trouble_is_marked(
 ) -> None:
     picture = ask(rover, kind="trajectory", run_ids=[1, 3], image_format="svg")
     assert words(picture) >= {
-        "run 1", "run 3", "start", "end", "pose.0", "pose.1", "stuck over 3 s, run 1 (1)",
+        "run 1", "run 3", "start", "end", "pose.0 [m]", "pose.1 [m]", "stuck over 3 s, run 1 (1)",
         "sensors.bumper, run 1 (1)",
     }  # fmt: skip
 
@@ -202,7 +203,7 @@ def unseen_labels(axes: Any) -> list[Any]:
     return [label for tick in ticks for label in (tick.label1, tick.label2)]
 
 
-@pytest.mark.parametrize("size", [(900, 500), (1400, 500)])
+@pytest.mark.parametrize("size", [(900, 500), (1400, 500), (600, 400), (400, 300)])
 @pytest.mark.parametrize(
     "names", [["*"], ["mode", "flag"], ["_hidden", "two*"], ["a.very.*"]], ids=str
 )
@@ -210,15 +211,44 @@ def test_no_text_leaves_the_picture_or_covers_another(
     record: Record, names: list[str], size: tuple[int, int]
 ) -> None:
     connection = record(odd_names, 300)
-    timeline, _ = compose_timeline(connection, [whole(connection)], names)
-    assert_readable(texts_of(lambda figure: paint_timeline(figure, timeline), Sheet(*size)), size)
+    sheet = Sheet(*size)
+    axes, _ = compose_signals(connection, [whole(connection)], names, sheet=sheet)
+    assert_readable(texts_of(lambda figure: paint_signals(figure, axes), sheet), size)
 
 
-def test_no_text_of_a_trajectory_leaves_the_picture_or_covers_another(record: Record) -> None:
+@pytest.mark.parametrize("size", [(900, 500), (400, 300), (400, 1200)])
+def test_no_text_of_a_trajectory_leaves_the_picture_or_covers_another(
+    record: Record, size: tuple[int, int]
+) -> None:
     connection = record(odd_names, 300)
-    ground, _ = compose_ground(connection, [whole(connection)])
-    texts = texts_of(lambda figure: paint_ground(figure, ground), Sheet())
-    assert_readable(texts, (900, 500))
+    axes, _ = compose_trajectory(connection, [whole(connection)])
+    texts = texts_of(lambda figure: paint_trajectory(figure, axes), Sheet(*size))
+    assert_readable(texts, size)
+
+
+def test_a_name_that_no_font_has_is_a_note_and_stays_text_in_an_svg(record: Record) -> None:
+    no_script = "\U0010fffd"  # for private use: no font has it
+    connection = record(lambda t: {"mode": no_script, "x_m": t})
+    (note,) = [n for n in plot(connection, signals=["x_m"]).notes if "font" in n]
+    assert repr(no_script) in note
+    picture = plot(connection, signals=["x_m"], image_format="svg")
+    assert not [note for note in picture.notes if "font" in note]
+    assert no_script in words(picture)
+
+
+def test_what_matplotlibs_own_font_lacks_is_drawn_with_another_font() -> None:
+    from matplotlib import font_manager
+    from matplotlib.figure import Figure
+
+    own = font_manager.get_font(font_manager.findfont("DejaVu Sans")).get_charmap()
+    other = font_manager.get_font(font_manager.findfont("STIXGeneral")).get_charmap()
+    character = chr(next(code for code in other if code not in own and chr(code).isalpha()))
+    figure = Figure()
+    text = figure.text(0, 0, f"signal {character}")
+    assert fit_fonts(figure) == ()
+    (family,) = text.get_fontfamily()[1:]
+    drawing = font_manager.get_font(font_manager.findfont(family))
+    assert drawing.get_char_index(ord(character))
 
 
 def assert_readable(texts: list[tuple[str, Any]], size: tuple[int, int]) -> None:
@@ -243,10 +273,10 @@ def test_the_process_and_its_settings_stay_as_they_were(rover: sqlite3.Connectio
 
 
 def test_pictures_can_be_drawn_at_the_same_time(rover: sqlite3.Connection) -> None:
-    timeline, _ = compose_timeline(rover, [whole(rover)], ["pose.0"])
+    axes, _ = compose_signals(rover, [whole(rover)], ["pose.0"])
 
     def picture(_: int) -> bytes:
-        return draw(Sheet(), lambda figure: paint_timeline(figure, timeline))
+        return draw(Sheet(), lambda figure: paint_signals(figure, axes))[0]
 
     with ThreadPoolExecutor(4) as pool:
         assert len(set(pool.map(picture, range(8)))) == 1
@@ -269,8 +299,8 @@ def test_matplotlib_waits_for_the_first_picture(module: str) -> None:
 def test_a_recording_too_long_to_be_read_is_drawn_from_its_rollups(record: Record) -> None:
     connection = record(lambda t: {"v": 3.0 if t == 160 else 12.0, "x": t, "y": 0.0}, 31_000)
     assert roll(connection, 100_000).done
-    timeline, _ = compose_timeline(connection, [whole(connection)], ["v", "x"])
-    (curve,) = [c for panel in timeline.panels for c in panel.curves if c.name == "v"]
+    axes, _ = compose_signals(connection, [whole(connection)], ["v", "x"])
+    (curve,) = [c for panel in axes.panels for c in panel.curves if c.name == "v"]
     assert min(point[2] for point in curve.points) == curve.low == 3.0
     picture = plot(connection, "trajectory")
     assert picture.notes == ("run 1: one place every 10 s (too many rows to draw each)",)
@@ -299,7 +329,7 @@ def test_a_run_that_has_only_begun_is_drawn(record: Record, rows: int) -> None:
         ({"start_s": 900}, NothingRecordedError, "begins after the newest row"),
         ({"signals": ["sensors.front"], "start_s": 101, "end_s": 103, "bands": ""},
          NothingRecordedError, "none of the signals has a value in rover, run 1, 101 to 103 s"),
-        ({"width_px": 12}, InvalidInputError, "width_px=12 must be from 300 to 2000"),
+        ({"width_px": 12}, InvalidInputError, "width_px=12 must be from 400 to 2000"),
         ({"image_format": "gif"}, InvalidInputError, "png or svg, not 'gif'"),
         ({"kind": "pie"}, InvalidInputError, "there is signals, trajectory"),
         ({"kind": "trajectory", "signals": ["pose.0"]}, InvalidInputError, "takes two signals"),

@@ -6,27 +6,36 @@ This package imports matplotlib inside its functions only: with the first pictur
 from __future__ import annotations
 
 import io
+import textwrap
 import threading
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.plotting.fonts import fit_fonts
 from webots_mcp.plotting.palette import FAINT, INK
 from webots_mcp.store.questions.series import MOST_POINTS
 
 ImageFormat = Literal["png", "svg"]
 
+MOST_PANELS: Final = 3
 WIDTH_PX: Final = 900
 HEIGHT_PX: Final = 500
-LEAST_PX: Final = 300
+LEAST_WIDTH_PX: Final = 400
+LEAST_HEIGHT_PX: Final = 300
 MOST_PX: Final = 2000
 _DPI: Final = 100
-_BESIDE_PX: Final = 200  # what stands beside an axis, about: its labels and a legend
+BESIDE_PX: Final = 200  # what stands beside an axis, about: its labels and a legend
+ROW_PX: Final = 17
+_PANEL_PX: Final = 110
+_TITLE_AND_LEGEND_PX: Final = 150
 _BUCKET_PX: Final = 3  # in fewer pixels the band of extremes would hide behind the line
 _LONGEST_NAME: Final = 24
+_SHOWN_NAMES: Final = 10
+_LETTER_PX: Final = 8  # of a bold title
 
 # A user's matplotlibrc must not change the pictures; what is recorded is text, never TeX.
 _STYLE: Final[dict[str, Any]] = {
@@ -80,9 +89,8 @@ class Sheet:
     image_format: ImageFormat = "png"
 
     def __post_init__(self) -> None:
-        for name, value in (("width_px", self.width_px), ("height_px", self.height_px)):
-            if not LEAST_PX <= value <= MOST_PX:
-                raise InvalidInputError(f"{name}={value} must be from {LEAST_PX} to {MOST_PX}")
+        _require_size("width_px", self.width_px, LEAST_WIDTH_PX)
+        _require_size("height_px", self.height_px, LEAST_HEIGHT_PX)
         if self.image_format not in get_args(ImageFormat):
             known = " or ".join(get_args(ImageFormat))
             raise InvalidInputError(f"a picture can be {known}, not {self.image_format!r}")
@@ -90,7 +98,17 @@ class Sheet:
     @property
     def axis_px(self) -> int:
         """About how long the time axis becomes; exactly that is known only after painting."""
-        return self.width_px - _BESIDE_PX
+        return self.width_px - BESIDE_PX
+
+    @property
+    def most_panels(self) -> int:
+        """How many panels are still readable below each other."""
+        return max(1, min(MOST_PANELS, (self.height_px - _TITLE_AND_LEGEND_PX) // _PANEL_PX))
+
+    @property
+    def most_rows(self) -> int:
+        """How many rows of modes, flags and events have room below the panels."""
+        return (self.height_px - _TITLE_AND_LEGEND_PX) // (2 * ROW_PX)
 
     @property
     def points(self) -> int:
@@ -98,19 +116,26 @@ class Sheet:
         return min(self.axis_px // _BUCKET_PX, MOST_POINTS)
 
 
-def draw(sheet: Sheet, paint: Callable[[Any], None]) -> bytes:
-    """The content of the file that `paint` makes of an empty matplotlib `Figure`."""
+def _require_size(name: str, value: int, least: int) -> None:
+    if not least <= value <= MOST_PX:
+        raise InvalidInputError(f"{name}={value} must be from {least} to {MOST_PX}")
+
+
+def draw(sheet: Sheet, paint: Callable[[Any], None]) -> tuple[bytes, tuple[str, ...]]:
+    """The content of the file that `paint` makes of an empty matplotlib `Figure`, and notes."""
     from matplotlib import style  # 0.5 s and more, at the first picture
     from matplotlib.figure import Figure
 
     buffer = io.BytesIO()
     size = (sheet.width_px / _DPI, sheet.height_px / _DPI)
     with _drawing, style.context(["default", _STYLE]), warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a box stands there
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a note says so
         figure: Any = Figure(figsize=size, dpi=_DPI, layout="constrained")
         paint(figure)
+        # In an SVG text stays text, for which the viewer has fonts.
+        notes = fit_fonts(figure) if sheet.image_format == "png" else ()
         figure.savefig(buffer, format=sheet.image_format, metadata=_metadata(sheet))
-    return buffer.getvalue()
+    return buffer.getvalue(), notes
 
 
 def _metadata(sheet: Sheet) -> dict[str, str | None]:
@@ -136,8 +161,26 @@ def media_type(sheet: Sheet) -> str:
     return "image/svg+xml" if sheet.image_format == "svg" else "image/png"
 
 
+def paint_title(figure: Any, title: str) -> None:
+    """At the top left, in as many lines as it needs."""
+    text = wrapped(title, figure.get_figwidth() * figure.dpi)
+    figure.suptitle(text, x=0.01, ha="left", fontsize=10, fontweight="bold")
+
+
+def wrapped(text: str, width_px: float) -> str:
+    """A line in as many lines as a picture of that width needs."""
+    return textwrap.fill(text, int(width_px / _LETTER_PX))
+
+
 def short(name: str) -> str:
     """A name that fits a legend, in one line: of a long one the end, which tells more."""
     line = " ".join(name.split())
     line = line if len(line) <= _LONGEST_NAME else f"…{line[1 - _LONGEST_NAME :]}"
     return f" {line}" if line.startswith("_") else line  # matplotlib hides labels in "_"
+
+
+def listed(names: Sequence[str]) -> str:
+    """The first names of several, and how many more there are."""
+    unlike = list(dict.fromkeys(names))
+    more = len(unlike) - _SHOWN_NAMES
+    return ", ".join(unlike[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")

@@ -8,7 +8,7 @@ scheme "light", made for the background of labels.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Final
+from typing import Final, NamedTuple
 from zlib import crc32
 
 LINES: Final = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -17,21 +17,33 @@ AREAS: Final = (
     "#77AADD", "#EE8866", "#44BB99", "#EEDD88", "#FFAABB", "#AAAA00", "#99DDFF", "#BBCC33",
 )  # fmt: skip
 _FIRST_CHOICE: Final = 4  # of the areas; the others are each close to one of these
-OTHER: Final = "#DDDDDD"  # for what there are too many kinds of
+OTHER_VALUES: Final = "others"  # the name that values share of which there are too many
 INK: Final = "#333333"
 FAINT: Final = "#767676"  # the lightest grey that is readable as text on white
 
 
-def area_colours(values: Iterable[str]) -> dict[str, str]:
-    """A colour for each value, from the ninth value on the same grey.
+class Area(NamedTuple):
+    """How an area, or a stretch of a way, is filled."""
+
+    colour: str
+    dotted: bool
+
+
+MERGED: Final = Area("#DDDDDD", dotted=False)
+MOST_VALUES: Final = 2 * len(AREAS)
+
+
+def area_styles(values: Iterable[str]) -> dict[str, Area]:
+    """A style for each value: eight colours, the same with dots, and grey from the 17th value on.
 
     The colour hangs on the value's own text, so that "cruise" looks alike in every picture, unless
     another value in the same one has taken it.
     """
-    colours: dict[str, str] = {}
+    styles: dict[str, Area] = {}
     for value in sorted(set(values)):
         first = crc32(value.encode()) % _FIRST_CHOICE
         order = (*AREAS[first:_FIRST_CHOICE], *AREAS[:first], *AREAS[_FIRST_CHOICE:])
-        free = (colour for colour in order if colour not in colours.values())
-        colours[value] = next(free, OTHER)
-    return colours
+        styled = (Area(colour, dotted) for dotted in (False, True) for colour in order)
+        free = (style for style in styled if style not in styles.values())
+        styles[value] = MERGED if value == OTHER_VALUES else next(free, MERGED)
+    return styles

@@ -8,7 +8,6 @@ from typing import Final
 
 from webots_mcp.plotting.curves import Curve
 
-MOST_PANELS: Final = 3
 MOST_CURVES: Final = 5  # more bands on top of each other are mud
 _LEAST_SHARE: Final = 0.07  # of the axis; a curve that moves less would look flat
 
@@ -44,12 +43,12 @@ class Panel:
 
 
 def _is_visible(curve: Curve, height: float) -> bool:
-    span = curve.high - curve.low
-    return span == 0 or span >= _LEAST_SHARE * height
+    interval = curve.high - curve.low
+    return interval == 0 or interval >= _LEAST_SHARE * height
 
 
-def by_scale(curves: Iterable[Curve]) -> tuple[list[Panel], list[str]]:
-    """The curves of one run in at most three panels, and the names of those left out.
+def by_scale(curves: Iterable[Curve], most_panels: int) -> tuple[list[Panel], list[str]]:
+    """The curves of one run in at most so many panels, and the names of those left out.
 
     A unit or a scale that has no panel yet comes before a second panel for one that has.
     """
@@ -60,11 +59,11 @@ def by_scale(curves: Iterable[Curve]) -> tuple[list[Panel], list[str]]:
         place = next((panel for panel in suitable if not panel.is_full), None)
         if place is not None:
             place.curves.append(curve)
-        elif suitable or len(panels) == MOST_PANELS:
+        elif suitable or len(panels) == most_panels:
             left_out.append(curve)
         else:
             panels.append(Panel([curve]))
-    for _ in range(len(panels), MOST_PANELS):
+    for _ in range(len(panels), most_panels):
         if left_out:
             panels.append(Panel(left_out[:1]))
             del left_out[0]
@@ -80,10 +79,10 @@ def _fill(panel: Panel, waiting: list[Curve]) -> None:
             waiting.remove(curve)
 
 
-def by_signal(curves: Sequence[Curve]) -> tuple[list[Panel], list[str]]:
+def by_signal(curves: Sequence[Curve], most_panels: int) -> tuple[list[Panel], list[str]]:
     """The curves of several runs, one panel per signal, and the names of those left out."""
     names = list(dict.fromkeys(curve.name for curve in curves))
     panels = [
-        Panel([curve for curve in curves if curve.name == name]) for name in names[:MOST_PANELS]
+        Panel([curve for curve in curves if curve.name == name]) for name in names[:most_panels]
     ]
-    return panels, names[MOST_PANELS:]
+    return panels, names[most_panels:]

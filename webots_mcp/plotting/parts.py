@@ -11,7 +11,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.series import DEFAULT_POINTS, History, RunHistory, query_history
+from webots_mcp.store.questions.series import History, RunHistory, query_history
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.runs import fetch_run
 from webots_mcp.store.signals.catalogue import one_signal, signals_of
@@ -20,7 +20,6 @@ from webots_mcp.store.signals.registry import Signal
 Known = dict[str, Signal]
 
 MOST_RUNS: Final = 4  # more lines of each signal could not be told apart
-_SHOWN_NAMES: Final = 10
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ def parts_of(
     connection: sqlite3.Connection,
     ranges: Sequence[TimeRange],
     names: Sequence[str],
-    points: int = DEFAULT_POINTS,
+    points: int,
 ) -> list[Part]:
     """Read the signals of each run in the ranges; several runs begin at 0 each.
 
@@ -134,11 +133,16 @@ def _seconds(time_s: float) -> str:
     return f"{time_s:.2f}".rstrip("0").rstrip(".")
 
 
-def listed(names: Sequence[str]) -> str:
-    """The first names of several, and how many more there are."""
-    unlike = list(dict.fromkeys(names))
-    more = len(unlike) - _SHOWN_NAMES
-    return ", ".join(unlike[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")
+def range_notes(parts: Sequence[Part]) -> list[str]:
+    """Where a range reaches outside the recording, and of what only the newest is drawn."""
+    notes = [note for part in parts for note in part.notes]
+    return notes + [
+        f"of {columns.total} changes of {columns.name} in {part.name} only the newest "
+        f"{len(columns.points)} are shown"
+        for part in parts
+        for columns in part.run.changes
+        if columns.total > len(columns.points)
+    ]
 
 
 def known_signals(connection: sqlite3.Connection, ranges: Sequence[TimeRange]) -> Known:

@@ -9,13 +9,20 @@ from functools import partial
 from typing import Final
 
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.plotting.canvas import LEAST_PX, Picture, Sheet, draw, media_type
+from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Sheet, draw, listed, media_type
 from webots_mcp.plotting.curves import Curve, curve_of
-from webots_mcp.plotting.marks import event_lanes
-from webots_mcp.plotting.panels import MOST_PANELS, by_scale, by_signal
-from webots_mcp.plotting.parts import Part, known_signals, listed, mode_signal, parts_of, title_of
-from webots_mcp.plotting.spans import Lane, Span, lane_of
-from webots_mcp.plotting.timeline import Timeline, paint_timeline
+from webots_mcp.plotting.event_lanes import event_lanes
+from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
+from webots_mcp.plotting.panels import by_scale, by_signal
+from webots_mcp.plotting.parts import (
+    Part,
+    known_signals,
+    mode_signal,
+    parts_of,
+    range_notes,
+    title_of,
+)
+from webots_mcp.plotting.signal_axes import SignalAxes, paint_signals
 from webots_mcp.store.reading.ranges import TimeRange
 
 MOST_LANES: Final = 4
@@ -50,17 +57,17 @@ def plot_signals(
         NothingRecordedError: None of the signals has a value in the range.
     """
     sheet = sheet or Sheet()
-    timeline, notes = compose_timeline(
+    plot, notes = compose_signals(
         connection, ranges, names, bands=bands, events=events, sheet=sheet
     )
-    if not timeline.panels:
-        rows = len(timeline.lanes) + len(timeline.events)
+    if not plot.panels:
+        rows = len(plot.lanes) + len(plot.events)
         sheet = replace(sheet, height_px=_height_of_rows(rows, sheet))
-    data = draw(sheet, partial(paint_timeline, timeline=timeline))
-    return Picture(data, media_type(sheet), _caption(timeline), notes)
+    data, font_notes = draw(sheet, partial(paint_signals, plot=plot))
+    return Picture(data, media_type(sheet), _caption(plot), (*notes, *font_notes))
 
 
-def compose_timeline(
+def compose_signals(
     connection: sqlite3.Connection,
     ranges: Sequence[TimeRange],
     names: Sequence[str],
@@ -68,34 +75,39 @@ def compose_timeline(
     bands: str | None = None,
     events: bool = True,
     sheet: Sheet | None = None,
-) -> tuple[Timeline, tuple[str, ...]]:
+) -> tuple[SignalAxes, tuple[str, ...]]:
     """What `plot_signals` paints, and its notes; arguments and errors as there."""
+    sheet = sheet or Sheet()
     mode = mode_signal(known_signals(connection, ranges), bands)
-    wanted = [*names, *([mode] if mode else [])]
-    parts = parts_of(connection, ranges, wanted, (sheet or Sheet()).points)
+    parts = parts_of(connection, ranges, [*names, *([mode] if mode else [])], sheet.points)
     overlaid = len(parts) > 1
     curves = [curve for part in parts for curve in _curves(part)]
-    panels, left_out = by_signal(curves) if overlaid else by_scale(curves)
+    panels, left_out = (by_signal if overlaid else by_scale)(curves, sheet.most_panels)
     behind, below = _behind_and_below(parts, mode if panels else None)
     if not panels and not below:
         raise NothingRecordedError(_nothing(parts))
+    most_lanes = min(MOST_LANES, sheet.most_rows)
+    left_out += [lane.name for lane in below[most_lanes:]]
+    below = below[:most_lanes]
     marked, event_notes = ([], [])
     if events and not overlaid:
         drawn = [name for panel in panels for name in panel.names] or names
-        marked, event_notes = event_lanes(connection, parts[0], drawn)
-    left_out += [lane.name for lane in below[MOST_LANES:]]
-    timeline = Timeline(
+        marked, event_notes = event_lanes(connection, parts[0], drawn, sheet.most_rows - len(below))
+    plot = SignalAxes(
         title=title_of(parts),
         x_label=_x_label(parts),
         x_range=_x_range(parts),
         panels=panels,
         colour_by_run={part.run.run_id: part.name for part in parts} if overlaid else {},
         bands=behind,
-        lanes=below[:MOST_LANES],
+        lanes=below,
         events=marked,
         gaps=() if overlaid else _gaps(parts[0]),
     )
-    return timeline, (*_notes(parts, curves), *event_notes, *_left_out(left_out))
+    notes = [*_notes(parts, curves), *merged_notes([*below, *([behind] if behind else [])])]
+    if left_out:
+        notes.append(_left_out(left_out, sheet))
+    return plot, (*notes, *event_notes)
 
 
 def _curves(part: Part) -> list[Curve]:
@@ -114,20 +126,16 @@ def _behind_and_below(parts: Sequence[Part], mode: str | None) -> tuple[Lane | N
 def _lanes(part: Part, overlaid: bool) -> list[Lane]:
     lanes = [lane_of(columns, part.run, part.end_s) for columns in part.run.changes]
     of_run = f", {part.name}" if overlaid else ""
-    return [
-        Lane(lane.name + of_run, [span.moved(part.origin_s) for span in lane.spans], lane.values)
-        for lane in lanes
-        if lane.spans
-    ]
+    return [lane.moved(part.origin_s, lane.name + of_run) for lane in lanes if lane.intervals]
 
 
-def _gaps(part: Part) -> list[Span]:
-    return [Span("", gap.start_s, gap.end_s).moved(part.origin_s) for gap in part.run.gaps]
+def _gaps(part: Part) -> list[Interval]:
+    return [Interval("", gap.start_s, gap.end_s).moved(part.origin_s) for gap in part.run.gaps]
 
 
 def _height_of_rows(rows: int, sheet: Sheet) -> int:
-    """Rows of spans alone need no more."""
-    return min(sheet.height_px, max(LEAST_PX, 130 + 50 * rows))
+    """Rows of intervals alone need no more."""
+    return min(sheet.height_px, max(LEAST_HEIGHT_PX, 130 + 50 * rows))
 
 
 def _x_range(parts: Sequence[Part]) -> tuple[float, float]:
@@ -141,18 +149,18 @@ def _x_label(parts: Sequence[Part]) -> str:
     steps = {part.run.step_s for part in parts if part.run.numbers}
     if len(steps) != 1 or None in steps:
         return clock
-    return f"{clock}      line: mean, band: minimum to maximum of every {steps.pop():g} s"
+    return f"{clock}; line: mean, band: minimum to maximum of every {steps.pop():g} s"
 
 
-def _caption(timeline: Timeline) -> str:
-    shown = [name for panel in timeline.panels for name in panel.names]
-    below = [lane.name for lane in timeline.lanes]
-    behind = f" over {timeline.bands.name}" if timeline.bands else ""
-    return f"{timeline.title}: {', '.join([*shown, *below])}{behind}"
+def _caption(plot: SignalAxes) -> str:
+    shown = [name for panel in plot.panels for name in panel.names]
+    below = [lane.name for lane in plot.lanes]
+    behind = f" over {plot.bands.name}" if plot.bands else ""
+    return f"{plot.title}: {', '.join([*shown, *below])}{behind}"
 
 
 def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
-    notes = [note for part in parts for note in part.notes]
+    notes = range_notes(parts)
     drawn = {(curve.run_id, curve.name) for curve in curves}
     for part in parts:
         silent = [c.name for c in part.run.numbers if (part.run.run_id, c.name) not in drawn]
@@ -162,11 +170,6 @@ def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
             notes.append(
                 f"{part.name} is drawn up to {part.run.cut_at_s:g} s only: it took too long"
             )
-        notes += [
-            f"of {columns.total} changes of {columns.name} only the newest are shown"
-            for columns in part.run.changes
-            if columns.total > len(columns.points)
-        ]
         notes += [
             f"{columns.name} in {part.name} was {_counted(columns.odd)}: not drawn"
             for columns in part.run.numbers
@@ -179,11 +182,10 @@ def _counted(odd: dict[str, int]) -> str:
     return ", ".join(f"{value} {count} times" for value, count in odd.items())
 
 
-def _left_out(names: Sequence[str]) -> list[str]:
-    if not names:
-        return []
-    why = f"a picture has at most {MOST_PANELS} panels and {MOST_LANES} rows"
-    return [f"left out: {listed(names)} ({why}); ask for them alone"]
+def _left_out(names: Sequence[str], sheet: Sheet) -> str:
+    lanes = min(MOST_LANES, sheet.most_rows)
+    why = f"most that a picture of this size holds: panels {sheet.most_panels}, rows {lanes}"
+    return f"left out: {listed(names)} ({why}); ask for them alone"
 
 
 def _nothing(parts: Sequence[Part]) -> str:

@@ -8,22 +8,23 @@ from functools import partial
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.plotting.canvas import Picture, Sheet, draw, media_type
-from webots_mcp.plotting.ground import Ground, Track, paint_ground
-from webots_mcp.plotting.marks import stuck_mark
+from webots_mcp.plotting.canvas import Picture, Sheet, draw, listed, media_type
+from webots_mcp.plotting.event_lanes import stuck_mark
+from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (
     Known,
     Part,
     known_signals,
-    listed,
     mode_signal,
     parts_of,
+    range_notes,
     title_of,
 )
 from webots_mcp.plotting.path import read_path
-from webots_mcp.plotting.spans import Lane, lane_of
+from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.questions.series import MOST_POINTS
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal
@@ -57,27 +58,27 @@ def plot_trajectory(
         NothingRecordedError: No position was recorded in the range.
     """
     sheet = sheet or Sheet()
-    ground, notes = compose_ground(connection, ranges, position, bands=bands, events=events)
-    data = draw(sheet, partial(paint_ground, ground=ground))
-    caption = f"{ground.title}: {ground.y_label} over {ground.x_label}"
-    return Picture(data, media_type(sheet), caption, notes)
+    plot, notes = compose_trajectory(connection, ranges, position, bands=bands, events=events)
+    data, font_notes = draw(sheet, partial(paint_trajectory, plot=plot))
+    caption = f"{plot.title}: {plot.y_label} over {plot.x_label}"
+    return Picture(data, media_type(sheet), caption, (*notes, *font_notes))
 
 
-def compose_ground(
+def compose_trajectory(
     connection: sqlite3.Connection,
     ranges: Sequence[TimeRange],
     position: tuple[str, str] | None = None,
     *,
     bands: str | None = None,
     events: bool = True,
-) -> tuple[Ground, tuple[str, ...]]:
+) -> tuple[TrajectoryAxes, tuple[str, ...]]:
     """What `plot_trajectory` paints, and its notes; arguments and errors as there."""
     known = known_signals(connection, ranges)
     x, y = _position(known, position)
     mode = mode_signal(known, bands)
     flags = _flags(known) if events else []
     names = [x.name, y.name, *([mode] if mode else []), *flags]
-    parts = parts_of(connection, ranges, names)
+    parts = parts_of(connection, ranges, names, MOST_POINTS)
     tracks: list[Track] = []
     for part in parts:
         modes = _lane(part, mode) if len(parts) == 1 else None
@@ -87,7 +88,10 @@ def compose_ground(
         tracks.append(Track(part.name, read_path(connection, part.range, x, y), modes, marks))
     if not any(track.path.places for track in tracks):
         raise NothingRecordedError(f"{x.name} and {y.name} have no values in {title_of(parts)}")
-    return Ground(title_of(parts), _label(x), _label(y), tracks, mode), _notes(parts, tracks)
+    metres = None if position else "m"
+    labels = (_label(x, metres), _label(y, metres))
+    axes = TrajectoryAxes(title_of(parts), *labels, tracks, mode)
+    return axes, _notes(parts, tracks)
 
 
 def _position(known: Known, named: tuple[str, str] | None) -> tuple[Signal, Signal]:
@@ -123,15 +127,19 @@ def _lane(part: Part, name: str | None) -> Lane | None:
 
 def _flagged(part: Part, flag: str) -> Lane:
     lane = _lane(part, flag)
-    return Lane(flag, [span for span in lane.spans if span.value == "true"] if lane else [], ())
+    intervals = lane.intervals if lane else ()
+    return Lane(flag, [each for each in intervals if each.value == "true"], ())
 
 
-def _label(signal: Signal) -> str:
-    return f"{signal.name} [{signal.unit}]" if signal.unit else signal.name
+def _label(signal: Signal, usual_unit: str | None) -> str:
+    """Webots measures in metres: a position whose name has no unit is taken to be one in metres."""
+    unit = signal.unit or usual_unit
+    return f"{signal.name} [{unit}]" if unit else signal.name
 
 
 def _notes(parts: Sequence[Part], tracks: Sequence[Track]) -> tuple[str, ...]:
-    notes = [note for part in parts for note in part.notes]
+    notes = range_notes(parts)
+    notes += merged_notes([track.modes for track in tracks if track.modes])
     notes += [
         f"{track.name}: one place every {track.path.step_s:g} s (too many rows to draw each)"
         for track in tracks

@@ -1,4 +1,4 @@
-"""Events as spans: what is marked in a picture."""
+"""Events as intervals: what is marked in a picture."""
 
 from __future__ import annotations
 
@@ -7,32 +7,40 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
+from webots_mcp.plotting.intervals import Interval, Lane
 from webots_mcp.plotting.parts import Part
-from webots_mcp.plotting.spans import Lane, Span
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.registry import drawn_kinds
 from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.questions.events import Events, find_events
 
 MOST_EVENTS: Final = 500
-MOST_LANES: Final = 5
+MOST_LANES: Final = 5  # in one picture
 
 
 def event_lanes(
-    connection: sqlite3.Connection, part: Part, names: Sequence[str]
+    connection: sqlite3.Connection, part: Part, names: Sequence[str], rows: int
 ) -> tuple[list[Lane], list[str]]:
-    """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole."""
+    """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole.
+
+    Args:
+        connection: Any.
+        part: The run.
+        names: The drawn signals.
+        rows: How many lanes have room.
+    """
+    most = min(rows, MOST_LANES)
     drawn = tuple(kind.name for kind in drawn_kinds())
     options = EventOptions(kinds=drawn, signals=tuple(names))
     found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=(), group=False)
     kinds = [kind for kind in drawn if any(event.kind == kind for event in found.events)]
-    lanes = [_lane(kind, found, part) for kind in kinds[:MOST_LANES]]
+    lanes = [_lane(kind, found, part) for kind in kinds[:most]]
     notes = [note for note in found.notes if note not in part.notes]
     notes += _not_looked_for(found.verdicts)
     if found.left_out:
         kind, rest = max(found.left_out.items(), key=lambda item: item[1].count)
         notes.append(f"{rest.count} events of kind {kind} up to {rest.last_s:.3f} s are not drawn")
-    if left_out := kinds[MOST_LANES:]:
+    if left_out := kinds[most:]:
         notes.append(f"events left out: {', '.join(left_out)}")
     return lanes, notes
 
@@ -51,25 +59,25 @@ def _not_looked_for(verdicts: Verdicts) -> list[str]:
 
 def _lane(kind: str, found: Events, part: Part) -> Lane:
     events = sorted((e for e in found.events if e.kind == kind), key=lambda event: event.start_s)
-    spans = [_span(event, part).moved(part.origin_s) for event in events]
-    return Lane(kind, spans, ())
+    intervals = [_interval(event, part).moved(part.origin_s) for event in events]
+    return Lane(kind, intervals, ())
 
 
-def _span(event: Event, part: Part) -> Span:
+def _interval(event: Event, part: Part) -> Interval:
     """Named by what it is about: the signal, the action, the level, or what the bridge noticed."""
     what = event.details.get("what") if event.kind == "noticed" else event.name
-    return _within(Span(str(what or ""), event.start_s, event.end_s), part)
+    return _within(Interval(str(what or ""), event.start_s, event.end_s), part)
 
 
-def _within(span: Span, part: Part) -> Span:
+def _within(interval: Interval, part: Part) -> Interval:
     """What of an event is in the picture: it may have begun before, and gone on."""
-    start_s = max(span.start_s, min(part.start_s, span.end_s))
-    return Span(span.value, start_s, min(span.end_s, max(part.end_s, start_s)))
+    start_s = max(interval.start_s, min(part.start_s, interval.end_s))
+    return Interval(interval.value, start_s, min(interval.end_s, max(part.end_s, start_s)))
 
 
 def stuck_mark(connection: sqlite3.Connection, part: Part, position: tuple[str, str]) -> Lane:
     """When the robot was stuck."""
     options = EventOptions(kinds=("stuck",), signals=position, position=position)
     found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=())
-    spans = [_within(Span("stuck", e.start_s, e.end_s), part) for e in found.events]
-    return Lane(f"stuck over {options.stuck_s:g} s", spans, ())
+    intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]
+    return Lane(f"stuck over {options.stuck_s:g} s", intervals, ())

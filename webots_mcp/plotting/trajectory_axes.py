@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.plotting.canvas import short
+from webots_mcp.plotting.canvas import paint_title, short
+from webots_mcp.plotting.intervals import Lane
 from webots_mcp.plotting.legend import Entry, paint_legend
-from webots_mcp.plotting.palette import DASHES, FAINT, INK, LINES, area_colours
+from webots_mcp.plotting.palette import DASHES, FAINT, INK, LINES, area_styles
 from webots_mcp.plotting.path import Path, Place, extent, headings, thinned
-from webots_mcp.plotting.spans import Lane
 
 _ARROWS: Final = 9
+_TICK_PX: Final = 45
 _ON_THE_SPOT: Final = 0.03  # of the size of the whole way
 _LEAST_SIZE: Final = 0.02  # of the picture, in the unit of the position
 _START: Final[dict[str, Any]] = {
     "marker": "o", "markersize": 9, "markerfacecolor": "white", "markeredgewidth": 1.8,
 }  # fmt: skip
 _END: Final[dict[str, Any]] = {"marker": "s", "markersize": 9}
+_DOTTED: Final[dict[str, Any]] = {
+    "color": INK, "linewidth": 1.4, "linestyle": (0, (1, 2)), "dash_capstyle": "butt",
+    "zorder": 3.2,
+}  # fmt: skip
 _MANY: Final = 10  # marks of a kind; more are drawn smaller
 _SHAPES: Final[tuple[dict[str, Any], ...]] = (  # the first can be seen around the others
     {"marker": "o", "markersize": 16, "markerfacecolor": "none", "markeredgewidth": 2.2},
@@ -45,7 +51,7 @@ class Track:
 
 
 @dataclass(frozen=True)
-class Ground:
+class TrajectoryAxes:
     """What is to be painted."""
 
     title: str
@@ -55,42 +61,57 @@ class Ground:
     mode: str | None
 
 
-def paint_ground(figure: Any, ground: Ground) -> None:
+def paint_trajectory(figure: Any, plot: TrajectoryAxes) -> None:
     """Paint it on an empty figure."""
-    figure.suptitle(ground.title, x=0.01, ha="left", fontsize=10, fontweight="bold")
+    paint_title(figure, plot.title)
     axes = figure.subplots()
-    axes.set_xlabel(ground.x_label)
-    axes.set_ylabel(ground.y_label)
+    axes.set_xlabel(plot.x_label)
+    axes.set_ylabel(plot.y_label)
     axes.grid(color="#E9E9E9", linewidth=0.6)
     entries: list[Entry] = []
-    for index, track in enumerate(ground.tracks):
+    for index, track in enumerate(plot.tracks):
         if track.path.places:
-            entries += _paint_track(figure, axes, track, index, ground)
-    _frame(axes, [place for track in ground.tracks for place in track.path.places])
-    paint_legend(figure, [*entries, *_end_entries()])
+            entries += _paint_track(figure, axes, track, index, plot)
+    _frame(figure, axes, [place for track in plot.tracks for place in track.path.places])
+    paint_legend(figure, [*_end_entries(), *entries])
 
 
-def _frame(axes: Any, places: Sequence[Place]) -> None:
-    """The same scale on both axes; a robot that stands still is not blown up."""
+def _frame(figure: Any, axes: Any, places: Sequence[Place]) -> None:
+    """The same scale and grid on both axes; a robot that stands still is not blown up."""
     middle = places[len(places) // 2]
     least = [(middle.x + side, middle.y + side) for side in (-_LEAST_SIZE / 2, _LEAST_SIZE / 2)]
     axes.update_datalim(least)
     axes.margins(0.06)
     axes.set_aspect("equal", adjustable="datalim")
+    figure.draw_without_rendering()  # how far the axes reach is known only then
+    _set_ticks(axes)
 
 
-def _paint_track(figure: Any, axes: Any, track: Track, index: int, ground: Ground) -> list[Entry]:
+def _set_ticks(axes: Any) -> None:
+    from matplotlib.ticker import MultipleLocator
+
+    box, (start, end) = axes.get_window_extent(), axes.get_xlim()
+    least = _TICK_PX * (end - start) / max(box.width, 1)
+    unit = 10.0 ** math.floor(math.log10(least))
+    step = next(unit * factor for factor in (1, 2, 5, 10) if unit * factor >= least)
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_locator(MultipleLocator(step))
+
+
+def _paint_track(
+    figure: Any, axes: Any, track: Track, index: int, plot: TrajectoryAxes
+) -> list[Entry]:
     _paint_leaps(axes, track.path)
-    if len(ground.tracks) > 1:
+    if len(plot.tracks) > 1:
         entries = _paint_in_one_colour(axes, track, index)
         ink = LINES[index % len(LINES)]
-    elif track.modes is not None and ground.mode is not None:
+    elif track.modes is not None and plot.mode is not None:
         entries, ink = _paint_modes(axes, track.path, track.modes), INK
     else:
         entries, ink = _paint_time(figure, axes, track.path), INK
     _paint_headings(axes, track.path, ink)
     _paint_ends(axes, track.path, ink)
-    alone = len(ground.tracks) == 1
+    alone = len(plot.tracks) == 1
     return [*entries, *_paint_marks(axes, track, LINES[1] if alone else ink, alone)]
 
 
@@ -115,16 +136,23 @@ def _paint_in_one_colour(axes: Any, track: Track, index: int) -> list[Entry]:
 def _paint_modes(axes: Any, path: Path, modes: Lane) -> list[Entry]:
     from matplotlib.lines import Line2D
 
-    colours = area_colours(modes.values)
+    styles = area_styles(modes.values)
     for piece in path.pieces():
         _line(axes, piece, color=INK, linewidth=4.4)  # an edge, so that light colours are seen
         part = Path(piece, None, frozenset())
-        for span in modes.spans:
-            held = part.between(span.start_s, span.end_s)
-            _line(axes, held, color=colours[span.value], linewidth=3)
+        for interval in modes.intervals:
+            held = part.between(interval.start_s, interval.end_s)
+            style = styles[interval.value]
+            _line(axes, held, color=style.colour, linewidth=3)
+            if style.dotted:
+                _line(axes, held, **_DOTTED)
             if len(held) > 1 and extent(held) < _ON_THE_SPOT * extent(path.places):
-                _dot(axes, held[-1], colours[span.value])
-    shown = [(Line2D([], [], color=colours[v], linewidth=4), short(v)) for v in modes.values]
+                _dot(axes, held[-1], style.colour)
+    shown: list[Entry] = []
+    for value, style in ((value, styles[value]) for value in modes.values):
+        line = Line2D([], [], color=style.colour, linewidth=4)
+        dots = Line2D([], [], **_DOTTED)
+        shown.append(((line, dots) if style.dotted else line, short(value)))
     return [(Line2D([], [], linestyle=""), f"{short(modes.name)}:"), *shown]
 
 
@@ -182,9 +210,9 @@ def _end_entries() -> list[Entry]:
 def _paint_marks(axes: Any, track: Track, colour: str, alone: bool) -> list[Entry]:
     entries: list[Entry] = []
     for mark, shape in zip(track.marks, _SHAPES, strict=False):
-        if not mark.spans:
+        if not mark.intervals:
             continue
-        places = [track.path.at(span.start_s) for span in mark.spans]
+        places = [track.path.at(interval.start_s) for interval in mark.intervals]
         xs, ys = [place.x for place in places], [place.y for place in places]
         size = shape["markersize"] * (0.6 if len(places) > _MANY else 1)
         style = shape | {"linestyle": "", "color": colour, "markersize": size}

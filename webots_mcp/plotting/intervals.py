@@ -3,57 +3,74 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Final
 
+from webots_mcp.plotting.canvas import listed
+from webots_mcp.plotting.palette import MOST_VALUES, OTHER_VALUES
 from webots_mcp.store.questions.series import ChangeColumns, RunHistory
 from webots_mcp.store.reading.changes import Point, spelled
 from webots_mcp.store.reading.gaps import Gap
 
-MOST_VALUES: Final = 8  # colours that can be told apart
-OTHER_VALUES: Final = "others"
-
 
 @dataclass(frozen=True)
-class Span:
+class Interval:
     """A value or a kind of event over a stretch of time; an instant has no length."""
 
     value: str
     start_s: float
     end_s: float
 
-    def moved(self, origin_s: float) -> Span:
+    def moved(self, origin_s: float) -> Interval:
         """The same on a clock that begins at `origin_s`."""
-        return Span(self.value, self.start_s - origin_s, self.end_s - origin_s)
+        return Interval(self.value, self.start_s - origin_s, self.end_s - origin_s)
 
 
 @dataclass(frozen=True)
 class Lane:
-    """A row of spans under one name; `values` in the order of their colours."""
+    """A row of intervals under one name.
+
+    Attributes:
+        values: In the order of their colours.
+        merged: Values that share the name "others", because there are too many to tell apart.
+    """
 
     name: str
-    spans: Sequence[Span]
+    intervals: Sequence[Interval]
     values: Sequence[str]
+    merged: Sequence[str] = ()
+
+    def moved(self, origin_s: float, name: str) -> Lane:
+        """The same under that name, on a clock that begins at `origin_s`."""
+        return replace(self, name=name, intervals=[i.moved(origin_s) for i in self.intervals])
 
 
 def lane_of(columns: ChangeColumns, run: RunHistory, end_s: float) -> Lane:
-    """A text or boolean signal as spans; the values beyond the eighth share one name.
+    """A text or boolean signal as intervals; values beyond the sixteenth share a name.
 
-    Where nothing was recorded there is no span: nobody knows the value.
+    Where nothing was recorded there is no interval: nobody knows the value.
     """
     values = list(columns.time_by_value_s)
     known = values if len(values) <= MOST_VALUES else values[: MOST_VALUES - 1]
-    spans = [
-        Span(value if value in known else OTHER_VALUES, *stretch)
+    intervals = [
+        Interval(value if value in known else OTHER_VALUES, *stretch)
         for start, until_s in _stretches(columns.points, end_s)
         for value in [spelled(start.value)]
         for stretch in _recorded(max(start.sim_time_s, run.start_s), until_s, run.gaps)
     ]
-    present = {span.value for span in spans}
-    return Lane(
-        columns.name, spans, [v for v in dict.fromkeys([*known, OTHER_VALUES]) if v in present]
-    )
+    present = {interval.value for interval in intervals}
+    shown = [value for value in dict.fromkeys([*known, OTHER_VALUES]) if value in present]
+    return Lane(columns.name, intervals, shown, values[len(known) :])
+
+
+def merged_notes(lanes: Sequence[Lane]) -> list[str]:
+    """Which values of which signal cannot be told apart in the picture."""
+    return [
+        f"{lane.name} has {len(lane.merged)} more values than colours, drawn as {OTHER_VALUES}: "
+        f"{listed(lane.merged)}"
+        for lane in lanes
+        if lane.merged
+    ]
 
 
 def _stretches(points: Sequence[Point], end_s: float) -> list[tuple[Point, float]]:

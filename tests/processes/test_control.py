@@ -139,26 +139,31 @@ def test_pausing_one_of_two_simulators_of_one_shell_leaves_the_other_alone(
         assert status(filed, "rover") == "running"
 
 
-def test_an_extern_and_an_intern_controller_of_one_simulator_are_companions(
-    extern_world: Path, connect_extern: Connect, filed: Recording, tmp_path: Path, data_dir: Path
-) -> None:
+@pytest.fixture
+def simulation_of_two(extern_world: Path, tmp_path: Path, data_dir: Path) -> Iterator[Simulation]:
+    """The extern rover's world with a referee, whose controller Webots starts."""
     referee = tmp_path / "referee.py"
     referee.write_text(CONTROLLER + LOOP)
     text = extern_world.read_text(encoding="utf-8")
     robot = 'Robot { name "referee" controller "referee" supervisor TRUE }'
     extern_world.write_text(text + robot, encoding="utf-8")
-    environment = {"WEBOTS_MCP_DATA_DIR": str(data_dir)}
-    with Simulation(
-        extern_world, controllers={"referee": referee}, environment=environment
-    ) as simulation:
-        connect_extern(simulation)
-        simulation.wait_for(lambda: has_states(filed), timeout_s=30)
-        simulation.wait_for(
-            lambda: filed.rows("SELECT count(*), count(DISTINCT instance) FROM session") == [(2, 1)]
-        )
-        assert filed.rows("SELECT extern FROM session ORDER BY extern") == [0, 1]
-        wait(simulation, filed, filed.send("pause"))
-        assert {status(filed, name) for name in ("rover", "referee")} == {"paused"}
+    controllers, environment = {"referee": referee}, {"WEBOTS_MCP_DATA_DIR": str(data_dir)}
+    with Simulation(extern_world, controllers=controllers, environment=environment) as simulation:
+        yield simulation
+
+
+def test_an_extern_and_an_intern_controller_of_one_simulator_are_companions(
+    simulation_of_two: Simulation, connect_extern: Connect, filed: Recording
+) -> None:
+    simulation = simulation_of_two
+    connect_extern(simulation)
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+    simulation.wait_for(
+        lambda: filed.rows("SELECT count(*), count(DISTINCT instance) FROM session") == [(2, 1)]
+    )
+    assert filed.rows("SELECT extern FROM session ORDER BY extern") == [0, 1]
+    wait(simulation, filed, filed.send("pause"))
+    assert {status(filed, name) for name in ("rover", "referee")} == {"paused"}
 
 
 def test_the_reload_of_an_extern_controller_is_answered_when_its_process_has_ended(
@@ -178,37 +183,29 @@ def test_the_reload_of_an_extern_controller_is_answered_when_its_process_has_end
 
 
 def test_a_robot_that_was_left_in_the_pause_of_another_is_told_by_whom(
-    extern_world: Path, connect_extern: Connect, filed: Recording, tmp_path: Path, data_dir: Path
+    simulation_of_two: Simulation, connect_extern: Connect, filed: Recording
 ) -> None:
-    referee = tmp_path / "referee.py"
-    referee.write_text(CONTROLLER + LOOP)
-    text = extern_world.read_text(encoding="utf-8")
-    robot = 'Robot { name "referee" controller "referee" supervisor TRUE }'
-    extern_world.write_text(text + robot, encoding="utf-8")
-    environment = {"WEBOTS_MCP_DATA_DIR": str(data_dir)}
-    with Simulation(
-        extern_world, controllers={"referee": referee}, environment=environment
-    ) as simulation:
-        simulation.wait_for(lambda: simulation.controller("referee").is_running)
-        process = connect_extern(simulation)
-        simulation.wait_for(lambda: has_states(filed), timeout_s=30)
-        simulation.wait_for(lambda: filed.rows("SELECT count(*) FROM session") == [2])
-        (newest,) = filed.rows("SELECT name FROM robot WHERE id = (SELECT max(id) FROM robot)")
-        wait(simulation, filed, filed.send("pause"))
-        other = "referee" if newest == "rover" else "rover"
-        if newest == "rover":
-            process.kill()
-            process.wait()
-        else:
-            simulation.controller("referee").kill()
+    simulation = simulation_of_two
+    simulation.wait_for(lambda: simulation.controller("referee").is_running)
+    process = connect_extern(simulation)
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+    simulation.wait_for(lambda: filed.rows("SELECT count(*) FROM session") == [2])
+    (newest,) = filed.rows("SELECT name FROM robot WHERE id = (SELECT max(id) FROM robot)")
+    wait(simulation, filed, filed.send("pause"))
+    other = "referee" if newest == "rover" else "rover"
+    if newest == "rover":
+        process.kill()
+        process.wait()
+    else:
+        simulation.controller("referee").kill()
 
-        def why() -> bool:
-            connection = connect(filed.database, "reader")
-            said = look(connection, other).status.why or ""
-            connection.close()
-            return f"robot {newest!r} paused the simulation" in said
+    def why() -> bool:
+        connection = connect(filed.database, "reader")
+        said = look(connection, other).status.why or ""
+        connection.close()
+        return f"robot {newest!r} paused the simulation" in said
 
-        simulation.wait_for(why, timeout_s=20)
+    simulation.wait_for(why, timeout_s=20)
 
 
 def test_a_killed_extern_controllers_hold_is_taken_over_by_the_next_one(

@@ -18,6 +18,7 @@ from typing import Final
 from webots_mcp.cli import data, history, looking, serving
 from webots_mcp.cli.command import COMMANDS
 from webots_mcp.cli.ending import ended_by, ending_by_signals
+from webots_mcp.cli.wording import as_typed, speak_of
 from webots_mcp.errors import WebotsMCPError
 
 __all__ = ["COMMANDS", "main"]
@@ -37,10 +38,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with ending_by_signals():
             arguments = _parser().parse_args(argv)
+            speak_of(arguments.arguments)
             arguments.run(arguments)
             sys.stdout.flush()
     except WebotsMCPError as error:
-        return _end(EXIT_BAD_INPUT, str(error))
+        return _end(EXIT_BAD_INPUT, as_typed(str(error)))
     except ModuleNotFoundError as error:
         return _end(EXIT_SYSTEM, _explain_missing(error))
     except KeyboardInterrupt as interrupt:
@@ -90,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
             description=inspect.cleandoc(text),
             formatter_class=_Paragraphs,
         )
-        subparser.set_defaults(run=run)
+        subparser.set_defaults(run=run, arguments=arguments)
         for flags, options in arguments:
             subparser.add_argument(*flags, **options)
     return parser

@@ -23,6 +23,21 @@ class Argument(NamedTuple):
     flags: tuple[str, ...]
     options: dict[str, Any]
 
+    @property
+    def name(self) -> str:
+        """What the value is called in the code, and in the questions that it is passed to."""
+        return self.options.get("dest") or self.flags[-1].lstrip("-").replace("-", "_")
+
+    @property
+    def typed(self) -> str:
+        """What a person types or reads in the help."""
+        return self.flags[-1] if self.flags[-1].startswith("-") else self.value_name
+
+    @property
+    def value_name(self) -> str:
+        """How the help calls the value."""
+        return self.options.get("metavar") or self.name.upper()
+
 
 class Command(NamedTuple):
     """A subcommand: its name, its function (whose docstring is its help), its arguments."""
@@ -41,7 +56,9 @@ def argument(*flags: str, **options: Any) -> Argument:
     return Argument(flags, options)
 
 
-def count(flag: str, what: str, *, default: int, least: int = 1) -> Argument:
+def count(
+    flag: str, what: str, *, default: int, least: int = 1, dest: str = "limit", metavar: str = "N"
+) -> Argument:
     """An argument that says how many; `what` is its help, to which the default is added."""
 
     def parse(text: str) -> int:
@@ -49,7 +66,8 @@ def count(flag: str, what: str, *, default: int, least: int = 1) -> Argument:
             return int(text)
         raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, {least} or more")
 
-    return argument(flag, type=parse, default=default, metavar="N", help=f"{what} ({default})")
+    told = f"{what} ({default})"
+    return argument(flag, type=parse, default=default, dest=dest, metavar=metavar, help=told)
 
 
 def command(

@@ -71,7 +71,7 @@ def runs(arguments: argparse.Namespace) -> None:
     from webots_mcp.store.questions.runs import list_runs
 
     with reading(arguments) as connection:
-        found = list_runs(connection, robot=arguments.robot, limit=arguments.n)
+        found = list_runs(connection, robot=arguments.robot, limit=arguments.limit)
     if arguments.json:
         return _print_json(found)
     rows = [
@@ -91,7 +91,7 @@ def runs(arguments: argparse.Namespace) -> None:
 @question(
     "history", DATA_DIR, DATABASE, *RANGE, JSON,
     argument("signals", nargs="+", metavar="SIGNAL", help="names, with '*'"),
-    count("--points", "at most N buckets", default=20),
+    count("--points", "at most N buckets", default=20, dest="max_points"),
 )  # fmt: skip
 def history(arguments: argparse.Namespace) -> None:
     """Show signals over time: mean, minimum and maximum of each bucket; changes of modes and flags.
@@ -103,7 +103,7 @@ def history(arguments: argparse.Namespace) -> None:
     with reading(arguments) as connection:
         found = query_history(
             connection, range_of(connection, arguments), arguments.signals,
-            max_points=arguments.points,
+            max_points=arguments.max_points,
         )  # fmt: skip
     if arguments.json:
         return _print_json(found)
@@ -123,7 +123,7 @@ def trends(arguments: argparse.Namespace) -> None:
     with reading(arguments) as connection:
         found = find_trends(
             connection, range_of(connection, arguments), arguments.signals or ["*"],
-            limit=arguments.n,
+            limit=arguments.limit,
         )  # fmt: skip
     if arguments.json:
         return _print_json(found)
@@ -149,7 +149,7 @@ def events(arguments: argparse.Namespace) -> None:
 
     with reading(arguments) as connection:
         found = find_events(
-            connection, range_of(connection, arguments), _options(arguments), limit=arguments.n,
+            connection, range_of(connection, arguments), _options(arguments), limit=arguments.limit,
             after=arguments.after,
         )  # fmt: skip
     if arguments.json:
@@ -184,6 +184,8 @@ def _verdicts(verdicts: Verdicts) -> list[str]:
     argument("--trajectory", action="store_true", help="the way of the robot, seen from above"),
     argument("--runs", type=int, nargs="+", default=[], dest="run_ids", metavar="ID",
              help="several runs, laid over each other"),
+    count("--width", "pixels", default=900, dest="width_px", metavar="PX"),
+    count("--height", "pixels", default=500, dest="height_px", metavar="PX"),
 )  # fmt: skip
 def plot(arguments: argparse.Namespace) -> None:
     """Draw signals over time, or the way of the robot; without signals those that changed most."""
@@ -197,6 +199,8 @@ def plot(arguments: argparse.Namespace) -> None:
             arguments.signals,
             scope=scope_of(arguments),
             run_ids=arguments.run_ids,
+            width_px=arguments.width_px,
+            height_px=arguments.height_px,
             image_format=plotting.image_format_of(file),
         )
     try:
@@ -218,12 +222,12 @@ def compare(arguments: argparse.Namespace) -> None:
     """Compare runs: duration, distance, time per mode, events, and the signals that differ most."""
     from webots_mcp.store.questions.compare import compare_code, compare_runs
 
-    names = arguments.signal or ["*"]
+    wanted: dict[str, Any] = {"names": arguments.signal or ["*"], "limit": arguments.limit}
     with reading(arguments) as connection:
         if arguments.run_ids:
-            found = compare_runs(connection, arguments.run_ids, names=names, limit=arguments.n)
+            found = compare_runs(connection, arguments.run_ids, **wanted)
         else:
-            found = compare_code(connection, robot=arguments.robot, names=names, limit=arguments.n)
+            found = compare_code(connection, robot=arguments.robot, **wanted)
     if arguments.json:
         return _print_json(found)
     _print_comparison(found)

@@ -76,7 +76,7 @@ def tail(arguments: argparse.Namespace) -> None:
     with reading(arguments) as connection:
         robot = arguments.robot and resolve_robot(connection, arguments.robot, time.time())
         follower = Follower(connection, robot.id if robot else None)
-        _print_lines(follower.look(arguments.n))
+        _print_lines(follower.look(arguments.limit))
         following = not arguments.no_follow and not storage(connection)
         while following:
             time.sleep(arguments.interval)

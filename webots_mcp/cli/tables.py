@@ -7,6 +7,8 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final, TextIO, cast
 
+from webots_mcp.cli.wording import as_typed
+
 _LONGEST_CELL: Final = 110
 _RIGHT: Final = (int, float)
 
@@ -51,4 +53,4 @@ def number_text(value: float) -> str:
 def print_notes(notes: Sequence[str], file: TextIO | None = None) -> None:
     """What there is to know about an answer, below it; on stdout, or in that file."""
     for note in notes:
-        print(f"note: {text_of(note)}", file=file)
+        print(f"note: {text_of(as_typed(note))}", file=file)

@@ -3,12 +3,27 @@
 matplotlib is imported with the first picture, never with this package.
 """
 
-from webots_mcp.plotting.canvas import ImageFormat, Picture, Sheet, image_format_of
+from webots_mcp.plotting.canvas import (
+    HEIGHT_PX,
+    LEAST_HEIGHT_PX,
+    LEAST_WIDTH_PX,
+    MOST_PX,
+    WIDTH_PX,
+    ImageFormat,
+    Picture,
+    Sheet,
+    image_format_of,
+)
 from webots_mcp.plotting.question import PlotKind, plot
 from webots_mcp.plotting.signals import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
 
 __all__ = [
+    "HEIGHT_PX",
+    "LEAST_HEIGHT_PX",
+    "LEAST_WIDTH_PX",
+    "MOST_PX",
+    "WIDTH_PX",
     "ImageFormat",
     "Picture",
     "PlotKind",

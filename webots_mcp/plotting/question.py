@@ -44,7 +44,7 @@ def plot(
         bands: The text signal that stands behind the curves or colours the way; None for the mode,
             where there is one; "" for none (a trajectory is coloured by time then).
         events: Whether to mark events.
-        width_px: 300 to 2000.
+        width_px: 400 to 2000.
         height_px: 300 to 2000.
         image_format: "png" or "svg".
 

@@ -8,7 +8,16 @@ from typing import Annotated
 from mcp.server.mcpserver import Image
 from pydantic import Field
 
-from webots_mcp.plotting import Picture, PlotKind, plot
+from webots_mcp.plotting import (
+    HEIGHT_PX,
+    LEAST_HEIGHT_PX,
+    LEAST_WIDTH_PX,
+    MOST_PX,
+    WIDTH_PX,
+    Picture,
+    PlotKind,
+    plot,
+)
 from webots_mcp.server.budget import notes_of
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import (
@@ -30,6 +39,8 @@ def webots_plot(
     ] = "signals",
     signals: AnyNames = None,
     run_ids: RunIds = None,
+    width_px: Annotated[int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX)] = WIDTH_PX,
+    height_px: Annotated[int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX)] = HEIGHT_PX,
 ) -> list[str | Image]:
     """A picture of signals over time (mean line, min-max band, modes, events), or of the way.
 
@@ -45,6 +56,8 @@ def webots_plot(
             signals or (),
             scope=scope if first else replace(scope, robot=view.robot.name),
             run_ids=run_ids or (),
+            width_px=width_px,
+            height_px=height_px,
         )
         return [_caption(view, picture), Image(data=picture.data, format="png")]
 

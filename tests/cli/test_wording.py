@@ -1,0 +1,56 @@
+"""What a command answers is put in the options that a person can type."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.recordings.rows import Recorded
+from webots_mcp.cli import COMMANDS, main
+from webots_mcp.cli.wording import as_typed, speak_of
+
+
+@pytest.fixture
+def data_dir(tmp_path: Path) -> Iterator[Path]:
+    recording = Recorded(tmp_path / "webots.db")
+    for name in ("rover", "crane"):
+        recording.robot(name).state(1.5, {"last_s": 1.0, "mode": "cruise"})
+    yield tmp_path
+    recording.close()
+
+
+@pytest.mark.parametrize(
+    ("typed", "answered"),
+    [
+        ("trends --robot rover --last -3", "--last -3.0 must be"),
+        ("trends --robot rover --start 9 --end 3", "--start 9 must be less than --end 3"),
+        ("trends --robot rover --last 3 --since 0", "use --start and --end (simulation time)"),
+        ("trends --robot rover --last 3 --since 0", "or --since and --until (wall time)"),
+        ("trends", "say which one with --robot NAME"),
+        ("trends --run 77", "leave --run out"),
+        ("compare 77 78", "no run 77"),
+        ("history mode --robot rover --points 5000", "--points 5000 must be from 1 to 500"),
+        ("runs -n 5000", "-n 5000 must be from 1 to"),
+        ("events --robot rover --above 1 --below 3", "--above and --below need signals"),
+        ("events --robot rover --for 3", "--for 3 needs --above or --below"),
+        ("events --robot rover --after x", "--after 'x' is no cursor"),
+        ("plot -o p.png --robot rover --width 5000", "--width 5000 must be from 400 to 2000"),
+        ("plot -o p.png --robot rover --height 5", "--height 5 must be from 300 to 2000"),
+        ("trends lost_s --robot rover", "'lost_s'"),
+    ],
+)
+def test_an_error_names_what_was_typed(
+    typed: str, answered: str, data_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*typed.split(), "--data-dir", str(data_dir)]) == 2
+    assert answered in capsys.readouterr().err
+
+
+def test_a_quoted_name_is_somebodys_data() -> None:
+    (trends,) = (command for command in COMMANDS if command.name == "trends")
+    speak_of(trends.arguments)
+    assert as_typed("no signal 'last_s'; last_s=3 is too much since the start") == (
+        "no signal 'last_s'; --last 3 is too much since the start"
+    )

@@ -39,8 +39,12 @@ def webots_plot(
     ] = "signals",
     signals: AnyNames = None,
     run_ids: RunIds = None,
-    width_px: Annotated[int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX)] = WIDTH_PX,
-    height_px: Annotated[int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX)] = HEIGHT_PX,
+    width_px: Annotated[
+        int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="A wider picture shows more detail.")
+    ] = WIDTH_PX,
+    height_px: Annotated[
+        int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="A higher one has room for more.")
+    ] = HEIGHT_PX,
 ) -> list[str | Image]:
     """A picture of signals over time (mean line, min-max band, modes, events), or of the way.
 

@@ -19,7 +19,7 @@ MOST_LANES: Final = 5  # in one picture
 
 
 def event_lanes(
-    connection: sqlite3.Connection, part: Part, names: Sequence[str], rows: int
+    connection: sqlite3.Connection, part: Part, names: Sequence[str], rows: int = MOST_LANES
 ) -> tuple[list[Lane], list[str]]:
     """One lane per kind of event, and notes: of the drawn signals, and of the robot as a whole.
 

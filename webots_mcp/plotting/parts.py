@@ -11,7 +11,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.series import History, RunHistory, query_history
+from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.runs import fetch_run
 from webots_mcp.store.signals.catalogue import one_signal, signals_of
@@ -60,7 +60,7 @@ def parts_of(
     connection: sqlite3.Connection,
     ranges: Sequence[TimeRange],
     names: Sequence[str],
-    points: int,
+    points: int = MOST_POINTS,
 ) -> list[Part]:
     """Read the signals of each run in the ranges; several runs begin at 0 each.
 

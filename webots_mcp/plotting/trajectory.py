@@ -24,7 +24,6 @@ from webots_mcp.plotting.path import read_path
 from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.questions.series import MOST_POINTS
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal
@@ -78,7 +77,7 @@ def compose_trajectory(
     mode = mode_signal(known, bands)
     flags = _flags(known) if events else []
     names = [x.name, y.name, *([mode] if mode else []), *flags]
-    parts = parts_of(connection, ranges, names, MOST_POINTS)
+    parts = parts_of(connection, ranges, names)
     tracks: list[Track] = []
     for part in parts:
         modes = _lane(part, mode) if len(parts) == 1 else None

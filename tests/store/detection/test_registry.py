@@ -11,7 +11,7 @@ import pytest
 
 import webots_mcp
 from tests.recordings.rover import Recorder
-from webots_mcp.plotting.marks import event_lanes
+from webots_mcp.plotting.event_lanes import event_lanes
 from webots_mcp.plotting.parts import parts_of
 from webots_mcp.store.detection import registry
 from webots_mcp.store.detection.event import Event, EventOptions
@@ -57,7 +57,7 @@ def test_a_kind_that_is_entered_once_is_found_compared_told_and_drawn(
     assert [spread and round(spread.median, 1) for spread in measure.spread] == [2.0, 2.0]
     (part,) = parts_of(tilting, [whole], ["tilt"])
     lanes, _ = event_lanes(tilting, part, ["tilt"])
-    assert lanes[0].name == "tilted" and len(lanes[0].spans) == 2
+    assert lanes[0].name == "tilted" and len(lanes[0].intervals) == 2
 
 
 def test_nothing_but_its_own_file_and_the_registry_names_a_kind() -> None:

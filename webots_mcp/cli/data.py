@@ -118,7 +118,7 @@ def prune(arguments: argparse.Namespace) -> None:
     """
     from webots_mcp.store.retention import in_force, plan
     from webots_mcp.store.retention.limits import set_limits
-    from webots_mcp.store.retention.stock import file_sizes
+    from webots_mcp.store.retention.usage import file_sizes
 
     limits = limits_of(arguments)
 

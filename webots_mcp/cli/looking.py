@@ -31,7 +31,7 @@ def status(arguments: argparse.Namespace) -> None:
     """Show the robots: whether they run, how old their data is, what could not be recorded."""
     import webots_mcp.store.recording as recordings
     from webots_mcp.store.retention.limits import described
-    from webots_mcp.store.retention.stock import file_sizes
+    from webots_mcp.store.retention.usage import file_sizes
     from webots_mcp.store.robots import list_robots
 
     recording = open_recording(arguments)

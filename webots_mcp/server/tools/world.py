@@ -13,7 +13,7 @@ from webots_mcp.server.shortening import cut_text, round_number
 from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention.limits import described, unheeded
-from webots_mcp.store.retention.stock import file_sizes
+from webots_mcp.store.retention.usage import file_sizes
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.runs import Run, count_runs
 from webots_mcp.store.sessions import Session, companions, fetch_session

@@ -21,9 +21,13 @@ _CHANGES: Final = (
     "SELECT sim_time_s, value FROM change WHERE run_id = ? AND signal_id = ? AND sim_time_s < ? "
     "ORDER BY state_id"
 )
-_FIRST_VALUE: Final = (
-    "SELECT first_sim_time_s FROM all_rollup WHERE run_id = ? AND signal_id = ? "
-    "AND first_sim_time_s IS NOT NULL ORDER BY bucket LIMIT 1"
+# Of each table the first bucket: in `all_rollup` SQLite would sort all of them.
+_FIRST_VALUE: Final = "SELECT min(first_sim_time_s) FROM ({})".format(
+    " UNION ALL ".join(
+        f"SELECT * FROM (SELECT first_sim_time_s FROM {table} WHERE run_id = :run "
+        "AND signal_id = :signal AND first_sim_time_s IS NOT NULL ORDER BY bucket LIMIT 1)"
+        for table in ("rollup", "recent_rollup")
+    )
 )
 
 
@@ -77,7 +81,8 @@ def _earlier(
     deadline: Deadline,
 ) -> list[Point]:
     """The points from before the first stored one: then it was a number, which has none stored."""
-    first = connection.execute(_FIRST_VALUE, (segment.run_id, signal.id)).fetchone()
+    values = {"run": segment.run_id, "signal": signal.id}
+    first = connection.execute(_FIRST_VALUE, values).fetchone()
     end_s = min(points[0].sim_time_s if points else math.inf, segment.end_s)
     if first is None or first[0] is None or first[0] >= end_s:
         return []

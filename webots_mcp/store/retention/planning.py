@@ -13,7 +13,7 @@ from typing import Final
 
 from webots_mcp.contract import FINAL_STATUSES
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Limit, Retention
-from webots_mcp.store.retention.stock import (
+from webots_mcp.store.retention.usage import (
     TABLES,
     Holding,
     Oldest,

@@ -22,7 +22,7 @@ from webots_mcp.store.images import inside
 from webots_mcp.store.retention.planning import OLD_COMMANDS, ROLLED, Plan, plan
 from webots_mcp.store.retention.planning import Step as Going
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
-from webots_mcp.store.retention.stock import TABLES
+from webots_mcp.store.retention.usage import TABLES
 from webots_mcp.store.rollup.rolling import roll, watermark
 
 BATCH_ROWS: Final = 500

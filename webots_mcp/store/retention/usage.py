@@ -1,4 +1,4 @@
-"""What each run holds, and about how much room it takes."""
+"""How much each run holds, and about how much room it takes on the disk."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 import time
 from collections.abc import Iterable, Sequence
@@ -29,7 +30,7 @@ _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
     "swing": ("oscillation",),
     "gap": ("gap",),
 }
-_OTHER_SIGNALS: Final = "not in "  # why some are never searched
+_OTHER_SIGNALS: Final = re.compile(r"not in \d+ of ")  # signals that are never searched
 _OF_ROBOT: Final = frozenset[Measure]({"standstill", "stuck", "leap", "gap"})
 
 
@@ -74,7 +75,8 @@ class Answer:
     def admits(self, measure: Measure) -> bool:
         """Whether it says that something of that kind may have been missed."""
         reasons = [self.not_searched.get(kind, "") for kind in _KINDS[measure]]
-        return any(reason and not reason.startswith(_OTHER_SIGNALS) for reason in reasons)
+        parts = [part for reason in reasons for part in reason.split("; ")]
+        return any(part and not _OTHER_SIGNALS.match(part) for part in parts)
 
 
 def ask_run(

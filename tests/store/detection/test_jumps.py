@@ -86,3 +86,12 @@ def test_a_jump_exactly_at_the_begin_of_a_range_is_in_it(
     for start_s, end_s, count in ((100.0, 150.0, 1), (50.0, 100.0, 0), (99.9, 100.0, 0)):
         asked = resolve_range(empty, start_s=start_s, end_s=end_s)
         assert len(find_events(empty, asked, EventOptions(kinds=("jump",))).events) == count
+
+
+def test_dropouts_everywhere_in_a_long_range_are_found_or_named_as_not_searched(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, lambda t: {"front": 0.0 if round(10 * t) % 70 == 33 else 2 + 0.1 * math.sin(t)})
+    asked = EventOptions(kinds=("jump",))
+    answer = find_events(empty, resolve_range(empty), asked)
+    assert answer.events or "vary as most do" in answer.verdicts.not_searched["jump"]

@@ -267,6 +267,10 @@ class LongView:
                 f"of {signal.name} only in the {JUMP_BUCKETS} widest of {len(wide)} "
                 "stretches of 10 s: ask for less time to see the others"
             )
+        elif len(wide) < len(widths):
+            self.notes.append(
+                f"not in stretches of {BUCKET_S:g} s that vary as most do: ask for less time"
+            )
         for _, bucket in sorted(sorted(wide, reverse=True)[:JUMP_BUCKETS], key=_bucket):
             if self._deadline.passed:
                 self._cut()

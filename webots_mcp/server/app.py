@@ -15,6 +15,7 @@ from webots_mcp import __version__
 from webots_mcp.contract import Database
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.server.declaring import tools_of
+from webots_mcp.server.prompts import add_prompts
 from webots_mcp.server.resources import add_resources
 from webots_mcp.server.tools import (
     commands,
@@ -85,6 +86,7 @@ def create_server(
         lifespan=_maintaining(None if read_only else database, Upkeep(data_dir), asked),
     )
     add_resources(mcp, recording)
+    add_prompts(mcp)
     return mcp
 
 

@@ -82,6 +82,14 @@ def test_more_modes_than_can_be_told_apart_share_a_name_and_a_note_lists_them(
     assert merged in compose_trajectory(connection, [whole(connection)])[1]
 
 
+def test_each_of_many_modes_is_drawn_where_it_was(record: Record) -> None:
+    connection = record(lambda t: {"mode": "go" if t % 1 < 0.5 else "turn", "x": t}, 4000)
+    axes, notes = compose_signals(connection, [whole(connection)], ["x"])
+    assert axes.bands is not None
+    assert (len(axes.bands.intervals), axes.bands.intervals[0].start_s) == (800, 0)
+    assert not [note for note in notes if "changes" in note]
+
+
 def test_events_are_of_the_drawn_signals_and_of_the_robot(rover: sqlite3.Connection) -> None:
     axes = signals_of_run(rover, "ir")
     events = {lane.name: [interval.value for interval in lane.intervals] for lane in axes.events}

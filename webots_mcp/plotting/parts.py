@@ -19,6 +19,7 @@ from webots_mcp.store.signals.registry import Signal
 
 Known = dict[str, Signal]
 
+MOST_CHANGES: Final = 5000  # of one text or flag; more would be a grey haze
 MOST_RUNS: Final = 4  # more lines of each signal could not be told apart
 
 
@@ -99,9 +100,12 @@ def _histories(
     least_step_s = 0.0
     while True:
         histories = [
-            query_history(connection, each, names, max_points=points, least_step_s=least_step_s)
+            query_history(
+                connection, each, names, max_points=points, max_changes=MOST_CHANGES,
+                least_step_s=least_step_s,
+            )
             for each in ranges
-        ]
+        ]  # fmt: skip
         runs = [run for history in histories for run in history.runs if run.sim_time_s]
         steps_s = {run.step_s or 0.0 for run in runs}
         if len(steps_s) <= 1 or max(steps_s) == least_step_s:

@@ -11,10 +11,9 @@ from itertools import accumulate, pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.naming import Value
-from webots_mcp.store.questions.series import MOST_POINTS, query_history
+from webots_mcp.plotting.parts import Part
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rhythm_of
-from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.reading.rows import exceeds, read_columns
 from webots_mcp.store.signals.registry import Signal
 
@@ -64,12 +63,11 @@ class Path:
         return self.places[max(0, start - 1) : end + 1]
 
 
-def read_path(connection: sqlite3.Connection, time_range: TimeRange, x: Signal, y: Signal) -> Path:
-    """The places in a range of one run: of every row, or of 500 moments if the rows are many."""
-    (segment,) = time_range.segments
+def read_path(connection: sqlite3.Connection, part: Part, x: Signal, y: Signal) -> Path:
+    """The places of one run: of every row, or of the part's buckets if the rows are many."""
+    (segment,) = part.range.segments
     if exceeds(connection, segment):
-        names = [x.name, y.name]
-        (run,) = query_history(connection, time_range, names, max_points=MOST_POINTS).runs
+        run = part.run
         by_name = {columns.name: columns.last for columns in run.numbers}
         return _path(run.sim_time_s, by_name[x.name], by_name[y.name], run.step_s)
     columns = read_columns(connection, segment, [x, y], Deadline())

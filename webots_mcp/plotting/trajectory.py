@@ -84,7 +84,7 @@ def compose_trajectory(
         marks = [_flagged(part, flag) for flag in flags]
         if events:
             marks.insert(0, stuck_mark(connection, part, (x.name, y.name)))
-        tracks.append(Track(part.name, read_path(connection, part.range, x, y), modes, marks))
+        tracks.append(Track(part.name, read_path(connection, part, x, y), modes, marks))
     if not any(track.path.places for track in tracks):
         raise NothingRecordedError(f"{x.name} and {y.name} have no values in {title_of(parts)}")
     metres = None if position else "m"

@@ -14,6 +14,7 @@ from webots_mcp.plotting.palette import DASHES, FAINT, INK, LINES, area_styles
 from webots_mcp.plotting.path import Path, Place, extent, headings, thinned
 
 _ARROWS: Final = 9
+_BREAK: Final = Place(math.nan, math.nan, math.nan)
 _TICK_PX: Final = 45
 _ON_THE_SPOT: Final = 0.03  # of the size of the whole way
 _LEAST_SIZE: Final = 0.02  # of the picture, in the unit of the position
@@ -129,7 +130,7 @@ def _paint_in_one_colour(axes: Any, track: Track, index: int) -> list[Entry]:
     pen: dict[str, Any] = {"color": LINES[index % len(LINES)], "linewidth": 1.6}
     pen["linestyle"] = DASHES[index % len(DASHES)]
     for piece in track.path.pieces():
-        _line(axes, piece, **pen)
+        _line(axes, [piece], **pen)
     return [(Line2D([], [], **pen), track.name)]
 
 
@@ -137,17 +138,20 @@ def _paint_modes(axes: Any, path: Path, modes: Lane) -> list[Entry]:
     from matplotlib.lines import Line2D
 
     styles = area_styles(modes.values)
+    stretches: dict[str, list[Sequence[Place]]] = {value: [] for value in modes.values}
+    spot = _ON_THE_SPOT * extent(path.places)
     for piece in path.pieces():
-        _line(axes, piece, color=INK, linewidth=4.4)  # an edge, so that light colours are seen
+        _line(axes, [piece], color=INK, linewidth=4.4)  # an edge, so that light colours are seen
         part = Path(piece, None, frozenset())
         for interval in modes.intervals:
             held = part.between(interval.start_s, interval.end_s)
-            style = styles[interval.value]
-            _line(axes, held, color=style.colour, linewidth=3)
-            if style.dotted:
-                _line(axes, held, **_DOTTED)
-            if len(held) > 1 and extent(held) < _ON_THE_SPOT * extent(path.places):
-                _dot(axes, held[-1], style.colour)
+            stretches[interval.value].append(held)
+            if len(held) > 1 and extent(held) < spot:
+                _dot(axes, held[-1], styles[interval.value].colour)
+    for value, held in stretches.items():
+        _line(axes, held, color=styles[value].colour, linewidth=3)
+        if styles[value].dotted:
+            _line(axes, held, **_DOTTED)
     shown: list[Entry] = []
     for value, style in ((value, styles[value]) for value in modes.values):
         line = Line2D([], [], color=style.colour, linewidth=4)
@@ -178,10 +182,11 @@ def _paint_time(figure: Any, axes: Any, path: Path) -> list[Entry]:
     return []
 
 
-def _line(axes: Any, places: Sequence[Place], **style: Any) -> Any:
-    kept = thinned(places)
+def _line(axes: Any, stretches: Sequence[Sequence[Place]], **style: Any) -> None:
+    """One line, broken between the stretches."""
+    kept = [place for stretch in stretches for place in (*thinned(stretch), _BREAK)]
     style = {"solid_capstyle": "round", "zorder": 3} | style
-    return axes.plot([place.x for place in kept], [place.y for place in kept], **style)
+    axes.plot([place.x for place in kept], [place.y for place in kept], **style)
 
 
 def _paint_headings(axes: Any, path: Path, colour: str) -> None:

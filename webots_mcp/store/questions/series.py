@@ -120,6 +120,7 @@ def query_history(
     names: Sequence[str],
     *,
     max_points: int = DEFAULT_POINTS,
+    max_changes: int | None = None,
     least_step_s: float = 0.0,
     deadline_s: float = QUESTION_DEADLINE_S,
 ) -> History:
@@ -134,6 +135,7 @@ def query_history(
         time_range: From `resolve_range`; over several runs each gets its share of the points.
         names: Signals, with `*`.
         max_points: 1 to 500.
+        max_changes: The most changes of a text or flag in a run; None for as many as points.
         least_step_s: The least length of a bucket, so that runs of unlike length can be drawn over
             each other; 0 leaves it open.
         deadline_s: After it, what was read so far is the answer, and says so.
@@ -148,8 +150,8 @@ def query_history(
     deadline = Deadline(deadline_s)
     runs = [
         _run_history(
-            connection, segment, signals, _share(max_points, segment, total_s), deadline,
-            least_step_s,
+            connection, segment, signals, _share(max_points, segment, total_s), max_changes,
+            deadline, least_step_s,
         )
         for segment in time_range.segments
     ]  # fmt: skip
@@ -165,6 +167,7 @@ def _run_history(
     segment: Segment,
     signals: Sequence[Signal],
     max_points: int,
+    max_changes: int | None,
     deadline: Deadline,
     least_step_s: float,
 ) -> RunHistory:
@@ -182,7 +185,9 @@ def _run_history(
         sim_time_s=list(table.starts),
         numbers=tuple(_columns(signal, table) for signal in numbers),
         changes=tuple(
-            _change_columns(signal, points[signal.name], segment, bounds[1], max_points)
+            _change_columns(
+                signal, points[signal.name], segment, bounds[1], max_changes or max_points
+            )
             for signal in states
         ),
         rows=table.rows,
@@ -213,7 +218,7 @@ def _columns(signal: Signal, table: Table) -> NumberColumns:
 
 
 def _change_columns(
-    signal: Signal, points: list[Point], segment: Segment, newest_s: float, max_points: int
+    signal: Signal, points: list[Point], segment: Segment, newest_s: float, most: int
 ) -> ChangeColumns:
     seconds = longest_values(points, segment.start_s, min(segment.end_s, newest_s))
-    return ChangeColumns(signal.name, signal.kind, points[-max_points:], len(points), seconds)
+    return ChangeColumns(signal.name, signal.kind, points[-most:], len(points), seconds)

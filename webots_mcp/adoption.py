@@ -61,6 +61,7 @@ SESSION_COLUMNS: Final = (
     "started_wall_time_s",
     "last_seen_wall_time_s",
     "last_seen_monotonic_s",
+    "throttle_interval",
 )
 _NEW_SESSION: Final = (
     f"INSERT INTO session (robot_id, {', '.join(SESSION_COLUMNS)}) "

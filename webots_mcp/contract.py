@@ -68,7 +68,12 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "screenshot": BuiltInAction(),
     "reset_state": BuiltInAction(needs_supervisor=False, runs_user_code=True),
     "set_parameters": BuiltInAction(needs_supervisor=False),
+    "arm_breakpoints": BuiltInAction(needs_supervisor=False),
 }
+
+BreakpointAction = Literal["pause", "log"]
+BREAKPOINT_ACTIONS: Final[tuple[BreakpointAction, ...]] = get_args(BreakpointAction)
+MAX_BREAKPOINTS: Final = 32  # of one robot that are armed
 
 COMMAND_TIME_TO_LIVE_S: Final = 10.0
 HEARTBEAT_INTERVAL_S: Final = 0.5  # how often a session says that its loop is alive

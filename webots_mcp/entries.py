@@ -39,6 +39,8 @@ Kind = Literal[
     "command issued",
     "command finished",
     "reload confirmed",
+    "breakpoint hit",
+    "breakpoint failed",
 ]
 Values = tuple[Any, ...] | dict[str, Any]
 
@@ -124,6 +126,8 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND action = 'reload' "
         "AND status = 'claimed' AND issued_wall_time_s IS NOT NULL"
     ),
+    "breakpoint hit": "UPDATE breakpoint SET hits = hits + 1 WHERE id = ?",
+    "breakpoint failed": "UPDATE breakpoint SET enabled = 0, error = ? WHERE id = ?",
 }
 ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction
 FORMAT: Final = 1  # of the file; whoever knows another one leaves the file alone

@@ -41,7 +41,7 @@ CREATE TABLE session (
 	rows_dropped INTEGER DEFAULT 0 NOT NULL /* rows that could never be written */, 
 	last_error TEXT /* newest thing that could not be recorded, and why */, 
 	ended_wall_time_s FLOAT, 
-	end_reason TEXT /* finished, reload, crashed, replaced */, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, process TEXT /* which process of that pid; null where the system does not tell */ NULL, last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */ NULL, extern INTEGER /* 1 where nobody starts the controller again */ NULL, hold_mode TEXT /* simulation mode to go back to when the hold ends */ NULL, adopted_rows INTEGER DEFAULT 0 /* number of the last entry taken in from its file beside */ NOT NULL, 
+	end_reason TEXT /* finished, reload, crashed, replaced */, uuid TEXT /* random (version 4); names the row among those of all machines */ NULL, process TEXT /* which process of that pid; null where the system does not tell */ NULL, last_seen_monotonic_s FLOAT /* the host's monotonic clock at last_seen_wall_time_s */ NULL, extern INTEGER /* 1 where nobody starts the controller again */ NULL, hold_mode TEXT /* simulation mode to go back to when the hold ends */ NULL, adopted_rows INTEGER DEFAULT 0 /* number of the last entry taken in from its file beside */ NOT NULL, throttle_interval INTEGER /* of so many publish() calls one is recorded */ NULL, 
 	CONSTRAINT fk_session_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_session_robot_id_id ON session (robot_id, id);
@@ -399,6 +399,23 @@ CREATE TABLE coarse_rollup (
 	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
  WITHOUT ROWID;
+CREATE TABLE breakpoint (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	robot_id INTEGER NOT NULL, 
+	session_id INTEGER, 
+	condition TEXT NOT NULL /* see docs/conditions.md */, 
+	action TEXT NOT NULL /* pause or log */, 
+	after_hits INTEGER DEFAULT 1 NOT NULL /* the action is taken from this hit of a run on */, 
+	enabled INTEGER DEFAULT 1 NOT NULL /* 0 once the condition failed */, 
+	hits INTEGER DEFAULT 0 NOT NULL /* how often it began to hold, in all runs */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	created_by TEXT /* mcp, cli or controller: its code, for session_id only */, 
+	error TEXT /* why the condition failed */, 
+	CONSTRAINT fk_breakpoint_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE CASCADE, 
+	CONSTRAINT fk_breakpoint_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
+);
+CREATE INDEX ix_breakpoint_robot_id ON breakpoint (robot_id);
+CREATE INDEX ix_breakpoint_session_id ON breakpoint (session_id);
 CREATE TABLE parameter (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	robot_id INTEGER NOT NULL, 

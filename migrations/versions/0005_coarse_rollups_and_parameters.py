@@ -2,7 +2,8 @@
 
 They are made from those of 10 s while the server maintains the database, also of older recordings.
 
-And parameters that a controller declares, and the values that they had in each run.
+And parameters that a controller declares, and the values that they had in each run; breakpoints;
+how many of its publish() calls a session records.
 
 Revision ID: 0005
 Revises: 0004
@@ -56,6 +57,13 @@ def upgrade() -> None:
         ),
     )
     create_coarse_rollup()
+    op.add_column(
+        "session",
+        sa.Column(
+            "throttle_interval", sa.Integer(), comment="of so many publish() calls one is recorded"
+        ),
+    )
+    create_breakpoint()
     create_parameter()
     create_parameter_value()
     if op.get_context().dialect.name == "sqlite":
@@ -150,7 +158,59 @@ def create_parameter_value() -> None:
     )
 
 
+def create_breakpoint() -> None:
+    op.create_table(
+        "breakpoint",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("robot_id", sa.Integer(), nullable=False),
+        sa.Column("session_id", sa.Integer()),
+        sa.Column("condition", sa.Text(), nullable=False, comment="see docs/conditions.md"),
+        sa.Column("action", sa.Text(), nullable=False, comment="pause or log"),
+        sa.Column(
+            "after_hits",
+            sa.Integer(),
+            server_default=sa.text("1"),
+            nullable=False,
+            comment="the action is taken from this hit of a run on",
+        ),
+        sa.Column(
+            "enabled",
+            sa.Integer(),
+            server_default=sa.text("1"),
+            nullable=False,
+            comment="0 once the condition failed",
+        ),
+        sa.Column(
+            "hits",
+            sa.Integer(),
+            server_default=sa.text("0"),
+            nullable=False,
+            comment="how often it began to hold, in all runs",
+        ),
+        sa.Column("created_wall_time_s", sa.Float(), nullable=False),
+        sa.Column(
+            "created_by", sa.Text(), comment="mcp, cli or controller: its code, for session_id only"
+        ),
+        sa.Column("error", sa.Text(), comment="why the condition failed"),
+        sa.ForeignKeyConstraint(
+            ["robot_id"], ["robot.id"], name=op.f("fk_breakpoint_robot_id"), ondelete="CASCADE"
+        ),
+        sa.ForeignKeyConstraint(
+            ["session_id"],
+            ["session.id"],
+            name=op.f("fk_breakpoint_session_id"),
+            ondelete="SET NULL",
+        ),
+        sa.PrimaryKeyConstraint("id"),
+        sqlite_autoincrement=True,
+    )
+    op.create_index(op.f("ix_breakpoint_robot_id"), "breakpoint", ["robot_id"])
+    op.create_index(op.f("ix_breakpoint_session_id"), "breakpoint", ["session_id"])
+
+
 def downgrade() -> None:
+    op.drop_table("breakpoint")
+    op.drop_column("session", "throttle_interval")
     if op.get_context().dialect.name == "sqlite":
         op.execute("DROP VIEW robot_parameter")
     op.drop_table("parameter_value")

@@ -80,6 +80,26 @@ def test_a_world_that_a_person_begins_anew_during_a_hold_can_be_resumed(
     assert sum("left the loop" in line for line in simulation.console) == 1
 
 
+def test_a_breakpoint_in_fast_mode_pauses_at_the_very_step(start: Start, filed: Recording) -> None:
+    simulation = start(
+        """
+bridge.breakpoint("time > 2 for 0.1")
+"""
+        + LOOP,
+        mode="fast",
+    )
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+    simulation.wait_for(lambda: filed.rows("SELECT hold FROM session") == ["paused"], timeout_s=30)
+    (hit_s,) = filed.rows("SELECT sim_time_s FROM event WHERE kind = 'breakpoint'")
+    # 2.016 is the first step beyond 2 s; 7 steps later it has lasted for 0.1 s.
+    assert hit_s == pytest.approx(2.128)
+    assert simulation.time_s == pytest.approx(hit_s)
+    assert filed.rows("SELECT max(sim_time_s) FROM state") == [pytest.approx(hit_s)]
+    assert simulation.mode is Mode.PAUSE
+    assert wait(simulation, filed, filed.send("fast"))["mode"] == "fast"
+    simulation.wait_for(lambda: simulation.time_s > hit_s + 1)
+
+
 @pytest.fixture
 def extern_world(tmp_path: Path) -> Path:
     text = DEFAULT_WORLD.read_text(encoding="utf-8").replace(

@@ -35,6 +35,7 @@ READING = {
     "webots_compare_runs",
     "webots_plot",
     "webots_query_sql",
+    "webots_list_breakpoints",
 }
 ACTING = {
     "webots_annotate_run",
@@ -44,6 +45,8 @@ ACTING = {
     "webots_world_reset",
     "webots_reset_controller_state",
     "webots_send_command",
+    "webots_breakpoint",
+    "webots_remove_breakpoint",
 }
 SHARED = ("robot", "run_id", "last_s", "start_s", "end_s", "timeout_s", "cursor")
 

@@ -52,7 +52,7 @@ def pause(context: Context, command: Command) -> Progress:
     if context.throttle.stale and not context.pause.active:
         context.throttle.want()
         yield
-    context.pause.begin(command)
+    context.pause.begin(command_id=command.id)
     return _mode(context)
 
 
@@ -86,14 +86,15 @@ def step(context: Context, command: Command) -> Progress:
     from_s, from_step = clock.sim_time_s, clock.steps_seen
     context.pause.end(command, stepping=True)
     try:
-        while (made := clock.steps_seen - from_step) < steps:
+        while (made := clock.steps_seen - from_step) < steps and not context.pause.active:
             yield
     except CommandRefusedError as interruption:
         made = clock.steps_seen - from_step
         raise CommandRefusedError(f"{interruption} after {made} of {steps} steps") from None
-    context.pause.begin(command)
+    why = {"why": "a breakpoint paused it before the last step"} if made < steps else {}
+    context.pause.begin(command_id=command.id)
     advanced_s = round(clock.sim_time_s - from_s, 6)
-    return {"steps": made, "advanced_s": advanced_s, **_mode(context)}
+    return {"steps": made, "advanced_s": advanced_s, **_mode(context), **why}
 
 
 @_built_in
@@ -180,6 +181,14 @@ def set_parameters(context: Context, command: Command) -> Progress:
     changed = parameters.set_now(given, setter)
     shown = {name: {"old": old, "new": new} for name, (old, new) in changed.items()}
     return {"values": shown, "since_sim_time_s": clock.sim_time_s, "run_id": clock.run.id}
+    yield
+
+
+@_built_in
+def arm_breakpoints(context: Context, command: Command) -> Progress:
+    """Read the breakpoints anew: some were set or removed."""
+    context.breakpoints.load()
+    return context.breakpoints.describe()
     yield
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.commands import CommandQueue
 from webots_mcp.bridge.heartbeat import Heartbeat
@@ -31,3 +32,4 @@ class Context(NamedTuple):
     queue: CommandQueue
     pause: Pause
     parameters: Parameters
+    breakpoints: Breakpoints

@@ -51,7 +51,7 @@ class Control:
             The command that was handled last in this call, if any.
         """
         now = time.monotonic()
-        if now < self._next_poll_s and not self._under_way:
+        if now < self._next_poll_s and not (self._under_way or self._context.pause.active):
             return None
         self._next_poll_s = now + POLL_INTERVAL_S
         self._advance_all()

@@ -32,9 +32,10 @@ class Identity(NamedTuple):
     controller_sha256: str | None
     git_commit: str | None
     versions: dict[str, str]
+    throttle_interval: int
 
 
-def identify(robot: Any, supervisor: bool, version: str) -> Identity:
+def identify(robot: Any, supervisor: bool, version: str, throttle_interval: int) -> Identity:
     """Collect the identity; what cannot be found out is None, never an error."""
     controller = controller_file()
     return Identity(
@@ -57,6 +58,7 @@ def identify(robot: Any, supervisor: bool, version: str) -> Identity:
             "webots_mcp": version,
             "sqlite": sqlite3.sqlite_version,
         },
+        throttle_interval=throttle_interval,
     )
 
 

@@ -25,6 +25,7 @@ from webots_mcp.contract import (
     LOG_LEVELS,
     STRICT_VARIABLE,
     THROTTLE_VARIABLE,
+    BreakpointAction,
     Database,
     MemoryDatabase,
     find_log_level,
@@ -256,6 +257,31 @@ class MCPBridge:
             name, default, low=low, high=high, choices=choices, doc=doc, unit=unit
         )
         return self._session.context.parameters.declare(declaration)
+
+    def breakpoint(
+        self, condition: str, action: BreakpointAction = "pause", after_hits: int = 1
+    ) -> int | None:
+        """Do something when a condition begins to hold, as long as this session lasts.
+
+            bridge.breakpoint("front_m < 0.1 for 0.5", action="log")
+
+        It is asked of each published state, also of those that are not recorded, and armed again
+        after a reset. A hit is recorded as an event with the state's values, and the state is.
+
+        Args:
+            condition: In the language of docs/conditions.md.
+            action: `pause` pauses the simulation at that very step, which needs a Supervisor;
+                `log` only records the hit.
+            after_hits: The action is taken from this hit of a run on.
+
+        Returns:
+            Its id; None while the database cannot be written.
+
+        Raises:
+            InvalidInputError: The condition is not of the language, there is no such action, or
+                there are 32 breakpoints already.
+        """
+        return self._session.context.breakpoints.set(condition, action, after_hits)
 
     def on_reload(self, callback: Callable[[], object]) -> None:
         """Call `callback` once for each reload or reset of the world, and on `reset_state`.

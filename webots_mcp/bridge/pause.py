@@ -55,13 +55,17 @@ class Pause:
         """The simulation mode now, or the one before the pause."""
         return self._mode_before if self.active else self._simulation.mode_name
 
-    def begin(self, command: Command) -> None:
-        """Pause the simulation and keep the loop from here on."""
+    def begin(self, **cause: object) -> None:
+        """Pause the simulation and keep the loop from here on.
+
+        Args:
+            cause: What it is paused for, as its event tells it.
+        """
         if self.active:
             return
         self._activate(self._simulation.mode_name)
         self._simulation.set_mode("pause")
-        self._journal.event("pause", {"command_id": command.id})
+        self._journal.event("pause", cause)
         self._heartbeat.change_loop(PAUSED, self._mode_before)
 
     def end(self, command: Command, mode: str | None = None, *, stepping: bool = False) -> None:

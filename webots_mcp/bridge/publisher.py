@@ -27,24 +27,36 @@ class Publisher:
         self._clock = context.clock
         self._heartbeat = context.heartbeat
         self._throttle = context.throttle
+        self._breakpoints = context.breakpoints
         self._runs = runs
         self._changes = Changes()
         self._run = context.clock.run
         self.cost = PublishCost()
 
     def publish(self, state: Mapping[Any, Any], force: bool) -> None:
-        """Record the state if it is this call's turn."""
+        """Record the state if it is this call's turn, or a breakpoint is hit."""
         if self._clock.look():
             self._runs.begin()
-        if self._throttle.admits(force or self._heartbeat.loop is not None):
+        hit = self._breakpoints.look(state) if self._breakpoints.concerned else ()
+        if self._throttle.admits(bool(force or hit or self._heartbeat.loop)):
             self._record(state)
+        if hit:
+            self._breakpoints.act(hit, state)
 
     def publish_devices(self, extra: Mapping[Any, Any], include_time: bool) -> None:
-        """Record what the devices say, if it is this call's turn."""
+        """Record what the devices say; they are read if it is this call's turn.
+
+        While breakpoints are armed they are read in every call.
+        """
         if self._clock.look():
             self._runs.begin()
-        if self._throttle.admits(self._heartbeat.loop is not None):
-            self._record({**self._read_devices(include_time), **_finite(extra)})
+        if self._breakpoints.concerned:
+            self.publish(self._read(extra, include_time), force=False)
+        elif self._throttle.admits(self._heartbeat.loop is not None):
+            self._record(self._read(extra, include_time))
+
+    def _read(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
+        return {**self._read_devices(include_time), **_finite(extra)}
 
     def _record(self, state: Mapping[Any, Any]) -> None:
         started_s = time.perf_counter()

@@ -164,4 +164,5 @@ def describe_session(identity: Identity, uuid: str, actions: str) -> dict[str, A
         "started_wall_time_s": now_s,
         "last_seen_wall_time_s": now_s,
         "last_seen_monotonic_s": time.monotonic(),
+        "throttle_interval": identity.throttle_interval,
     }

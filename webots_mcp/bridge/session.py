@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
+from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.commands import Command, CommandQueue
 from webots_mcp.bridge.context import Context
@@ -54,7 +55,9 @@ class Session:
     ) -> None:
         from webots_mcp import __version__
 
-        self._identity = identify(simulation.robot, simulation.supervisor, __version__)
+        self._identity = identify(
+            simulation.robot, simulation.supervisor, __version__, throttle.interval
+        )
         clock = Clock(simulation)
         recorder = Recorder(database, self._identity, clock, errors)
         journal, heartbeat = Journal(recorder, clock), Heartbeat(recorder, clock)
@@ -63,6 +66,7 @@ class Session:
         start_values = StartValues(given, self._identity.robot_name, errors)
         parameters = Parameters(clock, recorder, start_values, self._set_parameter)
         self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters)
+        pause = Pause(simulation, journal, heartbeat, self.runs.look_after_step)
         self.context = Context(
             simulation=simulation,
             clock=clock,
@@ -73,8 +77,9 @@ class Session:
             throttle=throttle,
             reloads=reloads,
             queue=CommandQueue(recorder),
-            pause=Pause(simulation, journal, heartbeat, self.runs.look_after_step),
+            pause=pause,
             parameters=parameters,
+            breakpoints=Breakpoints(simulation, clock, recorder, journal, pause),
         )
         self.control = Control(self.context)
         self.publisher = Publisher(self.context, self.runs)
@@ -92,6 +97,7 @@ class Session:
         self.runs.begin_first(reloaded=registration is not None and registration.reloaded)
         if registration is not None:
             self._succeed_to(registration)
+        self.context.breakpoints.begin()
 
     def _succeed_to(self, registration: Registration) -> None:
         simulation, clock = self.context.simulation, self.context.clock

@@ -6,7 +6,7 @@ from __future__ import annotations
 class Throttle:
     """Every so many calls one is recorded, and whenever somebody waits for the newest state.
 
-    Args:
+    Attributes:
         interval: Every so many.
 
     Raises:
@@ -16,7 +16,7 @@ class Throttle:
     def __init__(self, interval: int) -> None:
         if interval < 1:
             raise ValueError(f"throttle_interval must be 1 or more, got {interval!r}")
-        self._interval = interval
+        self.interval = interval
         self._wanted = False
         self.calls = 0
         self.skipped = 0
@@ -29,7 +29,7 @@ class Throttle:
     def admits(self, force: bool) -> bool:
         """Count a call; True if it is to be recorded."""
         self.calls += 1
-        if self.calls % self._interval and not (force or self._wanted):
+        if self.calls % self.interval and not (force or self._wanted):
             self.skipped += 1
             self.stale = True
             return False

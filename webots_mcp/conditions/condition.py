@@ -12,7 +12,7 @@ from webots_mcp.conditions.memory import SAME_TIME_S
 from webots_mcp.conditions.reading import Plain, State
 from webots_mcp.conditions.scanning import Scanned, refusal, scan
 from webots_mcp.errors import InvalidConditionError
-from webots_mcp.naming import Value, nearest_first
+from webots_mcp.naming import Value, flatten, nearest_first
 
 _MOST_OFFERED: Final = 3
 
@@ -94,6 +94,10 @@ class Evaluator:
         place = self._position.read(state) if self._position is not None else None
         values = {name: read(state) for name, read in self._readers.items()}
         return values | dict(zip(names, place or (None, None), strict=True)) if names else values
+
+    def names_in(self, state: State) -> list[str]:
+        """The names of all values of a state, null or not."""
+        return list(flatten(self._plain(self._as_dict(state))))
 
     def _as_dict(self, state: State) -> dict[Any, Any]:
         if state.__class__ is dict:

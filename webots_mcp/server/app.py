@@ -18,6 +18,7 @@ from webots_mcp.server.declaring import tools_of
 from webots_mcp.server.prompts import add_prompts
 from webots_mcp.server.resources import add_resources
 from webots_mcp.server.tools import (
+    breakpoints,
     commands,
     control,
     events,
@@ -53,7 +54,7 @@ _PAUSE_S: Final = 0.002  # between two short writes, for the robots to write the
 # In the order in which clients list them.
 _MODULES: Final = (
     world, state, pictures, logs, monitor, signals, history, trends, events, timeline, runs, plot,
-    sql, control, commands,
+    sql, control, breakpoints, commands,
 )  # fmt: skip
 
 

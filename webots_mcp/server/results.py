@@ -140,3 +140,21 @@ class CommandsAnswer(Answer):
         default=None, description="The controller's own actions with their docstrings."
     )
     built_in: list[str] | None = None
+
+
+class BreakpointAnswer(Answer):
+    """A breakpoint that was set or removed."""
+
+    breakpoint_id: int | None = None
+    condition: str | None = None
+    action: str | None = None
+    armed: bool | None = Field(
+        default=None, description="Whether the controller asks it now; null where it did not say."
+    )
+    notes: list[str] | None = None
+
+
+class BreakpointsAnswer(Answer):
+    """The breakpoints of a robot."""
+
+    breakpoints: Table | None = None

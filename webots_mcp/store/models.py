@@ -127,6 +127,7 @@ class Session(SQLModel, table=True):
     extern: bool | None = _column(Integer, "1 where nobody starts the controller again")
     hold_mode: str | None = _text("simulation mode to go back to when the hold ends")
     adopted_rows: int = _count("number of the last entry taken in from its file beside")
+    throttle_interval: int | None = _column(Integer, "of so many publish() calls one is recorded")
 
 
 class Run(SQLModel, table=True):
@@ -335,6 +336,30 @@ class Command(SQLModel, table=True):
     finished_sim_time_s: float | None = _number()
     result: str | None = _text("JSON value")
     error: str | None = _text()
+
+
+class Breakpoint(SQLModel, table=True):
+    """A condition that a robot's bridge asks of each published state, and what it does then."""
+
+    __table_args__ = (Index(None, "robot_id"), Index(None, "session_id"), _KEEP_IDS)
+    id: int | None = _id()
+    robot_id: int = _to("robot")
+    session_id: int | None = _to("session", nullable=True)
+    condition: str = _text("see docs/conditions.md", nullable=False)
+    action: str = _text("pause or log", nullable=False)
+    after_hits: int = _column(
+        Integer,
+        "the action is taken from this hit of a run on",
+        nullable=False,
+        server_default=text("1"),
+    )
+    enabled: bool = _column(
+        Integer, "0 once the condition failed", nullable=False, server_default=text("1")
+    )
+    hits: int = _count("how often it began to hold, in all runs")
+    created_wall_time_s: float = _number(nullable=False)
+    created_by: str | None = _text("mcp, cli or controller: its code, for session_id only")
+    error: str | None = _text("why the condition failed")
 
 
 class Image(SQLModel, table=True):

@@ -1,0 +1,84 @@
+"""Breakpoints by tool: a real client, a real server, a real bridge, a robot of the stand-in."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import anyio
+import pytest
+from mcp import Client
+
+from tests.recordings.rows import Recorded
+from tests.server.conftest import Connect, Driver, ask, fail
+
+pytestmark = pytest.mark.anyio
+
+
+async def newest_state(client: Client) -> dict[str, Any]:
+    """The answer about the robot's state, once there is one."""
+    with anyio.fail_after(20):
+        while "state" not in (answer := await ask(client, "webots_get_robot_state")):
+            await anyio.sleep(0.02)
+    return answer
+
+
+async def test_a_breakpoint_pauses_at_the_step_and_is_listed_and_removed(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        at = (await newest_state(client))["state"]["steps"] + 60
+        answer = await ask(client, "webots_breakpoint", condition=f"steps == {at}")
+        assert answer["armed"] is True
+        assert "notes" not in answer and "hint" not in answer
+        with anyio.fail_after(20):
+            while (await ask(client, "webots_get_robot_state"))["status"] != "paused":
+                await anyio.sleep(0.02)
+        state = await ask(client, "webots_get_robot_state")
+        assert state["state"]["steps"] == at
+
+        listed = await ask(client, "webots_list_breakpoints")
+        row = dict(zip(listed["breakpoints"]["columns"], listed["breakpoints"]["rows"][0]))  # noqa: B905
+        assert row["id"] == answer["breakpoint_id"]
+        assert (row["hits"], row["newest_hit_s"]) == (1, state["sim_time_s"])
+
+        events = await ask(client, "webots_find_events", kinds=["noticed"])
+        assert f"steps == {at}" in json.dumps(events["events"])
+
+        removed = await ask(
+            client, "webots_remove_breakpoint", breakpoint_id=answer["breakpoint_id"]
+        )
+        assert removed["armed"] is False and "hint" not in removed
+        assert "hint" in await ask(client, "webots_list_breakpoints")
+        await ask(client, "webots_simulation_control", command="resume")
+
+
+async def test_it_says_what_is_not_there_and_refuses_what_is_no_condition(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        await newest_state(client)
+        answer = await ask(
+            client, "webots_breakpoint", condition="stesp > 5 and pose[0] > 1e9", action="log"
+        )
+        (note,) = answer["notes"]
+        assert note.startswith("stesp is missing as long as it is not published; there is steps")
+        assert "write ==" in await fail(client, "webots_breakpoint", condition="steps = 5")
+        known = answer["breakpoint_id"]
+        wrong = await fail(client, "webots_remove_breakpoint", breakpoint_id=known + 7)
+        assert f"there are {known}" in wrong
+
+
+async def test_without_a_controller_it_is_stored_and_says_so(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot("rover")
+    robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
+    async with connect() as client:
+        answer = await ask(client, "webots_breakpoint", condition="front_m < 0.1 for 0.5")
+        assert answer["armed"] is False
+        assert "stored, but not armed yet" in answer["hint"]
+        rows = (await ask(client, "webots_list_breakpoints"))["breakpoints"]["rows"]
+        assert len(rows) == 1
+        again = await ask(client, "webots_breakpoint", condition="front_m < 0.1 for 0.5")
+        assert again["breakpoint_id"] == answer["breakpoint_id"]

@@ -1,0 +1,275 @@
+"""Breakpoints: conditions that are asked of every published state, recorded or not."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.encoding import plain
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.pause import Pause
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.run import Run
+from webots_mcp.bridge.simulation import Simulation
+from webots_mcp.bridge.text import cut, describe, storable
+from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS
+from webots_mcp.errors import ConditionFailedError, InvalidConditionError, InvalidInputError
+
+if TYPE_CHECKING:
+    from webots_mcp.conditions import Condition, Evaluator
+
+MOST_EVENTS: Final = 1000  # of one breakpoint in one run; a condition that flickers is no moment
+_UNPUBLISHED_S: Final = 1.0  # a signal that was not published for so long is told
+_MOST_ERROR_CHARACTERS: Final = 1000
+_OF_CONTROLLER: Final = "controller"
+
+# Those that the controller's own code sets end with its session; texts come as bytes, because one
+# that is no UTF-8 would fail the statement.
+_ARMED: Final = (
+    "SELECT id, CAST(condition AS BLOB), CAST(action AS BLOB), after_hits FROM breakpoint "
+    "WHERE robot_id = ? AND enabled AND (created_by IS NOT ? OR session_id = ?) ORDER BY id LIMIT ?"
+)
+_FORGET: Final = (
+    "DELETE FROM breakpoint WHERE robot_id = ? AND created_by = ? AND session_id IS NOT ?"
+)
+_SET: Final = (
+    "INSERT INTO breakpoint (robot_id, session_id, condition, action, after_hits, "
+    "created_wall_time_s, created_by) VALUES (?, ?, ?, ?, ?, ?, ?) RETURNING id"
+)
+
+
+@dataclass(eq=False)
+class Breakpoint:
+    """One that is armed.
+
+    Attributes:
+        id: None where the database could not take it yet.
+        hits: How often it began to hold in this run.
+        holding: It held in the state before.
+        asked_since_s: The simulation time of the first state that it was asked of in this run.
+        unseen: Its signals that no state has held yet.
+    """
+
+    id: int | None
+    condition: Condition
+    evaluator: Evaluator
+    action: str
+    after_hits: int
+    hits: int = 0
+    holding: bool = False
+    asked_since_s: float | None = None
+    unseen: frozenset[str] = frozenset()
+
+    def begin_run(self) -> None:
+        """It is armed again."""
+        self.evaluator.forget()
+        self.hits, self.holding, self.asked_since_s = 0, False, None
+
+    def begins_to_hold(self, state: Any, sim_time_s: float) -> bool:
+        """Take in a state.
+
+        Raises:
+            ConditionFailedError: See `Evaluator.holds`.
+        """
+        held, self.holding = self.holding, self.evaluator.holds(state, sim_time_s)
+        return self.holding and not held
+
+
+class Breakpoints:
+    """Those of this robot that are armed: the stored ones, and those of the controller's code."""
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        clock: Clock,
+        recorder: Recorder,
+        journal: Journal,
+        pause: Pause,
+    ) -> None:
+        self._simulation = simulation
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._pause = pause
+        self._run: Run = clock.run
+        self._off: dict[int, str] = {}
+        self.armed: list[Breakpoint] = []
+
+    # -- setting -------------------------------------------------------------------------------
+
+    def begin(self) -> None:
+        """At the start of a session: what is stored, without what sessions before have set."""
+        registration = self._recorder.session.registration
+        if registration is not None:
+            ids = (registration.robot_id, _OF_CONTROLLER, registration.session_id)
+            self._recorder.fetch(_FORGET, ids)
+        self.load()
+
+    def load(self) -> None:
+        """Arm what is stored now; what is armed already goes on."""
+        registration = self._recorder.session.registration
+        if registration is None:
+            return
+        ids = (registration.robot_id, _OF_CONTROLLER, registration.session_id, MAX_BREAKPOINTS)
+        rows = self._recorder.fetch(_ARMED, ids)
+        known = {each.id: each for each in self.armed}
+        unstored = [each for each in self.armed if each.id is None]
+        stored = [known.get(row[0]) or self._read(*row) for row in rows]
+        self.armed = [*unstored, *filter(None, stored)]
+
+    def _read(self, number: int, text: bytes, action: bytes, after_hits: int) -> Breakpoint | None:
+        from webots_mcp.conditions import parse_condition
+
+        try:
+            condition = parse_condition(text.decode("utf-8", "replace"))
+        except InvalidConditionError as error:
+            self._turn_off(number, str(error))
+            return None
+        return _armed(number, condition, action.decode("utf-8", "replace"), int(after_hits))
+
+    def set(self, text: str, action: str, after_hits: int) -> int | None:
+        """Arm one of the controller's code, for as long as its session lasts.
+
+        Returns:
+            Its id; None while the database cannot take it, which keeps it from nothing else.
+
+        Raises:
+            InvalidInputError: The condition is not of the language, there is no such action, or
+                there are too many.
+        """
+        from webots_mcp.conditions import parse_condition
+
+        condition = parse_condition(text)
+        _require_action(action, after_hits)
+        for each in self.armed:
+            if (each.condition, each.action, each.after_hits) == (condition, action, after_hits):
+                return each.id
+        if len(self.armed) >= MAX_BREAKPOINTS:
+            raise InvalidInputError(f"{MAX_BREAKPOINTS} breakpoints are armed already: remove one")
+        number = self._store(condition.text, action, after_hits)
+        self.armed.append(_armed(number, condition, action, after_hits))
+        return number
+
+    def _store(self, text: str, action: str, after_hits: int) -> int | None:
+        registration = self._recorder.session.registration
+        if registration is None:
+            return None
+        ids = (registration.robot_id, registration.session_id)
+        values = (*ids, storable(text), action, after_hits, time.time(), _OF_CONTROLLER)
+        for (number,) in self._recorder.fetch(_SET, values):
+            return int(number)
+        return None
+
+    def describe(self) -> dict[str, object]:
+        """What is armed and what is off, by id; and whether a pause is possible."""
+        told: dict[str, object] = {"armed": [each.id for each in self.armed if each.id is not None]}
+        if self._off:
+            told["off"] = {str(number): why for number, why in self._off.items()}
+        if not self._simulation.supervisor:
+            told["cannot_pause"] = _CANNOT_PAUSE
+        return told
+
+    # -- asking --------------------------------------------------------------------------------
+
+    @property
+    def concerned(self) -> bool:
+        """Whether the next state has to be looked at: one is armed, or may be in a new run."""
+        return bool(self.armed) or self._clock.run is not self._run
+
+    def look(self, state: Any) -> list[Breakpoint]:
+        """Those that begin to hold with a state, and whose action is due; usually none."""
+        clock, hit = self._clock, list[Breakpoint]()
+        if clock.run is not self._run:
+            self._begin_run()
+        for each in tuple(self.armed):
+            try:
+                if each.begins_to_hold(state, clock.sim_time_s):
+                    self._count(each, hit)
+            except ConditionFailedError as error:
+                self._disarm(each, str(error))
+            except Exception as error:  # noqa: BLE001  (whatever an object of the user's does)
+                self._disarm(each, f"condition {each.condition.text!r}: {describe(error)}")
+            if each.unseen:
+                self._look_for_signals(each, state)
+        return hit
+
+    def _count(self, each: Breakpoint, hit: list[Breakpoint]) -> None:
+        each.hits += 1
+        if each.id is not None:
+            self._recorder.record("breakpoint hit", None, (each.id,))
+        if each.hits >= each.after_hits:
+            hit.append(each)
+
+    def act(self, hit: list[Breakpoint], state: Any) -> None:
+        """Record the hits, and pause where one of them asks for it."""
+        for each in hit:
+            if each.hits - each.after_hits < MOST_EVENTS:
+                self._tell(each, state)
+        pausing = [each for each in hit if each.action == "pause"]
+        if pausing and self._simulation.supervisor:
+            first = pausing[0]
+            self._pause.begin(breakpoint_id=first.id, condition=first.condition.text)
+
+    def _tell(self, each: Breakpoint, state: Any) -> None:
+        data: dict[str, object] = {
+            "breakpoint_id": each.id,
+            "action": each.action,
+            "hits": each.hits,
+            "values": each.evaluator.values(state),
+        }
+        if each.action == "pause" and not self._simulation.supervisor:
+            data["not_paused"] = _CANNOT_PAUSE
+        self._journal.event("breakpoint", data, each.condition.text)
+
+    def _begin_run(self) -> None:
+        self._run = self._clock.run
+        self.load()
+        for each in self.armed:
+            each.begin_run()
+
+    # -- what is wrong with one ----------------------------------------------------------------
+
+    def _disarm(self, each: Breakpoint, why: str) -> None:
+        """A condition that fails would fail with every state: it is told once, and off."""
+        self.armed.remove(each)
+        if each.id is not None:
+            self._turn_off(each.id, why)
+        self._journal.log("warning", "bridge", f"breakpoint {each.id or ''} is off: {why}")
+
+    def _turn_off(self, number: int, why: str) -> None:
+        text = storable(cut(why, _MOST_ERROR_CHARACTERS))
+        self._off[number] = text
+        self._recorder.record("breakpoint failed", None, (text, number))
+
+    def _look_for_signals(self, each: Breakpoint, state: Any) -> None:
+        """Tell once of signals that are never published: a name may be misspelt."""
+        now_s = self._clock.sim_time_s
+        if each.asked_since_s is None:
+            each.asked_since_s = now_s
+        values = each.evaluator.values(state)
+        each.unseen = frozenset(name for name in each.unseen if values.get(name) is None)
+        if each.unseen and now_s - each.asked_since_s >= _UNPUBLISHED_S:
+            each.unseen = frozenset()
+            known = each.evaluator.names_in(state)
+            for said in each.condition.describe_unknown(known):
+                self._journal.log("warning", "bridge", f"breakpoint {each.id or ''}: {said}")
+
+
+_CANNOT_PAUSE: Final = (
+    "the robot is no Supervisor: set its field `supervisor` to TRUE in the world file"
+)
+
+
+def _armed(number: int | None, condition: Condition, action: str, after_hits: int) -> Breakpoint:
+    evaluator, unseen = condition.evaluator(plain), frozenset(condition.signals)
+    return Breakpoint(number, condition, evaluator, action, after_hits, unseen=unseen)
+
+
+def _require_action(action: str, after_hits: object) -> None:
+    if action not in BREAKPOINT_ACTIONS:
+        names = " or ".join(map(repr, BREAKPOINT_ACTIONS))
+        raise InvalidInputError(f"the action of a breakpoint is {names}, not {action!r}")
+    if isinstance(after_hits, bool) or not isinstance(after_hits, int) or after_hits < 1:
+        raise InvalidInputError(f"after_hits is a whole number from 1 on, not {after_hits!r}")

@@ -32,6 +32,22 @@ def test_a_robot_whose_time_moves_is_running(recorded: Recorded) -> None:
     assert status_of(recorded.robot(now=NOW), after_s=0.6) == ("running", None)
 
 
+def test_a_loop_that_runs_and_publishes_nothing_says_so(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW, sim_time_s=20.0)
+    for i in range(4):
+        robot.state(i * 0.5, {}, at=NOW - 20 + i * 0.5)
+    status = status_of(robot, after_s=0.6)
+    assert status.is_moving
+    assert "for 18.5 s of simulation time it recorded no state" in (status.why or "")
+
+
+def test_a_loop_that_publishes_now_and_then_publishes(recorded: Recorded) -> None:
+    robot = recorded.robot(now=NOW, sim_time_s=20.0)
+    for i in range(4):
+        robot.state(i * 5.0, {}, at=NOW - 20 + i * 5)
+    assert status_of(robot, after_s=0.6) == ("running", None)
+
+
 def test_a_running_robot_stays_running_between_two_heartbeats(recorded: Recorded) -> None:
     assert status_of(recorded.robot(now=NOW), after_s=1.4).is_moving
 

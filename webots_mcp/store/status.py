@@ -33,6 +33,13 @@ _CLAIMED: Final = (
 _STILL_MOVING_S: Final = 1.0
 _SLOWEST_STILL_MOVING_S: Final = 15.0
 
+_UNPUBLISHED_S: Final = 5.0  # of wall time without a row
+_UNPUBLISHED_INTERVALS: Final = 10.0  # of the usual time between two rows
+_UNPUBLISHED: Final = (
+    "its loop runs, but for {:.1f} s of simulation time it recorded no state: is bridge.publish() "
+    "still called in the loop?"
+)
+
 _ENDED: Final = {
     "finished": "its controller finished",
     "reload": "the world was reloaded and no new controller session has appeared yet",
@@ -97,7 +104,7 @@ def judge(
     if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= still_moving_s:
         return Status(STARTING, _STARTED)
     if moved_s is not None and session.age_s(moved_s, now_s) <= still_moving_s:
-        return Status(RUNNING)
+        return Status(RUNNING, _why_unpublished(connection, session, run))
     return _stopped(session, moved_s, now_s, _why_standing(connection, session, moved_s, now_s))
 
 
@@ -109,6 +116,27 @@ def _moved_wall_time_s(
     if row is None or row.sim_time_s <= (session.sim_time_s or 0.0):
         return session.moved_wall_time_s
     return max(row.wall_time_s, session.moved_wall_time_s or row.wall_time_s)
+
+
+def _why_unpublished(
+    connection: sqlite3.Connection, session: Session, run: Run | None
+) -> str | None:
+    """That the loop goes on and records no state; None where it records, or has just begun."""
+    if run is None or run.session_id != session.id or session.sim_time_s is None:
+        return None
+    row = newest_state(connection, run.id)
+    since_s = run.started_sim_time_s if row is None else row.sim_time_s
+    usual_s = recent_interval_s(connection, run.id) or 0.0
+    unpublished_s = session.sim_time_s - since_s
+    beaten_since_s = session.last_seen_wall_time_s - (
+        run.started_wall_time_s if row is None else row.wall_time_s
+    )
+    if (
+        beaten_since_s <= max(_UNPUBLISHED_S, _UNPUBLISHED_INTERVALS * usual_s)
+        or unpublished_s <= 0
+    ):
+        return None
+    return _UNPUBLISHED.format(unpublished_s)
 
 
 def _why_ended(session: Session) -> str | None:

@@ -87,3 +87,18 @@ def test_rows_of_a_paused_simulation_count_once() -> None:
     paused = np.insert(times, 900, np.full(5000, times[900]))
     (swing,) = swings_of(paused, np.sin(np.pi * paused))
     assert swing.period_s == pytest.approx(2.0, rel=0.02)
+
+
+@pytest.mark.parametrize("speed", [0.01504, 0.0149, 0.0007])
+def test_a_steady_course_that_is_rounded_does_not_swing(speed: float) -> None:
+    """Steps of 1 and 2 ten-thousandths follow each other regularly."""
+    times = np.arange(0, 120, 0.008)
+    assert swings_of(times, np.round(speed * times, 4)) == []
+
+
+@pytest.mark.parametrize("levels", [(-0.2, 0.2), (-0.2, 0.0, 0.2, 0.0)])
+def test_what_is_switched_to_and_fro_swings(levels: tuple[float, ...]) -> None:
+    times = np.arange(0, 120, 0.032)
+    at = (times / (2.0 / len(levels))).astype(np.int64) % len(levels)
+    (swing,) = swings_of(times, np.array(levels)[at])
+    assert swing.period_s == pytest.approx(2.0, rel=0.02)

@@ -35,6 +35,8 @@ PERIODS_FITTED: Final = 2.5  # at once: over more, a swing may change a little
 TRIED_PERIODS: Final = np.linspace(0.92, 1.08, 9)  # times the period of the crossings
 NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
 MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
+SAME_NUMBER: Final = 1e-9  # of the value: what adding up floating-point numbers makes of one
+SWITCHED_VALUES: Final = 3
 MOST_OVERLAP: Final = 0.2  # of the shorter one
 
 
@@ -266,8 +268,21 @@ def _fitted(
     explained, period_s, amplitude = best
     noise = noise_of(values[rows])
     of_means = noise / np.sqrt(period_s / interval_s * count / 2)
-    if amplitude >= min(NOISE_AMPLITUDES * noise, MEAN_AMPLITUDES * of_means):
+    if amplitude > _resolution(values[rows]) and amplitude >= min(
+        NOISE_AMPLITUDES * noise, MEAN_AMPLITUDES * of_means
+    ):
         yield Swing(start_s, end_s, count, period_s, amplitude, explained)
+
+
+def _resolution(values: Array) -> float:
+    """The smallest step between two values: a slow course that is rounded goes in steps.
+
+    Such a staircase swings about its course by half a step. 0 for up to three values, between
+    which something is switched to and fro.
+    """
+    apart = np.diff(np.unique(values))
+    told_apart = apart[apart > SAME_NUMBER * float(np.abs(values).max())]
+    return float(told_apart.min()) if len(told_apart) >= SWITCHED_VALUES else 0.0
 
 
 def _varies(sizes: Array) -> float:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
+from unittest.mock import patch
 
 from tests.detection.asking import Answer, Claim, ask_run, ask_since
 from tests.detection.drawing import draw_case
@@ -15,15 +17,14 @@ from tests.detection.labelled import Case, Incident, LabelledRun, Measure, repea
 from tests.detection.writing import purge, roll_up, write_all
 from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S
+from webots_mcp.store.reading import rows
 
 Summaries = Literal["long", "purged"]
 Key = tuple[str, Measure, str]  # kind of recording, what is judged, under which conditions
 
 NOISY_M: Final = 0.01  # more noise than this has goals of its own
-# Longer than what any question reads row by row; what is compared is the first part, shorter than
-# that, which can be asked of rows as well.
-LONG_ROWS: Final = 36_000
-PART_ROWS: Final = 12_000
+LONG_ROWS: Final = 36_000  # longer than what any question reads row by row
+PART_ROWS: Final = 12_000  # of it, which then repeats; purging takes the first
 MOST_ALONE: Final = 4  # incidents of a run that are asked about one by one
 AROUND_S: Final = 10.0  # before and after each
 _MOST_VALUES: Final = 0  # no further signals in long recordings: their rows cost enough
@@ -113,24 +114,35 @@ def _measure_whole(case: Case, report: Report) -> None:
 
 
 def _measure_long(case: Case, summaries: Summaries, report: Report) -> None:
-    """The first part of a long run, asked of its rows and of the summaries of the whole run."""
+    """A long run, asked of all of its rows and of its summaries.
+
+    What happens often is told as one event that counts it, so that both are asked of the same time.
+    """
     short = repeated(case.runs[-1], min(PART_ROWS, 4 * len(case.runs[-1].times)))
-    end_s = float(short.times[-1])
     long = repeated(short, LONG_ROWS)
     with memory_connection() as connection, tempfile.TemporaryDirectory() as folder:
         (run_id,) = write_all(connection, [long])
         roll_up(connection)
-        of_rows = ask_run(connection, case.asked, run_id, end_s=end_s + 1e-6)
+        with _read_row_by_row():
+            of_rows = ask_run(connection, case.asked, run_id)
         if summaries == "purged":
             purge(connection, Path(folder), len(long.times) - len(short.times))
         of_summaries = ask_run(connection, case.asked, run_id)
-    of_part = _until(of_summaries, end_s)
     for each in case.asked:
-        _judge(case, short, run_id, Asked(each, of_rows, "rows"), report)
-        _judge(case, short, run_id, Asked(each, of_part, summaries), report)
+        _judge(case, long, run_id, Asked(each, of_rows, "rows"), report)
+        _judge(case, long, run_id, Asked(each, of_summaries, summaries), report)
         told = [_as_incident(claim) for claim in of_rows.of(each, run_id)]
-        agreed = judge(told, of_part.of(each, run_id), short.interval_s)
+        # One event that counts many stands for itself, on both sides.
+        alike = [replace(claim, count=1) for claim in of_summaries.of(each, run_id)]
+        agreed = judge(told, alike, long.interval_s)
         report.add_agreement((case.kind, each), agreed)
+
+
+@contextmanager
+def _read_row_by_row() -> Generator[None]:
+    """No range is too long for it."""
+    with patch.object(rows, "RAW_ROWS", 10**9):
+        yield
 
 
 def _as_incident(claim: Claim) -> Incident:
@@ -171,16 +183,6 @@ def _tells(answer: Answer, incident: Incident, run_id: int, run: LabelledRun) ->
 def _lost(case: Case, run: LabelledRun, incident: Incident) -> str:
     where = f"{case.kind} {case.number}, {1000 * run.interval_s:g} ms"
     return f"{where}: {_text(incident)} is told of that time and not of the whole run"
-
-
-def _until(answer: Answer, end_s: float) -> Answer:
-    """What of it began before that time, and no more of that than lies before it."""
-    claims = [
-        replace(each, end_s=min(each.end_s, end_s))
-        for each in answer.claims
-        if each.start_s <= end_s
-    ]
-    return replace(answer, claims=tuple(claims))
 
 
 def _judge(case: Case, run: LabelledRun, run_id: int, asked: Asked, report: Report) -> None:

@@ -116,6 +116,12 @@ def _questions(db: sqlite3.Connection, rows: int) -> Iterator[Question]:
         lambda: list_signals(db),
         "SELECT count(*) FROM state",
         "count(*)",
+        at_most_s=0.020,
+    )
+    yield Question(
+        "trends of all signals, whole run",
+        lambda: trends(db, whole),
+        scan(list(numbers.values()), length_s),
     )
     yield Question(
         "trends of all signals, 10 minutes",

@@ -240,6 +240,11 @@ class LongView:
     def spans(self, signal: Signal, condition: Condition) -> list[Span]:
         """From rollups, and rows where they leave it open."""
         self._note_late()
+        if self._purged_until_s is not None:
+            self.notes.append(
+                f"not those of less than {self.shortest_rest_s:g} s before "
+                f"{self._purged_until_s:.3f} s, whose rows were purged"
+            )
         if condition.lasting and not self._rests(signal):
             return []
         if self._deadline.passed:

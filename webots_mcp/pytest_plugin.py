@@ -6,10 +6,11 @@ fixtures that use it.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pytest
 
@@ -20,7 +21,23 @@ if TYPE_CHECKING:
 
 
 @pytest.fixture
-def webots_database(monkeypatch: pytest.MonkeyPatch) -> Iterator[MemoryDatabase]:
+def webots_parameters(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> dict[str, Any]:
+    """Start values of the parameters, from `@pytest.mark.webots_parameters(kp=3.0)`."""
+    from webots_mcp.contract import PARAMETERS_VARIABLE
+
+    marker = request.node.get_closest_marker("webots_parameters")
+    values: dict[str, Any] = dict(marker.kwargs) if marker else {}
+    if marker:
+        monkeypatch.setenv(PARAMETERS_VARIABLE, json.dumps(values))
+    return values
+
+
+@pytest.fixture
+def webots_database(
+    webots_parameters: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> Iterator[MemoryDatabase]:
     """A database in memory, empty.
 
     While it is there, a bridge in the test's process raises what it could not do, and each
@@ -77,13 +94,14 @@ def webots_recording(webots_database: MemoryDatabase) -> Recording:
 
 @pytest.fixture
 def webots_simulation(
-    tmp_path: Path, request: pytest.FixtureRequest
+    tmp_path: Path, request: pytest.FixtureRequest, webots_parameters: dict[str, Any]
 ) -> Iterator[SimulationFactory]:
     """Starts a world whose controllers are real processes that record into the test's folder.
 
-    `webots_simulation(world=..., controllers={"rover": file}, environment={})`: paused before its
-    first step; `run_for(duration_s)` lets it run, `recording` is what its controllers recorded.
-    Paths are those in pytest's rootdir. A failure shows in which file the recording is.
+    `webots_simulation(world=..., controllers={"rover": file}, environment={}, parameters={})`:
+    paused before its first step; `run_for(duration_s)` lets it run, `recording` is what its
+    controllers recorded. Paths are those in pytest's rootdir. A failure shows in which
+    file the recording is.
     """
     from webots_mcp.testing import RecordedSimulation, SimulationFactory
 
@@ -94,6 +112,13 @@ def webots_simulation(
     factory = SimulationFactory(tmp_path, request.config.rootpath, tell)
     yield factory
     factory.close()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Make the marker known."""
+    config.addinivalue_line(
+        "markers", "webots_parameters(**values): start values of the controllers' parameters"
+    )
 
 
 def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str] | None:

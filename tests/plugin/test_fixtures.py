@@ -374,3 +374,45 @@ def test_a_robot_without_rights_cannot_pause(
         bridge.get_command()
     assert pause.status == "failed"
     assert pause.error is not None and "pause needs a Supervisor" in pause.error
+
+
+@pytest.mark.webots_parameters(kp=3.0)
+def test_parameters_begin_as_the_marker_says_and_are_set_in_between(
+    webots_bridge: MCPBridge, webots_recording: Recording
+) -> None:
+    kp = webots_bridge.parameter("kp", 2.0, high=10)
+    assert webots_recording.parameters() == {"kp": 3.0}
+    good, bad = (webots_recording.set_parameters({"kp": value}) for value in (4.0, 11.0))
+    for _ in range(2):
+        webots_bridge.get_command()
+    assert (good.status, bad.status, kp.value) == ("done", "failed", 4.0)
+    assert webots_recording.parameters() == {"kp": 4.0}
+
+
+TUNABLE = """
+from controller import Supervisor
+from webots_mcp import MCPBridge
+
+robot = Supervisor()
+bridge = MCPBridge(robot)
+kp = bridge.parameter("kp", 2.0)
+while robot.step(16) != -1:
+    bridge.publish({"kp": kp.value})
+    bridge.get_command()
+"""
+
+
+def test_a_simulation_begins_with_the_parameters_of_the_test(
+    webots_simulation: SimulationFactory, tmp_path: Path
+) -> None:
+    controller = tmp_path / "tunable.py"
+    controller.write_text(TUNABLE)
+    simulation = webots_simulation(controllers={"rover": controller}, parameters={"kp": 5.0})
+    simulation.run_for(0.16)
+    assert simulation.recording.signal("kp").changes() == [5.0]
+    waiting = simulation.recording.set_parameters({"kp": 6.0}, when="reset")
+    reset = simulation.recording.send("reset")
+    simulation.run_for(0.32)
+    assert (waiting.status, reset.status) == ("done", "done")
+    before, after = simulation.recording.runs()
+    assert (before.parameters(), after.parameters()) == ({"kp": 5.0}, {"kp": 6.0})

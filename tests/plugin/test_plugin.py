@@ -200,7 +200,7 @@ def test_no_fixture_takes_a_name_that_a_test_suite_may_use_itself(
 ) -> None:
     text = pytester.runpytest_inprocess("--fixtures").stdout.str()
     names = re.findall(r"^(\w+) -- .*webots_mcp.pytest_plugin\.py:\d+$", text, re.MULTILINE)
-    assert len(names) == 6
+    assert len(names) == 7
     assert all(name.startswith("webots_") for name in names)
 
 

@@ -57,6 +57,7 @@ READING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_get_logs", {}),
     ("webots_monitor", {"lookback_s": 3600}),
     ("webots_list_commands", {}),
+    ("webots_get_parameters", {}),
     ("webots_list_signals", {}),
     ("webots_query_history", {"signals": ["*"]}),
     ("webots_query_history", {"signals": ["*"], "raw": True}),

@@ -25,6 +25,7 @@ READING = {
     "webots_get_logs",
     "webots_monitor",
     "webots_list_commands",
+    "webots_get_parameters",
     "webots_wait_for_command",
     "webots_list_signals",
     "webots_query_history",
@@ -39,6 +40,7 @@ READING = {
 }
 ACTING = {
     "webots_annotate_run",
+    "webots_set_parameters",
     "webots_take_screenshot",
     "webots_simulation_control",
     "webots_world_reload",
@@ -81,7 +83,7 @@ async def test_every_parameter_is_described_and_flat(connect: Connect) -> None:
         for tool in (await client.list_tools()).tools:
             for name, schema in tool.input_schema.get("properties", {}).items():
                 assert schema.get("description"), f"{tool.name}({name})"
-                flat = schema.get("type") != "object" or name == "params"
+                flat = schema.get("type") != "object" or name in ("params", "values")
                 assert flat, f"{tool.name}({name})"
 
 

@@ -129,6 +129,13 @@ class CommandAnswer(Answer):
     error: str | None = Field(default=None, description="What the controller or the bridge said.")
 
 
+class ParametersAnswer(Answer):
+    """The parameters of a run."""
+
+    parameters: Table | None = None
+    total: int | None = None
+
+
 class CommandsAnswer(Answer):
     """Commands, newest first, and what can be asked for."""
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Literal, overload
 
+from webots_mcp.parameter import Value
 from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.testing.rehearsal import Rehearsal
@@ -99,6 +100,7 @@ class SimulationFactory:
         data_dir: Path | None = None,
         controllers: Mapping[str, str | Path] | None = None,
         environment: Mapping[str, str] | None = None,
+        parameters: Mapping[str, Value] | None = None,
         console: Callable[[str], object] | None = None,
     ) -> RecordedSimulation:
         """A simulation that is paused before its first step; arguments and errors as there."""
@@ -108,6 +110,7 @@ class SimulationFactory:
             data_dir=data_dir or self._folder / f"mcp_data_{len(self._started) + 1}",
             controllers=files,
             environment=environment,
+            parameters=parameters,
             console=console,
         )
         self._started.append(simulation)

@@ -5,18 +5,20 @@ from __future__ import annotations
 import math
 import sqlite3
 import sys
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import closing, contextmanager
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 from webots_mcp.connection import Role, connect
 from webots_mcp.contract import LOG_LEVELS, Database
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.parameter import Value
 from webots_mcp.schema import schema_version
 from webots_mcp.store.detection.event import Event as FoundEvent
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.events import Event, newest_events
 from webots_mcp.store.logs import LogFilter, LogLine, newest_lines
+from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.queue import CommandQueue, list_commands
 from webots_mcp.store.reading.deadline import Deadline
@@ -178,6 +180,25 @@ class Recording:
                 requested_by="test",
             )
         return RecordedCommand(self.database, command.id)
+
+    # -- parameters ----------------------------------------------------------------------------
+
+    def parameters(self) -> dict[str, Value]:
+        """The parameters of the run with their last values."""
+        with self._subject() as (connection, subject):
+            found = parameters_of(connection, [subject.run_id])[subject.run_id]
+        return {name: parameter.value for name, parameter in found.items()}
+
+    def set_parameters(
+        self, values: Mapping[str, Value], *, when: Literal["now", "reset"] = "now"
+    ) -> RecordedCommand:
+        """Set parameters of the robot, all or none: in the controller's next `get_command()`.
+
+        Args:
+            values: By name.
+            when: "reset" for the next reset of the world.
+        """
+        return self.send("set_parameters", values=dict(values), when=when)
 
     # -- inside --------------------------------------------------------------------------------
 

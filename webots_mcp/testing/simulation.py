@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable, Mapping
 from contextlib import closing
@@ -9,8 +10,14 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from webots_mcp.connection import connect
-from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, THROTTLE_VARIABLE
+from webots_mcp.contract import (
+    DATA_DIR_VARIABLE,
+    DATABASE_NAME,
+    PARAMETERS_VARIABLE,
+    THROTTLE_VARIABLE,
+)
 from webots_mcp.errors import WebotsMCPError
+from webots_mcp.parameter import Value
 from webots_mcp.schema import require_current
 from webots_mcp.standin import Mode, Simulation, StandInError
 from webots_mcp.standin.controllers import Controller
@@ -37,6 +44,7 @@ class RecordedSimulation(Simulation):
         data_dir: Path,
         controllers: Mapping[str, str | Path] | None = None,
         environment: Mapping[str, str] | None = None,
+        parameters: Mapping[str, Value] | None = None,
         console: Callable[[str], object] | None = None,
     ) -> None:
         """Load a world; nothing runs before `start` or `with`.
@@ -46,6 +54,7 @@ class RecordedSimulation(Simulation):
             data_dir: Where bridges that are told nothing else record.
             controllers: Controller files by robot name, instead of those that the world names.
             environment: Variables for the controllers, on top of those of this process.
+            parameters: Start values of the controllers' parameters; others begin as in the code.
             console: Is called with each line of Webots' console.
 
         Raises:
@@ -62,6 +71,7 @@ class RecordedSimulation(Simulation):
             environment={
                 DATA_DIR_VARIABLE: str(data_dir),
                 THROTTLE_VARIABLE: "1",
+                **({PARAMETERS_VARIABLE: json.dumps(dict(parameters))} if parameters else {}),
                 **(environment or {}),
             },
         )

@@ -1,0 +1,64 @@
+"""The command that shows and sets parameters."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.server.test_parameters import TunableDriver
+from webots_mcp.cli import main
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Path:
+    return tmp_path / "webots.db"
+
+
+@pytest.fixture
+def tunable(database: Path) -> Iterator[TunableDriver]:
+    driving = TunableDriver(database)
+    driving.start()
+    yield driving
+    driving.stop()
+
+
+def test_parameters_are_shown_and_set(
+    tunable: TunableDriver, database: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["parameters", "--database", str(database)]
+    assert main([*line, "kp=3.5", "gait=walk"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith('gait: "trot" -> "walk"\nkp: 2.0 -> 3.5\nfrom ')
+    assert " s of run 1 on" in out
+    assert (tunable.kp.value, tunable.gait.value) == (3.5, "walk")
+    assert main(line) == 0
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[0].split()[:4] == ["name", "value", "unit", "default"]
+    assert rows[1].split()[:4] == ["kp", "3.5", "1/s", "2"]
+    assert main([*line, "laps=4", "--from-reset"]) == 0
+    assert capsys.readouterr().out == "laps: 3 -> 4\nfrom the next reset on\n"
+    assert main([*line, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)[1]["next"] == 4
+
+
+@pytest.mark.usefixtures("tunable")
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        (["kp=fast"], "'kp' is a number from 0 up to 10, not 'fast'"),
+        (["kp"], "'kp' sets nothing: write kp=VALUE"),
+        (["kq=1"], "no parameter 'kq'"),
+        (["gait=1"], "one of 'trot', 'walk', not '1'"),
+        (["kp=1", "--run", "1"], "parameters are set in the current one"),
+    ],
+)
+def test_a_wrong_setting_is_one_line_and_exit_code_2(
+    database: Path, capsys: pytest.CaptureFixture[str], settings: list[str], said: str
+) -> None:
+    assert main(["parameters", "--database", str(database), *settings]) == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1

@@ -1,0 +1,95 @@
+"""Commands that set what a controller lets be set."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+from webots_mcp.cli.command import DATA_DIR, DATABASE, JSON, ROBOT, argument, command, reading
+from webots_mcp.cli.history import RUN
+from webots_mcp.cli.tables import print_table
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
+
+if TYPE_CHECKING:
+    from webots_mcp.server.results import CommandAnswer
+    from webots_mcp.server.tuning import When
+
+
+@command(
+    "parameters", DATA_DIR, DATABASE, ROBOT, RUN, JSON,
+    argument("settings", nargs="*", metavar="NAME=VALUE", help="set these, all or none"),
+    argument("--from-reset", action="store_true", help="not now, but from the next reset on"),
+)  # fmt: skip
+def parameters(arguments: argparse.Namespace) -> None:
+    """Show the parameters that a controller declares, or set some while it runs.
+
+    webots-mcp parameters kp=3.5 gait=trot
+    """
+    if not arguments.settings:
+        return _show(arguments)
+    if arguments.run_id is not None:
+        raise InvalidInputError("--run shows an earlier run; parameters are set in the current one")
+    answer = _set(arguments)
+    if answer.outcome != "done":
+        why = answer.error or answer.hint or "no answer in time"
+        raise CommandRefusedError(f"the parameters were not set ({answer.outcome}): {why}")
+    print(json.dumps(answer.result, indent=2) if arguments.json else _as_text(answer.result))
+
+
+def _show(arguments: argparse.Namespace) -> None:
+    from webots_mcp.store.parameters import COLUMNS, described
+    from webots_mcp.store.recording import look
+
+    with reading(arguments) as connection:
+        view = look(connection, arguments.robot, arguments.run_id)
+        found = described(connection, view.require_run())
+    if arguments.json:
+        print(json.dumps(found, indent=2))
+    else:
+        print_table(COLUMNS, [[each[column] for column in COLUMNS] for each in found])
+
+
+def _set(arguments: argparse.Namespace) -> CommandAnswer:
+    import anyio
+
+    from webots_mcp.contract import resolve_database
+    from webots_mcp.server.tuning import set_parameters, settable
+    from webots_mcp.store.recording import Recording
+
+    recording = Recording(*resolve_database(arguments.database, arguments.data_dir))
+    declared = settable(recording, arguments.robot)
+    values: dict[str, Any] = {}
+    for setting in arguments.settings:
+        name, equals, text = setting.partition("=")
+        if not equals:
+            raise InvalidInputError(f"{setting!r} sets nothing: write {name}=VALUE")
+        is_text = name in declared and declared[name].declaration.kind == "str"
+        values[name] = text if is_text else _value(text)
+    when: When = "reset" if arguments.from_reset else "now"
+    ask = partial(set_parameters, when=when, robot=arguments.robot)
+    return anyio.run(ask, recording, _silent, values)
+
+
+async def _silent(waited_s: float, of_s: float, text: str) -> None:
+    """It takes a round of the loop, which is too short to report on."""
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _as_text(result: dict[str, Any]) -> str:
+    lines = [
+        f"{name}: {' -> '.join(json.dumps(value) for value in pair.values())}"
+        for name, pair in result["values"].items()
+    ]
+    if "since_sim_time_s" in result:
+        lines.append(f"from {result['since_sim_time_s']:.3f} s of run {result['run_id']} on")
+    else:
+        lines.append("from the next reset on")
+    return "\n".join(lines)

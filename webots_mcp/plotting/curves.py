@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
+from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.questions.series import NumberColumns, RunHistory
-from webots_mcp.store.reading.gaps import rhythm_of
 
 Point = tuple[float, float, float, float]  # time, mean, minimum, maximum
 _BREAK: Point = (math.nan, math.nan, math.nan, math.nan)

@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 
 from webots_mcp.naming import Value
 from webots_mcp.plotting.parts import Part
+from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.gaps import rhythm_of
 from webots_mcp.store.reading.rows import exceeds, read_columns
 from webots_mcp.store.signals.registry import Signal
 

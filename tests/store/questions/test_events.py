@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import random
 import re
 import sqlite3
 from collections import Counter
 from itertools import count
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.recordings.rover import WALL_START_S, Recorder
@@ -275,10 +275,8 @@ def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
 
 @pytest.mark.parametrize("seed", range(10))
 def test_noise_neither_jumps_nor_swings(seed: int) -> None:
-    noise = random.Random(seed)
-    times = [0.1 * index for index in range(2000)]
-    values = [noise.gauss(0, 1) for _ in times]
-    assert find_jumps(times, values, 12.0) == []
+    noise = np.random.default_rng(seed).normal(size=2000)
+    assert find_jumps(np.arange(2000.0), noise, 12.0) == []
 
 
 def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tuple[Event, ...]:

@@ -10,97 +10,14 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.recordings.rover import Recorder
-from webots_mcp.store.analysis.features import (
-    find_oscillation,
-    find_spikes,
-    fit_line,
-    flat_since,
-    time_effect,
-    unwrap,
-)
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, trends
 from webots_mcp.store.reading.ranges import resolve_range
 from webots_mcp.store.rollup.rolling import roll
 
 Course = Callable[[float], float | None]  # from the time; None leaves the key out
-numbers = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=50)
-
-
-@given(numbers)
-def test_the_fitted_line_is_that_of_the_statistics_module(values: list[float]) -> None:
-    times = [0.5 * index for index in range(len(values))]
-    line = fit_line(times, values, statistics.fmean(values))
-    assert line is not None
-    expected = statistics.linear_regression(times, values)
-    assert line.slope_per_s == pytest.approx(expected.slope, abs=1e-6, rel=1e-6)
-    assert 0 <= line.r2 <= 1
-
-
-@given(st.floats(-3, 3), st.lists(st.floats(-3, 3), max_size=40))
-def test_an_unwrapped_angle_differs_by_whole_turns(first: float, turns: list[float]) -> None:
-    angles, total = [first], first
-    for turn in turns:
-        total += turn
-        angles.append(math.remainder(total, 2 * math.pi))
-    for wrapped, unwrapped in zip(angles, unwrap(angles), strict=True):
-        assert math.remainder(unwrapped - wrapped, 2 * math.pi) == pytest.approx(0, abs=1e-6)
-    assert unwrap(angles)[-1] - unwrap(angles)[0] == pytest.approx(total - first, abs=1e-6)
-
-
-def test_a_swing_has_its_period_and_amplitude() -> None:
-    times = [0.1 * index for index in range(600)]
-    values = [5 + 2 * math.sin(2 * math.pi * time / 3) for time in times]
-    crossings, swing = find_oscillation(times, values, 5.0, statistics.stdev(values))
-    assert swing is not None
-    assert swing.period_s == pytest.approx(3, rel=0.02)
-    assert swing.amplitude == pytest.approx(2, rel=0.02)
-    assert crossings in (39, 40, 41)
-
-
-@pytest.mark.parametrize("seed", range(20))
-def test_noise_is_no_oscillation_and_has_no_spikes(seed: int) -> None:
-    noise = random.Random(seed)
-    times = [0.1 * index for index in range(1000)]
-    white = [noise.gauss(0, 1) for _ in times]
-    walk = [sum(white[: index + 1]) for index in range(len(white))]
-    for values in (white, walk):
-        mean, deviation = statistics.fmean(values), statistics.stdev(values)
-        assert find_oscillation(times, values, mean, deviation)[1] is None
-        assert find_spikes(times, values) == []
-
-
-def test_a_spike_is_found_and_a_step_is_none() -> None:
-    times = [float(index) for index in range(100)]
-    values = [0.0] * 50 + [1.0] * 50
-    assert find_spikes(times, values) == []
-    values[20] = 3.0
-    (spike,) = find_spikes(times, values)
-    assert (spike.sim_time_s, spike.value) == (20.0, 3.0)
-
-
-def test_slow_change_counts_and_noise_does_not() -> None:
-    noise = random.Random(3)
-    times = [float(index) for index in range(800)]
-
-    def effect(values: list[float]) -> float:
-        mean = statistics.fmean(values)
-        return time_effect(times, values, mean, sum((value - mean) ** 2 for value in values))
-
-    assert effect([noise.gauss(0, 1) for _ in times]) < 0.05
-    assert effect(times) > 0.9
-    assert effect([1.0] * 800) == 0.0
-
-
-def test_flat_since_is_the_begin_of_the_rest() -> None:
-    times = [float(index) for index in range(100)]
-    assert flat_since(times, [min(index, 60.0) for index in range(100)]) == 60.0
-    assert flat_since(times, [float(index) for index in range(100)]) is None
-    assert flat_since(times, [2.0] * 100) == 0.0
 
 
 def ask(connection: sqlite3.Connection, *names: str, **bounds: Any) -> RunTrends:
@@ -136,9 +53,10 @@ def test_a_stuck_robot_rests(rover: sqlite3.Connection) -> None:
 
 def test_a_swinging_heading_is_described_across_the_turn(rover: sqlite3.Connection) -> None:
     heading = one(rover, "heading", start_s=60.0, end_s=90.0)
-    assert heading.shape == "oscillating" and heading.oscillation is not None
-    assert heading.oscillation.period_s == pytest.approx(2.0, rel=0.02)
-    assert heading.oscillation.amplitude == pytest.approx(0.5, rel=0.03)
+    (swing,) = heading.swings
+    assert heading.shape == "oscillating"
+    assert swing.period_s == pytest.approx(2.0, rel=0.02)
+    assert swing.amplitude == pytest.approx(0.5, rel=0.03)
     assert abs(heading.mean or 0) == pytest.approx(math.pi, abs=0.02)
 
 
@@ -173,9 +91,11 @@ def test_a_swing_faster_than_the_rollups_gets_no_period_of_an_alias(
         return math.remainder(math.pi + 0.5 * math.sin(3 * time_s), 2 * math.pi)
 
     record(empty, rows=4000, interval_s=0.1, sine=math.sin, yaw=yaw)
+    (note,) = trends(empty, resolve_range(empty, run_id=1)).notes
+    assert "swings shorter than 80 s were not looked for" in note
     for name in ("sine", "yaw"):
         trend = one(empty, name)
-        assert (trend.shape, trend.oscillation, trend.flat_since_s) == ("varying", None, None)
+        assert (trend.shape, trend.swings, trend.flat_since_s) == ("varying", (), None)
         assert "varies faster than 10 s: ask for a shorter range" in trend.says
         assert "varies faster" not in one(empty, name, start_s=100.0, end_s=109.0).says
 
@@ -185,8 +105,11 @@ def test_a_swing_slower_than_the_rollups_is_told_in_both_tiers(
 ) -> None:
     record(empty, rows=4000, interval_s=0.2, sine=lambda t: math.sin(2 * math.pi * t / 80))
     sine = one(empty, "sine")
-    assert sine.shape == "oscillating" and sine.oscillation is not None
-    assert sine.oscillation.period_s == pytest.approx(80, rel=0.03)
+    (swing,) = sine.swings
+    assert sine.shape == "oscillating"
+    assert swing.period_s == pytest.approx(80, rel=0.03)
+    assert swing.amplitude == pytest.approx(1, rel=0.02)
+    assert ("seen in means of 10 s" in sine.says) == (tier != "rows")
 
 
 def test_what_swung_and_rests_is_said_to_have_swung(empty: sqlite3.Connection) -> None:
@@ -196,7 +119,8 @@ def test_what_swung_and_rests_is_said_to_have_swung(empty: sqlite3.Connection) -
     record(empty, rows=1000, interval_s=0.1, swing=swing)
     trend = one(empty, "swing")
     assert trend.shape == "resting"
-    assert trend.says == "swung by 0.3 about 0 every 2 s from 70.1 to 82.1 s; flat at 0 since 82 s"
+    says = "swung by 0.301 every 1.99 s from 70.043 to 81.957 s; flat at 0 since 82 s"
+    assert trend.says == says
 
 
 def test_the_least_value_of_what_falls_is_told_where_it_is_not_its_end(
@@ -226,7 +150,7 @@ def test_what_adding_leaves_is_no_change_and_no_value(empty: sqlite3.Connection)
 
 def test_what_fell_rested_and_rose_twice_does_not_swing(empty: sqlite3.Connection) -> None:
     record(empty, rows=1300, interval_s=0.1, front=lambda t: 1.0 if t % 60 < 30 else 0.05)
-    assert one(empty, "front").oscillation is None
+    assert one(empty, "front").swings == ()
 
 
 def test_noise_does_not_hide_a_swing(empty: sqlite3.Connection) -> None:
@@ -236,8 +160,9 @@ def test_noise_does_not_hide_a_swing(empty: sqlite3.Connection) -> None:
         sine=lambda t: math.sin(2 * math.pi * t / 5) + noise.gauss(0, 0.3),
     )  # fmt: skip
     sine = one(empty, "sine")
-    assert sine.oscillation is not None and sine.crossings in (23, 24)
-    assert sine.oscillation.period_s == pytest.approx(5, rel=0.02)
+    (swing,) = sine.swings
+    assert swing.half_swings in (22, 23, 24)
+    assert swing.period_s == pytest.approx(5, rel=0.02)
 
 
 @pytest.mark.parametrize("rate_rad_s", [0.2, -0.21])

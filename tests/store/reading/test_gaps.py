@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
-from webots_mcp.store.reading.gaps import rhythm_in, rhythm_of
+from webots_mcp.store.analysis.rhythm import rhythm_of
+from webots_mcp.store.reading.gaps import rhythm_in
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.rolling import roll
 

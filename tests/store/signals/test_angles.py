@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.recordings.rover import Recorder
+from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import trends
@@ -44,10 +45,10 @@ def test_the_third_item_of_a_planar_pose_is_an_angle(empty: sqlite3.Connection) 
         assert known["drone.pose.2"].kind == "num"  # of six items the third is z
 
 
-@given(st.lists(st.floats(-50, 50), min_size=1, max_size=50))
-def test_unwrapping_is_numpys(angles: list[float]) -> None:
-    assert unwrap(angles) == np.unwrap(angles).tolist()
-    assert unwrap(angles, 360.0) == np.unwrap(angles, period=360.0).tolist()
+@given(st.lists(st.floats(-50, 50), min_size=1, max_size=50).map(np.array))
+def test_unwrapping_is_numpys(angles: Array) -> None:
+    assert unwrap(angles).tolist() == np.unwrap(angles).tolist()
+    assert unwrap(angles, 360.0).tolist() == np.unwrap(angles, period=360.0).tolist()
 
 
 def trend_of(connection: sqlite3.Connection, name: str, course: Callable[[float], float]) -> Trend:

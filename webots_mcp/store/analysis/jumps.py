@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from dataclasses import dataclass, replace
 from typing import Final
 
-from webots_mcp.store.reading.gaps import rhythm_of
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.store.analysis.rhythm import gap_borders, usual_interval_s
 
 MOST_JUMPS_SHARE: Final = 0.1  # of the rows: more of them are how the signal is
 LEAST_STEPS: Final = 10
@@ -32,9 +32,7 @@ class Jump:
     back_s: float | None = None
 
 
-def find_jumps(
-    times: Sequence[float], values: Sequence[float], score: float, usual: Sequence[float] = ()
-) -> list[Jump]:
+def find_jumps(times: Array, values: Array, score: float, usual: Array | None = None) -> list[Jump]:
     """Steps whose modified z-score (see `features.find_spikes`) is above the score.
 
     Compared is with the steps that are not zero and do not come back at once, of which there have
@@ -47,30 +45,19 @@ def find_jumps(
         times: Of the values.
         values: In order.
         score: How much larger than usual a step has to be.
-        usual: The sizes of steps to compare with; empty for those of the values themselves.
+        usual: The sizes of steps to compare with; None for those of the values themselves.
     """
-    steps = [abs(after - before) for before, after in pairwise(values)]
+    steps = np.abs(np.diff(values))
     backs = _come_back(times, values, steps)
-    there_and_back = {row for left, back in backs.items() for row in range(left, back)}
-    sizes = sorted(
-        size
-        for size in usual or (s for place, s in enumerate(steps) if place not in there_and_back)
-        if size > 0
-    )
+    sizes = usual if usual is not None else steps[_stay(backs, len(steps))]
+    sizes = sizes[sizes > 0]
     if len(sizes) < LEAST_STEPS:
-        return [
-            Jump(times[row + 1], values[row], values[row + 1], times[back])
-            for row, back in backs.items()
-        ]
-    median = sizes[len(sizes) // 2]
+        return [_jump(times, values, row, float(times[back])) for row, back in backs.items()]
+    median = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
     limit = median + score * median / 0.6745
-    wide = [index for index, step in enumerate(steps) if step > limit]
-    found = [
-        Jump(times[index + 1], values[index], values[index + 1])
-        for index, intervals in zip(wide, _intervals(times, wide), strict=True)
-        if _step(values[index], values[index + 1]) > limit * intervals
-    ]
-    return list(_with_return(found))
+    wide = np.flatnonzero(steps > limit)
+    far = _step(values[wide], values[wide + 1]) > limit * _intervals(times, wide)
+    return list(_with_return([_jump(times, values, row) for row in wide[far].tolist()]))
 
 
 def are_usual(jumps: Sequence[Jump], rows: int) -> bool:
@@ -78,35 +65,47 @@ def are_usual(jumps: Sequence[Jump], rows: int) -> bool:
     return len(jumps) > max(3, MOST_JUMPS_SHARE * rows)
 
 
-def _come_back(
-    times: Sequence[float], values: Sequence[float], steps: Sequence[float]
-) -> dict[int, int]:
+def _jump(times: Array, values: Array, row: int, back_s: float | None = None) -> Jump:
+    """The one after that row."""
+    return Jump(float(times[row + 1]), float(values[row]), float(values[row + 1]), back_s)
+
+
+def _come_back(times: Array, values: Array, steps: Array) -> dict[int, int]:
     """Rows after which a value that had rested left, and rows in which it was back soon after.
 
     What was recorded on the other side of a gap is not soon after.
     """
-    gaps_s = {gap.end_s for gap in rhythm_of(times).gaps}
+    left = np.flatnonzero((steps[1:] > 0) & (steps[:-1] == 0)) + 1
+    left = left[_step(values[left], values[left + 1]) > 0]
     backs: dict[int, int] = {}
-    for row in range(1, len(steps)):
-        if steps[row] > 0 and steps[row - 1] == 0 and _step(values[row], values[row + 1]) > 0:
-            soon = range(row + 2, min(row + 2 + LONGEST_EXCURSION, len(values)))
-            back = next((later for later in soon if values[later] == values[row]), None)
-            if back is not None and not gaps_s.intersection(times[row + 1 : back + 1]):
-                backs[row] = back
-    return backs
+    for later in range(LONGEST_EXCURSION + 1, 1, -1):
+        within = left[left + later < len(values)]
+        back = within[values[within + later] == values[within]]
+        backs.update(zip(back.tolist(), (back + later).tolist(), strict=True))
+    gaps = gap_borders(times, usual_interval_s(times) or math.inf)
+    passed: list[int] = np.searchsorted(gaps, np.arange(len(times)), "right").tolist()
+    return {row: backs[row] for row in sorted(backs) if passed[backs[row]] == passed[row]}
 
 
-def _intervals(times: Sequence[float], indexes: Sequence[int]) -> list[float]:
+def _stay(backs: dict[int, int], steps: int) -> Flags:
+    """Which steps are no part of an excursion."""
+    stays = np.ones(steps, np.bool_)
+    for left, back in backs.items():
+        stays[left:back] = False
+    return stays
+
+
+def _intervals(times: Array, rows: Indexes) -> Array:
     """How many usual intervals, at least one, lie between each of those rows and the next."""
-    usual_s = (rhythm_of(times).interval_s if indexes else None) or math.inf
-    return [max(1.0, (times[index + 1] - times[index]) / usual_s) for index in indexes]
+    usual_s = usual_interval_s(times) if len(rows) else None
+    return np.maximum(1.0, (times[rows + 1] - times[rows]) / (usual_s or math.inf))
 
 
-def _step(before: float, after: float) -> float:
+def _step(before: Array, after: Array) -> Array:
     """How far it is from one to the other; the short way round where they may be angles."""
-    far = abs(after - before)
-    turns = (turn for turn in WHOLE_TURNS if max(abs(before), abs(after)) <= turn and far <= turn)
-    return min((far, *(turn - far for turn in turns)))
+    far = np.abs(after - before)
+    largest = np.maximum(np.maximum(np.abs(before), np.abs(after)), far)
+    return np.min([far, *(np.where(largest <= turn, turn - far, far) for turn in WHOLE_TURNS)], 0)
 
 
 def _with_return(jumps: Sequence[Jump]) -> Iterator[Jump]:
@@ -117,7 +116,7 @@ def _with_return(jumps: Sequence[Jump]) -> Iterator[Jump]:
         following = jumps[index + 1] if index + 1 < len(jumps) else None
         size = abs(jump.after - jump.before)
         if following is not None and abs(following.after - jump.before) < BACK_SHARE * size:
-            yield Jump(jump.sim_time_s, jump.before, jump.after, following.sim_time_s)
+            yield replace(jump, back_s=following.sim_time_s)
             index += 2
         else:
             yield jump
@@ -132,14 +131,14 @@ def find_leaps(
     Longer than `at_least_m`, and than five times the 99th percentile of all steps; after a gap, by
     as many times as it is longer than the usual interval.
     """
-    steps = [math.dist(before, after) for before, after in pairwise(places)]
-    if not steps:
+    if len(places) < 2:
         return []
-    usual_m = sorted(steps)[min(len(steps) - 1, int(0.99 * len(steps)))]
+    moments: Array = np.array(times, np.float64)
+    x, y = (np.array([place[axis] for place in places], np.float64) for axis in (0, 1))
+    steps = np.hypot(np.diff(x), np.diff(y))
+    place = min(len(steps) - 1, int(0.99 * len(steps)))
+    usual_m = float(np.partition(steps, place)[place])
     limit_m = max(at_least_m, POSITION_STEPS * usual_m if len(steps) > 100 else 0.0)
-    long = [index for index, step in enumerate(steps) if step > limit_m]
-    return [
-        (times[index + 1], steps[index])
-        for index, intervals in zip(long, _intervals(times, long), strict=True)
-        if steps[index] > limit_m * intervals
-    ]
+    long = np.flatnonzero(steps > limit_m)
+    long = long[steps[long] > limit_m * _intervals(moments, long)]
+    return list(zip(moments[long + 1].tolist(), steps[long].tolist(), strict=True))

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from webots_mcp.store.analysis.arrays import Array, np
 
 _ORDER: Final = 4
 # The fourth difference of independent noise has sqrt(1 + 16 + 36 + 16 + 1) = sqrt(70) times its
 # standard deviation, and a normal variable has a median magnitude of 0.6745 of it.
 _GAIN: Final = 0.6745 * 70**0.5
+_BLOCK_ROWS: Final = 128
 LEAST_ROWS: Final = 3 * _ORDER
 
 
@@ -28,6 +26,18 @@ def noise_of(values: Array) -> float:
     if len(values) < LEAST_ROWS:
         return 0.0
     return float(np.median(np.abs(np.diff(values, _ORDER)))) / _GAIN
+
+
+def local_noise(values: Array) -> Array:
+    """The noise about each of the values, the least of those in the stretches around it."""
+    blocks = len(values) // _BLOCK_ROWS
+    if blocks < 2:
+        return np.full(len(values), noise_of(values))
+    sizes: Array = np.abs(np.diff(np.pad(values, (0, _ORDER), mode="edge"), _ORDER))
+    parts: Array = np.reshape(sizes[: blocks * _BLOCK_ROWS], (blocks, _BLOCK_ROWS))
+    padded: Array = np.pad(np.median(parts, axis=1) / _GAIN, 1, mode="edge")
+    least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
+    return least[np.minimum(np.arange(len(values)) // _BLOCK_ROWS, blocks - 1)]
 
 
 def smooth(values: Array, rows: int) -> tuple[Array, float]:

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.track import Track
 
 WIDENED_BY: Final = 5.0  # a place is at least so many deviations of the smoothed position wide

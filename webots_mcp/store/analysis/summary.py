@@ -13,6 +13,7 @@ from operator import attrgetter, mul, ne
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.naming import Value
+from webots_mcp.store.analysis.arrays import Array, np
 
 _NUMBERS: Final = frozenset({int, float, bool})
 _LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
@@ -136,6 +137,42 @@ def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = 
     )
 
 
+def summarise_numbers(
+    times: Array, numbers: Array, *, rows: int | None = None, angle: bool = False
+) -> Summary:
+    """The same of usable numbers in arrays, as `usable_arrays` gives them: faster where many.
+
+    Args:
+        times: Of the numbers.
+        numbers: In order.
+        rows: Of which so many held one; None for as many.
+        angle: They are angles in radians.
+    """
+    count = len(numbers)
+    if not count:
+        return Summary(rows or 0)
+    low, high = int(numbers.argmin()), int(numbers.argmax())
+    total = float(numbers.sum())
+    deviations = numbers - total / count
+    return Summary(
+        count if rows is None else rows,
+        count,
+        int(np.count_nonzero(np.diff(numbers))),
+        *_at(times, numbers, 0),
+        *_at(times, numbers, -1),
+        *_at(times, numbers, low),
+        *_at(times, numbers, high),
+        total,
+        float(deviations @ deviations),
+        float(np.sin(numbers).sum()) if angle else None,
+        float(np.cos(numbers).sum()) if angle else None,
+    )
+
+
+def _at(times: Array, numbers: Array, index: int) -> tuple[float, float]:
+    return float(numbers[index]), float(times[index])
+
+
 def _without_numbers(times: Sequence[float], values: Sequence[Value]) -> Summary:
     held = [time for time, value in zip(times, values, strict=True) if type(value) is str]
     if not held:
@@ -158,6 +195,18 @@ def usable_numbers(
         if type(value) in _NUMBERS and -_LARGEST <= cast("float", value) <= _LARGEST
     ]
     return [time for time, _ in pairs], [value for _, value in pairs]
+
+
+def usable_arrays(times: Sequence[float], values: Sequence[Value]) -> tuple[Array, Array]:
+    """The same as arrays."""
+    try:
+        numbers: Array = np.array(values, np.float64)  # null becomes NaN
+    except (OverflowError, TypeError, ValueError):
+        some_times, some = usable_numbers(times, values)
+        return np.array(some_times, np.float64), np.array(some, np.float64)
+    moments: Array = np.array(times, np.float64)
+    usable = np.abs(numbers) <= _LARGEST
+    return (moments, numbers) if usable.all() else (moments[usable], numbers[usable])
 
 
 def _usable(numbers: Sequence[float]) -> bool:

@@ -13,16 +13,16 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
-import numpy as np
+from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.noise import local_noise, noise_of
+from webots_mcp.store.analysis.rhythm import gap_borders
 
-from webots_mcp.store.analysis.noise import Array, noise_of
-
+LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again
 SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
 SCALE_RATIO: Final = 2**0.5  # from one band to the next
 FINEST_SHARE: Final = 8  # of a band's period: what is shorter is smoothed away
 ROWS_PER_PERIOD: Final = 16  # of a band: of more, means are taken
 FITTED_PER_PERIOD: Final = 32  # the same where a sine is fitted; it loses 0.2 % of its height
-GAP_INTERVALS: Final = 3.0  # a gap is longer than so many usual intervals
 JOINED_PERIODS: Final = 1.5  # so near a gap a swing ends or begins that may go on across it
 ALIKE: Final = (1.15, 1.5)  # ratio of periods and of amplitudes on both sides of a gap
 HALF_PERIODS: Final = (0.5 / 1.7, 0.5 * 1.5)  # of the band's period, that a half swing may last
@@ -32,11 +32,16 @@ MOST_VARIED: Final = 0.4  # and of how far the half swings reach
 LEAST_EXPLAINED: Final = (0.85, 0.70)  # of the variance by a sine, for 6 half swings and for 10
 STRAIGHTENED_EXPLAINED: Final = 0.9  # where a course of slopes was taken out before
 PERIODS_FITTED: Final = 2.5  # at once: over more, a swing may change a little
-TRIED_PERIODS: Final = np.linspace(0.92, 1.08, 9)  # times the period of the crossings
+PIECES_TRIED: Final = 16  # with each period; the whole with the best of them
+LEAST_TRIED: Final = 0.5  # explained of these pieces; less is not looked at further
+NOISE_BENDS: Final = 10.0  # deviations of the noise, over the root of the rows; it makes hardly 7
+# Times the period of the crossings:
+TRIED_PERIODS: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)
 NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
 MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
 SAME_NUMBER: Final = 1e-9  # of the value: what adding up floating-point numbers makes of one
 SWITCHED_VALUES: Final = 3
+REACHES: Final = 2.0  # times as far as in its band a swing reaches at most
 MOST_OVERLAP: Final = 0.2  # of the shorter one
 
 
@@ -83,7 +88,7 @@ def find_swings(
     if len(times) <= SHORTEST_PERIOD_ROWS:
         return []
     interval_s = float(np.median(np.diff(times)))
-    borders = np.flatnonzero(np.diff(times) > GAP_INTERVALS * interval_s * (1 + 1e-6)) + 1
+    borders = gap_borders(times, interval_s)
     found: list[Swing] = []
     for moments, stretch in zip(np.split(times, borders), np.split(values, borders), strict=True):
         swings = _in_stretch(moments, stretch, least_half_swings, longest_period_s)
@@ -151,18 +156,33 @@ def _in_stretch(
     if len(times) <= SHORTEST_PERIOD_ROWS or not np.ptp(values):
         return []
     interval_s = float(np.median(np.diff(times)))
+    noise = local_noise(values)
+    rounding = len(values) * float(np.spacing(np.abs(values).max()))
     found: list[Swing] = []
     rows = SHORTEST_PERIOD_ROWS
     while rows * interval_s <= longest_period_s * SCALE_RATIO and rows < len(values):
         step = max(1, int(rows / ROWS_PER_PERIOD))
         moments, means = _means(times, step), _means(values, step)
-        for band in _bands(moments, means, round(rows / step)):
+        of_means = noise[: len(means) * step : step] / step**0.5
+        for band in _bands(moments, means, round(rows / step), of_means):
             for crossings in _regular(
-                _crossings(moments, band), rows * interval_s, least_half_swings
+                _crossings(moments, band, rounding), rows * interval_s, least_half_swings
             ):
-                found += _fitted(times, values, crossings, interval_s)
+                if not any(_is_same(crossings, each) for each in found):
+                    found += _fitted(times, values, crossings, interval_s)
         rows *= SCALE_RATIO
     return _best([each for each in found if each.period_s <= longest_period_s])
+
+
+def _is_same(crossings: _Crossings, swing: Swing) -> bool:
+    """Whether the swing was found there already, in the band of a shorter period."""
+    first_s, last_s = crossings.moments[0], crossings.moments[-1]
+    near_s = swing.period_s / 4
+    return bool(
+        len(crossings.halves) == swing.half_swings
+        and abs(first_s - swing.start_s) < near_s
+        and abs(last_s - swing.end_s) < near_s
+    )
 
 
 def _means(values: Array, step: int) -> Array:
@@ -171,12 +191,19 @@ def _means(values: Array, step: int) -> Array:
     return np.add.reduceat(values[:whole], np.arange(0, whole, step)) / step if step > 1 else values
 
 
-def _bands(times: Array, values: Array, rows: int) -> Iterator[Array]:
-    """What swings with about that period: as it is, and without a course of slopes."""
-    for course in (values, _straightened(times, values, rows)):
-        if course is not None:
-            fine = _moving_mean(course, rows // FINEST_SHARE)
-            yield fine - _moving_mean(course, rows)
+def _bands(times: Array, values: Array, rows: int, noise: Array) -> Iterator[Array]:
+    """What swings with about that period: as it is, and without a course of slopes that bends."""
+    slow = _moving_mean(values, rows)
+    yield _moving_mean(values, rows // FINEST_SHARE) - slow
+    if _bends(slow, rows, noise) and (course := _straightened(times, values, rows)) is not None:
+        yield _moving_mean(course, rows // FINEST_SHARE) - _moving_mean(course, rows)
+
+
+def _bends(slow: Array, rows: int, noise: Array) -> bool:
+    """Whether a course of means over so many rows bends anywhere by more than noise makes it."""
+    bends = np.abs(slow[2 * rows :] - 2 * slow[rows:-rows] + slow[: -2 * rows])
+    limits = NOISE_BENDS * noise[rows:-rows] / rows**0.5
+    return not len(bends) or bool(np.any(bends > limits))
 
 
 def _moving_mean(values: Array, rows: int) -> Array:
@@ -209,10 +236,10 @@ def _straightened(times: Array, values: Array, rows: int) -> Array | None:
     return values - np.interp(times, moments, np.concatenate(([0.0], np.cumsum(slopes))))
 
 
-def _crossings(times: Array, band: Array) -> _Crossings:
-    """Between two rows the band is taken to be straight."""
+def _crossings(times: Array, band: Array, rounding: float) -> _Crossings:
+    """Between two rows the band is taken to be straight; what comes of rounding is none."""
     before = np.flatnonzero(np.diff(band >= 0))
-    if len(before) < 2:
+    if len(before) < 2 or np.abs(band).max() <= rounding:
         return _Crossings(np.empty(0), np.empty(0), np.empty(0))
     share = band[before] / (band[before] - band[before + 1])
     moments = times[before] + share * (times[before + 1] - times[before])
@@ -260,18 +287,26 @@ def _fitted(
     period_s = 2 * (end_s - start_s) / count
     start, end = np.searchsorted(times, [start_s, end_s])
     rows = slice(max(0, int(start) - 1), min(len(times), int(end) + 1))
+    noise = noise_of(values[rows])
+    if REACHES * float(crossings.reaches.mean()) < _least_amplitude(
+        noise, period_s, interval_s, count
+    ):
+        return
     best = _best_sine(times[rows], values[rows], period_s, interval_s)
     if best[0] < _least_explained(count):
         best = _best_sine_of_straightened(times, values, rows, period_s, interval_s)
         if best[0] < STRAIGHTENED_EXPLAINED:
             return
     explained, period_s, amplitude = best
-    noise = noise_of(values[rows])
-    of_means = noise / np.sqrt(period_s / interval_s * count / 2)
-    if amplitude > _resolution(values[rows]) and amplitude >= min(
-        NOISE_AMPLITUDES * noise, MEAN_AMPLITUDES * of_means
-    ):
+    least = _least_amplitude(noise, period_s, interval_s, count)
+    if amplitude >= least and amplitude > _resolution(values[rows]):
         yield Swing(start_s, end_s, count, period_s, amplitude, explained)
+
+
+def _least_amplitude(noise: float, period_s: float, interval_s: float, half_swings: int) -> float:
+    """How high so many half swings have to be, to rise above the noise."""
+    of_means = noise / (period_s / interval_s * half_swings / 2) ** 0.5
+    return min(NOISE_AMPLITUDES * noise, MEAN_AMPLITUDES * of_means)
 
 
 def _resolution(values: Array) -> float:
@@ -318,53 +353,67 @@ def _best_sine(
     step = max(1, int(period_s / interval_s / FITTED_PER_PERIOD))
     times, values = _means(times, step), _means(values, step)
     pieces = max(1, round((times[-1] - times[0]) / (PERIODS_FITTED * period_s)))
-    ends: Array = np.linspace(float(times[0]), float(times[-1]), pieces + 1)
-    borders = np.searchsorted(times, ends[1:-1])
-    periods = period_s * TRIED_PERIODS
-    fits = [
-        _fit(moments - moments.mean(), piece, periods)
-        for moments, piece in zip(np.split(times, borders), np.split(values, borders), strict=True)
-        if len(piece) >= SHORTEST_PERIOD_ROWS
-    ]
-    course = sum(fit.of_course for fit in fits)
-    if not course > 0:
+    rows = len(values) // pieces
+    if rows < SHORTEST_PERIOD_ROWS:
         return 0.0, period_s, 0.0
-    explained = 1 - np.sum([fit.of_sines for fit in fits], axis=0) / course
-    best = int(np.argmax(explained))
-    amplitude = float(np.median([fit.amplitudes[best] for fit in fits]))
-    return float(explained[best]), float(periods[best]), amplitude
+    shape = pieces, rows
+    moments: Array = np.reshape(times[: pieces * rows], shape)
+    parts: Array = np.reshape(values[: pieces * rows], shape)
+    periods = period_s * np.array(TRIED_PERIODS)
+    some = slice(None, None, -(-pieces // PIECES_TRIED))
+    tried = _explained(_fit(moments[some], parts[some], periods))
+    best = int(np.argmax(tried))
+    if tried[best] < LEAST_TRIED:
+        return float(tried[best]), period_s, 0.0
+    fit = _fit(moments, parts, periods[best : best + 1])
+    return float(_explained(fit)[0]), float(periods[best]), float(np.median(fit.amplitudes))
+
+
+def _explained(fit: _Fit) -> Array:
+    """The share of the squares that a sine of each period explains."""
+    course = float(fit.of_course.sum())
+    left: Array = np.sum(fit.of_sines, axis=0)
+    return np.asarray(1 - left / course if course > 0 else 0 * left, np.float64)
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """What a parabola leaves of the squares; what it leaves with a sine of each period."""
+    """Per piece, what a parabola leaves of the squares; what it leaves with a sine of each period.
 
-    of_course: float
+    Attributes:
+        of_sines: One row per piece, one column per period; `amplitudes` alike.
+    """
+
+    of_course: Array
     of_sines: Array
     amplitudes: Array
 
 
 def _fit(times: Array, values: Array, periods: Array) -> _Fit:
-    """Sines are fitted to what a parabola leaves of the values and of the sines themselves."""
-    place = times / max(float(np.ptp(times)), 1e-9)
-    basis: Array = np.linalg.qr(np.vander(place, 3))[0]
-    rest = _without(basis, values)
-    angles: Array = 2 * np.pi * times / periods[:, None]
-    sines, cosines = (_without(basis, waves) for waves in (np.sin(angles), np.cos(angles)))
+    """Sines are fitted to what a parabola leaves of the values and of the sines themselves.
+
+    Args:
+        times: One row per piece.
+        values: Alike.
+        periods: That are tried.
+    """
+    moments = times - times.mean(axis=1, keepdims=True)
+    place = moments / np.maximum(np.ptp(moments, axis=1, keepdims=True), 1e-9)
+    basis: Array = np.linalg.qr(np.stack((place**2, place, np.ones_like(place)), axis=2))[0]
+    angles: Array = 2 * np.pi * moments[:, None, :] / periods[:, None]
+    waves = np.concatenate((np.sin(angles), np.cos(angles), values[:, None, :]), axis=1)
+    rest: Array = waves - (waves @ basis) @ np.swapaxes(basis, 1, 2)
+    sines, cosines, left = np.split(rest, [len(periods), 2 * len(periods)], axis=1)
     ss, cc, sc = (_products(*pair) for pair in ((sines,) * 2, (cosines,) * 2, (sines, cosines)))
-    sy, cy = _products(sines, rest), _products(cosines, rest)
+    sy, cy, of_course = (_products(each, left) for each in (sines, cosines, left))
     determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
     of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant
-    of_course = float(rest @ rest)
-    return _Fit(of_course, of_course - of_sine * sy - of_cosine * cy, np.hypot(of_sine, of_cosine))
-
-
-def _without(basis: Array, waves: Array) -> Array:
-    return waves - (waves @ basis) @ np.transpose(basis)
+    amplitudes: Array = np.hypot(of_sine, of_cosine)
+    return _Fit(of_course, of_course - of_sine * sy - of_cosine * cy, amplitudes)
 
 
 def _products(one: Array, other: Array) -> Array:
-    return np.asarray(np.sum(one * other, axis=1), np.float64)
+    return np.einsum("ijk,ijk->ij", *np.broadcast_arrays(one, other))
 
 
 def _best(found: list[Swing]) -> list[Swing]:

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
-import numpy as np
-
-from webots_mcp.store.analysis.noise import Array, noise_of, smooth
+from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.noise import noise_of, smooth
 
 LEG_NOISE: Final = 8.0  # a leg is longer than so many deviations of the smoothed position
 GAP_INTERVALS: Final = 3.0

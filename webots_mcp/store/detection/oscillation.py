@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from webots_mcp.store.analysis.features import unwrap
-from webots_mcp.store.analysis.summary import usable_numbers
+from webots_mcp.store.analysis.swings import Swing, find_swings, joined_swings
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.registry import Signal
-
-if TYPE_CHECKING:
-    from webots_mcp.store.analysis.swings import Swing
 
 # What a robot swings with; sensors swing by nature while it drives.
 _SWINGING: Final = re.compile(
@@ -27,8 +24,6 @@ _SWINGING: Final = re.compile(
 
 def oscillation_events(search: Search) -> Iterator[Event]:
     """Of heading, wheels, speed, position and the like, and of what is asked for."""
-    from webots_mcp.store.analysis.swings import joined_swings  # numpy: not at the server's start
-
     asked = search.options.signals != EventOptions.signals
     signals = [each for each in search.required_numbers() if asked or _SWINGING.search(each.name)]
     left = len(search.numbers) - len(signals)
@@ -52,14 +47,10 @@ def oscillation_events(search: Search) -> Iterator[Event]:
 
 
 def _swings(search: Search, signal: Signal, columns: Columns) -> list[Swing]:
-    import numpy as np
-
-    from webots_mcp.store.analysis.swings import find_swings
-
-    times, numbers = usable_numbers(columns.times, columns.values[signal.name])
+    times, numbers = columns.numbers(signal.name)
     return find_swings(
-        np.asarray(times, np.float64),
-        np.asarray(unwrap(numbers, signal.turn) if signal.turn else numbers, np.float64),
+        times,
+        unwrap(numbers, signal.turn) if signal.turn else numbers,
         least_half_swings=search.options.oscillation_turns,
         longest_period_s=search.options.oscillation_period_s,
     )

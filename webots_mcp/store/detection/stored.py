@@ -9,11 +9,12 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any, Final
 
+from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.detection.event import LEVELS, Event
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError, only_if_named
 from webots_mcp.store.detection.search import Search, wall_time_at
 from webots_mcp.store.reading.changes import change_points
-from webots_mcp.store.reading.gaps import rhythm_in, rhythm_of, with_rows_around
+from webots_mcp.store.reading.gaps import rhythm_in, with_rows_around
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rows import exceeds, read_columns
 

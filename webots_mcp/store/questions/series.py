@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.analysis.rhythm import Gap
 from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.reading.buckets import Table, Tier, tabulate
 from webots_mcp.store.reading.changes import Point, change_points, longest_values
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.reading.gaps import Gap
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of

@@ -5,25 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Final, Literal
 
+from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.features import (
-    SLOW_SHARE,
     Line,
-    Oscillation,
     Spike,
-    find_oscillation,
     fit_line,
     flat_since,
+    is_monotonic,
+    leaps_in,
     time_effect,
-    unwrap,
 )
-from webots_mcp.store.analysis.summary import Summary, summarise
+from webots_mcp.store.analysis.summary import Summary, summarise_numbers
+from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
+from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.signals.registry import Signal
 
 STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
 TOLD_MISSING_SHARE: Final = 0.001
+SLOW_SHARE: Final = 0.5  # of the variance must be left in means for their course to be the values'
 SWINGING_SHARE: Final = 0.6  # of the range: what swung for less did something else as well
 TOLD_BEYOND_ENDS: Final = 0.05  # of the range: extremes nearer to the ends are as good as them
 _DUST: Final = 1e-12  # of a value: what adding leaves of it
@@ -49,8 +50,9 @@ class Trend:
         leaps: An angle that changed by more than a quarter turn from row to row, as the bearing to
             the nearest of several things does: its turns cannot be counted.
         monotonic: "rising", "falling" (never the other way, and not constant), or None.
-        crossings: Of the mean, by more than noise.
         fast: It varies so fast that the means of buckets do not show its course.
+        swings: Where it went to and fro, as `find_events` tells it, but of any period.
+        resolution_s: Length of the means in which swings were seen; None where rows were.
         flat_since_s: Since when it rests; None if it does not.
         spikes: Values that stand out from both neighbours; None where rows were not looked at.
         missing_share: Rows without a value.
@@ -71,9 +73,9 @@ class Trend:
     r2: float | None
     shape: Shape
     monotonic: Monotonic | None
-    crossings: int
     fast: bool
-    oscillation: Oscillation | None
+    swings: tuple[Swing, ...]
+    resolution_s: float | None
     flat_since_s: float | None
     spikes: tuple[Spike, ...] | None
     missing_share: float
@@ -84,11 +86,11 @@ class Trend:
 def judge(
     signal: Signal,
     summary: Summary,
-    times: Sequence[float],
-    numbers: Sequence[float],
+    times: Array,
+    numbers: Array,
     spikes: list[Spike] | None,
     inner_variance: float = 0.0,
-    resolution_s: float = 0.0,
+    resolution_s: float | None = None,
 ) -> Trend:
     """Put together what the summary tells and what the course of the numbers tells.
 
@@ -100,25 +102,21 @@ def judge(
         spikes: None where only buckets were looked at.
         inner_variance: That of the values within the buckets. Where more of it lies there than
             between them, a course of their means is not that of the values (it may be an alias).
-        resolution_s: The length of the buckets.
+        resolution_s: The length of the buckets; None where the numbers are the values.
     """
     of_rows = spikes is not None
     turn = signal.turn if of_rows or signal.kind == "angle" else None
-    leaps = turn is not None and of_rows and _leaps(numbers, turn)
-    course = unwrap(numbers, turn) if turn and not leaps else numbers
-    inner = summary if len(course) == summary.present and not turn else summarise(times, course)
+    leaps = turn is not None and of_rows and leaps_in(numbers, turn)
+    course = np.unwrap(numbers, period=turn) if turn and not leaps else numbers
+    inner = summary if of_rows and course is numbers else summarise_numbers(times, course)
     slow = _slow_share(inner, inner_variance, angle=signal.kind == "angle")
     fast = slow < SLOW_SHARE or leaps
     line = None if leaps else _of_all(fit_line(times, course, inner.mean or 0.0), slow)
-    crossings, swing = 0, None
-    if not fast:
-        crossings, swing = find_oscillation(
-            times, course, inner.mean or 0.0, inner.deviation or 0.0
-        )
+    swings = () if fast else _swings(times, course, resolution_s)
     monotonic = None if fast else _monotonic(course)
     rest_s = None if fast else flat_since(times, course)
     summary = _unwrapped(summary, inner) if course is not numbers else summary
-    shape = _shape(summary, line, monotonic, swing, rest_s, times[-1] - times[0])
+    shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
     trend = Trend(
         name=signal.name,
         kind=signal.kind,
@@ -132,16 +130,18 @@ def judge(
         r2=line.r2 if line else None,
         shape=shape,
         monotonic=monotonic,
-        crossings=crossings,
         fast=fast,
-        oscillation=swing,
+        swings=swings,
+        resolution_s=resolution_s,
         flat_since_s=rest_s,
         spikes=None if spikes is None else tuple(spikes),
         missing_share=1 - summary.present / summary.rows,
-        change=_change(times, course, inner) * slow * _relative_range(summary),
+        change=time_effect(times, course, inner.mean or 0.0, inner.squares or 0.0)
+        * slow
+        * _relative_range(summary),
         says="",
     )
-    return replace(trend, says="; ".join(_remarks(trend, resolution_s)))
+    return replace(trend, says="; ".join(_remarks(trend)))
 
 
 def _slow_share(means: Summary, inner_variance: float, *, angle: bool) -> float:
@@ -157,10 +157,18 @@ def _of_all(line: Line | None, slow: float) -> Line | None:
     return line and replace(line, r2=line.r2 * slow)
 
 
-def _leaps(numbers: Sequence[float], turn: float) -> bool:
-    """Whether it changed, the short way round, by more than a quarter turn from row to row."""
-    steps = (abs(math.remainder(after - before, turn)) for before, after in pairwise(numbers))
-    return any(step > turn / 4 for step in steps)
+def _swings(times: Array, course: Array, resolution_s: float | None) -> tuple[Swing, ...]:
+    """Of any period of which six half swings fit in; means show less of a swing than it is high."""
+    longest_s = 2 * float(times[-1] - times[0]) / LEAST_HALF_SWINGS
+    found = find_swings(
+        times, course, least_half_swings=LEAST_HALF_SWINGS, longest_period_s=longest_s
+    )
+    if resolution_s is None:
+        return tuple(found)
+    return tuple(
+        replace(swing, amplitude=swing.amplitude / float(np.sinc(resolution_s / swing.period_s)))
+        for swing in found
+    )
 
 
 def _unwrapped(summary: Summary, course: Summary) -> Summary:
@@ -173,16 +181,16 @@ def _unwrapped(summary: Summary, course: Summary) -> Summary:
     )
 
 
-def _mean(
-    signal: Signal, summary: Summary, course: Summary, numbers: Sequence[float]
-) -> float | None:
+def _mean(signal: Signal, summary: Summary, course: Summary, numbers: Array) -> float | None:
     """Of an angle in degrees that of the unwrapped one, written as its values are."""
     if signal.kind == "angle":
         return summary.direction
     if signal.turn is None or course is summary or course.mean is None:
         return summary.mean
     return (
-        course.mean % signal.turn if min(numbers) >= 0 else math.remainder(course.mean, signal.turn)
+        course.mean % signal.turn
+        if numbers.min() >= 0
+        else math.remainder(course.mean, signal.turn)
     )
 
 
@@ -192,14 +200,9 @@ def _deviation(signal: Signal, summary: Summary, course: Summary, *, leaps: bool
     return course.deviation if signal.turn else summary.deviation
 
 
-def _turned(summary: Summary, numbers: Sequence[float], turn: float) -> float:
-    ends = (summary.first or 0.0, summary.last or 0.0)
-    turned = unwrap([ends[0], *numbers, ends[1]], turn)
-    return turned[-1] - turned[0]
-
-
-def _change(times: Sequence[float], course: Sequence[float], inner: Summary) -> float:
-    return time_effect(times, course, inner.mean or 0.0, inner.squares or 0.0)
+def _turned(summary: Summary, numbers: Array, turn: float) -> float:
+    turned = np.unwrap([summary.first or 0.0, *numbers, summary.last or 0.0], period=turn)
+    return float(turned[-1] - turned[0])
 
 
 def _rounded(mean: float | None, inner: Summary) -> float | None:
@@ -210,26 +213,23 @@ def _rounded(mean: float | None, inner: Summary) -> float | None:
     return round(mean, 5 - math.floor(math.log10(span)))
 
 
-def _monotonic(values: Sequence[float]) -> Monotonic | None:
-    if values[0] == values[-1]:
+def _monotonic(values: Array) -> Monotonic | None:
+    if not is_monotonic(values):
         return None
-    rising = values[-1] > values[0]
-    if any((b < a) if rising else (b > a) for a, b in pairwise(values)):
-        return None
-    return "rising" if rising else "falling"
+    return "rising" if values[-1] > values[0] else "falling"
 
 
 def _shape(
     summary: Summary,
     line: Line | None,
     monotonic: Monotonic | None,
-    swing: Oscillation | None,
+    swings: Sequence[Swing],
     rest_s: float | None,
     whole_s: float,
 ) -> Shape:
     if _is_constant(summary):
         return "constant"
-    if swing is not None and swing.end_s - swing.start_s >= SWINGING_SHARE * whole_s:
+    if swings and sum(each.end_s - each.start_s for each in swings) >= SWINGING_SHARE * whole_s:
         return "oscillating"
     if monotonic is not None:
         return monotonic
@@ -250,13 +250,13 @@ def _relative_range(summary: Summary) -> float:
     return (summary.max - summary.min) / largest if largest else 0.0
 
 
-def _remarks(trend: Trend, resolution_s: float) -> Iterator[str]:
+def _remarks(trend: Trend) -> Iterator[str]:
     summary, unit = trend.summary, f" {trend.unit}" if trend.unit else ""
     yield _course(trend, unit)
     if trend.leaps:
         yield "changes by more than a quarter turn at once: turns are not counted"
     elif trend.fast:
-        yield f"varies faster than {resolution_s:g} s: ask for a shorter range"
+        yield f"varies faster than {trend.resolution_s:g} s: ask for a shorter range"
     yield from _beyond_ends(trend)
     if trend.flat_since_s is not None and trend.shape != "constant":
         yield f"flat at {_told(summary.last, summary)} since {trend.flat_since_s:.6g} s"
@@ -274,12 +274,8 @@ def _course(trend: Trend, unit: str) -> str:
     summary = trend.summary
     if trend.shape == "constant":
         return f"constant at {summary.last or 0.0:.4g}{unit}"
-    if (swing := trend.oscillation) is not None:
-        how = f"by {swing.amplitude:.3g}{unit} about {trend.mean or 0.0:.4g} every"
-        if trend.shape == "oscillating":
-            return f"swings {how} {swing.period_s:.3g} s"
-        stretch = f"from {swing.start_s:.6g} to {swing.end_s:.6g} s"
-        return f"swung {how} {swing.period_s:.3g} s {stretch}"
+    if trend.swings:
+        return _swinging(trend, unit)
     if trend.shape in ("rising", "falling"):
         slope = f" ({trend.slope_per_s:.3g}{unit}/s)" if trend.slope_per_s is not None else ""
         if trend.turned is not None:
@@ -313,3 +309,15 @@ def _told(value: float | None, summary: Summary) -> str:
     """A value with four digits; 0 where it is only what adding leaves beside the extremes."""
     largest = max(abs(summary.min or 0.0), abs(summary.max or 0.0))
     return f"{value:.4g}" if value is not None and abs(value) > _DUST * largest else "0"
+
+
+def _swinging(trend: Trend, unit: str) -> str:
+    """Of several stretches the longest."""
+    swing = max(trend.swings, key=lambda each: each.end_s - each.start_s)
+    seen = f" (seen in means of {trend.resolution_s:g} s)" if trend.resolution_s else ""
+    how = f"by {swing.amplitude:.3g}{unit}{{}} every {swing.period_s:.3g} s{seen}"
+    if trend.shape == "oscillating":
+        return f"swings {how.format(f' about {trend.mean or 0.0:.4g}')}"
+    others = f", and {len(trend.swings) - 1} times besides" if trend.swings[1:] else ""
+    stretch = f"from {shown_time(swing.start_s):g} to {shown_time(swing.end_s):g} s"
+    return f"swung {how.format('')} {stretch}{others}"

@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.features import find_spikes
-from webots_mcp.store.analysis.summary import summarise, usable_numbers
+from webots_mcp.store.analysis.summary import summarise_numbers
+from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.questions.trend import Trend, judge
 from webots_mcp.store.reading.changes import change_points, longest_values
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
@@ -47,7 +49,7 @@ class RunTrends:
 
     Attributes:
         resolution_s: None if every row was looked at; else the length of the rollups from which
-            shape, slope and crossings come (counts, extremes, mean and deviation stay exact).
+            shape, slope and swings come (counts, extremes, mean and deviation stay exact).
         numbers: What changed most comes first; at most `limit` of `total`.
         silent: Names that have no value in the range.
         cut_at_s: The deadline passed; from there on rows are missing in the answer.
@@ -100,7 +102,16 @@ def trends(
     runs = [
         run_trends(connection, segment, signals, limit, deadline) for segment in time_range.segments
     ]
-    return Trends(time_range.robot, tuple(runs), time_range.notes)
+    notes = [_unseen_swings(run) for run in runs if run.resolution_s is not None]
+    return Trends(time_range.robot, tuple(runs), (*time_range.notes, *notes))
+
+
+def _unseen_swings(run: RunTrends) -> str:
+    shortest_s = SHORTEST_PERIOD_ROWS * (run.resolution_s or 0.0)
+    return (
+        f"run {run.run_id} is seen in means of {run.resolution_s:g} s: swings shorter than "
+        f"{shortest_s:g} s were not looked for; ask for less time to see them"
+    )
 
 
 def run_trends(
@@ -141,11 +152,12 @@ def run_trends(
 
 
 def _trend_of_rows(signal: Signal, columns: Columns) -> Trend | None:
-    values = columns.values[signal.name]
-    times, numbers = usable_numbers(columns.times, values)
-    if not numbers:
+    times, numbers = columns.numbers(signal.name)
+    if not len(numbers):
         return None
-    summary = summarise(columns.times, values, angle=signal.kind == "angle")
+    summary = summarise_numbers(
+        times, numbers, rows=len(columns.times), angle=signal.kind == "angle"
+    )
     return judge(signal, summary, times, numbers, find_spikes(times, numbers))
 
 
@@ -164,7 +176,8 @@ def _trend_of_pieces(signal: Signal, pieces: Pieces) -> Trend | None:
             means.append(centre)
             inner.append((part.circular_deviation if angle else part.deviation) or 0.0)
     variance = statistics.fmean(deviation**2 for deviation in inner)
-    return judge(signal, summary, middles, means, None, variance, pieces.piece_s)
+    course = np.array(middles), np.array(means)
+    return judge(signal, summary, *course, None, variance, pieces.piece_s)
 
 
 def _state_trends(

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 from itertools import count, groupby, pairwise
 from typing import Final, Literal
 
+from webots_mcp.store.analysis.rhythm import Rhythm, rhythm_of
 from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.gaps import Rhythm, rhythm_in, rhythm_of
+from webots_mcp.store.reading.gaps import rhythm_in
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import piece_length_s, read_pieces
 from webots_mcp.store.reading.rows import Columns, exceeds, read_columns

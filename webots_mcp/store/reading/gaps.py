@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import sqlite3
-import statistics
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final
 
+from webots_mcp.store.analysis.rhythm import GAP_INTERVALS, Gap, Rhythm, gaps_in, usual_interval_s
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, Grain, bucket_of
 
-GAP_INTERVALS: Final = 3.0  # a gap is longer than so many median intervals
 _SAMPLE_ROWS: Final = 2000
 _ROWS_AROUND: Final = 20  # before and after a stretch: they tell what is usual
 _MOST_BUCKETS: Final = 300  # of a long stretch that are looked into row by row
@@ -45,27 +44,6 @@ _LACKING: Final = (
 )
 
 
-@dataclass(frozen=True)
-class Gap:
-    """No row between two rows of a run, for longer than usual."""
-
-    start_s: float
-    end_s: float
-
-
-@dataclass(frozen=True)
-class Rhythm:
-    """How regularly rows were recorded.
-
-    Attributes:
-        interval_s: The median simulated time between rows; None for fewer than two rows.
-        gaps: In order.
-    """
-
-    interval_s: float | None
-    gaps: tuple[Gap, ...]
-
-
 def with_rows_around(connection: sqlite3.Connection, segment: Segment) -> Segment:
     """The segment with some rows before and after it: a gap at its end, or all around it, shows."""
     before = connection.execute(_BEFORE, (segment.run_id, segment.start_s, _ROWS_AROUND)).fetchall()
@@ -75,23 +53,6 @@ def with_rows_around(connection: sqlite3.Connection, segment: Segment) -> Segmen
     return Segment(segment.run_id, start_s, end_s)
 
 
-def rhythm_of(times: Sequence[float]) -> Rhythm:
-    """The rhythm of the given times; a gap is an interval of more than three median ones.
-
-    Intervals of zero, while a simulation is paused, do not count for the median.
-    """
-    moving = [after - before for before, after in pairwise(times) if after > before]
-    if not moving:
-        return Rhythm(None, ())
-    interval_s = statistics.median(moving)
-    return Rhythm(interval_s, tuple(_wider(times, interval_s)))
-
-
-def _wider(times: Sequence[float], interval_s: float) -> Iterator[Gap]:
-    limit_s = GAP_INTERVALS * interval_s * (1 + 1e-6)
-    return (Gap(a, b) for a, b in pairwise(times) if b - a > limit_s)
-
-
 def rhythm_in(connection: sqlite3.Connection, segment: Segment) -> Rhythm:
     """The rhythm of a long segment, from the rollups: rows are read only where some are missing.
 
@@ -99,7 +60,7 @@ def rhythm_in(connection: sqlite3.Connection, segment: Segment) -> Rhythm:
     is irregular rather than interrupted, and within the others only whole missing buckets count.
     """
     sample = _times(connection, segment.run_id, segment.start_s, segment.end_s, _SAMPLE_ROWS)
-    interval_s = rhythm_of(sample).interval_s
+    interval_s = usual_interval_s(sample)
     if interval_s is None:
         return Rhythm(None, ())
     irregular = _irregular(connection, segment, interval_s)
@@ -145,8 +106,8 @@ def _joined(buckets: Sequence[tuple[int, int]]) -> Iterator[tuple[float, float]]
 def _gaps(connection: sqlite3.Connection, segment: Segment, interval_s: float) -> Iterator[Gap]:
     before: Sequence[float] = ()
     for times, complete in _stretches(connection, segment, interval_s):
-        yield from _wider((*before[-1:], times[0]), interval_s)
-        yield from () if complete else _wider(times, interval_s)
+        yield from gaps_in((*before[-1:], times[0]), interval_s)
+        yield from () if complete else gaps_in(times, interval_s)
         before = times
 
 

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from webots_mcp.naming import Value, flatten
+from webots_mcp.store.analysis.arrays import Array
+from webots_mcp.store.analysis.summary import usable_arrays
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.batch import is_odd, odd_names
@@ -50,6 +52,10 @@ class Columns:
     values: dict[str, list[Value]] = field(default_factory=dict[str, list[Value]])
     odd: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])
     cut: bool = False
+
+    def numbers(self, name: str) -> tuple[Array, Array]:
+        """Times and numbers of a numeric signal, of the rows that have a usable one."""
+        return usable_arrays(self.times, self.values[name])
 
 
 def exceeds(connection: sqlite3.Connection, segment: Segment) -> bool:

@@ -11,12 +11,12 @@ import sqlite3
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Final, Protocol
 
-from webots_mcp.store.analysis.summary import Summary, summarise, usable_numbers
+from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.rhythm import GAP_INTERVALS, usual_interval_s
+from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.gaps import GAP_INTERVALS, rhythm_of
 from webots_mcp.store.reading.intervals import (
     Condition,
     Span,
@@ -58,12 +58,12 @@ class Course:
     """Numbers of a signal in which jumps are looked for.
 
     Attributes:
-        usual_steps: Sizes of steps to compare with; empty for those of the numbers themselves.
+        usual_steps: Sizes of steps to compare with; None for those of the numbers themselves.
     """
 
-    times: Sequence[float]
-    numbers: Sequence[float]
-    usual_steps: Sequence[float] = ()
+    times: Array
+    numbers: Array
+    usual_steps: Array | None = None
 
 
 class View(Protocol):
@@ -155,8 +155,9 @@ class RowView:
     def summary(self, signal: Signal) -> Summary:
         """Of all rows."""
         if signal.name not in self._summaries:
-            values = self._columns.values[signal.name]
-            self._summaries[signal.name] = summarise(self._columns.times, values)
+            rows = len(self._columns.times)
+            numbers = self._columns.numbers(signal.name)
+            self._summaries[signal.name] = summarise_numbers(*numbers, rows=rows)
         return self._summaries[signal.name]
 
     def spans(self, signal: Signal, condition: Condition) -> list[Span]:
@@ -166,7 +167,7 @@ class RowView:
 
     def courses(self, signal: Signal) -> Iterator[Course]:
         """All of it."""
-        yield Course(*usable_numbers(self._columns.times, self._columns.values[signal.name]))
+        yield Course(*self._columns.numbers(signal.name))
 
     def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Columns]:
         """All rows at once."""
@@ -355,16 +356,14 @@ class LongView:
     def _cut(self) -> None:
         self.notes.append("the time was over before all was searched: ask for less time or kinds")
 
-    def _numbers(self, signal: Signal, bucket: int) -> tuple[Sequence[float], Sequence[float]]:
+    def _numbers(self, signal: Signal, bucket: int) -> tuple[Array, Array]:
         start_s = max(self._segment.start_s, bucket * BUCKET_S - self._join_s)
         end_s = min(self._segment.end_s, (bucket + 1) * BUCKET_S + self._join_s)
         part = replace(self._segment, start_s=start_s, end_s=end_s)
-        columns = read_columns(self._connection, part, [signal], self._deadline)
-        return usable_numbers(columns.times, columns.values[signal.name])
+        return read_columns(self._connection, part, [signal], self._deadline).numbers(signal.name)
 
-    def _usual_steps(self, signal: Signal) -> list[float]:
-        _, numbers = usable_numbers(self._sample.times, self._sample.values[signal.name])
-        return [abs(after - before) for before, after in pairwise(numbers)]
+    def _usual_steps(self, signal: Signal) -> Array:
+        return np.abs(np.diff(self._sample.numbers(signal.name)[1]))
 
 
 def _bucket(wide: tuple[float, int]) -> int:
@@ -373,4 +372,4 @@ def _bucket(wide: tuple[float, int]) -> int:
 
 def _join_s(times: Sequence[float]) -> float:
     """Rows within this time of each other follow directly: there is no gap between them."""
-    return GAP_INTERVALS * (rhythm_of(times).interval_s or 0.0)
+    return GAP_INTERVALS * (usual_interval_s(times) or 0.0)

@@ -1,0 +1,26 @@
+"""numpy, imported at its first use: neither a server's start nor a summary waits for it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Array = NDArray[np.float64]
+    Flags = NDArray[np.bool_]
+    Indexes = NDArray[np.intp]
+else:
+    Array = Flags = Indexes = Any
+
+    class _AtFirstUse:
+        def __getattr__(self, name: str) -> Any:
+            import numpy
+
+            setattr(self, name, getattr(numpy, name))
+            return getattr(numpy, name)
+
+    np = _AtFirstUse()
+
+__all__ = ["Array", "Flags", "Indexes", "np"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import accumulate
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.memory import memory_connection
@@ -23,6 +23,7 @@ from webots_mcp.store.rollup.rolling import roll
     start=st.floats(0, 0.5),
     end=st.floats(0.5, 1.2),
 )
+@example(gaps={20: 3.5}, start=0.0, end=1.0)  # lacks two rows of a bucket
 def test_gaps_are_those_of_the_rows(
     interval_s: float, gaps: dict[int, float], start: float, end: float
 ) -> None:

@@ -76,7 +76,7 @@ def _irregular(
     run_id, span = segment.run_id, range(bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
     values = {
         **_bounds(run_id, span),
-        "least": BUCKET_S / interval_s - 2,
+        "least": _least_rows(interval_s),
         "margin_s": GAP_INTERVALS / 2 * interval_s,
     }
     there = [bucket for (bucket,) in connection.execute(_THERE, values)]
@@ -90,6 +90,11 @@ def _irregular(
         replace(segment, start_s=max(segment.start_s, a), end_s=min(segment.end_s, b))
         for a, b in _joined(sorted([*lacking, *missing, *edges]))
     ]
+
+
+def _least_rows(interval_s: float) -> float:
+    """With fewer rows a bucket may hold a gap: of n rows n - 2 usual intervals and the gap fit."""
+    return BUCKET_S / interval_s - GAP_INTERVALS + 2
 
 
 def _joined(buckets: Sequence[tuple[int, int]]) -> Iterator[tuple[float, float]]:
@@ -121,7 +126,7 @@ def _stretches(
         start_s, end_s = bucket * BUCKET_S, (bucket + 1) * BUCKET_S
         if start_s > reached_s and (head := _times(connection, run_id, reached_s, start_s)):
             yield head, False
-        complete = rows >= BUCKET_S / interval_s - 2 or looked >= _MOST_BUCKETS
+        complete = rows >= _least_rows(interval_s) or looked >= _MOST_BUCKETS
         looked += not complete
         reached_s = end_s
         if complete and first_s is not None:

@@ -129,7 +129,8 @@ def find_events(
     """What happened in a range: with its true begin and end, also where it reaches out of it.
 
     Up to 30,000 rows of a run are all looked at. Of a longer range the rollups and the change
-    table tell where to look, and the notes say what may have been missed.
+    table tell where to look; swings and leaps are searched row by row from the newest on, as far
+    as the time allows. The verdicts say what was not searched.
 
     Args:
         connection: Any.
@@ -141,8 +142,8 @@ def find_events(
         group: Many dropouts, steps or silences of one signal are told as one event, which counts
             them; else each is one.
         after: The `cursor` of an answer, for the events that it left out.
-        deadline_s: After it, what was found so far is the answer, and the notes say what was not
-            looked at.
+        deadline_s: After it, what was found so far is the answer, and the verdicts say what was
+            not looked at.
 
     Raises:
         UnknownSignalError: A name in the options or in `around` meets nothing.

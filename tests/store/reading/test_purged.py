@@ -103,6 +103,7 @@ def test_where_rows_were_purged_events_do_not_claim_to_have_looked_at_them(
     told = find_events(rover, resolve_range(rover, run_id=1)).verdicts.not_searched
     for kind in ("still", "stuck", "jump", "oscillation"):
         assert "not before 55.000 s, whose rows were purged" in told[kind], kind
+    assert "not those of less than 20 s before 55.000 s" in told["silent"]
 
 
 def distance(comparison: Comparison) -> list[Spread | None]:

@@ -95,3 +95,17 @@ def test_dropouts_everywhere_in_a_long_range_are_found_or_named_as_not_searched(
     asked = EventOptions(kinds=("jump",))
     answer = find_events(empty, resolve_range(empty), asked)
     assert answer.events or "vary as most do" in answer.verdicts.not_searched["jump"]
+
+
+def test_a_swing_whose_rows_meet_the_same_values_again_does_not_drop_out(
+    empty: sqlite3.Connection,
+) -> None:
+    """Two rows lie at each of its turns, at the same height."""
+    heights = (0.1, 0.2, 0.2, 0.1)
+
+    def swinging(time_s: float) -> dict[str, Any]:
+        step = round(time_s * 10)
+        return {"steer": heights[step % 4] if 400 <= step < 440 else 0.0}
+
+    record(empty, swinging)
+    assert jumps(empty) == []

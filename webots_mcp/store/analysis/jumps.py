@@ -75,7 +75,8 @@ def _come_back(times: Array, values: Array, steps: Array) -> dict[int, int]:
 
     What was recorded on the other side of a gap is not soon after.
     """
-    left = np.flatnonzero((steps[1:] > 0) & (steps[:-1] == 0)) + 1
+    # At the turn of a swing two rows may meet the same value; three are a rest.
+    left = np.flatnonzero((steps[2:] > 0) & (steps[1:-1] == 0) & (steps[:-2] == 0)) + 2
     left = left[_step(values[left], values[left + 1]) > 0]
     backs: dict[int, int] = {}
     for later in range(LONGEST_EXCURSION + 1, 1, -1):

@@ -46,6 +46,9 @@ HUGE = 2**63
         ("find_events", {"for_s": 2.0}, "for_s=2 needs above or below"),
         ("query_history", {"signals": ["x"], "cursor": 3}, "cursor goes on with rows"),
         ("get_timeline", {"kinds": ["threshold"]}, "a threshold has no place here"),
+        ("monitor", {"duration_s": 2, "lookback_s": 9}, "give either duration_s"),
+        ("simulation_control", {"command": "pause", "steps": 2}, "steps is for command='step'"),
+        ("get_trends", {"robot": "r" * 201}, "robot must have at most 200 characters, not"),
     ],
 )
 async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
@@ -136,3 +139,27 @@ async def test_a_misspelt_signal_is_answered_with_the_nearest_names(
         ):
             told = await fail(client, "webots_get_trends", signals=[wrong])
             assert f"no signal {wrong!r} is recorded; there is {near}" in told
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "near"),
+    [
+        ("find_events", {"kinds": ["stucked"]}, "stuck"),
+        ("get_logs", {"level": "warn"}, "warning"),
+        ("simulation_control", {"command": "resett"}, "reset"),
+        ("list_commands", {"status": "canceled"}, "cancelled"),
+    ],
+)
+async def test_a_near_miss_of_a_choice_is_offered_what_was_perhaps_meant(
+    connect: Connect, tool: str, arguments: dict[str, Any], near: str
+) -> None:
+    async with connect() as client:
+        told = await fail(client, f"webots_{tool}", **arguments)
+    assert told.endswith(f"; did you mean {near!r}?")
+
+
+async def test_an_offset_into_an_object_is_refused(connect: Connect, recorded: Recorded) -> None:
+    recorded.robot().state(1.0, {"pose": {"x": 1}})
+    async with connect() as client:
+        told = await fail(client, "webots_get_full_state", path="pose", offset=1)
+    assert "offset is for arrays and texts" in told

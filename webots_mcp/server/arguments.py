@@ -6,6 +6,7 @@ question than was asked; and it tells what is wrong with a value in the words of
 
 from __future__ import annotations
 
+import difflib
 import re
 from collections.abc import Iterable
 from typing import Any, Final
@@ -90,7 +91,14 @@ def _fault(error: ErrorDetails) -> str:
     asked = re.sub(r"^(Value error, |\w+ should )", "must ", error["msg"])
     if error["type"] == "int_parsing_size":
         asked = "must be a smaller number"
-    return f"{name} {asked}, not {_shown(error['input'])}"
+    return f"{name} {asked}, not {_shown(error['input'])}{_near(error)}"
+
+
+def _near(error: ErrorDetails) -> str:
+    """The choice that was perhaps meant."""
+    choices = re.findall(r"'([^']+)'", error["msg"])
+    near = difflib.get_close_matches(str(error["input"])[:_LONGEST_VALUE], choices, n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
 
 
 def _shown(value: object) -> str:

@@ -11,11 +11,12 @@ from webots_mcp.store.detection.registry import KINDS, kind_names
 
 # Clients put a call aside after two minutes; some of this time is for a busy database.
 MAX_WAIT_S: Final = 90
+LONGEST_NAME: Final = 200
 
 
 def _as_kind(name: str) -> str:
     if name not in kind_names():
-        raise ValueError(f"be one of {', '.join(kind_names())}")
+        raise ValueError(f"be one of {', '.join(map(repr, kind_names()))}")
     return name
 
 
@@ -31,6 +32,12 @@ def _as_seconds(value: float) -> float:
     return value
 
 
+def _as_name(value: str) -> str:
+    if len(value) > LONGEST_NAME:
+        raise ValueError(f"have at most {LONGEST_NAME} characters")
+    return value
+
+
 # Bounds that only an absurd value meets stay out of the schemas, which every client carries along.
 # The others stand before a validator of ours: behind it pydantic does not know JSON Schema's words.
 _RowId = Annotated[int, Field(ge=1), AfterValidator(_as_id)]
@@ -38,11 +45,8 @@ _Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]
 _Seconds = Annotated[float, AfterValidator(_as_seconds)]
 _Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
 RobotName = Annotated[
-    str | None,
-    Field(
-        max_length=200,
-        description="Robot name (webots_list_robots); may be left out while only one is live.",
-    ),
+    Annotated[str, AfterValidator(_as_name)] | None,
+    Field(description="Its name (webots_list_robots), where several are live."),
 ]
 RunId = Annotated[_RowId | None, Field(description="That run instead of the robot's current one.")]
 LastS = Annotated[
@@ -80,7 +84,7 @@ Names = Annotated[
 ]
 AnyNames = Annotated[
     list[str] | None,
-    Field(max_length=50, description="Signal names, as webots_list_signals has them; all if none."),
+    Field(max_length=50, description="Only these signals (webots_list_signals); '*' any text."),
 ]
 MaxPoints = Annotated[
     int | None,

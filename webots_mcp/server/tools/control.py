@@ -11,6 +11,7 @@ from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.contract import MAX_STEPS
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.server.declaring import ACTS, RESTARTS, tool
 from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.keyboard import press_reset
@@ -32,13 +33,9 @@ async def webots_simulation_control(
     command: Annotated[Control, Field(description="reset and reload begin a new run at time 0.")],
     ctx: Context[Any],
     steps: Annotated[
-        int,
-        Field(
-            ge=1,
-            le=MAX_STEPS,
-            description="For step: so many rounds of the controller's own loop, then paused.",
-        ),
-    ] = 1,
+        Annotated[int, Field(ge=1, le=MAX_STEPS)] | None,
+        Field(description="For step, by default 1: rounds of the controller's loop, then paused."),
+    ] = None,
     robot: RobotName = None,
     timeout_s: Annotated[
         float | None,
@@ -56,6 +53,9 @@ async def webots_simulation_control(
     alone. `reload` restarts the controllers that Webots starts, with their code as it is on
     disk now; an extern controller ends, and somebody has to start it again by hand.
     """
+    if steps is not None and command != "step":
+        raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
+    steps = steps or 1
     params = {"steps": steps} if command == "step" else {}
     waiting_s = timeout_s or await to_thread.run_sync(
         _usual_wait_s, recording, command, steps, robot
@@ -70,7 +70,7 @@ async def webots_world_reload(
     robot: RobotName = None,
     timeout_s: TimeoutS = _RELOAD_WAIT_S,
 ) -> CommandAnswer:
-    """Reload the world from disk and restart its controllers; waits until a new one records.
+    """Load world and code anew: webots_simulation_control("reload") by another name.
 
     An extern controller ends, and somebody has to start it again by hand.
     """
@@ -84,14 +84,14 @@ async def webots_world_reset(
     force: Annotated[
         bool,
         Field(
-            description="Press Webots' own keys instead of asking the controller (macOS only): "
-            "for a controller that does not answer any more."
+            description="Press Webots' own keys instead (macOS only), where the controller no "
+            "longer answers."
         ),
     ] = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
-    """Put the world back to its start, simulation time 0; controllers go on running."""
+    """Back to time 0: webots_simulation_control("reset"), and with force for a stuck controller."""
     if force:
         return await _reset_by_keys(recording, robot, timeout_s)
     return await Dispatcher(recording, ctx.report_progress).ask(robot, "reset", timeout_s)
@@ -101,9 +101,9 @@ async def webots_world_reset(
 async def webots_reset_controller_state(
     recording: Recording, ctx: Context[Any], robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
 ) -> CommandAnswer:
-    """Run the callbacks that the controller registered with bridge.on_reload().
+    """Put the controller's own variables back; world and time go on as they are.
 
-    They put the controller's own variables back; the world stays as it is.
+    Runs the callbacks that it registered with bridge.on_reload().
     """
     return await Dispatcher(recording, ctx.report_progress).ask(robot, "reset_state", timeout_s)
 

@@ -68,7 +68,7 @@ def webots_find_events(
     limit: ShownLimit = None,
     cursor: TextCursor = "",
 ) -> EventsAnswer:
-    """What happened in a stretch of time, by default the whole run, with begin and duration.
+    """What went wrong, since when, how often: searches the values, by default of the whole run.
 
     Many alike events of one signal are told as one, counted. verdicts: what was found, what
     is absent, what was not looked for and why. What is not shown is counted; cursor shows it.

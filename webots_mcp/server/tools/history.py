@@ -64,10 +64,10 @@ def webots_query_history(
     ] = False,
     cursor: Cursor = None,
 ) -> HistoryAnswer:
-    """Signals over time, by default the whole run: min, max, mean, last per bucket.
+    """The values of signals over time: min, max, mean, last per bucket, by default the whole run.
 
     No extreme is averaged away; empty buckets are null, gaps are listed. Text and flags come as
-    the points at which they changed. For "what happened" webots_get_trends is shorter.
+    the points at which they changed. webots_get_trends first: in words, which signals matter.
     """
     if cursor is not None and not raw:
         raise InvalidInputError("cursor goes on with rows: give it together with raw=true")

@@ -11,6 +11,7 @@ from anyio import to_thread
 from mcp.server.mcpserver import Context
 from pydantic import Field
 
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.server.budget import BUDGET, answer_about, notes_of
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.history_results import MonitorAnswer
@@ -23,6 +24,7 @@ from webots_mcp.store.questions.events import search_events
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.recording import Recording, View
 
+USUAL_DURATION_S: Final = 10.0
 _REPORT_INTERVAL_S: Final = 1.0
 _SHOWN_SIGNALS: Final = 12
 _SHOWN_EVENTS: Final = 30
@@ -33,8 +35,9 @@ async def webots_monitor(
     recording: Recording,
     ctx: Context[Any],
     duration_s: Annotated[
-        float, Field(ge=1, le=MAX_WAIT_S, description="How long to watch, wall seconds.")
-    ] = 10,
+        Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None,
+        Field(description="How long to watch, wall seconds; by default 10."),
+    ] = None,
     lookback_s: Annotated[
         float | None,
         Field(
@@ -46,11 +49,16 @@ async def webots_monitor(
     ] = None,
     robot: RobotName = None,
 ) -> MonitorAnswer:
-    """Watch for some seconds, then report what was recorded meanwhile; or look back at once.
+    """What does it do now? Watch it live for some seconds of wall time, then report.
 
-    Movement, trends and events (changed modes and flags, stuck, pauses, commands, warnings) of
-    exactly the rows of that window: nothing depends on when one looked.
+    Movement, trends and events of exactly the rows of that window. For longer ago, another run,
+    or chosen signals: webots_get_trends and webots_find_events, which take simulation time.
     """
+    if lookback_s is not None and duration_s is not None:
+        raise InvalidInputError(
+            "give either duration_s, to watch from now on, or lookback_s, to look back at once"
+        )
+    duration_s = duration_s or USUAL_DURATION_S
     if lookback_s is not None:
         return await to_thread.run_sync(_look_back, recording, robot, lookback_s)
     name, started_s = await to_thread.run_sync(_start, recording, robot)

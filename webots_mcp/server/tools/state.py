@@ -6,7 +6,7 @@ from typing import Annotated, Any, Final, cast
 
 from pydantic import Field
 
-from webots_mcp.errors import NothingRecordedError
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.server.budget import some
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import RobotName, RunId
@@ -109,6 +109,8 @@ def webots_get_full_state(
             hint, recorder = _nothing_yet(view), _recorder(view)
             return FullStateAnswer(**view.header(), hint=hint, recorder=recorder)
         part = select(view.state.value(), path)
+        if offset and not isinstance(part, (list, str)):
+            raise InvalidInputError("offset is for arrays and texts: give path to one of them")
         answer = _page(part, path, offset, limit)
         answer |= view.header()
         if not path:

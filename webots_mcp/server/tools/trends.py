@@ -49,7 +49,7 @@ def webots_get_trends(
     signals: AnyNames = None,
     limit: ShownLimit = None,
 ) -> TrendsAnswer:
-    """What each signal did over a stretch of time, by default the whole run, in one line each.
+    """What each signal did, in words, by default over the whole run; values: webots_query_history.
 
     What changed most comes first: rises, falls, swings (period, amplitude), rests since when,
     spikes, missing values; of modes and flags the changes and the time in each value.

@@ -46,34 +46,27 @@ _Seconds = Annotated[float, AfterValidator(_as_seconds)]
 _Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
 RobotName = Annotated[
     Annotated[str, AfterValidator(_as_name)] | None,
-    Field(description="Its name (webots_list_robots), where several are live."),
+    Field(description="Its name, where several are live."),
 ]
-RunId = Annotated[_RowId | None, Field(description="That run instead of the robot's current one.")]
+RunId = Annotated[_RowId | None, Field(description="Instead of its current run.")]
 LastS = Annotated[
     _Duration | None,
-    Field(description="Only the last so many seconds of simulation time."),
+    Field(description="Only the last seconds of simulation time."),
 ]
 StartS = Annotated[_Seconds | None, Field(description="From this simulation time on, s.")]
-EndS = Annotated[
-    _Seconds | None, Field(description="Up to, not including, this simulation time, s.")
-]
+EndS = Annotated[_Seconds | None, Field(description="Before this simulation time, s.")]
 TimeoutS = Annotated[
     float,
-    Field(ge=0.1, le=MAX_WAIT_S, description="How long to wait for the outcome, wall seconds."),
+    Field(ge=0.1, le=MAX_WAIT_S, description="Longest wait for the outcome, wall seconds."),
 ]
-_CURSOR: Final = "From the previous answer, to go on where it ended."
+_CURSOR: Final = "From the previous answer, to go on there."
 Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
 Since = Annotated[
     float | str | None,
-    Field(
-        description="From this wall time on, across runs: ISO 8601 or Unix seconds. Instead of "
-        "simulation times."
-    ),
+    Field(description="From this wall time on, across runs: ISO 8601 or Unix seconds."),
 ]
-Until = Annotated[
-    float | str | None, Field(description="Up to, not including, this wall time; see since.")
-]
+Until = Annotated[float | str | None, Field(description="Before this wall time; see since.")]
 Names = Annotated[
     list[str],
     Field(
@@ -107,12 +100,12 @@ Kinds = Annotated[
     ),
 ]
 TimelineKinds = Annotated[
-    list[Kind] | None,
-    Field(description="Only these; by default all that were stored; see webots_find_events."),
+    list[Annotated[str, AfterValidator(_as_kind)]] | None,
+    Field(description="Only these kinds of webots_find_events; by default all that were stored."),
 ]
 ShownLimit = Annotated[
     int | None,
-    Field(ge=1, le=500, description="At most so many; by default as many as a short answer holds."),
+    Field(ge=1, le=500, description="At most so many; by default what a short answer holds."),
 ]
 LogLevel = Annotated[contract.LogLevel, Field(description="Log lines of this level and above.")]
 Limit = Annotated[int, Field(ge=1, le=500, description="At most so many.")]

@@ -10,17 +10,15 @@ import math
 import operator
 from collections.abc import Callable
 from functools import reduce
-from typing import Any, Final, NoReturn, TypeAlias, cast
+from typing import Any, Final, TypeAlias, cast
 
 from webots_mcp.conditions.memory import Changed, Displacement, Lasting, Memory, Rate
+from webots_mcp.conditions.nodes import FLAGS, Nodes, function_of, is_signal
 from webots_mcp.conditions.reading import Plain, PositionReader, Read, State, reader
-from webots_mcp.conditions.scanning import Scanned, refusal
-from webots_mcp.errors import ConditionFailedError
+from webots_mcp.conditions.scanning import Scanned
 from webots_mcp.naming import Value, nearest_first
 
-MAX_DEPTH: Final = 50
 MAX_DURATION_S: Final = 3600.0
-MAX_NUMBER: Final = 1e300
 MAX_NAME_CHARACTERS: Final = 200
 
 Number: TypeAlias = "int | float"
@@ -36,42 +34,45 @@ _COMPARISONS: Final[dict[type[ast.cmpop], tuple[str, Callable[[Any, Any], bool]]
     ast.Eq: ("==", operator.eq),
     ast.NotEq: ("!=", operator.ne),
 }
-_ARITHMETIC: Final[dict[type[ast.operator], Callable[[Any, Any], Any]]] = {
+ARITHMETIC: Final[dict[type[ast.operator], Callable[[Any, Any], Any]]] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
     ast.Mult: operator.mul,
     ast.Div: lambda a, b: a / b,
 }
-_FLAGS: Final = {"true": True, "false": False, "True": True, "False": False}
-_OF_NUMBERS: Final[dict[str, Callable[..., Any]]] = {"abs": abs, "min": min, "max": max}
+OF_NUMBERS: Final[dict[str, Callable[..., Any]]] = {"abs": abs, "min": min, "max": max}
 _GIVING_FLAGS: Final = ("changed", "missing")
-FUNCTIONS: Final = (*_OF_NUMBERS, *_GIVING_FLAGS, "rate", "displacement", "signal")
+_ALWAYS_OR_NEVER: Final = "it would hold always or never"
+FUNCTIONS: Final = (*OF_NUMBERS, *_GIVING_FLAGS, "rate", "displacement", "signal")
 
 
-class Compiler:
-    """Makes closures of the nodes of one condition.
+class Compiler(Nodes):
+    """Makes closures of the nodes of one condition, or of one number within a score.
 
     Attributes:
         readers: What reads each signal that is named, by its name.
+        columns: Where each of them is named first, counted from 0.
         memories: What has to take in every state, in this order.
         position: Where displacements are read from; None if there are none.
-        root: Whether the condition holds.
+        root: Whether the condition holds; or the number.
     """
 
-    def __init__(self, scanned: Scanned, tree: ast.expr, plain: Plain) -> None:
-        self._scanned = scanned
+    def __init__(
+        self, scanned: Scanned, tree: ast.expr, plain: Plain, *, number: bool = False
+    ) -> None:
+        super().__init__(scanned)
         self._plain = plain
-        self._durations = set(scanned.durations)
-        self._encoded = scanned.source.encode()
         self.readers: dict[str, Read] = {}
+        self.columns: dict[str, int] = {}
         self.memories: list[Memory] = []
         self.position: PositionReader | None = None
         self._require_shallow(tree)
-        self.root = self._condition(tree)
+        self.root: Any = self._number(tree) if number else self._condition(tree)
         for place in self._durations:
             self._refuse_at(place, "`for` follows a condition: put parentheses around both")
         if not self.readers and self.position is None:
-            self._refuse_at(0, "no signal is named: it would hold always or never")
+            same = "it would be the same in every state"
+            self._refuse(tree, f"no signal is named: {same if number else _ALWAYS_OR_NEVER}")
 
     # -- conditions ----------------------------------------------------------------------------
 
@@ -85,9 +86,9 @@ class Compiler:
             return self._comparison(node)
         if isinstance(node, ast.Tuple):
             return self._lasting(node)
-        if _function_of(node) in _GIVING_FLAGS:
+        if function_of(node) in _GIVING_FLAGS:
             return self._flag_of(cast("ast.Call", node))
-        if _is_signal(node):
+        if is_signal(node):
             return self._flag(node)
         self._refuse(node, "this is a value; a condition compares it, as in `x < 1`")
 
@@ -129,18 +130,9 @@ class Compiler:
         held = self._keep(Lasting(self._condition(condition), self._seconds(seconds, "for")))
         return held.holds
 
-    def _durations_between(self, node: ast.Tuple) -> list[int]:
-        start, end = self._column(node), self._end_column(node)
-        inner = [(self._column(part), self._end_column(part)) for part in node.elts]
-        return sorted(
-            place
-            for place in self._durations
-            if start <= place < end and not any(a <= place < b for a, b in inner)
-        )
-
     def _flag_of(self, node: ast.Call) -> Holds:
         value = self._value(self._only(node))
-        if _function_of(node) == "missing":
+        if function_of(node) == "missing":
             return lambda state: value(state) is None
         return self._keep(Changed(value)).holds
 
@@ -160,11 +152,11 @@ class Compiler:
 
     def _value(self, node: ast.expr) -> Read:
         """A number, a flag, a text or None."""
-        if isinstance(node, ast.Name) and node.id in _FLAGS:
-            return _constant(_FLAGS[node.id])
+        if isinstance(node, ast.Name) and node.id in FLAGS:
+            return _constant(FLAGS[node.id])
         if isinstance(node, ast.Constant):
             return _constant(self._constant(node))
-        return self._signal(node) if _is_signal(node) else self._number(node)
+        return self._signal(node) if is_signal(node) else self._number(node)
 
     def _number(self, node: ast.expr) -> ReadNumber:
         if isinstance(node, ast.Constant):
@@ -174,7 +166,7 @@ class Compiler:
                 if isinstance(value, (str, bool))
                 else _constant(value)
             )
-        if _is_signal(node):
+        if is_signal(node):
             return self._number_of(self._signal(node), node)
         if isinstance(node, ast.BinOp):
             return self._arithmetic(node)
@@ -197,10 +189,10 @@ class Compiler:
         return number
 
     def _arithmetic(self, node: ast.BinOp) -> ReadNumber:
-        if type(node.op) not in _ARITHMETIC:
+        if type(node.op) not in ARITHMETIC:
             self._refuse(node, "there are + - * / only")
         left, right = self._number(node.left), self._number(node.right)
-        apply = _ARITHMETIC[type(node.op)]
+        apply = ARITHMETIC[type(node.op)]
 
         def number(state: State) -> Number | None:
             a, b = left(state), right(state)
@@ -215,14 +207,14 @@ class Compiler:
         return number
 
     def _call(self, node: ast.Call) -> ReadNumber:
-        name = _function_of(node)
+        name = function_of(node)
         if name in _GIVING_FLAGS:
             self._refuse(node, f"{name}(...) is a condition, not a number")
         if name == "rate":
             return self._keep(Rate(self._number(self._only(node)))).read
         if name == "displacement":
             return self._displacement(self._only(node))
-        if name in _OF_NUMBERS:
+        if name in OF_NUMBERS:
             return self._of_numbers(node, name)
         self._refuse(node, self._unknown_function(node))
 
@@ -239,7 +231,7 @@ class Compiler:
             hint = "" if name == "abs" else f"; of a long array there is ranges.{name}"
             self._refuse(node, f"{name} takes {count}{hint}")
         numbers = tuple(self._number(each) for each in node.args)
-        return _applied(_OF_NUMBERS[name], numbers)
+        return _applied(OF_NUMBERS[name], numbers)
 
     def _keep(self, memory: Any) -> Any:
         """After those that it is made of: they are up to date when it is its turn."""
@@ -254,6 +246,7 @@ class Compiler:
             self._refuse(node, f"a name has at most {MAX_NAME_CHARACTERS} characters")
         if name not in self.readers:
             self.readers[name] = reader(name, self._plain)
+            self.columns[name] = self._column(node)
         return self.readers[name]
 
     def _name(self, node: ast.expr) -> str:
@@ -263,7 +256,7 @@ class Compiler:
             return f"{self._name(node.value)}.{node.attr}"
         if isinstance(node, ast.Subscript):
             return f"{self._name(node.value)}.{self._item(node.slice)}"
-        if isinstance(node, ast.Call) and _function_of(node) == "signal":
+        if isinstance(node, ast.Call) and function_of(node) == "signal":
             return self._quoted_name(self._only(node))
         self._refuse(node, "a signal is needed here")
 
@@ -278,17 +271,6 @@ class Compiler:
             return str(value)
         self._refuse(node, "an item is a number from 0, or a key in quotes, as in front[2]")
 
-    def _constant(self, node: ast.Constant) -> Number | str:
-        value = node.value
-        if type(value) is str or type(value) is bool:
-            return value
-        if type(value) not in (int, float):
-            self._refuse(node, "it has no meaning here; for no value, write missing(x)")
-        number = cast("int | float", value)
-        if abs(number) > MAX_NUMBER:
-            self._refuse(node, f"numbers are up to {MAX_NUMBER:g}")
-        return number
-
     def _seconds(self, node: ast.expr, of: str) -> float:
         value = node.value if isinstance(node, ast.Constant) else None
         if type(value) not in (int, float):
@@ -298,60 +280,12 @@ class Compiler:
             self._refuse(node, f"seconds are above 0 and at most {MAX_DURATION_S:g}")
         return float(seconds)
 
-    # -- refusals ------------------------------------------------------------------------------
-
-    def _only(self, node: ast.Call) -> ast.expr:
-        self._require_plain_call(node)
-        if len(node.args) != 1:
-            self._refuse(node, f"{_function_of(node)} takes one value, not {len(node.args)}")
-        return node.args[0]
-
-    def _require_plain_call(self, node: ast.Call) -> None:
-        if node.keywords or any(isinstance(each, ast.Starred) for each in node.args):
-            self._refuse(node, "a function takes values only, as in max(a, b)")
-
     def _unknown_function(self, node: ast.Call) -> str:
-        name = _function_of(node)
+        name = function_of(node)
         if name is None:
             return "only functions can be called: " + ", ".join(FUNCTIONS)
         offer = ", ".join(f"{each}()" for each in nearest_first(name, FUNCTIONS))
         return f"there is no {name}(); there are {offer}"
-
-    def _require_shallow(self, tree: ast.expr) -> None:
-        level: list[ast.AST] = [tree]
-        for _ in range(MAX_DEPTH):
-            level = [child for node in level for child in ast.iter_child_nodes(node)]
-        if level:
-            self._refuse_at(0, f"it is nested over {MAX_DEPTH} levels: make it simpler")
-
-    def _column(self, node: ast.expr) -> int:
-        return len(self._encoded[: node.col_offset].decode())
-
-    def _end_column(self, node: ast.expr) -> int:
-        return len(self._encoded[: node.end_col_offset].decode())
-
-    def _refuse(self, node: ast.expr, why: str) -> NoReturn:
-        self._refuse_at(self._column(node), why)
-
-    def _refuse_at(self, column: int, why: str) -> NoReturn:
-        raise refusal(self._scanned.original, column, why)
-
-    def _failure(self, column: int, why: str) -> ConditionFailedError:
-        text = self._scanned.original
-        return ConditionFailedError(f"condition {text!r}, column {column + 1}: {why}")
-
-
-def _is_signal(node: ast.expr) -> bool:
-    if isinstance(node, ast.Name):
-        return node.id not in _FLAGS
-    return isinstance(node, (ast.Attribute, ast.Subscript)) or _function_of(node) == "signal"
-
-
-def _function_of(node: ast.expr) -> str | None:
-    """The name of the function that is called; None where none is."""
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
-        return node.func.id
-    return None
 
 
 def _said(value: Value) -> str:

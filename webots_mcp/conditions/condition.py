@@ -11,7 +11,6 @@ from webots_mcp.conditions.compiling import Compiler
 from webots_mcp.conditions.memory import SAME_TIME_S
 from webots_mcp.conditions.reading import Plain, State
 from webots_mcp.conditions.scanning import Scanned, refusal, scan
-from webots_mcp.errors import InvalidConditionError
 from webots_mcp.naming import Value, flatten, nearest_first
 
 _MOST_OFFERED: Final = 3
@@ -114,21 +113,26 @@ def parse_condition(text: str) -> Condition:
             be possible there.
     """
     scanned = scan(text)
-    tree = _parse(scanned)
+    tree = parse(scanned)
     compiled = Compiler(scanned, tree, _as_it_is)
     return Condition(
         scanned.original, tuple(compiled.readers), compiled.position is not None, scanned, tree
     )
 
 
-def _parse(scanned: Scanned) -> ast.expr:
+def parse(scanned: Scanned) -> ast.expr:
+    """Python's tree of a scanned text.
+
+    Raises:
+        InvalidConditionError: Its signs make no sense in this order.
+    """
     try:
         return ast.parse(scanned.source, mode="eval").body
     except SyntaxError as error:
         column = error.offset - 1 if error.offset else len(scanned.original)
-        raise refusal(scanned.original, column, _why_unread(scanned, column, error)) from None
+        raise refusal(scanned, column, _why_unread(scanned, column, error)) from None
     except (RecursionError, MemoryError, ValueError):
-        raise InvalidConditionError(f"condition {scanned.original!r} is nested too deep") from None
+        raise refusal(scanned, 0, "it is nested too deep") from None
 
 
 def _why_unread(scanned: Scanned, column: int, error: SyntaxError) -> str:

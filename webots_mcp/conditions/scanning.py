@@ -22,6 +22,7 @@ _TOKEN: Final = re.compile(
     |(?P<space>[ ]+)""",
     re.VERBOSE,
 )
+_SUCH_AS: Final = {"condition": "front_m < 0.1 for 0.5", "score": "mean(abs(error))"}
 _INSTEAD: Final = {
     "=": "to compare, write ==",
     "&": "write `and`",
@@ -46,52 +47,57 @@ class Scanned:
         original: As it was given, without the spaces around it.
         source: A comma stands in the place of each `for`.
         durations: The places of the words `for`, from 0.
+        what: What the text is: a condition, or a score.
     """
 
     original: str
     source: str
     durations: frozenset[int]
+    what: str = "condition"
+
+    def place(self, column: int) -> str:
+        """The text and a place in it, for messages; the column is counted from 0."""
+        return f"{self.what} {self.original!r}, column {column + 1}"
 
 
-def refusal(text: str, column: int, why: str) -> InvalidConditionError:
-    """The error of a condition, at a column that is counted from 0."""
-    return InvalidConditionError(f"condition {text!r}, column {column + 1}: {why}")
+def refusal(scanned: Scanned, column: int, why: str) -> InvalidConditionError:
+    """The error of a text, at a column that is counted from 0."""
+    return InvalidConditionError(f"{scanned.place(column)}: {why}")
 
 
-def scan(text: str) -> Scanned:
-    """Look at each sign of a condition.
+def scan(text: str, what: str = "condition") -> Scanned:
+    """Look at each sign of a condition, or of what else is written in its language.
 
     Raises:
         InvalidConditionError: It is empty or too long, or holds a sign that is not of the language.
     """
     text = text.strip(" ")
-    _require_length(text)
+    _require_length(text, what)
+    unread = Scanned(text, text, frozenset(), what)
     durations: list[int] = []
     place, before = 0, "space"
     while place < len(text):
         found = _TOKEN.match(text, place)
         if found is None:
-            raise refusal(text, place, _why_unknown(text[place]))
+            raise refusal(unread, place, _why_unknown(text[place]))
         kind = str(found.lastgroup)
         if (before, kind) in (("number", "word"), ("word", "text"), ("number", "number")):
-            raise refusal(text, place, "a space or an operator is missing before it")
+            raise refusal(unread, place, "a space or an operator is missing before it")
         if found.group() == "for":
             durations.append(place)
         place, before = found.end(), kind
     source = list(text)
     for place in durations:
         source[place : place + 3] = ",  "
-    return Scanned(text, "".join(source), frozenset(durations))
+    return Scanned(text, "".join(source), frozenset(durations), what)
 
 
-def _require_length(text: str) -> None:
+def _require_length(text: str, what: str) -> None:
     if not text:
-        raise InvalidConditionError(
-            "the condition is empty: give one such as 'front_m < 0.1 for 0.5'"
-        )
+        raise InvalidConditionError(f"the {what} is empty: give one such as {_SUCH_AS[what]!r}")
     if len(text) > MAX_CHARACTERS:
         raise InvalidConditionError(
-            f"the condition has {len(text)} characters; at most {MAX_CHARACTERS} are possible"
+            f"the {what} has {len(text)} characters; at most {MAX_CHARACTERS} are possible"
         )
 
 

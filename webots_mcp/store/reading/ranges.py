@@ -85,6 +85,10 @@ class Segment:
         """Its part before that time."""
         return replace(self, end_s=end_s, open_end=False)
 
+    def through(self, last_s: float) -> Segment:
+        """Its part up to that time, with what is shown as of it."""
+        return self.until(moment_of(shown_time(last_s) + 0.001))
+
     @property
     def holds_from_s(self) -> float:
         """Where the range begins for what is not a state row."""

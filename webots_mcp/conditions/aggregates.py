@@ -1,0 +1,78 @@
+"""What the values of a whole run come to: mean(x), max(x), time(condition), as states follow."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Sequence
+from typing import Final, Protocol, TypeAlias
+
+from webots_mcp.conditions.compiling import Compiler
+from webots_mcp.conditions.reading import State
+
+Number: TypeAlias = "int | float"
+
+REDUCTIONS: Final[dict[str, Callable[[Sequence[Number]], Number]]] = {
+    "min": min,
+    "max": max,
+    "mean": statistics.fmean,
+    "first": lambda numbers: numbers[0],
+    "last": lambda numbers: numbers[-1],
+}
+
+
+class Aggregate(Protocol):
+    """One of them, in one run."""
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """Take in the next state."""
+        ...
+
+    def value(self) -> Number | None:
+        """What it has come to; None where nothing had a value."""
+        ...
+
+
+class Reduced:
+    """The mean, an extreme, or the first or last of a number's values."""
+
+    def __init__(self, compiled: Compiler, reduce: Callable[[Sequence[Number]], Number]) -> None:
+        self._compiled = compiled
+        self._reduce = reduce
+        self._numbers: list[Number] = []
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """States in which the number has no value do not count."""
+        number = _root(self._compiled, state, sim_time_s)
+        if number is not None:
+            self._numbers.append(number)
+
+    def value(self) -> Number | None:
+        """Flags count as 1 and 0."""
+        return self._reduce(self._numbers) if self._numbers else None
+
+
+class TimeHeld:
+    """For how many seconds a condition held: from each state in which it does up to the next."""
+
+    def __init__(self, compiled: Compiler) -> None:
+        self._compiled = compiled
+        self._since_s: float | None = None
+        self._held_s: float | None = None
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """Take in the next state."""
+        if self._since_s is not None:
+            self._held_s = (self._held_s or 0.0) + sim_time_s - self._since_s
+        holds = _root(self._compiled, state, sim_time_s)
+        self._since_s = sim_time_s if holds else None
+        self._held_s = self._held_s or 0.0
+
+    def value(self) -> float | None:
+        """None without any state."""
+        return self._held_s
+
+
+def _root(compiled: Compiler, state: State, sim_time_s: float) -> Number | None:
+    for memory in compiled.memories:
+        memory.update(state, sim_time_s)
+    return compiled.root(state)

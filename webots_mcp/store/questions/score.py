@@ -1,0 +1,159 @@
+"""`score_run`: what a finished run comes to, by an expression over its signals and events."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, Final
+
+from webots_mcp.conditions.score import Facts, Score, Scored, parse_score
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.naming import nearest_first
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.registry import kind_names
+from webots_mcp.store.questions.events import collect
+from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import Segment, TimeRange, whole_run
+from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.signals.catalogue import catalogue
+from webots_mcp.store.signals.flatten import parse
+
+SCORE_DEADLINE_S: Final = 60.0
+_ROWS: Final = (
+    "SELECT sim_time_s, data FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
+    "ORDER BY sim_time_s, id"
+)
+_STORED: Final = (
+    "SELECT count(*) FROM event WHERE run_id = ? AND kind = ? AND sim_time_s >= ? "
+    "AND sim_time_s < ?"
+)
+_STORED_KINDS: Final = "SELECT DISTINCT kind FROM event WHERE run_id = ?"
+_BRIDGE_KINDS: Final = ("breakpoint", "pause", "resume", "dropped", "storage")
+
+
+@dataclass(frozen=True)
+class RunScore:
+    """What a run came to.
+
+    Attributes:
+        value: None where the run does not give one.
+        why: Why it does not.
+        duration_s: Simulated seconds that were scored.
+    """
+
+    run_id: int
+    score: str
+    value: float | None
+    why: str | None
+    duration_s: float
+    rows: int
+
+
+@in_one_snapshot
+def score_run(
+    connection: sqlite3.Connection,
+    run_id: int,
+    text: str,
+    *,
+    end_s: float | None = None,
+    deadline_s: float = SCORE_DEADLINE_S,
+) -> RunScore:
+    """Score a run.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        text: The score; see docs/trials.md.
+        end_s: Only what came up to and with this simulation time counts; None for all of it.
+        deadline_s: A run that takes longer to read has no score.
+
+    Raises:
+        InvalidConditionError: The text is no score.
+        UnknownRunError, UnknownSignalError: As they say.
+        InvalidInputError: It counts events of a kind that there is not.
+    """
+    score = parse_score(text)
+    run, segment = run_info(connection, run_id), whole_run(connection, run_id)
+    subject = Subject(fetch_run(connection, run_id).robot_id, run.robot, run_id)
+    _require_kinds(connection, score, run_id)
+    if run.purged_rows:
+        why = f"{run.purged_rows} rows of run {run_id} were purged: what is left is not the run"
+        return RunScore(run_id, score.text, None, why, run.duration_s, 0)
+    if segment is None:
+        why = f"run {run_id} has no state row: its controller published nothing"
+        return RunScore(run_id, score.text, None, why, run.duration_s, 0)
+    score.require_known(catalogue(connection, subject))
+    duration_s = run.duration_s
+    if end_s is not None and end_s < segment.end_s:
+        duration_s = end_s - fetch_run(connection, run_id).started_sim_time_s
+        segment = segment.through(end_s)
+    return _scored(connection, score, subject, segment, duration_s, Deadline(deadline_s))
+
+
+def _scored(
+    connection: sqlite3.Connection,
+    score: Score,
+    subject: Subject,
+    segment: Segment,
+    duration_s: float,
+    deadline: Deadline,
+) -> RunScore:
+    rows = _Rows(connection, segment, deadline)
+    time_range = TimeRange(subject.robot_id, subject.robot, (segment,), "simulation")
+    counts = {kind: _count(connection, kind, time_range, deadline) for kind in score.kinds}
+    found = score.of(rows, Facts(duration_s, counts))
+    if rows.cut:
+        found = Scored(None, f"the time was over after {rows.read} rows")
+    return RunScore(segment.run_id, score.text, *found, duration_s, rows.read)
+
+
+class _Rows:
+    """The states of a segment, in order."""
+
+    def __init__(
+        self, connection: sqlite3.Connection, segment: Segment, deadline: Deadline
+    ) -> None:
+        self._rows = connection.execute(_ROWS, (segment.run_id, segment.start_s, segment.end_s))
+        self._deadline = deadline
+        self.read = 0
+        self.cut = False
+
+    def __iter__(self) -> Iterator[tuple[float, Any]]:
+        for sim_time_s, data in self._rows:
+            self.cut = self.read % 500 == 499 and self._deadline.passed
+            if self.cut:
+                return
+            self.read += 1
+            yield sim_time_s, parse(data)
+
+
+def _require_kinds(connection: sqlite3.Connection, score: Score, run_id: int) -> None:
+    """Before anything is run: a misspelt kind never happens, and its count would be 0."""
+    stored = [kind for (kind,) in connection.execute(_STORED_KINDS, (run_id,)).fetchall()]
+    known = [*kind_names(), *stored, *_BRIDGE_KINDS]
+    for kind, column in score.kinds.items():
+        if kind not in known:
+            offer = ", ".join(nearest_first(kind, list(dict.fromkeys(known)))[:5])
+            raise InvalidInputError(
+                f"{score.place(column)}: there is no kind of event {kind!r}; there is {offer}"
+            )
+
+
+def _count(
+    connection: sqlite3.Connection, kind: str, time_range: TimeRange, deadline: Deadline
+) -> int | str:
+    if kind not in kind_names():
+        (segment,) = time_range.segments
+        bounds = (segment.run_id, kind, segment.holds_from_s, segment.holds_to_s)
+        return int(connection.execute(_STORED, bounds).fetchone()[0])
+    try:
+        options = EventOptions(kinds=(kind,))
+        found = collect(connection, time_range, options, deadline.left_s)
+    except NothingRecordedError as error:
+        return str(error)
+    why = found.ledger.verdicts(found.kinds, found.events).not_searched.get(kind)
+    return why or len(found.events)

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.arrays import Array, inner, np
 
 TIME_BINS: Final = 8
 SPIKE_SCORE: Final = 8.0  # 3.5 is the usual; here thousands of values are looked at at once
@@ -40,7 +40,7 @@ def fit_line(times: Array, values: Array, mean: float) -> Line | None:
     where time stood still; r2 is 0 for a constant.
     """
     dt, dv = times - times.mean(), values - mean
-    stt, stv, svv = float(dt @ dt), float(dt @ dv), float(dv @ dv)
+    stt, stv, svv = inner(dt, dt), inner(dt, dv), inner(dv, dv)
     if stt == 0:
         return None
     return Line(stv / stt, min(1.0, stv / stt * (stv / svv)) if svv > 0 else 0.0)

@@ -13,7 +13,7 @@ from operator import attrgetter, mul, ne
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.naming import Value
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.arrays import Array, inner, np
 
 _NUMBERS: Final = frozenset({int, float, bool})
 _LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
@@ -163,7 +163,7 @@ def summarise_numbers(
         *_at(times, numbers, low),
         *_at(times, numbers, high),
         total,
-        float(deviations @ deviations),
+        inner(deviations, deviations),
         float(np.sin(numbers).sum()) if angle else None,
         float(np.cos(numbers).sum()) if angle else None,
     )

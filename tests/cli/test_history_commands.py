@@ -73,6 +73,8 @@ def test_events_tell_since_when_it_was_stuck(say: Say) -> None:
     assert line_with(text, "gap", "89.9")
     beyond = say("events", "--run", "1", "--signal", "pose.0", "--above", "7.9", "--for", "2")
     assert len(beyond.splitlines()) == 3
+    held = say("events", "--run", "1", "--where", "pose.0 > 7.9 and displacement(3) < 0.01")
+    assert line_with(held, "condition", "43", "9.1")
     assert "looked for and absent: stuck" in say("events", "--kind", "stuck")
 
 

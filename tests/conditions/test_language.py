@@ -15,6 +15,7 @@ from webots_mcp.errors import InvalidConditionError
         ("front_m < 0.1 for 0.5", ["front_m"]),
         ("(front_m < 0.1 for 0.5) and mode == 'drive'", ["front_m", "mode"]),
         ("0 < sensors.front <= front[2] + 1", ["sensors.front", "front.2"]),
+        ("pose.0 + pose.1 > .5 and grid.2.11 < 1", ["pose.0", "pose.1", "grid.2.11"]),
         ("pose['x y'][0] > -.5e-3", ["pose.x y.0"]),
         ("signal('front left').x > 1", ["front left.x"]),
         ("changed(mode) or missing(lidar.min)", ["mode", "lidar.min"]),
@@ -54,6 +55,11 @@ def test_a_condition_names_the_signals_that_it_reads(text: str, signals: list[st
         ("a ** 9 < 1", 1, "+ - * /"),
         ("a // 2 < 1", 1, "+ - * /"),
         ("a % 2 < 1", 3, "remainder"),
+        ("pose.0 + pose.1 = 3", 17, "write =="),
+        ("pose.0 + pose.1 < 3 fro 1", 21, "'fro 1'"),
+        ("pose.0 + 'a' < 3", 10, "number"),
+        ("pose.1e5 < 3", 5, "from 0"),
+        ("pose.0x < 3", 7, "space or an operator"),
         ("a[-1] < 1", 3, "from 0"),
         ("a[b] < 1", 3, "from 0"),
         ("a in b", 1, "no `in`"),
@@ -117,4 +123,4 @@ def test_unknown_signals_are_told_with_the_nearest_ones() -> None:
     (told,) = condition.describe_unknown(["front_m", "mode", "speed"])
 
     assert told.startswith("frnt_m is missing as long as it is not published; there is front_m")
-    assert "nothing is yet" in condition.describe_unknown([])[0]
+    assert "there is nothing yet" in condition.describe_unknown([])[0]

@@ -178,6 +178,19 @@ async def test_events_tell_what_nobody_noted(story: Path) -> None:
     assert sum(answer["verdicts"]["found"].values()) == len(events)
 
 
+async def test_a_condition_is_found_in_the_past_as_often_as_it_would_have_been_hit(
+    story: Path,
+) -> None:
+    where = "sensors.bumper and displacement(3) < 0.01"
+    answer = await tell(story, "webots_find_events", run_id=STORY, where=where)
+    assert answer["verdicts"]["found"] == {"condition": 1}
+    (row,) = rows_of(answer["events"])
+    assert (row["start_s"], row["name"]) == (43.0, where)
+    assert row["details"]["sensors.bumper"] is True
+    assert any("between two rows" in note for note in answer["notes"])
+    assert "column 3" in await refuse(story, "webots_find_events", where="n = 3")
+
+
 async def test_a_threshold_holds_for_at_least_so_long(story: Path) -> None:
     asked = {"signals": ["pose.0"], "above": 7.9, "run_id": STORY}
     both = await tell(story, "webots_find_events", **asked, for_s=2)

@@ -136,6 +136,8 @@ def trends(arguments: argparse.Namespace) -> None:
     "events", DATA_DIR, DATABASE, *RANGE, JSON,
     argument("--kind", action="append", metavar="KIND", help="only this kind; may be repeated"),
     argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
+    argument("--where", metavar="CONDITION",
+             help="where a condition held, such as 'front_m < 0.1 for 0.5'"),
     argument("--above", type=float, metavar="X", help="where the signals were above X"),
     argument("--below", type=float, metavar="X", help="where the signals were below X"),
     argument("--for", type=float, default=0.0, dest="for_s", metavar="S",
@@ -254,8 +256,13 @@ def _options(arguments: argparse.Namespace) -> EventOptions:
     limits = thresholds_on(
         arguments.signal or (), arguments.above, arguments.below, arguments.for_s
     )
-    kinds = tuple(arguments.kind or ("threshold",) * bool(limits))
-    return EventOptions(kinds=kinds, signals=tuple(arguments.signal or "*"), thresholds=limits)
+    given = ("threshold",) * bool(limits) + ("condition",) * (arguments.where is not None)
+    return EventOptions(
+        kinds=tuple(arguments.kind or given),
+        signals=tuple(arguments.signal or "*"),
+        thresholds=limits,
+        where=arguments.where,
+    )
 
 
 def _print_json(found: Any) -> None:

@@ -19,6 +19,7 @@ from webots_mcp.conditions.scanning import Scanned
 from webots_mcp.naming import Value, nearest_first
 
 MAX_DURATION_S: Final = 3600.0
+_MOST_TIMES_AS_OLD: Final = 2.0  # a displacement takes a place that is so many times as old
 MAX_NAME_CHARACTERS: Final = 200
 
 Number: TypeAlias = "int | float"
@@ -54,6 +55,7 @@ class Compiler(Nodes):
         columns: Where each of them is named first, counted from 0.
         memories: What has to take in every state, in this order.
         position: Where displacements are read from; None if there are none.
+        remembers_s: How far back in time it may reach.
         root: Whether the condition holds; or the number.
     """
 
@@ -66,6 +68,7 @@ class Compiler(Nodes):
         self.columns: dict[str, int] = {}
         self.memories: list[Memory] = []
         self.position: PositionReader | None = None
+        self.remembers_s = 0.0
         self._require_shallow(tree)
         self.root: Any = self._number(tree) if number else self._condition(tree)
         for place in self._durations:
@@ -278,6 +281,7 @@ class Compiler(Nodes):
         seconds = cast("int | float", value)
         if not 0 < seconds <= MAX_DURATION_S:
             self._refuse(node, f"seconds are above 0 and at most {MAX_DURATION_S:g}")
+        self.remembers_s += _MOST_TIMES_AS_OLD * seconds
         return float(seconds)
 
     def _unknown_function(self, node: ast.Call) -> str:

@@ -28,11 +28,13 @@ class Condition:
         text: Without the spaces around it.
         signals: The names of those that it reads, in order, without the position's.
         asks_position: Whether it asks where the robot is.
+        remembers_s: How far back in time what it says of a state may reach.
     """
 
     text: str
     signals: tuple[str, ...]
     asks_position: bool
+    remembers_s: float
     _scanned: Scanned = field(repr=False, compare=False)
     _tree: ast.expr = field(repr=False, compare=False)
 
@@ -47,7 +49,15 @@ class Condition:
 
     def describe_unknown(self, known: Collection[str]) -> list[str]:
         """A sentence for each of its signals that is not among the known ones."""
-        return [_unknown(name, known) for name in self.signals if name not in known]
+        return [
+            f"{name} is missing as long as it is not published; there is {near}"
+            for name, near in self.nearest_to_unknown(known)
+        ]
+
+    def nearest_to_unknown(self, known: Collection[str]) -> list[tuple[str, str]]:
+        """Each of its signals that is not among the known ones, and the names that are near."""
+        unknown = [name for name in self.signals if name not in known]
+        return [(name, _nearest(name, known)) for name in unknown]
 
 
 class Evaluator:
@@ -115,9 +125,9 @@ def parse_condition(text: str) -> Condition:
     scanned = scan(text)
     tree = parse(scanned)
     compiled = Compiler(scanned, tree, _as_it_is)
-    return Condition(
-        scanned.original, tuple(compiled.readers), compiled.position is not None, scanned, tree
-    )
+    asks_position = compiled.position is not None
+    told = (tuple(compiled.readers), asks_position, compiled.remembers_s)
+    return Condition(scanned.original, *told, scanned, tree)
 
 
 def parse(scanned: Scanned) -> ast.expr:
@@ -129,21 +139,19 @@ def parse(scanned: Scanned) -> ast.expr:
     try:
         return ast.parse(scanned.source, mode="eval").body
     except SyntaxError as error:
-        column = error.offset - 1 if error.offset else len(scanned.original)
-        raise refusal(scanned, column, _why_unread(scanned, column, error)) from None
+        end = len(scanned.source)
+        place = min(error.offset - 1, end) if error.offset else end
+        raise refusal(scanned, place, _why_unread(scanned, place, error)) from None
     except (RecursionError, MemoryError, ValueError):
         raise refusal(scanned, 0, "it is nested too deep") from None
 
 
-def _why_unread(scanned: Scanned, column: int, error: SyntaxError) -> str:
+def _why_unread(scanned: Scanned, place: int, error: SyntaxError) -> str:
     if "never closed" in str(error.msg) or "unmatched" in str(error.msg):
         return str(error.msg)
-    rest = scanned.original[column:].strip()
+    rest = scanned.original[scanned.columns[place] :].strip()
     return f"not understood from {rest[:20]!r} on" if rest else "something is missing at the end"
 
 
-def _unknown(name: str, known: Collection[str]) -> str:
-    if not known:
-        return f"{name} is missing as long as it is not published; nothing is yet"
-    offer = ", ".join(nearest_first(name, known)[:_MOST_OFFERED])
-    return f"{name} is missing as long as it is not published; there is {offer}"
+def _nearest(name: str, known: Collection[str]) -> str:
+    return ", ".join(nearest_first(name, known)[:_MOST_OFFERED]) or "nothing yet"

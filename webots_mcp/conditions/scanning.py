@@ -1,7 +1,8 @@
 """The text of a condition, made ready for Python's parser: signs of the language only.
 
 `a < 1 for 0.5` is no expression of Python's. With a comma in the place of `for` it is a pair,
-whose precedence is the one that is wanted: lower than `or`. Real commas stand in calls only.
+whose precedence is the one that is wanted: lower than `or`. Real commas stand in calls only. And
+`pose.0`, as signals are called, becomes `pose[0]`.
 """
 
 from __future__ import annotations
@@ -23,6 +24,17 @@ _TOKEN: Final = re.compile(
     re.VERBOSE,
 )
 _SUCH_AS: Final = {"condition": "front_m < 0.1 for 0.5", "score": "mean(abs(error))"}
+_NAMES: Final = ("word", "item")
+_NEVER_TOGETHER: Final = frozenset(
+    (
+        ("number", "word"),
+        ("number", "number"),
+        ("word", "text"),
+        ("item", "word"),
+        ("item", "number"),
+        ("item", "text"),
+    )
+)
 _INSTEAD: Final = {
     "=": "to compare, write ==",
     "&": "write `and`",
@@ -41,27 +53,29 @@ _INSTEAD: Final = {
 
 @dataclass(frozen=True)
 class Scanned:
-    """A text that Python's parser takes, with the same columns.
+    """A text that Python's parser takes.
 
     Attributes:
         original: As it was given, without the spaces around it.
-        source: A comma stands in the place of each `for`.
-        durations: The places of the words `for`, from 0.
+        source: For the parser: a comma stands in the place of each `for`.
+        columns: For each sign of `source`, and its end, the place in the original; from 0.
+        durations: The places in `source` of the words `for`.
         what: What the text is: a condition, or a score.
     """
 
     original: str
     source: str
+    columns: tuple[int, ...]
     durations: frozenset[int]
     what: str = "condition"
 
     def place(self, column: int) -> str:
-        """The text and a place in it, for messages; the column is counted from 0."""
-        return f"{self.what} {self.original!r}, column {column + 1}"
+        """The text and a place in it, for messages; the column is that in `source`, from 0."""
+        return f"{self.what} {self.original!r}, column {self.columns[column] + 1}"
 
 
 def refusal(scanned: Scanned, column: int, why: str) -> InvalidConditionError:
-    """The error of a text, at a column that is counted from 0."""
+    """The error of a text, at a column of its `source` that is counted from 0."""
     return InvalidConditionError(f"{scanned.place(column)}: {why}")
 
 
@@ -73,23 +87,34 @@ def scan(text: str, what: str = "condition") -> Scanned:
     """
     text = text.strip(" ")
     _require_length(text, what)
-    unread = Scanned(text, text, frozenset(), what)
-    durations: list[int] = []
+    unread = Scanned(text, text, tuple(range(len(text) + 1)), frozenset(), what)
+    source, columns, durations = "", list[int](), list[int]()
     place, before = 0, "space"
     while place < len(text):
         found = _TOKEN.match(text, place)
         if found is None:
             raise refusal(unread, place, _why_unknown(text[place]))
-        kind = str(found.lastgroup)
-        if (before, kind) in (("number", "word"), ("word", "text"), ("number", "number")):
+        kind, token = str(found.lastgroup), found.group()
+        if kind == "number" and token[0] == "." and (before in _NAMES or text[place - 1] in ")]"):
+            kind = "item"
+        if (before, kind) in _NEVER_TOGETHER:
             raise refusal(unread, place, "a space or an operator is missing before it")
-        if found.group() == "for":
-            durations.append(place)
+        if token == "for":
+            durations.append(len(source))
+            token = ",  "
+        elif kind == "item":
+            token = _as_item(unread, place, token)
+        source += token
+        columns += (place + min(i, found.end() - place - 1) for i in range(len(token)))
         place, before = found.end(), kind
-    source = list(text)
-    for place in durations:
-        source[place : place + 3] = ",  "
-    return Scanned(text, "".join(source), frozenset(durations), what)
+    return Scanned(text, source, (*columns, len(text)), frozenset(durations), what)
+
+
+def _as_item(unread: Scanned, place: int, token: str) -> str:
+    """`.0` as `[0]`."""
+    if not token[1:].isdecimal():
+        raise refusal(unread, place, "an item is a number from 0, as in pose.0 or pose[0]")
+    return f"[{token[1:]}]"
 
 
 def _require_length(text: str, what: str) -> None:

@@ -206,7 +206,8 @@ class _Compiler(Nodes):
     def _aggregate(self, node: ast.Call, aggregate: Aggregate) -> Term:
         self.aggregates.append(aggregate)
         start, end = self._column(node), self._end_column(node)
-        text = self._scanned.original[start:end]
+        columns = self._scanned.columns
+        text = self._scanned.original[columns[start] : columns[end]]
 
         def value(facts: Facts) -> Number:
             found = aggregate.value()

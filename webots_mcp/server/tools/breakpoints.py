@@ -15,7 +15,7 @@ from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.parameters import RobotName, TimeoutS
+from webots_mcp.server.parameters import RobotName
 from webots_mcp.server.results import BreakpointAnswer, BreakpointsAnswer, CommandAnswer, Table
 from webots_mcp.server.shortening import cut_text
 from webots_mcp.store.breakpoints import (
@@ -48,19 +48,18 @@ async def webots_breakpoint(
         Field(
             max_length=500,
             description="On signals: front_m < 0.1 for 0.5; mode == 'turn' and displacement(3) "
-            "< 0.05; changed(mode); abs(rate(speed)) > 2; missing(gps.x); pose[0] > 1.",
+            "< 0.05; changed(mode); abs(rate(v)) > 2; missing(gps.x); pose.0 > 1.",
         ),
     ],
     ctx: Context[Any],
     action: Annotated[
         BreakpointAction,
-        Field(description="pause: the simulation, at that step; log: only record the hit."),
+        Field(description="log only records the hit."),
     ] = "pause",
     after_hits: Annotated[
         int, Field(ge=1, le=1_000_000, description="Act from this hit of a run on.")
     ] = 1,
     robot: RobotName = None,
-    timeout_s: TimeoutS = _WAIT_S,
 ) -> BreakpointAnswer:
     """Pause, or take note, when a condition begins to hold; asked at every publish() call.
 
@@ -71,7 +70,7 @@ async def webots_breakpoint(
     name, stored, notes = await to_thread.run_sync(
         _store, recording, robot, parsed, action, after_hits
     )
-    told = await _arm(recording, ctx, name, timeout_s)
+    told = await _arm(recording, ctx, name)
     armed = stored in told.armed
     if action == "pause" and told.cannot_pause:
         notes.append(f"it will only record: {told.cannot_pause}")
@@ -106,11 +105,10 @@ async def webots_remove_breakpoint(
     breakpoint_id: BreakpointId,
     ctx: Context[Any],
     robot: RobotName = None,
-    timeout_s: TimeoutS = _WAIT_S,
 ) -> BreakpointAnswer:
     """Remove a breakpoint. The events of its hits stay; a paused simulation stays paused."""
     name = await to_thread.run_sync(_remove, recording, robot, breakpoint_id)
-    told = await _arm(recording, ctx, name, timeout_s)
+    told = await _arm(recording, ctx, name)
     return BreakpointAnswer(
         **await to_thread.run_sync(_header, recording, name),
         breakpoint_id=breakpoint_id,
@@ -166,10 +164,10 @@ def _remove(recording: Recording, robot: str | None, breakpoint_id: int) -> str:
     return name
 
 
-async def _arm(recording: Recording, ctx: Context[Any], robot: str, timeout_s: float) -> _Told:
+async def _arm(recording: Recording, ctx: Context[Any], robot: str) -> _Told:
     """Have the controller read its breakpoints anew."""
     try:
-        answer = await Dispatcher(recording, ctx.report_progress).ask(robot, _ARM, timeout_s)
+        answer = await Dispatcher(recording, ctx.report_progress).ask(robot, _ARM, _WAIT_S)
     except CommandRefusedError as refused:
         return _Told(why_not=f"{refused}. A controller of this robot reads them when it starts")
     if answer.outcome != "done":

@@ -46,9 +46,16 @@ def webots_find_events(
     recording: Recording,
     scope: Scope,
     kinds: Kinds = None,
+    where: Annotated[
+        str | None,
+        Field(
+            max_length=500,
+            description="A condition, as in webots_breakpoint: each stretch in which it held.",
+        ),
+    ] = None,
     signals: AnyNames = None,
     above: Annotated[
-        float | None, Field(description="For threshold: where the signals were above this ...")
+        float | None, Field(description="Short for where: the signals were above this ...")
     ] = None,
     below: Annotated[float | None, Field(description="... or below this ...")] = None,
     for_s: Annotated[
@@ -75,7 +82,8 @@ def webots_find_events(
     """
     thresholds = thresholds_on(signals or (), above, below, for_s)
     options = EventOptions(
-        kinds=_kinds(kinds, thresholds),
+        kinds=_kinds(kinds, thresholds, where),
+        where=where,
         signals=tuple(signals or ("*",)),
         thresholds=thresholds,
         stuck_s=stuck_s,
@@ -90,11 +98,14 @@ def webots_find_events(
         )
 
 
-def _kinds(kinds: Sequence[str] | None, thresholds: Sequence[Threshold]) -> tuple[str, ...]:
-    """Who gives a threshold asks about that, unless other kinds are named."""
+def _kinds(
+    kinds: Sequence[str] | None, thresholds: Sequence[Threshold], where: str | None
+) -> tuple[str, ...]:
+    """Who gives a threshold or a condition asks about that, unless other kinds are named."""
     if kinds and "threshold" in kinds and not thresholds:
         raise InvalidInputError("kinds=['threshold'] needs signals, and above or below")
-    return tuple(kinds or ()) or ("threshold",) * bool(thresholds)
+    given = ("threshold",) * bool(thresholds) + ("condition",) * (where is not None)
+    return tuple(kinds or ()) or given
 
 
 def _found(

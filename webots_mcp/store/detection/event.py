@@ -81,6 +81,7 @@ class EventOptions:
             more), stuck who should move besides, ...
         stuck_s: ... for so long.
         thresholds: For the kind "threshold".
+        where: For the kind "condition"; see docs/conditions.md.
         silent_s: Without a value for so long, though it mostly has one.
         flat_s: Exactly the same number for so long, though it mostly changes.
         jump_score: How many times larger than the usual step (modified z-score) a jump is.
@@ -100,6 +101,7 @@ class EventOptions:
     stuck_m: float = 0.05
     stuck_s: float = 3.0
     thresholds: tuple[Threshold, ...] = ()
+    where: str | None = None
     silent_s: float = 1.0
     flat_s: float = 20.0
     jump_score: float = 12.0

@@ -9,6 +9,7 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.detection import (
+    condition,
     flat,
     jump,
     oscillation,
@@ -27,6 +28,7 @@ KINDS: Final[list[EventKind]] = [
     still.STILL,
     still.STUCK,
     threshold.THRESHOLD,
+    condition.CONDITION,
     silent.SILENT,
     flat.FLAT,
     jump.JUMP,

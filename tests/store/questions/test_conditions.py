@@ -1,0 +1,145 @@
+"""The past is asked with the same conditions: where they held, how often, from when to when."""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import Any
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tests.recordings.rover import Recorder
+from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
+from webots_mcp.store.detection.event import EventOptions, Threshold
+from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.reading.ranges import resolve_range
+
+
+def ask(connection: sqlite3.Connection, where: str, **bounds: Any) -> Events:
+    found = resolve_range(connection, **(bounds or {"run_id": 1}))
+    return find_events(connection, found, EventOptions(kinds=("condition",), where=where))
+
+
+def spans(events: Events) -> list[tuple[float, float]]:
+    return [(round(event.start_s, 1), round(event.end_s, 1)) for event in events.events]
+
+
+@pytest.fixture
+def counting(empty: sqlite3.Connection) -> Recorder:
+    """A run in which `n` counts, a row each 0.1 s."""
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    return recorder
+
+
+def test_each_stretch_is_told_with_begin_end_and_values(rover: sqlite3.Connection) -> None:
+    found = ask(rover, "sensors.bumper and mode == 'cruise'")
+
+    assert spans(found) == [(40.0, 51.9)]
+    assert found.events[0].name == "sensors.bumper and mode == 'cruise'"
+    assert found.events[0].details == {"sensors.bumper": True, "mode": "cruise"}
+    assert found.verdicts.found == {"condition": 1}
+
+
+def test_a_duration_begins_when_it_is_over(rover: sqlite3.Connection) -> None:
+    assert spans(ask(rover, "sensors.bumper for 5")) == [(45.0, 51.9)]
+    ((start_s, end_s),) = spans(ask(rover, "mode == 'cruise' and displacement(2) < 0.01"))
+    assert (start_s, end_s) == (42.0, 51.9)
+
+
+def test_what_reaches_out_of_the_range_is_told_whole(rover: sqlite3.Connection) -> None:
+    bounds = {"run_id": 1, "start_s": 48.0, "end_s": 49.0}
+
+    assert spans(ask(rover, "sensors.bumper", **bounds)) == [(40.0, 51.9)]
+    assert spans(ask(rover, "sensors.bumper for 5", **bounds)) == [(45.0, 51.9)]
+
+
+def test_what_began_before_the_range_is_remembered(rover: sqlite3.Connection) -> None:
+    found = ask(rover, "changed(mode)", run_id=1, start_s=52.0, end_s=52.05)
+
+    assert spans(found) == [(52.0, 52.0)]
+
+
+def test_several_runs_are_several_pasts(rover: sqlite3.Connection) -> None:
+    everything = {"since": 0.0, "until": 2e9}
+    found = ask(rover, "not missing(target) for 25", **everything)
+
+    assert [event.run_id for event in found.events] == [1, 2, 3]
+    assert {round(event.start_s, 1) for event in found.events} == {25.0}
+
+
+def test_where_it_never_held_the_answer_says_how_many_rows_were_looked_at(
+    rover: sqlite3.Connection,
+) -> None:
+    found = ask(rover, "pose.0 > 1e6")
+
+    assert found.verdicts.absent["condition"] == "it held in none of 1150 rows"
+
+
+@pytest.mark.parametrize(
+    ("interval", "said"),
+    [(1, "nothing was missed"), (5, "one publish() call in 5 is a row"), (None, "may be fewer")],
+)
+def test_the_answer_says_whether_the_rows_are_all_that_was_published(
+    counting: Recorder, interval: int | None, said: str
+) -> None:
+    counting.publish(0.0, {"n": 1})
+    counting.connection.execute("UPDATE session SET throttle_interval = ?", (interval,))
+
+    (note,) = ask(counting.connection, "n > 0").notes
+
+    assert said in note
+
+
+def test_a_wrong_question_is_refused_with_what_would_do(rover: sqlite3.Connection) -> None:
+    with pytest.raises(InvalidConditionError, match="column 16"):
+        ask(rover, "sensors.bumper = true")
+    with pytest.raises(UnknownSignalError, match="no signal 'bmuper' is recorded"):
+        ask(rover, "bmuper")
+    with pytest.raises(InvalidInputError, match=r"the text 'cruise' < the number 3\? \(in run 1"):
+        ask(rover, "mode < 3")
+    found = find_events(rover, resolve_range(rover), EventOptions(kinds=("condition",)))
+    assert "give where" in found.verdicts.not_searched["condition"]
+
+
+def test_what_there_was_no_time_for_is_named_by_time(rover: sqlite3.Connection) -> None:
+    found = find_events(
+        rover,
+        resolve_range(rover, run_id=1),
+        EventOptions(kinds=("condition",), where="sensors.bumper"),
+        deadline_s=0.0,
+    )
+
+    assert "the time was over" in found.verdicts.not_searched["condition"]
+
+
+@settings(
+    deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    st.lists(st.sampled_from([0.0, 1.0, 2.0, None]), min_size=1, max_size=30),
+    st.sampled_from([0.0, 0.2, 0.5]),
+    st.booleans(),
+)
+def test_thresholds_are_a_short_form_of_a_condition(
+    empty: sqlite3.Connection, values: list[float | None], for_s: float, above: bool
+) -> None:
+    empty.execute("DELETE FROM robot")
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    run_id = recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    for step, value in enumerate([*values, 1.0]):
+        recorder.publish(step * 0.1, {"x": value})
+    whole = resolve_range(empty, run_id=run_id)
+    limit = Threshold("x", **{"above" if above else "below": 1.0}, for_s=for_s)
+    short = find_events(empty, whole, EventOptions(kinds=("threshold",), thresholds=(limit,)))
+    text = f"x {'>' if above else '<'} 1" + (f" for {for_s}" if for_s else "")
+
+    held = ask(empty, text, run_id=run_id)
+
+    told = [(event.start_s + for_s, event.end_s) for event in short.events]
+    assert [(event.start_s, event.end_s) for event in held.events] == [
+        (pytest.approx(start_s), end_s) for start_s, end_s in told
+    ]

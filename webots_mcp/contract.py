@@ -48,7 +48,7 @@ class BuiltInAction(NamedTuple):
 
     Attributes:
         needs_supervisor: Only a Supervisor can do it.
-        ends_steps: A `step` command that is still at work ends with it.
+        ends_steps: A `step` or `run` command that is still at work ends with it.
         runs_user_code: It calls functions of the controller, which may take their time.
     """
 
@@ -63,6 +63,8 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "resume": BuiltInAction(ends_steps=True),
     "fast": BuiltInAction(ends_steps=True),
     "step": BuiltInAction(ends_steps=True),
+    "run": BuiltInAction(ends_steps=True),
+    "cancel_run": BuiltInAction(needs_supervisor=False),
     "reset": BuiltInAction(ends_steps=True),
     "reload": BuiltInAction(ends_steps=True),
     "screenshot": BuiltInAction(),
@@ -74,6 +76,11 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
 BreakpointAction = Literal["pause", "log"]
 BREAKPOINT_ACTIONS: Final[tuple[BreakpointAction, ...]] = get_args(BreakpointAction)
 MAX_BREAKPOINTS: Final = 32  # of one robot that are armed
+LOOPING: Final = ("step", "run")  # actions that let the loop come round; one is under way at most
+Pace = Literal["fast", "real_time"]  # of a `run` command
+Then = Literal["pause", "go_on", "as_before"]  # what it does at its end
+RunEnd = Literal["condition held", "time over", "run ended", "interrupted", "condition failed"]
+MAX_RUN_S: Final = 1e6  # of simulation time, of one `run` command
 
 COMMAND_TIME_TO_LIVE_S: Final = 10.0
 HEARTBEAT_INTERVAL_S: Final = 0.5  # how often a session says that its loop is alive

@@ -23,6 +23,8 @@ of its own.
     ├── NothingRecordedError        the question is fine, the recording has no answer yet
     ├── ConditionFailedError        a condition met values that it cannot be asked of
     └── CommandRefusedError         the simulation or the robot cannot do what was asked
+        └── InterruptedCommandError something else ended it before it was done
+            └── ControllerEndedError
 
 Each message names the value that was wrong and the next step to take.
 """
@@ -106,3 +108,11 @@ class ConditionFailedError(WebotsMCPError):
 
 class CommandRefusedError(WebotsMCPError):
     """The simulation or the robot cannot do what a command asked for."""
+
+
+class InterruptedCommandError(CommandRefusedError):
+    """Something ended a command that was under way; the text says what."""
+
+
+class ControllerEndedError(InterruptedCommandError):
+    """The controller, or its bridge, ended while a command was under way."""

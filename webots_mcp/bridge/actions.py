@@ -13,11 +13,17 @@ from typing import Any, Final, cast
 
 from webots_mcp.bridge.commands import Command
 from webots_mcp.bridge.context import Context
+from webots_mcp.bridge.goal import Goal, read_goal
 from webots_mcp.bridge.parameters import SETTERS, Setter
 from webots_mcp.bridge.pictures import complete_png_size
 from webots_mcp.bridge.text import describe
-from webots_mcp.contract import BUILT_IN_ACTIONS, MAX_STEPS, SCREENSHOT_FOLDER
-from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.contract import BUILT_IN_ACTIONS, MAX_STEPS, SCREENSHOT_FOLDER, Then
+from webots_mcp.errors import (
+    CommandRefusedError,
+    ControllerEndedError,
+    InterruptedCommandError,
+    InvalidInputError,
+)
 
 Progress = Generator[None, None, object]
 Action = Callable[[Context, Command], Progress]
@@ -88,7 +94,7 @@ def step(context: Context, command: Command) -> Progress:
     try:
         while (made := clock.steps_seen - from_step) < steps and not context.pause.active:
             yield
-    except CommandRefusedError as interruption:
+    except InterruptedCommandError as interruption:
         made = clock.steps_seen - from_step
         raise CommandRefusedError(f"{interruption} after {made} of {steps} steps") from None
     why = {"why": "a breakpoint paused it before the last step"} if made < steps else {}
@@ -98,10 +104,32 @@ def step(context: Context, command: Command) -> Progress:
 
 
 @_built_in
+def run(context: Context, command: Command) -> Progress:
+    """Let the loop run until a condition holds or a time is over; then pause, unless told else."""
+    goal = read_goal(command.params)
+    context.watch.require_free()
+    return _run_until(context, command, goal)
+
+
+@_built_in
+def cancel_run(context: Context, command: Command) -> Progress:
+    """End the `run` command of that id, as its `then` says: nobody waits for it any more."""
+    return {"was_under_way": context.watch.cancel(command.params.get("command_id"))}
+    yield
+
+
+@_built_in
 def reset(context: Context, command: Command) -> Progress:
     """Ask for the reset; done when simulation time went back, which takes a physics step."""
-    clock, run, was_paused = context.clock, context.clock.run, context.pause.active
+    was_paused = context.pause.active
     context.queue.issue(command)
+    yield from _reset(context, command)
+    why = "a reset takes a step, which ended the pause" if was_paused else "a reset keeps the mode"
+    return {"run_id": context.clock.run.id, **_mode(context), "why": f"{why}; time goes on"}
+
+
+def _reset(context: Context, command: Command) -> Generator[None]:
+    clock, run = context.clock, context.clock.run
     context.pause.end(command)  # first: a paused simulation makes no physics step
     clock.await_reset()
     context.simulation.robot.simulationReset()
@@ -114,8 +142,6 @@ def reset(context: Context, command: Command) -> Progress:
                 f"{_RESET_TIMEOUT_S:.0f} s"
             )
         yield
-    why = "a reset takes a step, which ended the pause" if was_paused else "a reset keeps the mode"
-    return {"run_id": clock.run.id, **_mode(context), "why": f"{why}; time goes on"}
 
 
 @_built_in
@@ -190,6 +216,57 @@ def arm_breakpoints(context: Context, command: Command) -> Progress:
     context.breakpoints.load()
     return context.breakpoints.describe()
     yield
+
+
+def _run_until(context: Context, command: Command, goal: Goal) -> Progress:
+    """Set what the goal asks for, run until it is reached, and say how far it came."""
+    watch, pause, finish = context.watch, context.pause, _finish_of(context, command, goal.then)
+    _set_before_run(context, command, goal)
+    watch.begin(command.id, goal, finish)
+    pause.ask_before_steps(watch.before_step)
+    try:
+        pause.end(command, goal.pace)
+        if goal.reset:
+            yield from _reset(context, command)
+        while not watch.over():
+            if pause.active:
+                cause = ", ".join(f"{name} {value}" for name, value in pause.cause.items())
+                watch.interrupt("interrupted", f"the simulation was paused meanwhile: {cause}")
+            yield
+        return watch.describe() | {"mode": context.simulation.mode_name}
+    except ControllerEndedError as ending:
+        watch.interrupt("run ended", str(ending))
+        return watch.describe()
+    except InterruptedCommandError as interruption:
+        watch.interrupt("interrupted", str(interruption))
+        return watch.describe()
+    except CommandRefusedError:  # the reset did not come
+        finish()
+        raise
+    finally:
+        pause.ask_before_steps(None)
+        watch.end()
+
+
+def _set_before_run(context: Context, command: Command, goal: Goal) -> None:
+    """Set the parameters of a goal, all or none."""
+    if goal.parameters:
+        parameters, setter = context.parameters, Setter("command", command.id)
+        (parameters.set_from_reset if goal.reset else parameters.set_now)(goal.parameters, setter)
+
+
+def _finish_of(context: Context, command: Command, then: Then) -> Callable[[], None]:
+    """What to do at the step that ends a run."""
+    pause, simulation = context.pause, context.simulation
+    was_paused, mode_before = pause.active, pause.running_mode
+
+    def finish() -> None:
+        if then == "as_before" and not was_paused:
+            simulation.set_mode(mode_before)
+        elif then != "go_on":
+            pause.begin(command_id=command.id)
+
+    return finish
 
 
 def _mode(context: Context) -> dict[str, object]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.commands import CommandQueue
+from webots_mcp.bridge.goal import Watch
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.parameters import Parameters
@@ -33,3 +34,4 @@ class Context(NamedTuple):
     pause: Pause
     parameters: Parameters
     breakpoints: Breakpoints
+    watch: Watch

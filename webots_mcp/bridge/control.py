@@ -14,8 +14,12 @@ from webots_mcp.bridge.handlers import Handlers
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S
 from webots_mcp.bridge.text import describe
 from webots_mcp.connection import is_busy
-from webots_mcp.contract import BUILT_IN_ACTIONS
-from webots_mcp.errors import CommandRefusedError
+from webots_mcp.contract import BUILT_IN_ACTIONS, LOOPING
+from webots_mcp.errors import (
+    CommandRefusedError,
+    ControllerEndedError,
+    InterruptedCommandError,
+)
 from webots_mcp.settlement import EXTERN
 
 POLL_INTERVAL_S: Final = 0.005
@@ -37,7 +41,9 @@ class Control:
         context.pause.serve = self._serve_pause
 
     def report_end(self, *, extern: bool) -> None:
-        """The process is about to end: say what no successor will say of a reload."""
+        """The process is about to end: say what no successor will say."""
+        for under_way in [c for c in self._under_way if c.action in LOOPING]:
+            self._end(under_way, ControllerEndedError("the controller ended"))
         command = self._context.reloads.requested_by
         if command is not None and extern and not self._reported:
             self._reported = True
@@ -89,9 +95,10 @@ class Control:
             if built_in is None:
                 self._succeed(command, self.handlers.run(command))
             else:
+                progress = actions.begin(self._context, command)
                 if built_in.ends_steps:
-                    self._end_steps(command)
-                self._under_way[command] = actions.begin(self._context, command)
+                    self._interrupt(f"interrupted by command {command.id} ({command.action})")
+                self._under_way[command] = progress
         except BaseException as error:
             self._fail(command, error)  # whatever a handler raises is the answer
             if not isinstance(error, Exception):
@@ -107,11 +114,10 @@ class Control:
 
     def _abandon(self, command: Command) -> None:
         """Webots is not asked for anything any more; the successor confirms a reload."""
-        del self._under_way[command]
-        if command.action != "reload":
-            self._fail(
-                command, CommandRefusedError("Webots ended the controller before it was done")
-            )
+        if command.action == "reload":
+            del self._under_way[command]
+        else:
+            self._end(command, ControllerEndedError("Webots ended the controller"))
 
     def _advance(self, command: Command) -> None:
         """Go on with a built-in action; a callback of the user's in it may come back to here."""
@@ -128,13 +134,20 @@ class Control:
             if not isinstance(error, Exception):
                 raise
 
-    def _end_steps(self, by: Command) -> None:
-        for command in [c for c in self._under_way if c.action == "step"]:
-            progress = self._under_way.pop(command)
-            try:
-                progress.throw(CommandRefusedError(f"interrupted by command {by.id} ({by.action})"))
-            except CommandRefusedError as reason:
-                self._fail(command, reason)
+    def _interrupt(self, why: str) -> None:
+        """Something else decides from now on how the loop goes on."""
+        for command in [c for c in self._under_way if c.action in LOOPING]:
+            self._end(command, InterruptedCommandError(why))
+
+    def _end(self, command: Command, interruption: InterruptedCommandError) -> None:
+        """End a built-in action that is under way: it may say how far it came."""
+        progress = self._under_way.pop(command)
+        try:
+            progress.throw(interruption)
+        except StopIteration as end:
+            self._succeed(command, end.value)
+        except CommandRefusedError as reason:
+            self._fail(command, reason)
 
     def _succeed(self, command: Command, result: object) -> None:
         context = self._context

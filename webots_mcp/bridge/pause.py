@@ -31,6 +31,7 @@ class Pause:
 
     Attributes:
         active: The loop stays where it is.
+        cause: What the newest pause was begun for.
         serve: Serves commands until the pause has ended: for a loop that steps during it.
     """
 
@@ -47,7 +48,9 @@ class Pause:
         self._stepped = stepped
         self._mode_before = "real_time"
         self._user_code_depth = 0  # a handler may ask for commands itself
+        self._ask_before_steps: Callable[[], object] | None = None
         self.active = False
+        self.cause: dict[str, object] = {}
         self.serve: Callable[[], object] = self.pump
 
     @property
@@ -63,6 +66,7 @@ class Pause:
         """
         if self.active:
             return
+        self.cause = cause
         self._activate(self._simulation.mode_name)
         self._simulation.set_mode("pause")
         self._journal.event("pause", cause)
@@ -102,6 +106,11 @@ class Pause:
         elif not self._simulation.paused:
             self._end_by("a person or another controller, in Webots")
 
+    def ask_before_steps(self, ask: Callable[[], object] | None) -> None:
+        """Call it before each step that the loop begins: it may begin the pause. None: no more."""
+        self._ask_before_steps = ask
+        self._guard_steps()
+
     @contextmanager
     def user_code(self) -> Generator[None]:
         """While a handler or a callback runs: its steps are made, also during the pause."""
@@ -129,10 +138,13 @@ class Pause:
 
     def _guard_steps(self) -> None:
         """Outside of a pause the steps of user code are only told: they show that it lives."""
-        needed = self.active or self._user_code_depth > 0
+        needed = self.active or self._user_code_depth > 0 or self._ask_before_steps is not None
         self._simulation.guard_steps(self._on_step if needed else None)
 
     def _on_step(self, step: Step) -> int:
+        if step.begins and self._ask_before_steps is not None and not self.active:
+            self._stepped()  # a loop may make several steps in a round
+            self._ask_before_steps()
         if self.active and step.begins:
             if self._user_code_depth:
                 self.pump()  # a person may have ended the pause by now

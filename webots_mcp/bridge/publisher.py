@@ -28,17 +28,19 @@ class Publisher:
         self._heartbeat = context.heartbeat
         self._throttle = context.throttle
         self._breakpoints = context.breakpoints
+        self._watch = context.watch
         self._runs = runs
         self._changes = Changes()
         self._run = context.clock.run
         self.cost = PublishCost()
 
     def publish(self, state: Mapping[Any, Any], force: bool) -> None:
-        """Record the state if it is this call's turn, or a breakpoint is hit."""
+        """Record the state if it is this call's turn, a breakpoint is hit or a goal is reached."""
         if self._clock.look():
             self._runs.begin()
         hit = self._breakpoints.look(state) if self._breakpoints.concerned else ()
-        if self._throttle.admits(bool(force or hit or self._heartbeat.loop)):
+        reached = self._watch.asks_states and self._watch.look(state)
+        if self._throttle.admits(bool(force or hit or reached or self._heartbeat.loop)):
             self._record(state)
         if hit:
             self._breakpoints.act(hit, state)
@@ -46,11 +48,11 @@ class Publisher:
     def publish_devices(self, extra: Mapping[Any, Any], include_time: bool) -> None:
         """Record what the devices say; they are read if it is this call's turn.
 
-        While breakpoints are armed they are read in every call.
+        While breakpoints are armed or a run has a goal they are read in every call.
         """
         if self._clock.look():
             self._runs.begin()
-        if self._breakpoints.concerned:
+        if self._breakpoints.concerned or self._watch.asks_states:
             self.publish(self._read(extra, include_time), force=False)
         elif self._throttle.admits(self._heartbeat.loop is not None):
             self._record(self._read(extra, include_time))

@@ -14,6 +14,7 @@ from webots_mcp.bridge.commands import Command, CommandQueue
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.error_report import ErrorReport
+from webots_mcp.bridge.goal import Watch
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
@@ -80,6 +81,7 @@ class Session:
             pause=pause,
             parameters=parameters,
             breakpoints=Breakpoints(simulation, clock, recorder, journal, pause),
+            watch=Watch(clock, simulation.basic_time_step_s / 2),
         )
         self.control = Control(self.context)
         self.publisher = Publisher(self.context, self.runs)

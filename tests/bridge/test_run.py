@@ -1,0 +1,381 @@
+"""The action `run`: the loop runs until a condition holds or a time is over, to the very step."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.bridge.conftest import STEP_MS, Recording, eager
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.standin import InProcessRobot, InProcessSupervisor
+
+STEP_S = STEP_MS / 1000
+
+
+@pytest.fixture
+def sparse(
+    robot: InProcessSupervisor, database: MemoryDatabase, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[MCPBridge]:
+    """A bridge that records one call in seven."""
+    monkeypatch.setenv("WEBOTS_MCP_STRICT", "1")
+    with MCPBridge(robot, throttle_interval=7, database=database) as bridge:
+        yield bridge
+
+
+class Rounds:
+    """The user's loop, in one of the orders that controllers have; `n` counts its rounds.
+
+    Where the simulation is paused, the loop would wait for ever: see `let_go_when_paused`.
+    """
+
+    def __init__(
+        self, robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording, order: str
+    ) -> None:
+        self.robot, self.bridge, self.recording = robot, bridge, recording
+        self.order, self.n = order, 0
+
+    def state(self) -> dict[str, Any]:
+        return {"n": self.n, "time": self.robot.getTime(), "even": self.n % 2 == 0}
+
+    def drive(self, rounds: int, publish_each: int = 1) -> None:
+        for _ in range(rounds):
+            if self.robot.step(STEP_MS) == -1:
+                return
+            self.n += 1
+            publish = self.n % publish_each == 0
+            if self.order == "published first" and publish:
+                self.bridge.publish(self.state())
+            eager(self.bridge)
+            if self.order == "asked first" and publish:
+                self.bridge.publish(self.state())
+
+
+ORDERS = ("published first", "asked first")
+
+
+@pytest.fixture(params=ORDERS)
+def rounds(
+    request: pytest.FixtureRequest,
+    robot: InProcessSupervisor,
+    sparse: MCPBridge,
+    recording: Recording,
+) -> Rounds:
+    return Rounds(robot, sparse, recording, request.param)
+
+
+def let_go_when_paused(rounds: Rounds) -> list[float]:
+    """The times at which the simulation is paused; a `resume` is sent at that moment."""
+    times: list[float] = []
+    robot = rounds.robot
+    set_mode = robot.simulationSetMode
+
+    def noticed(mode: int) -> None:
+        set_mode(mode)
+        if mode == robot.SIMULATION_MODE_PAUSE:
+            times.append(robot.getTime())
+            rounds.recording.send("resume")
+
+    vars(robot)["simulationSetMode"] = noticed
+    return times
+
+
+def test_it_pauses_at_the_very_step_at_which_the_condition_holds(
+    rounds: Rounds, recording: Recording
+) -> None:
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", until="n >= 40", pace="fast")
+    rounds.drive(60)
+    status, result, error = recording.fate(sent)
+    assert (status, error) == ("done", None)
+    assert paused == [pytest.approx(40 * STEP_S)]
+    assert result["ended"] == "condition held"
+    assert result["sim_time_s"] == pytest.approx(40 * STEP_S)
+    assert result["values"] == {"n": 40}
+    assert result["mode"] == "pause"
+    assert 40 in [state["n"] for state in recording.states()], "whatever the throttle"
+    notes = recording.rows("SELECT data ->> 'command_id' FROM event WHERE kind = 'pause'")
+    assert notes == [sent]
+
+
+def test_it_pauses_at_the_step_that_reaches_the_time(rounds: Rounds, recording: Recording) -> None:
+    rounds.drive(3)
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", for_s=100 * STEP_S)
+    rounds.drive(150)
+    _, result, error = recording.fate(sent)
+    assert error is None
+    (at_s,) = paused
+    began = 4  # it is claimed in the fourth round
+    assert at_s == pytest.approx((began + 100) * STEP_S)
+    assert result["ended"] == "time over"
+    assert result["advanced_s"] == pytest.approx(100 * STEP_S)
+    assert began + 100 in [state["n"] for state in recording.states()]
+
+
+@pytest.mark.parametrize("publish_each", [2, 9])
+def test_the_time_is_exact_where_the_loop_does_not_publish_in_each_round(
+    rounds: Rounds, recording: Recording, publish_each: int
+) -> None:
+    paused = let_go_when_paused(rounds)
+    recording.send("run", for_s=50 * STEP_S)
+    rounds.drive(80, publish_each)
+    assert paused == [pytest.approx(51 * STEP_S)]
+
+
+def test_the_time_is_exact_where_the_loop_asks_for_commands_now_and_then(
+    robot: InProcessSupervisor, sparse: MCPBridge, recording: Recording
+) -> None:
+    rounds = Rounds(robot, sparse, recording, "published first")
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", for_s=20 * STEP_S)
+    rounds.drive(1)
+    for n in range(60):
+        robot.step(STEP_MS)
+        if n % 25 == 0:
+            sparse.publish({"n": n})
+            eager(sparse)
+    assert paused == [pytest.approx(21 * STEP_S)]
+    assert recording.fate(sent)[1]["advanced_s"] == pytest.approx(20 * STEP_S)
+
+
+def test_a_reset_counts_the_time_from_zero_and_asks_the_first_state_after_it(
+    rounds: Rounds, recording: Recording
+) -> None:
+    rounds.drive(30)
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", until="time < 1", for_s=2.0, reset=True, pace="fast")
+    rounds.drive(20)
+    _, result, error = recording.fate(sent)
+    assert error is None
+    assert (result["ended"], result["from_s"]) == ("condition held", 0.0)
+    assert result["sim_time_s"] == paused[0] <= 2 * STEP_S
+    assert recording.rows("SELECT max(id) FROM run") == [result["run_id"]]
+
+    sent = recording.send("run", for_s=2.0, reset=True)
+    rounds.drive(200)
+    _, result, error = recording.fate(sent)
+    assert error is None
+    assert result["sim_time_s"] == pytest.approx(2.0) == result["advanced_s"]
+    assert paused[1:] == [pytest.approx(2.0)]
+
+
+@pytest.mark.parametrize(
+    ("then", "mode_before", "mode_after"),
+    [
+        ("go_on", "real_time", "fast"),
+        ("as_before", "real_time", "real_time"),
+        ("as_before", "fast", "fast"),
+    ],
+)
+def test_at_the_end_it_goes_on_or_is_as_it_was(
+    rounds: Rounds, recording: Recording, then: str, mode_before: str, mode_after: str
+) -> None:
+    robot = rounds.robot
+    robot.simulationSetMode(getattr(robot, f"SIMULATION_MODE_{mode_before.upper()}"))
+    sent = recording.send("run", until="n == 10", pace="fast", then=then)
+    rounds.drive(12)
+    _, result, error = recording.fate(sent)
+    assert error is None
+    assert (result["ended"], result["mode"]) == ("condition held", mode_after)
+    assert result["sim_time_s"] == pytest.approx(10 * STEP_S)
+    assert 10 in [state["n"] for state in recording.states()]
+    assert recording.rows("SELECT count(*) FROM event WHERE kind = 'pause'") == [0]
+
+
+def test_as_before_pauses_what_was_paused(rounds: Rounds, recording: Recording) -> None:
+    paused: list[float] = []
+    recording.send("pause")
+    sent = recording.send("run", until="n >= 10", then="as_before")
+    robot, set_mode = rounds.robot, rounds.robot.simulationSetMode
+
+    def noticed(mode: int) -> None:
+        set_mode(mode)
+        if mode == robot.SIMULATION_MODE_PAUSE:
+            paused.append(robot.getTime())
+            if len(paused) > 1:
+                recording.send("resume")
+
+    vars(robot)["simulationSetMode"] = noticed
+    rounds.drive(12)
+    assert recording.fate(sent)[1]["mode"] == "pause"
+    assert paused[1:] == [pytest.approx(10 * STEP_S)]
+
+
+@pytest.mark.parametrize("by", ["pause", "resume", "fast", "step", "reset"])
+def test_what_steers_the_loop_interrupts_it_and_it_says_how_far_it_came(
+    rounds: Rounds, recording: Recording, by: str
+) -> None:
+    rounds.drive(2)
+    sent = recording.send("run", until="n > 1000", for_s=100)
+    rounds.drive(1)
+    let_go_when_paused(rounds)
+    rounds.drive(10)
+    interrupting = recording.send(by)
+    rounds.drive(3)
+    status, result, error = recording.fate(sent)
+    assert (status, error) == ("done", None)
+    assert result["ended"] == "interrupted"
+    assert result["why"] == f"interrupted by command {interrupting} ({by})"
+    assert result["advanced_s"] == pytest.approx(11 * STEP_S)
+    again = recording.send("run", for_s=STEP_S, then="go_on")
+    rounds.drive(4)
+    assert recording.fate(again)[0] == "done"
+
+
+def test_a_breakpoint_that_pauses_interrupts_it(rounds: Rounds, recording: Recording) -> None:
+    number = rounds.bridge.breakpoint("n == 8")
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", until="n > 1000", then="go_on")
+    rounds.drive(12)
+    _, result, error = recording.fate(sent)
+    assert (error, result["ended"]) == (None, "interrupted")
+    assert f"breakpoint_id {number}, condition n == 8" in result["why"]
+    assert paused == [pytest.approx(8 * STEP_S)] == [pytest.approx(result["sim_time_s"])]
+
+
+def test_a_reset_by_a_person_ends_it(rounds: Rounds, recording: Recording) -> None:
+    rounds.drive(1)
+    run_id = rounds.bridge.run_id
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", until="n > 1000")
+    rounds.drive(10)
+    rounds.robot.simulationReset()
+    rounds.drive(5)
+    _, result, error = recording.fate(sent)
+    assert error is None
+    assert (result["ended"], result["why"]) == ("run ended", "the world was reset")
+    assert result["run_id"] == run_id
+    assert result["sim_time_s"] == pytest.approx(11 * STEP_S)
+    assert len(paused) == 1, "and then the simulation stands, as it was asked"
+    assert paused[0] <= 2 * STEP_S
+
+
+def test_a_quit_ends_it(rounds: Rounds, recording: Recording) -> None:
+    sent = recording.send("run", until="n > 1000")
+    rounds.drive(10)
+    rounds.robot.simulation.quit()
+    rounds.drive(5)
+    rounds.bridge.close()
+    _, result, error = recording.fate(sent)
+    assert error is None
+    assert result["ended"] == "run ended"
+    assert result["sim_time_s"] == pytest.approx(10 * STEP_S)
+
+
+def test_a_condition_that_cannot_be_asked_ends_it_as_it_was_told_to_end(
+    rounds: Rounds, recording: Recording
+) -> None:
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", until="n < 'a'")
+    rounds.drive(5)
+    status, _, error = recording.fate(sent)
+    assert status == "failed"
+    assert error is not None and "n < 'a'" in error
+    assert len(paused) == 1
+
+
+def test_a_cancelled_one_ends_as_it_was_told_to_end(rounds: Rounds, recording: Recording) -> None:
+    sent = recording.send("run", until="n > 1000")
+    rounds.drive(10)
+    other = recording.send("cancel_run", command_id=sent + 1000)
+    rounds.drive(2)
+    assert recording.fate(other)[1] == {"was_under_way": False}
+    assert recording.fate(sent)[0] == "claimed"
+    paused = let_go_when_paused(rounds)
+    cancel = recording.send("cancel_run", command_id=sent)
+    rounds.drive(3)
+    assert recording.fate(cancel)[1] == {"was_under_way": True}
+    _, result, error = recording.fate(sent)
+    assert (error, result["ended"], result["why"]) == (None, "interrupted", "it was cancelled")
+    assert len(paused) == 1
+
+
+def test_two_at_once_are_refused_and_the_first_goes_on(
+    rounds: Rounds, recording: Recording
+) -> None:
+    first = recording.send("run", until="n == 20", then="go_on")
+    second = recording.send("run", until="n == 5", reset=True)
+    rounds.drive(10)
+    status, _, error = recording.fate(second)
+    assert status == "failed"
+    assert error is not None and f"command {first} (run) is under way" in error
+    rounds.drive(20)
+    assert recording.fate(first)[1]["values"] == {"n": 20}
+    assert recording.rows("SELECT count(*) FROM run") == [1]
+
+
+@pytest.mark.parametrize(
+    ("params", "told"),
+    [
+        ({}, "give until"),
+        ({"until": "n <"}, "condition 'n <'"),
+        ({"until": 3}, "until is a condition"),
+        ({"for_s": 0}, "above 0"),
+        ({"for_s": float("1e9")}, "up to 1000000"),
+        ({"for_s": True}, "for_s is a number"),
+        ({"for_s": "20"}, "for_s is a number"),
+        ({"for_s": 1, "pace": "slow"}, "pace must be one of null, 'fast', 'real_time', not 'slow'"),
+        ({"for_s": 1, "then": "stop"}, "then must be one of 'pause', 'go_on', 'as_before'"),
+        ({"for_s": 1, "reset": "yes"}, "reset must be one of False, True"),
+        ({"for_s": 1, "parameters": [1]}, "parameters are names and values"),
+        ({"for_s": 1, "parameters": {"kp": 1}}, "kp"),
+        ({"for_s": 1, "parameters": {"gain": 11}}, "up to 10"),
+        ({"for_s": 1, "parameters": {"gain": 5, "kp": 1}, "reset": True}, "kp"),
+    ],
+)
+def test_what_makes_no_sense_is_refused_and_nothing_is_done(
+    rounds: Rounds, recording: Recording, params: dict[str, Any], told: str
+) -> None:
+    gain = rounds.bridge.parameter("gain", 2.0, low=0, high=10)
+    rounds.drive(3)
+    before = rounds.robot.simulationGetMode()
+    sent = recording.send("run", 10, **({"pace": "real_time"} | params))
+    rounds.drive(3)
+    status, _, error = recording.fate(sent)
+    assert status == "failed"
+    assert error is not None and told in error
+    assert rounds.robot.simulationGetMode() == before
+    assert gain.value == 2.0
+    assert recording.rows("SELECT count(*) FROM run") == [1]
+    rounds.robot.simulationReset()
+    rounds.drive(3)
+    assert gain.value == 2.0
+
+
+@pytest.mark.parametrize("reset", [False, True])
+def test_parameters_are_set_before_it_runs(
+    rounds: Rounds, recording: Recording, reset: bool
+) -> None:
+    gain = rounds.bridge.parameter("gain", 2.0, low=0, high=10)
+    rounds.drive(5)
+    recording.send("run", for_s=0.2, reset=reset, parameters={"gain": 4}, then="go_on")
+    rounds.drive(5)
+    assert gain.value == 4.0
+    of_run = "run_id = (SELECT max(id) FROM run) ORDER BY since_s, utc"
+    assert recording.rows(f"SELECT value FROM robot_parameter WHERE {of_run}")[-1] == 4.0
+
+
+def test_auto_publish_is_asked_at_every_call(
+    robot: InProcessSupervisor, sparse: MCPBridge, recording: Recording
+) -> None:
+    rounds = Rounds(robot, sparse, recording, "nothing is published")
+    paused = let_go_when_paused(rounds)
+    sent = recording.send("run", until="n >= 12", for_s=10)
+    for n in range(20):
+        robot.step(STEP_MS)
+        sparse.auto_publish({"n": n})
+        eager(sparse)
+    assert recording.fate(sent)[1]["values"] == {"n": 12}
+    assert paused == [pytest.approx(13 * STEP_S)]
+    assert 12 in [state["n"] for state in recording.states()]
+
+
+def test_a_plain_robot_is_told_that_it_takes_a_supervisor(database: MemoryDatabase) -> None:
+    robot = InProcessRobot("rover")
+    with MCPBridge(robot, database=database) as bridge:
+        recording = Recording(database)
+        sent = recording.send("run", for_s=1)
+        eager(bridge)
+        assert "run needs a Supervisor" in (recording.fate(sent)[2] or "")

@@ -1,0 +1,122 @@
+"""The action `run` with real processes: fast mode stops at the very step, kills are survived."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from tests.bridge.conftest import Recording
+from tests.processes.conftest import Start, has_states
+from tests.processes.test_control import wait
+from webots_mcp.connection import connect
+from webots_mcp.settlement import settle
+from webots_mcp.standin import Mode, Simulation
+
+# `front_m` falls and rises with time in the same way in each run, whatever the physics do.
+DRIVE = """
+import math
+
+if {interval} != 1:
+    bridge.close()
+    bridge = MCPBridge(robot, throttle_interval={interval})
+
+def state():
+    time = robot.getTime()
+    return {{"time": time, "front_m": round(abs(math.sin(1.3 * time)), 6)}}
+
+while robot.step(16) != -1:
+    {loop}
+"""
+PUBLISHED_FIRST = "bridge.publish(state()); bridge.get_command()"
+ASKED_FIRST = "bridge.get_command(); bridge.publish(state())"
+
+
+def drive(
+    start: Start, interval: int, loop: str = PUBLISHED_FIRST, mode: str = "fast"
+) -> Simulation:
+    return start(DRIVE.format(interval=interval, loop=loop), mode)
+
+
+@pytest.mark.parametrize("loop", [PUBLISHED_FIRST, ASKED_FIRST])
+def test_fast_mode_stops_at_the_very_step(start: Start, filed: Recording, loop: str) -> None:
+    simulation = drive(start, 50, loop)
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+    for _ in range(3):
+        command = filed.send("run", until="front_m < 0.02", for_s=60, reset=True, pace="fast")
+        result = wait(simulation, filed, command)
+        assert result["ended"] == "condition held"
+        assert simulation.mode is Mode.PAUSE
+        assert simulation.time_s == pytest.approx(result["sim_time_s"])
+        newest = "SELECT data FROM state ORDER BY id DESC LIMIT 1"
+        assert f'"front_m":{result["values"]["front_m"]}' in filed.rows(newest)[0]
+        # The first step of all at which it holds, as all steps recorded would show it.
+        assert result["sim_time_s"] == pytest.approx(first_step_below_0_02())
+
+
+def first_step_below_0_02() -> float:
+    steps = (0.016 * n for n in range(1, 10_000))
+    return next(time for time in steps if round(abs(math.sin(1.3 * time)), 6) < 0.02)
+
+
+def test_the_step_is_the_one_that_a_recording_of_every_step_shows(
+    start: Start, filed: Recording
+) -> None:
+    simulation = drive(start, 1)
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+    command = filed.send("run", until="front_m > 0.9 for 0.1", reset=True, pace="fast")
+    result = wait(simulation, filed, command)
+    rows = filed.rows(
+        "SELECT sim_time_s, data ->> 'front_m' FROM state WHERE run_id = ? ORDER BY id",
+        result["run_id"],
+    )
+    since = next(time for time, front in rows if front > 0.9)
+    assert result["sim_time_s"] == pytest.approx(
+        next(t for t, _ in rows if t - since >= 0.1 - 1e-6)
+    )
+    assert rows[-1][0] == pytest.approx(result["sim_time_s"])
+
+
+def test_twenty_seconds_are_twenty_seconds(start: Start, filed: Recording) -> None:
+    simulation = drive(start, 7, ASKED_FIRST)
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+    result = wait(simulation, filed, filed.send("run", for_s=20, reset=True, pace="fast"))
+    assert (result["ended"], result["sim_time_s"]) == ("time over", pytest.approx(20.0))
+    assert simulation.time_s == pytest.approx(20.0)
+    further = wait(simulation, filed, filed.send("run", for_s=0.5, pace="fast"))
+    assert further["advanced_s"] == pytest.approx(0.5, abs=0.008)
+    assert simulation.time_s == pytest.approx(20.5, abs=0.008)
+
+
+def test_a_killed_controller_leaves_no_run_behind(start: Start, filed: Recording) -> None:
+    simulation = drive(start, 5)
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+    command = filed.send("run", until="front_m > 2", reset=True)
+    simulation.wait_for(lambda: filed.fate(command)[0] == "claimed")
+    simulation.wait_for(lambda: filed.rows("SELECT count(*) FROM run") == [2])
+    simulation.controller("rover").kill()
+    simulation.wait_for(lambda: not simulation.controller("rover").is_running)
+    connection = connect(filed.database, "writer")
+    settle(connection, 1e10)
+    connection.close()
+    status, _, error = filed.fate(command)
+    assert (status, error) == (
+        "lost",
+        "its controller ended before it finished; it may have run in part",
+    )
+
+
+@pytest.mark.parametrize("press", ["reset", "reload", "quit"])
+def test_what_a_person_does_ends_it(start: Start, filed: Recording, press: str) -> None:
+    simulation = drive(start, 5, mode="realtime")
+    simulation.wait_for(lambda: has_states(filed), timeout_s=30)
+    command = filed.send("run", until="front_m > 2", then="go_on")
+    simulation.wait_for(lambda: filed.fate(command)[0] == "claimed")
+    at_s = simulation.time_s
+    simulation.wait_for(lambda: simulation.time_s > at_s + 0.2)
+    getattr(simulation, press)()
+    simulation.wait_for(lambda: filed.fate(command)[0] != "claimed", timeout_s=20)
+    status, result, error = filed.fate(command)
+    assert (status, error) == ("done", None)
+    assert result["ended"] == "run ended"
+    assert result["sim_time_s"] >= at_s

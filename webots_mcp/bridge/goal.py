@@ -1,0 +1,284 @@
+"""What a `run` command lets the loop run until: a condition, a simulation time."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple, cast, get_args
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.encoding import plain
+from webots_mcp.bridge.run import Run
+from webots_mcp.bridge.text import describe
+from webots_mcp.contract import MAX_RUN_S, Pace, RunEnd, Then
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
+
+if TYPE_CHECKING:
+    from webots_mcp.conditions import Condition, Evaluator
+    from webots_mcp.naming import Value
+
+
+class Goal(NamedTuple):
+    """What a `run` command asks for.
+
+    Attributes:
+        until: Run until it holds; None for no condition.
+        for_s: Run for so much simulation time; None for no limit.
+        reset: Reset the world first; the time counts from there.
+        pace: The simulation mode to run in; None for the one that it ran in last.
+        parameters: To set before, at the reset where there is one.
+        then: What to do when the run is over.
+    """
+
+    until: Condition | None
+    for_s: float | None
+    reset: bool
+    pace: Pace | None
+    parameters: dict[str, object]
+    then: Then
+
+
+def read_goal(params: dict[str, Any]) -> Goal:
+    """What the parameters of a command say.
+
+    Raises:
+        InvalidInputError: One of them is wrong, or both `until` and `for_s` are missing.
+    """
+    from webots_mcp.conditions import parse_condition  # only here: most controllers need none
+
+    until, for_s, parameters = params.get("until"), params.get("for_s"), params.get("parameters")
+    if until is None and for_s is None:
+        raise InvalidInputError("give until (a condition), for_s (simulated seconds), or both")
+    if until is not None and not isinstance(until, str):
+        raise InvalidInputError(f"until is a condition, such as 'front_m < 0.1', not {until!r:.80}")
+    if parameters is not None and not isinstance(parameters, dict):
+        raise InvalidInputError(f"parameters are names and values, not {parameters!r:.80}")
+    return Goal(
+        until=None if until is None else parse_condition(until),
+        for_s=None if for_s is None else _seconds(for_s),
+        reset=_one_of("reset", params.get("reset", False), (False, True)),
+        pace=_one_of("pace", params.get("pace"), (None, *get_args(Pace))),
+        parameters=cast("dict[str, object]", parameters or {}),
+        then=_one_of("then", params.get("then", "pause"), get_args(Then)),
+    )
+
+
+def _seconds(value: object) -> float:
+    if isinstance(value, (int, float)) and not isinstance(value, bool) and 0 < value <= MAX_RUN_S:
+        return float(value)
+    raise InvalidInputError(
+        f"for_s is a number of simulated seconds above 0, up to {MAX_RUN_S:.0f}, not {value!r:.80}"
+    )
+
+
+def _one_of(name: str, value: Any, choices: tuple[Any, ...]) -> Any:
+    if any(value is choice or (isinstance(value, str) and value == choice) for choice in choices):
+        return value
+    told = ", ".join("null" if choice is None else repr(choice) for choice in choices)
+    raise InvalidInputError(f"{name} must be one of {told}, not {value!r:.80}")
+
+
+class Reached(NamedTuple):
+    """How a run of the loop ended.
+
+    Attributes:
+        end: In one word or two.
+        run: In which it ended.
+        sim_time_s: Of the very step.
+        monotonic_s: When that was.
+        why: What there is to say beside it.
+        values: Of the condition's signals.
+    """
+
+    end: RunEnd
+    run: Run
+    sim_time_s: float
+    monotonic_s: float
+    why: str | None = None
+    values: dict[str, Value] | None = None
+
+
+class _Watched:
+    """A goal, from the command that set it until it is reached.
+
+    Attributes:
+        run: In which it is watched; None before the reset that is waited for.
+        former: The run before that.
+        since_s: The simulation time from which on it runs, and the monotonic clock at that time.
+        published_s: Of the newest published state.
+    """
+
+    def __init__(self, command_id: int, goal: Goal, clock: Clock, finish: Callable[[], object]):
+        self.command_id = command_id
+        self.goal = goal
+        self.finish = finish
+        self.finished = False
+        self.evaluator: Evaluator | None = goal.until and goal.until.evaluator(plain)
+        self.former, self.run = clock.run, None if goal.reset else clock.run
+        self.since_s = (clock.sim_time_s, time.monotonic())
+        self.published_s = -math.inf
+        self.reached: Reached | None = None
+
+
+class Watch:
+    """Watches whether the goal of a `run` command is reached, at each published state and step.
+
+    The simulation is stopped at the very step: in `get_command()` where the state of that step is
+    published by then, else before the loop's next step begins.
+
+    Args:
+        clock: Tells time and run.
+        tolerance_s: A clock that adds up steps reaches a time by as much less.
+    """
+
+    def __init__(self, clock: Clock, tolerance_s: float) -> None:
+        self._clock = clock
+        self._tolerance_s = tolerance_s
+        self._watched: _Watched | None = None
+
+    @property
+    def asks_states(self) -> bool:
+        """Whether each state has to be looked at, recorded or not."""
+        return self._watched is not None and self._watched.reached is None
+
+    def require_free(self) -> None:
+        """Refuse a second goal.
+
+        Raises:
+            CommandRefusedError: With what can be done.
+        """
+        if (watched := self._watched) is not None:
+            raise CommandRefusedError(
+                f"command {watched.command_id} (run) is under way: wait for it with "
+                f"webots_wait_for_command (command_id {watched.command_id}), or pause to end it"
+            )
+
+    def begin(self, command_id: int, goal: Goal, finish: Callable[[], object]) -> None:
+        """Watch from the next state on; where the goal asks for a reset, from the first after it.
+
+        Args:
+            command_id: Of the `run` command.
+            goal: What it asks for.
+            finish: Called once, at the step at which it is reached.
+        """
+        self._watched = _Watched(command_id, goal, self._clock, finish)
+
+    def end(self) -> None:
+        """The command is settled."""
+        self._watched = None
+
+    # -- from the loop -------------------------------------------------------------------------
+
+    def look(self, state: Any) -> bool:
+        """Take in a published state; True if it is the one that reaches the goal."""
+        watched = self._watched
+        if watched is None or watched.reached is not None or not self._begun(watched):
+            return False
+        watched.published_s = self._clock.sim_time_s
+        watched.reached = self._judge_run(watched) or self._judge(watched, state)
+        return watched.reached is not None and watched.reached.run is self._clock.run
+
+    def before_step(self) -> None:
+        """The loop begins its next step: the last one is over."""
+        watched = self._watched
+        if watched is None or not self._begun(watched):
+            return
+        watched.reached = watched.reached or self._judge_run(watched) or self._judge_time(watched)
+        if watched.reached is not None:
+            self._finish(watched)
+
+    def over(self) -> bool:
+        """In `get_command()`: whether the goal is reached and there is nothing more to wait for."""
+        watched = self._watched
+        if watched is None or not self._begun(watched):
+            return watched is None
+        if watched.reached is None:
+            watched.reached = self._judge_run(watched)
+        if watched.reached is None and watched.published_s == self._clock.sim_time_s:
+            watched.reached = self._judge_time(watched)
+        if watched.reached is not None:
+            self._finish(watched)
+        return watched.reached is not None
+
+    def interrupt(self, end: RunEnd, why: str) -> None:
+        """Something else decides from now on what the loop does."""
+        if (watched := self._watched) is not None:
+            watched.reached = watched.reached or self._reached(end, why)
+            watched.finished = True
+
+    def cancel(self, command_id: object) -> bool:
+        """Have the run of that command end now, as its `then` says; False where there is none."""
+        watched = self._watched
+        if watched is None or watched.command_id != command_id:
+            return False
+        watched.reached = watched.reached or self._reached("interrupted", "it was cancelled")
+        return True
+
+    def describe(self) -> dict[str, object]:
+        """How far it came, and why not farther.
+
+        Raises:
+            CommandRefusedError: The condition could not be asked of what is published.
+        """
+        assert self._watched is not None and self._watched.reached is not None, "ask over() first"
+        reached, (since_s, since_monotonic_s) = self._watched.reached, self._watched.since_s
+        if reached.end == "condition failed":
+            raise CommandRefusedError(f"{reached.why}; it ended at {reached.sim_time_s:.6g} s")
+        wall_s = reached.monotonic_s - since_monotonic_s
+        advanced_s = round(reached.sim_time_s - since_s, 6)
+        told = {
+            "ended": reached.end,
+            "why": reached.why,
+            "run_id": reached.run.id,
+            "from_s": round(since_s, 6),
+            "sim_time_s": round(reached.sim_time_s, 6),
+            "advanced_s": advanced_s,
+            "wall_s": round(wall_s, 3),
+            "factor": round(advanced_s / wall_s, 3) if wall_s > 0 else None,
+            "values": reached.values,
+        }
+        return {name: value for name, value in told.items() if value is not None}
+
+    # -- inside --------------------------------------------------------------------------------
+
+    def _begun(self, watched: _Watched) -> bool:
+        """Whether the run has begun in which it is watched."""
+        if watched.run is None and self._clock.run is not watched.former:
+            watched.run = self._clock.run
+            watched.since_s = (0.0, time.monotonic())
+        return watched.run is not None
+
+    def _finish(self, watched: _Watched) -> None:
+        if not watched.finished:
+            watched.finished = True
+            watched.finish()
+
+    def _judge(self, watched: _Watched, state: Any) -> Reached | None:
+        evaluator = watched.evaluator
+        if evaluator is None:
+            return self._judge_time(watched)
+        try:
+            if evaluator.holds(state, self._clock.sim_time_s):
+                return self._reached("condition held", values=evaluator.values(state))
+        except Exception as error:  # noqa: BLE001  (whatever an object of the user's does)
+            return self._reached("condition failed", describe(error))
+        return self._judge_time(watched)
+
+    def _judge_time(self, watched: _Watched) -> Reached | None:
+        for_s, (since_s, _) = watched.goal.for_s, watched.since_s
+        if for_s is None or self._clock.sim_time_s - since_s < for_s - self._tolerance_s:
+            return None
+        return self._reached("time over")
+
+    def _judge_run(self, watched: _Watched) -> Reached | None:
+        if watched.run is None or self._clock.run is watched.run:
+            return None
+        at_s = self._clock.ended_sim_time_s
+        return Reached("run ended", watched.run, at_s, time.monotonic(), "the world was reset")
+
+    def _reached(
+        self, end: RunEnd, why: str | None = None, values: dict[str, Value] | None = None
+    ) -> Reached:
+        clock = self._clock
+        return Reached(end, clock.run, clock.sim_time_s, time.monotonic(), why, values)

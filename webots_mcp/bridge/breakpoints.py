@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.bridge.clock import Clock
@@ -40,7 +39,6 @@ _SET: Final = (
 )
 
 
-@dataclass(eq=False)
 class Breakpoint:
     """One that is armed.
 
@@ -52,15 +50,23 @@ class Breakpoint:
         unseen: Its signals that no state has held yet.
     """
 
-    id: int | None
-    condition: Condition
-    evaluator: Evaluator
-    action: str
-    after_hits: int
-    hits: int = 0
-    holding: bool = False
-    asked_since_s: float | None = None
-    unseen: frozenset[str] = frozenset()
+    def __init__(
+        self,
+        id: int | None,  # noqa: A002
+        condition: Condition,
+        evaluator: Evaluator,
+        action: str,
+        after_hits: int,
+    ) -> None:
+        self.id = id
+        self.condition = condition
+        self.evaluator = evaluator
+        self.action = action
+        self.after_hits = after_hits
+        self.hits = 0
+        self.holding = False
+        self.asked_since_s: float | None = None
+        self.unseen = frozenset(condition.signals)
 
     def begin_run(self) -> None:
         """It is armed again."""
@@ -263,8 +269,7 @@ _CANNOT_PAUSE: Final = (
 
 
 def _armed(number: int | None, condition: Condition, action: str, after_hits: int) -> Breakpoint:
-    evaluator, unseen = condition.evaluator(plain), frozenset(condition.signals)
-    return Breakpoint(number, condition, evaluator, action, after_hits, unseen=unseen)
+    return Breakpoint(number, condition, condition.evaluator(plain), action, after_hits)
 
 
 def _require_action(action: str, after_hits: object) -> None:

@@ -73,7 +73,7 @@ class Breakpoint:
         self.evaluator.forget()
         self.hits, self.holding, self.asked_since_s = 0, False, None
 
-    def begins_to_hold(self, state: Any, sim_time_s: float) -> bool:
+    def begins(self, state: Any, sim_time_s: float) -> bool:
         """Take in a state.
 
         Raises:
@@ -131,7 +131,7 @@ class Breakpoints:
         try:
             condition = parse_condition(text.decode("utf-8", "replace"))
         except InvalidConditionError as error:
-            self._turn_off(number, str(error))
+            self._disable(number, str(error))
             return None
         return _armed(number, condition, action.decode("utf-8", "replace"), int(after_hits))
 
@@ -191,7 +191,7 @@ class Breakpoints:
             self._begin_run()
         for each in tuple(self.armed):
             try:
-                if each.begins_to_hold(state, clock.sim_time_s):
+                if each.begins(state, clock.sim_time_s):
                     self._count(each, hit)
             except ConditionFailedError as error:
                 self._disarm(each, str(error))
@@ -241,10 +241,10 @@ class Breakpoints:
         """A condition that fails would fail with every state: it is told once, and off."""
         self.armed.remove(each)
         if each.id is not None:
-            self._turn_off(each.id, why)
+            self._disable(each.id, why)
         self._journal.log("warning", "bridge", f"breakpoint {each.id or ''} is off: {why}")
 
-    def _turn_off(self, number: int, why: str) -> None:
+    def _disable(self, number: int, why: str) -> None:
         text = storable(cut(why, _MOST_ERROR_CHARACTERS))
         self._off[number] = text
         self._recorder.record("breakpoint failed", None, (text, number))

@@ -6,6 +6,7 @@ from runpy import run_path
 
 import pytest
 
+from webots_mcp import MCPBridge
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.testing import RecordedSimulation, SimulationFactory
 
@@ -56,10 +57,21 @@ def test_after_a_reset_it_begins_anew(simulation: RecordedSimulation) -> None:
     assert after.signal("mode").changes() == ["cruise"]
 
 
-def test_it_turns_the_short_way_round(webots_robot: InProcessSupervisor) -> None:
+def test_it_drives_as_fast_as_its_parameter_says(simulation: RecordedSimulation) -> None:
+    simulation.run_for(1)
+    sent = simulation.recording.set_parameters({"speed": 2.0})
+    simulation.run_for(1)
+    assert sent.status == "done"
+    assert simulation.recording.signal("wheel_radps.left").last == pytest.approx(2.0, abs=0.01)
+    assert simulation.recording.parameters() == {"speed": 2.0, "near": 0.35}
+
+
+def test_it_turns_the_short_way_round(
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge
+) -> None:
     """A part of the controller by itself, without a process."""
     controller = run_path(str(PROJECT / "controllers" / "rover" / "rover.py"))
-    rover = controller["Rover"](webots_robot)
+    rover = controller["Rover"](webots_robot, webots_bridge)
     webots_robot.step(rover.time_step)
     rover.sense()
     assert rover.turn_to({"heading": -1.0})["to_turn_rad"] == pytest.approx(-1.0)

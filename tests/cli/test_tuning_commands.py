@@ -49,7 +49,7 @@ def test_parameters_are_shown_and_set(
     ("settings", "said"),
     [
         (["kp=fast"], "'kp' is a number from 0 up to 10, not 'fast'"),
-        (["kp"], "'kp' sets nothing: write kp=VALUE"),
+        (["kp"], "'kp' names no value: write kp=VALUE"),
         (["kq=1"], "no parameter 'kq'"),
         (["gait=1"], "one of 'trot', 'walk', not '1'"),
         (["kp=1", "--run", "1"], "parameters are set in the current one"),

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import functools
+import json
 import sys
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
-from webots_mcp.errors import MalformedRowError, WebotsMCPError
+from webots_mcp.errors import InvalidInputError, MalformedRowError, WebotsMCPError
 
 if TYPE_CHECKING:
     import sqlite3
@@ -130,6 +131,24 @@ DATA_DIR: Final = argument(
 DATABASE: Final = argument("--database", metavar="FILE", help="the database file itself")
 ROBOT: Final = argument("--robot", metavar="NAME", help="only this robot")
 JSON: Final = argument("--json", action="store_true", help="print it as JSON")
+
+
+def settings_of(texts: Sequence[str]) -> dict[str, Any]:
+    """Values by name, of texts NAME=VALUE; a value that is no JSON is a text.
+
+    Raises:
+        InvalidInputError: One has no `=`.
+    """
+    values: dict[str, Any] = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals:
+            raise InvalidInputError(f"{text!r} names no value: write {name}=VALUE")
+        try:
+            values[name] = json.loads(value)
+        except (ValueError, RecursionError):
+            values[name] = value
+    return values
 
 
 @contextmanager

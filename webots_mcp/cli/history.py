@@ -21,6 +21,7 @@ from webots_mcp.cli.command import (
     count,
     question,
     reading,
+    settings_of,
 )
 from webots_mcp.cli.tables import print_notes, print_table
 from webots_mcp.errors import InvalidInputError
@@ -64,6 +65,8 @@ SIGNALS: Final = argument("signals", nargs="*", metavar="SIGNAL", help="names, w
 
 @question(
     "runs", DATA_DIR, DATABASE, ROBOT, JSON,
+    argument("--parameter", action="append", metavar="NAME=VALUE",
+             help="only runs in which it had this value; may be repeated"),
     count("-n", "the newest N runs", default=20),
 )  # fmt: skip
 def runs(arguments: argparse.Namespace) -> None:
@@ -71,19 +74,23 @@ def runs(arguments: argparse.Namespace) -> None:
     from webots_mcp.store.questions.runs import list_runs
 
     with reading(arguments) as connection:
-        found = list_runs(connection, robot=arguments.robot, limit=arguments.limit)
+        wanted = settings_of(arguments.parameter or [])
+        found = list_runs(
+            connection, robot=arguments.robot, limit=arguments.limit, parameters=wanted
+        )
     if arguments.json:
         return _print_json(found)
     rows = [
         [
-            run.run_id, run.robot, run.label, _clock(run.started_wall_time_s), run.duration_s,
-            run.real_time_factor, run.rows, run.end_reason or "going on",
+            run.run_id, run.robot, run.label, run.parameters or None,
+            _clock(run.started_wall_time_s), run.duration_s, run.real_time_factor, run.rows,
+            run.end_reason or "going on",
             (run.controller_sha256 or "")[:8] or None, run.notable or None, run.note,
         ]
         for run in found.runs
     ]  # fmt: skip
-    columns = ("run", "robot", "label", "started", "duration_s", "pace", "rows", "ended by",
-               "code", "notable", "note")  # fmt: skip
+    columns = ("run", "robot", "label", "parameters", "started", "duration_s", "pace", "rows",
+               "ended by", "code", "notable", "note")  # fmt: skip
     print_table(columns, rows)
     print_notes([f"{found.total} runs in all: -n shows more"] if found.cursor else [])
 
@@ -331,10 +338,15 @@ def _spelled(value: object) -> object:
 
 def _print_comparison(found: Comparison) -> None:
     groups = [
-        [group.name, ", ".join(str(run.run_id) for run in group.runs), group.duration_s]
+        [
+            group.name,
+            ", ".join(str(run.run_id) for run in group.runs),
+            group.duration_s,
+            {name: ", ".join(map(str, each)) for name, each in group.parameters.items()} or None,
+        ]
         for group in found.groups
     ]
-    print_table(("", "runs", "duration_s"), groups)
+    print_table(("", "runs", "duration_s", "parameters"), groups)
     names: Sequence[str] = [group.name for group in found.groups]
     print(f"\nThe first {found.compared_s:.3f} s of each run:")
     verdicts = [f"{name} differs" for name in names[1:]]

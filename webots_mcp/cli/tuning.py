@@ -7,7 +7,16 @@ import json
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from webots_mcp.cli.command import DATA_DIR, DATABASE, JSON, ROBOT, argument, command, reading
+from webots_mcp.cli.command import (
+    DATA_DIR,
+    DATABASE,
+    JSON,
+    ROBOT,
+    argument,
+    command,
+    reading,
+    settings_of,
+)
 from webots_mcp.cli.history import RUN
 from webots_mcp.cli.tables import print_table
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
@@ -60,13 +69,10 @@ def _set(arguments: argparse.Namespace) -> CommandAnswer:
 
     recording = Recording(*resolve_database(arguments.database, arguments.data_dir))
     declared = settable(recording, arguments.robot)
-    values: dict[str, Any] = {}
-    for setting in arguments.settings:
-        name, equals, text = setting.partition("=")
-        if not equals:
-            raise InvalidInputError(f"{setting!r} sets nothing: write {name}=VALUE")
-        is_text = name in declared and declared[name].declaration.kind == "str"
-        values[name] = text if is_text else _value(text)
+    values = settings_of(arguments.settings)
+    for name, _, text in (setting.partition("=") for setting in arguments.settings):
+        if name in declared and declared[name].declaration.kind == "str":
+            values[name] = text  # also one that looks like a number
     when: When = "reset" if arguments.from_reset else "now"
     ask = partial(set_parameters, when=when, robot=arguments.robot)
     return anyio.run(ask, recording, _silent, values)
@@ -74,13 +80,6 @@ def _set(arguments: argparse.Namespace) -> CommandAnswer:
 
 async def _silent(waited_s: float, of_s: float, text: str) -> None:
     """It takes a round of the loop, which is too short to report on."""
-
-
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text
 
 
 def _as_text(result: dict[str, Any]) -> str:

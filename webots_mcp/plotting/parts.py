@@ -11,6 +11,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.runs import fetch_run
@@ -21,6 +22,7 @@ Known = dict[str, Signal]
 
 MOST_CHANGES: Final = 5000  # of one text or flag; more would be a grey haze
 MOST_RUNS: Final = 4  # more lines of each signal could not be told apart
+_SHOWN_PARAMETERS: Final = 3
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,7 @@ class Part:
 
     Attributes:
         range: The run's part of what was asked for.
-        name: "run 3", with its label where it has one.
+        name: "run 3", with its label where it has one, and the parameters in which the runs differ.
         start_s: The first moment that was recorded and asked for; `end_s` the last one.
         origin_s: The simulation time that is drawn as 0.
     """
@@ -90,7 +92,20 @@ def parts_of(
     if not any(part.has_rows for part in parts):
         notes = [note for each in ranges for note in each.notes]
         raise NothingRecordedError("; ".join(["nothing was recorded in the range", *notes]))
-    return [part for part in parts if part.has_rows]
+    return _named_by_parameters(connection, [part for part in parts if part.has_rows])
+
+
+def _named_by_parameters(connection: sqlite3.Connection, parts: list[Part]) -> list[Part]:
+    """Runs that differ in parameters are told apart by them: run 3 (kp 2)."""
+    had = parameters_of(connection, [part.run.run_id for part in parts])
+    unlike = differing(list(had.values()))[:_SHOWN_PARAMETERS]
+    named: list[Part] = []
+    for part in parts:
+        own = had[part.run.run_id]
+        values = [f"{name} {short(str(own[name].described))}" for name in unlike if name in own]
+        name = f"{part.name} ({', '.join(values)})" if values else part.name
+        named.append(replace(part, name=name))
+    return named
 
 
 def _histories(

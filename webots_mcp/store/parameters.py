@@ -8,7 +8,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.parameter import Declaration, Value
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.parameter import Declaration, Value, require_known
 from webots_mcp.store.runs import Run
 
 COLUMNS: Final = (
@@ -20,7 +21,13 @@ _DECLARED: Final = (
     "SELECT name, kind, default_value, low, high, choices, doc, unit, next_value FROM parameter "
     "WHERE session_id = ? ORDER BY id"
 )
-_NAMES: Final = "SELECT DISTINCT name FROM parameter_value ORDER BY name"
+_NAMES: Final = "SELECT DISTINCT name FROM parameter ORDER BY name"
+# Of a run `r`, and with the JSON object :parameters: whether it had all these values at some time.
+HAD_VALUES: Final = (
+    "NOT EXISTS (SELECT 1 FROM json_each(:parameters) wanted WHERE NOT EXISTS ("
+    "SELECT 1 FROM parameter_value v WHERE v.run_id = r.id AND v.name = wanted.key AND "
+    "CASE WHEN json_valid(v.value) THEN json_extract(v.value, '$') = wanted.value END))"
+)
 _VALUES: Final = (
     "SELECT run_id, name, sim_time_s, value, is_default, set_by, command_id FROM parameter_value "
     "WHERE run_id IN (SELECT value FROM json_each(?)) ORDER BY id"
@@ -63,6 +70,11 @@ class RunParameter:
     def value(self) -> Value:
         """The last value."""
         return self.settings[-1].value
+
+    @property
+    def values(self) -> tuple[Value, ...]:
+        """All its values, in order."""
+        return tuple(setting.value for setting in self.settings)
 
     @property
     def is_default(self) -> bool:
@@ -118,19 +130,46 @@ def described(connection: sqlite3.Connection, run: Run) -> list[dict[str, Any]]:
     return [_described(name, values.get(name), declared.get(name)) for name in names]
 
 
-def recorded_names(connection: sqlite3.Connection) -> list[str]:
-    """The names of all parameters that any run had."""
-    return [name for (name,) in connection.execute(_NAMES)]
+def notable_parameters(
+    connection: sqlite3.Connection, run_ids: Iterable[int]
+) -> dict[int, dict[str, Value | str]]:
+    """Of each run the parameters that are not as declared, or not the same in all these runs.
+
+    Those in which the runs differ come first. A value that changed in the middle of its run is told
+    as a text, with the time.
+    """
+    found = parameters_of(connection, run_ids)
+    unlike = differing(list(found.values()))
+    return {
+        run_id: {name: had[name].described for name in _ordered(had, unlike)}
+        for run_id, had in found.items()
+    }
 
 
 def differing(runs: Sequence[RunParameters]) -> list[str]:
-    """The names of which not all of these runs had the same values; the first seen comes first."""
+    """The names of which not all runs that have them had the same values, each at any time."""
     names = dict.fromkeys(name for run in runs for name in run)
-    return [name for name in names if len({_values_of(run.get(name)) for run in runs}) > 1]
+    return [name for name in names if len({run[name].values for run in runs if name in run}) > 1]
 
 
-def _values_of(parameter: RunParameter | None) -> tuple[Value, ...] | None:
-    return None if parameter is None else tuple(each.value for each in parameter.settings)
+def _ordered(had: RunParameters, unlike: Sequence[str]) -> list[str]:
+    first = [name for name in unlike if name in had]
+    return first + [name for name in had if not had[name].is_default and name not in first]
+
+
+def as_filter(connection: sqlite3.Connection, values: Mapping[str, Value]) -> str:
+    """Values by name as JSON, for a query that asks which runs had them.
+
+    Raises:
+        InvalidInputError: No controller ever declared one of the names, or a value is not finite.
+    """
+    if not values:
+        return "{}"
+    require_known(list(values), [name for (name,) in connection.execute(_NAMES)])
+    try:
+        return json.dumps(dict(values), allow_nan=False)
+    except ValueError as error:
+        raise InvalidInputError(f"no run has such a value of a parameter: {error}") from error
 
 
 def _described(name: str, values: RunParameter | None, declared: Declared | None) -> dict[str, Any]:

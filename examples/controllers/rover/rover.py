@@ -1,7 +1,8 @@
 """A rover that wanders about the arena, records what it does and takes commands.
 
-The bridge is in five places: it is made, commands are registered, and the loop publishes, asks for
-commands and now and then saves a picture. All else is an ordinary Webots controller.
+The bridge is in six places: it is made, parameters are declared, commands are registered, and the
+loop publishes, asks for commands and now and then saves a picture. All else is an ordinary Webots
+controller.
 """
 
 from math import hypot, inf, pi
@@ -13,7 +14,6 @@ from webots_mcp import MCPBridge
 
 WHEEL_RADIUS_M = 0.04
 MAX_SPEED_RADPS = 10.0
-NEAR_M = 0.35
 FREE_M = 0.6
 PICTURE_EVERY_S = 5.0
 
@@ -21,8 +21,14 @@ PICTURE_EVERY_S = 5.0
 class Rover:
     """Senses, decides between a few modes, and turns the wheels."""
 
-    def __init__(self, robot: Supervisor) -> None:
+    def __init__(self, robot: Supervisor, bridge: MCPBridge) -> None:
         self.robot = robot
+        self.speed = bridge.parameter(
+            "speed", 5.0, low=0.0, high=MAX_SPEED_RADPS, unit="rad/s", doc="cruising speed"
+        )
+        self.near = bridge.parameter(
+            "near", 0.35, low=0.2, high=FREE_M, unit="m", doc="how near it gets before it turns"
+        )
         self.time_step = int(robot.getBasicTimeStep())
         self.motors = [robot.getDevice(f"{side} wheel motor") for side in ("left", "right")]
         self.encoders = [robot.getDevice(f"{side} wheel sensor") for side in ("left", "right")]
@@ -35,7 +41,6 @@ class Rover:
             sensor.enable(self.time_step)
         for sensor in (self.lidar, self.camera):
             sensor.enable(4 * self.time_step)
-        self.speed_radps = 5.0
         self.start()
 
     def start(self) -> None:
@@ -93,7 +98,7 @@ class Rover:
         since_s = self.time_s - self.mode_since_s
         if self.mode == "cruise" and self.stuck:
             self.enter("back_up")
-        elif self.mode == "cruise" and min(left, right) < NEAR_M:
+        elif self.mode == "cruise" and min(left, right) < self.near.value:
             self.turn_sign = 1.0 if left > right else -1.0
             self.enter("turn")
         elif self.mode == "back_up" and since_s > 0.8:
@@ -113,7 +118,7 @@ class Rover:
 
     def act(self) -> None:
         """Sets the wheels' speeds for the mode."""
-        speed = self.speed_radps
+        speed = self.speed.value
         turn_to = max(-3.0, min(3.0, 6.0 * self.heading_error()))
         left, right = {
             "cruise": (speed, speed),
@@ -128,8 +133,8 @@ class Rover:
 
     def set_speed(self, command: dict[str, Any]) -> dict[str, float]:
         """Set the cruising speed: `speed` in rad/s of the wheels, 0 to 10."""
-        self.speed_radps = max(0.0, min(MAX_SPEED_RADPS, float(command["speed"])))
-        return {"speed_radps": self.speed_radps}
+        self.speed.set(max(0.0, min(MAX_SPEED_RADPS, float(command["speed"]))))
+        return {"speed_radps": self.speed.value}
 
     def turn_to(self, command: dict[str, Any]) -> dict[str, float]:
         """Turn on the spot to `heading` in radians (0 is east, pi/2 north), then cruise on."""
@@ -140,8 +145,8 @@ class Rover:
 
 def main() -> None:
     robot = Supervisor()
-    rover = Rover(robot)
     bridge = MCPBridge(robot)
+    rover = Rover(robot, bridge)
     bridge.register_command("set_speed", rover.set_speed)
     bridge.register_command("turn_to", rover.turn_to)
     bridge.on_reload(lambda: bridge.log("the world was reset or reloaded"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from pathlib import PurePath
 from typing import Annotated, Any, Final
@@ -35,6 +35,7 @@ from webots_mcp.server.parameters import (
     ShownLimit,
 )
 from webots_mcp.server.results import Table
+from webots_mcp.server.shortening import DETAIL_BUDGET, WHOLE, shorten
 from webots_mcp.store.analysis.spread import Spread
 from webots_mcp.store.questions.compare import (
     Comparison,
@@ -54,12 +55,13 @@ from webots_mcp.store.questions.runs import (
 from webots_mcp.store.recording import Recording, View, look
 
 RUN_COLUMNS: Final = (
-    "run_id", "robot", "label", "started", "began_by", "ended_by", "duration_s",
+    "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
     "real_time_factor", "rows", "purged_rows", "notable", "controller", "sha256", "git_commit",
     "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
-    "name", "robot", "runs", "labels", "sha256", "ended_by", "duration_s", "real_time_factor",
+    "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by", "duration_s",
+    "real_time_factor",
 )  # fmt: skip
 MEASURE_COLUMNS: Final = ("name", "median", "range", "different")
 DIFFERENCE_COLUMNS: Final = (
@@ -75,17 +77,30 @@ _TAKE_AWAY: Final = "-"
 
 @tool("List the runs", READS)
 def webots_list_runs(
-    recording: Recording, limit: Limit = 20, cursor: Cursor = None, robot: RobotName = None
+    recording: Recording,
+    limit: Limit = 20,
+    cursor: Cursor = None,
+    parameters: Annotated[
+        dict[str, float | int | bool | str] | None,
+        Field(
+            max_length=20,
+            description='Only runs in which they had these values at some time: {"kp": 3.0}.',
+        ),
+    ] = None,
+    robot: RobotName = None,
 ) -> RunsAnswer:
     """Runs, newest first: controller file and its hash, world, duration, pace, how it ended.
 
     A run is a stretch of rising simulation time: a start, reset or reload begins the next.
-    `notable` counts warnings, errors, dropped rows, failed commands.
+    `notable` counts warnings, errors, dropped rows, failed commands. `parameters` are those that
+    are not as the code declared them, or differ between these runs.
     """
     with recording.reader() as connection:
         header = look(connection, robot).header() if robot else header_of_only(connection)
         most = min(limit, MOST_RUNS)
-        found = list_runs(connection, robot=robot, limit=most, before_id=cursor)
+        found = list_runs(
+            connection, robot=robot, limit=most, before_id=cursor, parameters=parameters
+        )
         rows = fitting([run_row(run) for run in found.runs])
         older = len(rows) < len(found.runs)
         return RunsAnswer(
@@ -93,7 +108,7 @@ def webots_list_runs(
             runs=without_empty(RUN_COLUMNS, rows),
             total=found.total,
             cursor=found.runs[len(rows) - 1].run_id if older else found.cursor,
-            hint=None if rows else "no run was recorded, or none before that cursor",
+            hint=None if rows else _no_runs(parameters),
         )
 
 
@@ -152,12 +167,24 @@ def _change(text: str) -> str | None:
     return "" if text == _TAKE_AWAY else text or None
 
 
+def _no_runs(parameters: dict[str, Any] | None) -> str:
+    if parameters:
+        return "no run had these values of its parameters, or none before that cursor"
+    return "no run was recorded, or none before that cursor"
+
+
+def _values_of(parameters: Mapping[str, Any]) -> Any:
+    """Values of parameters as they are, of many the first."""
+    return shorten(dict(parameters), DETAIL_BUDGET, WHOLE).value or None
+
+
 def run_row(run: RunInfo) -> list[Any]:
     """A run as a row under `RUN_COLUMNS`."""
     return [
         run.run_id,
         short_name(run.robot),
         short_name(run.label),
+        _values_of(run.parameters),
         started(run),
         run.start_reason,
         run.end_reason or _GOING_ON,
@@ -260,6 +287,7 @@ def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
         short_name(group.runs[0].robot) if told_robot else None,
         [run.run_id for run in group.runs],
         labels or None,
+        _values_of({n: v[0] if len(v) == 1 else v for n, v in group.parameters.items()}),
         ", ".join(hashes) or None,
         ", ".join(dict.fromkeys(run.end_reason or _GOING_ON for run in group.runs)),
         seconds(group.duration_s),

@@ -9,12 +9,14 @@ from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.parameter import Value
 from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.differences import Difference, difference_of, only_in, size_of
 from webots_mcp.store.questions.outcomes import Measure, RunPart, measures_of, sampling_notes
-from webots_mcp.store.questions.runs import RunInfo, run_info
+from webots_mcp.store.questions.runs import RunInfo, run_infos
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import whole_run
 from webots_mcp.store.reading.rollups import read_pieces
@@ -43,11 +45,13 @@ class Group:
 
     Attributes:
         duration_s: Simulated seconds of all its runs, as long as they are.
+        parameters: Those in which the compared runs differ, with the values that its runs had.
     """
 
     name: str
     runs: tuple[RunInfo, ...]
     duration_s: float
+    parameters: dict[str, tuple[Value | str, ...]]
 
 
 @dataclass(frozen=True)
@@ -166,7 +170,7 @@ def _compare(
     ]
     differences = [difference_of(signal, summaries, 2 * len(numbers)) for signal in numbers]
     shared = sorted((each for each in differences if all(each.count)), key=size_of, reverse=True)
-    told = tuple(_group(connection, name, found) for name, found in parts.items())
+    told = _groups(connection, groups)
     measures = measures_of(connection, list(parts.values()), options, deadline)
     cut = [part for found in parts.values() for part in found]
     notes = _notes(told) + sampling_notes(connection, cut)
@@ -220,6 +224,16 @@ def _summarise(
     return {signal.name: pieces.whole(signal.name) for signal in own}
 
 
-def _group(connection: sqlite3.Connection, name: str, parts: Sequence[RunPart]) -> Group:
-    runs = tuple(run_info(connection, part.segment.run_id) for part in parts)
-    return Group(name, runs, sum(run.duration_s for run in runs))
+def _groups(connection: sqlite3.Connection, groups: dict[str, list[int]]) -> tuple[Group, ...]:
+    run_ids = [run_id for found in groups.values() for run_id in found]
+    runs = {run.run_id: run for run in run_infos(connection, run_ids)}
+    unlike = differing(list(parameters_of(connection, run_ids).values()))
+    return tuple(
+        _group(name, [runs[run_id] for run_id in found], unlike) for name, found in groups.items()
+    )
+
+
+def _group(name: str, runs: Sequence[RunInfo], unlike: Sequence[str]) -> Group:
+    had = {each: [r.parameters[each] for r in runs if each in r.parameters] for each in unlike}
+    parameters = {each: tuple(dict.fromkeys(values)) for each, values in had.items() if values}
+    return Group(name, tuple(runs), sum(run.duration_s for run in runs), parameters)

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 import sqlite3
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.parameter import Value
 from webots_mcp.settlement import gone_sessions
+from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameters
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.runs import fetch_run
@@ -37,10 +40,12 @@ _WHAT: Final = (
 )  # fmt: skip
 _PAGE: Final = (
     f"{_RUNS} WHERE (:robot IS NULL OR r.robot_id = :robot) AND (:before IS NULL OR r.id < :before)"
-    " ORDER BY r.id DESC LIMIT :limit"
+    f" AND {HAD_VALUES} ORDER BY r.id DESC LIMIT :limit"
 )
 _ONE: Final = f"{_RUNS} WHERE r.id = ?"
-_TOTAL: Final = "SELECT count(*) FROM run WHERE :robot IS NULL OR robot_id = :robot"
+_TOTAL: Final = (
+    f"SELECT count(*) FROM run r WHERE (:robot IS NULL OR robot_id = :robot) AND {HAD_VALUES}"
+)
 _NOTABLE: Final = (
     "SELECT 'log ' || level, count(*) FROM log WHERE run_id = :run "
     "AND level IN ('warning', 'error', 'critical') GROUP BY level UNION ALL "
@@ -72,6 +77,8 @@ class RunInfo:
         rows: State rows, of which retention has deleted `purged_rows`.
         notable: How often what needs attention was stored: warnings, errors, dropped rows,
             failed or lost commands, trouble with storage.
+        parameters: Those that are not as the code declared them, or differ between the runs that
+            were asked for together; a text tells of changes in the middle of the run.
     """
 
     run_id: int
@@ -92,6 +99,7 @@ class RunInfo:
     held_s: float
     duration_s: float
     notable: dict[str, int]
+    parameters: dict[str, Value | str]
 
     @property
     def real_time_factor(self) -> float | None:
@@ -120,6 +128,7 @@ def list_runs(
     robot: str | None = None,
     limit: int = 20,
     before_id: int | None = None,
+    parameters: Mapping[str, Value] | None = None,
 ) -> RunList:
     """List runs, the newest first.
 
@@ -128,19 +137,20 @@ def list_runs(
         robot: Whose; None for all robots.
         limit: 1 to 200.
         before_id: Only runs with smaller ids: the `cursor` of the page before.
+        parameters: Only runs in which these parameters had these values at some time.
 
     Raises:
         UnknownRobotError: No robot has that name.
-        InvalidInputError: `limit` is out of bounds.
+        InvalidInputError: `limit` is out of bounds, or no parameter was ever called so.
     """
     if not 1 <= limit <= MOST_RUNS:
         raise InvalidInputError(f"limit={limit} must be from 1 to {MOST_RUNS}")
     robot_id = None if robot is None else resolve_robot(connection, robot, time.time()).id
-    page = {"robot": robot_id, "before": before_id, "limit": limit + 1}
+    asked = {"robot": robot_id, "parameters": as_filter(connection, parameters or {})}
+    page = {**asked, "before": before_id, "limit": limit + 1}
     rows: list[Any] = connection.execute(_PAGE, page).fetchall()
-    gone = dict(gone_sessions(connection))
-    runs = tuple(_info(connection, row, gone) for row in rows[:limit])
-    total = connection.execute(_TOTAL, {"robot": robot_id}).fetchone()[0]
+    runs = tuple(_infos(connection, rows[:limit]))
+    total = connection.execute(_TOTAL, asked).fetchone()[0]
     return RunList(runs, total, runs[-1].run_id if len(rows) > limit else None)
 
 
@@ -150,8 +160,18 @@ def run_info(connection: sqlite3.Connection, run_id: int) -> RunInfo:
     Raises:
         UnknownRunError: There is none of that id.
     """
-    row = connection.execute(_ONE, (fetch_run(connection, run_id).id,)).fetchone()
-    return _info(connection, row, dict(gone_sessions(connection)))
+    (run,) = run_infos(connection, [run_id])
+    return run
+
+
+def run_infos(connection: sqlite3.Connection, run_ids: Sequence[int]) -> list[RunInfo]:
+    """Several runs, in this order.
+
+    Raises:
+        UnknownRunError: There is none of one of these ids.
+    """
+    ids = [fetch_run(connection, run_id).id for run_id in run_ids]
+    return _infos(connection, [connection.execute(_ONE, (each,)).fetchone() for each in ids])
 
 
 def annotate_run(
@@ -189,7 +209,18 @@ def pace(duration_s: float, wall_s: float) -> float | None:
     return duration_s / wall_s if wall_s >= 1 else None
 
 
-def _info(connection: sqlite3.Connection, row: tuple[Any, ...], gone: dict[int, str]) -> RunInfo:
+def _infos(connection: sqlite3.Connection, rows: Sequence[tuple[Any, ...]]) -> list[RunInfo]:
+    gone = dict(gone_sessions(connection))
+    parameters = notable_parameters(connection, [row[0] for row in rows])
+    return [_info(connection, row, gone, parameters[row[0]]) for row in rows]
+
+
+def _info(
+    connection: sqlite3.Connection,
+    row: tuple[Any, ...],
+    gone: dict[int, str],
+    parameters: dict[str, Value | str],
+) -> RunInfo:
     """One run; `gone` tells of sessions that look open how they ended."""
     *what, started_wall_s, last_wall_s, started_s, last_s = row
     named = dict(zip(_WHAT, what, strict=True))
@@ -201,6 +232,7 @@ def _info(connection: sqlite3.Connection, row: tuple[Any, ...], gone: dict[int, 
         held_s=_held_s(connection, row[0], last_wall_s),
         duration_s=last_s - started_s,
         notable=dict(connection.execute(_NOTABLE, {"run": row[0]}).fetchall()),
+        parameters=parameters,
     )
 
 

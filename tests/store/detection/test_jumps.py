@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import sqlite3
 from collections.abc import Callable
 from typing import Any
@@ -109,3 +110,16 @@ def test_a_swing_whose_rows_meet_the_same_values_again_does_not_drop_out(
 
     record(empty, swinging)
     assert jumps(empty) == []
+
+
+def test_a_quick_swing_after_a_long_rest_is_a_motion_and_a_dropout_in_it_is_a_jump(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    dice = random.Random(3)
+
+    def steering(time_s: float) -> dict[str, Any]:
+        swing = 0.25 * math.sin(4 * (time_s - 100)) if 0 <= time_s - 100 < 2.5 * math.pi else 0.0
+        return {"steering": 9.0 if time_s == 105.0 else 0.7 + swing + dice.gauss(0, 0.005)}
+
+    record(empty, steering)
+    assert [(event.name, event.start_s) for event in jumps(empty)] == [("steering", 105.0)]

@@ -272,3 +272,22 @@ def test_unknown_runs_and_robots_are_named(rover: sqlite3.Connection) -> None:
         list_runs(rover, robot="rovre")
     with pytest.raises(InvalidInputError, match="limit"):
         list_runs(rover, limit=0)
+
+
+@pytest.mark.parametrize(("name", "turn"), [("heading", math.tau), ("heading_deg", 360.0)])
+def test_headings_on_both_sides_of_the_end_of_a_scale_are_near_each_other(
+    empty: sqlite3.Connection, name: str, turn: float
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    for mean in (-turn / 180, turn / 180):
+        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+        for step in range(200):
+            heading = mean + turn / 60 * math.sin(step)
+            recorder.publish(step * 0.1, {name: heading % turn})
+    (difference,) = compare_runs(empty, [1, 2], names=[name]).differences
+    before, after = difference.mean
+    assert before is not None and after is not None
+    assert after.median - before.median == pytest.approx(turn / 90, rel=0.05)
+    deviation = difference.deviation[0]
+    assert deviation is not None and deviation.median == pytest.approx(turn / 60 / 2**0.5, rel=0.02)

@@ -63,6 +63,19 @@ def trend_of(connection: sqlite3.Connection, name: str, course: Callable[[float]
 
 
 @pytest.mark.parametrize(("name", "turn"), [("heading", math.tau), ("heading_deg", 360.0)])
+def test_a_heading_about_the_end_of_its_scale_is_one_course_in_the_means_of_a_long_run(
+    empty: sqlite3.Connection, long_ranges: None, name: str, turn: float
+) -> None:
+    heading = trend_of(
+        empty, name, lambda t: (turn / 36 * math.sin(t * math.tau / 60) + turn * (t > 0)) % turn
+    )
+    low, high = heading.summary.min, heading.summary.max
+    assert low is not None and high is not None and heading.mean is not None
+    assert not heading.fast and high - low == pytest.approx(turn / 18, rel=0.15)
+    assert math.remainder(heading.mean, turn) == pytest.approx(0, abs=turn / 360)
+
+
+@pytest.mark.parametrize(("name", "turn"), [("heading", math.tau), ("heading_deg", 360.0)])
 def test_a_heading_that_swings_across_the_end_of_its_scale_has_narrow_extremes(
     empty: sqlite3.Connection, name: str, turn: float
 ) -> None:

@@ -14,6 +14,7 @@ MOST_JUMPS_SHARE: Final = 0.1  # of the rows: more of them are how the signal is
 LEAST_STEPS: Final = 10
 LONGEST_EXCURSION: Final = 5  # rows that a value which otherwise rests may be elsewhere
 BACK_SHARE: Final = 0.2  # of a step: who comes back to so near where it began is back
+MOTION_SHARE: Final = 0.5  # of a step: the least of one beside it, if both are of one motion
 POSITION_STEPS: Final = 5.0  # a position jumps by so many times its 99th percentile step
 WHOLE_TURNS: Final = (math.tau, 360.0)
 
@@ -37,9 +38,11 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
 
     Compared is with the steps that are not zero and do not come back at once, of which there have
     to be ten: for counters and commanded values a step is what they do. Of a value that otherwise
-    rests only what comes back at once counts. After a gap a step may be larger by as many times as
-    the gap is longer than the usual interval; and the step of an angle over the end of its scale
-    (pi, 180 degrees, 360 degrees) is as large as what is left of a whole turn.
+    rests only what comes back at once counts. A step beside one that goes the same way and is at
+    least half as large is part of a motion, however quick, and no jump. After a gap a step may be
+    larger by as many times as the gap is longer than the usual interval; and the step of an angle
+    over the end of its scale (pi, 180 degrees, 360 degrees) is as large as what is left of a whole
+    turn.
 
     Args:
         times: Of the values.
@@ -57,7 +60,8 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
     limit = median + score * median / 0.6745
     wide = np.flatnonzero(steps > limit)
     far = _step(values[wide], values[wide + 1]) > limit * _intervals(times, wide)
-    return list(_with_return([_jump(times, values, row) for row in wide[far].tolist()]))
+    alone = far & ~_in_motion(values, wide)
+    return list(_with_return([_jump(times, values, row) for row in wide[alone].tolist()]))
 
 
 def are_usual(jumps: Sequence[Jump], rows: int) -> bool:
@@ -94,6 +98,14 @@ def _stay(backs: dict[int, int], steps: int) -> Flags:
     for left, back in backs.items():
         stays[left:back] = False
     return stays
+
+
+def _in_motion(values: Array, rows: Indexes) -> Flags:
+    """Whether the step after each of those rows goes on as the step before or after it goes."""
+    steps = np.pad(np.diff(values), 1)
+    here = steps[rows + 1]
+    beside = np.maximum(steps[rows] * np.sign(here), steps[rows + 2] * np.sign(here))
+    return beside >= MOTION_SHARE * np.abs(here)
 
 
 def _intervals(times: Array, rows: Indexes) -> Array:

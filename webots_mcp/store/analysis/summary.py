@@ -60,6 +60,10 @@ class Summary(NamedTuple):
             return None
         return circular_mean(self.sines, self.cosines, self.present)
 
+    def turn_of(self, turn: float | None) -> float | None:
+        """A whole turn of the angle, if its circular figures are known; they are of newer rows."""
+        return None if self.sines is None else turn
+
     def centre(self, turn: float | None) -> float | None:
         """The mean; of an angle the circular one, in its unit: below 0 only where its values are.
 
@@ -90,6 +94,13 @@ class Summary(NamedTuple):
             return None
         length = min(1.0, math.hypot(self.sines, self.cosines) / self.present)
         return math.sqrt(-2 * math.log(length)) if length > 0 else None
+
+    def deviation_in(self, turn: float | None) -> float | None:
+        """The standard deviation; of an angle the circular one, in its unit (see `centre`)."""
+        if turn is None or self.sines is None:
+            return self.deviation
+        deviation = self.circular_deviation
+        return None if deviation is None else deviation * turn / math.tau
 
 
 def circular_mean(sines: float, cosines: float, count: int) -> float | None:

@@ -48,7 +48,9 @@ def difference_of(
     """A signal in each run of each group; of so many tests that are made at once."""
     runs = [[run.get(signal.name, Summary()) for run in group] for group in groups]
     runs = [[each for each in group if each.sum is not None] for group in runs]
-    means, deviations = _means(signal, runs), _deviations(signal, runs)
+    known = all(each.sines is not None for group in runs for each in group)
+    turn = signal.turn if known else None
+    means, deviations = _means(turn, runs), _deviations(turn, runs)
     mean, deviation = [spread_of(each) for each in means], [spread_of(each) for each in deviations]
     verdicts = zip(verdicts_on(means, tests), verdicts_on(deviations, tests), strict=True)
     return Difference(
@@ -67,28 +69,27 @@ def difference_of(
         ],
         count=[sum(each.present for each in group) for group in runs],
         deviation_ratio=[_ratio(each, deviation[0]) for each in deviation],
-        effect=[_effect(signal, mean, deviation, index) for index in range(len(groups))],
+        effect=[_effect(turn, mean, deviation, index) for index in range(len(groups))],
         different=[_either(*pair) for pair in verdicts],
     )
 
 
-def _means(signal: Signal, groups: Sequence[Sequence[Summary]]) -> list[list[float | None]]:
+def _means(turn: float | None, groups: Sequence[Sequence[Summary]]) -> list[list[float | None]]:
     """Of an angle all within half a turn of the first: their own mean must not be cut in two."""
-    if signal.kind != "angle":
-        return [[each.mean for each in group] for group in groups]
-    found = [[each.direction for each in group] for group in groups]
+    found = [[each.centre(turn) for each in group] for group in groups]
+    if turn is None:
+        return found
     start = next((each for group in found for each in group if each is not None), 0.0)
     return [
-        [None if each is None else start + math.remainder(each - start, math.tau) for each in group]
+        [None if each is None else start + math.remainder(each - start, turn) for each in group]
         for group in found
     ]
 
 
-def _deviations(signal: Signal, groups: Sequence[Sequence[Summary]]) -> list[list[float | None]]:
-    angle = signal.kind == "angle"
-    return [
-        [each.circular_deviation if angle else each.deviation for each in group] for group in groups
-    ]
+def _deviations(
+    turn: float | None, groups: Sequence[Sequence[Summary]]
+) -> list[list[float | None]]:
+    return [[each.deviation_in(turn) for each in group] for group in groups]
 
 
 def _either(one: bool | None, other: bool | None) -> bool | None:
@@ -102,7 +103,7 @@ def _ratio(deviation: Spread | None, first: Spread | None) -> float | None:
 
 
 def _effect(
-    signal: Signal,
+    turn: float | None,
     means: Sequence[Spread | None],
     deviations: Sequence[Spread | None],
     index: int,
@@ -112,7 +113,7 @@ def _effect(
     if mean is None or mean1 is None or deviation is None or deviation1 is None:
         return None
     apart = mean.median - mean1.median
-    apart = math.remainder(apart, math.tau) if signal.kind == "angle" else apart
+    apart = apart if turn is None else math.remainder(apart, turn)
     pooled = math.sqrt((deviation.median**2 + deviation1.median**2) / 2)
     if pooled <= 1e-12 * max(abs(mean.median), abs(mean1.median)):
         return 0.0 if math.isclose(mean.median, mean1.median, rel_tol=1e-9) else None

@@ -105,16 +105,17 @@ def judge(
         resolution_s: The length of the buckets; None where the numbers are the values.
     """
     of_rows = spikes is not None
-    turn = signal.turn if of_rows or signal.kind == "angle" else None
+    turn = signal.turn if of_rows else summary.turn_of(signal.turn)
     leaps = turn is not None and of_rows and leaps_in(numbers, turn)
     course = np.unwrap(numbers, period=turn) if turn and not leaps else numbers
     inner = summary if of_rows and course is numbers else summarise_numbers(times, course)
-    slow = _slow_share(inner, inner_variance, angle=signal.kind == "angle")
+    slow = _slow_share(inner, inner_variance, turn)
     fast = slow < SLOW_SHARE or leaps
     line = None if leaps else _of_all(fit_line(times, course, inner.mean or 0.0), slow)
     swings = () if fast else _swings(times, course, resolution_s)
     monotonic = None if fast else _monotonic(course)
     rest_s = None if fast else flat_since(times, course)
+    mean = _mean(signal, summary, inner, numbers)
     summary = _unwrapped(summary, inner) if course is not numbers else summary
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
     trend = Trend(
@@ -122,7 +123,7 @@ def judge(
         kind=signal.kind,
         unit=signal.unit,
         summary=summary,
-        mean=_rounded(_mean(signal, summary, inner, numbers), inner),
+        mean=_rounded(mean, inner),
         deviation=_deviation(signal, summary, inner, leaps=leaps),
         turned=_turned(summary, numbers, turn) if turn and not fast else None,
         leaps=leaps,
@@ -144,9 +145,10 @@ def judge(
     return replace(trend, says="; ".join(_remarks(trend)))
 
 
-def _slow_share(means: Summary, inner_variance: float, *, angle: bool) -> float:
+def _slow_share(means: Summary, inner_variance: float, turn: float | None) -> float:
     """The share of the variance between the means; 0 where an angle's turns cannot be counted."""
-    if inner_variance == 0 or (angle and inner_variance > _HALF_TURN_VARIANCE):
+    countable = math.inf if turn is None else _HALF_TURN_VARIANCE * (turn / math.tau) ** 2
+    if inner_variance == 0 or inner_variance > countable:
         return float(inner_variance == 0)
     between = (means.squares or 0.0) / means.present
     return between / (between + inner_variance)
@@ -182,9 +184,9 @@ def _unwrapped(summary: Summary, course: Summary) -> Summary:
 
 
 def _mean(signal: Signal, summary: Summary, course: Summary, numbers: Array) -> float | None:
-    """Of an angle in degrees that of the unwrapped one, written as its values are."""
-    if signal.kind == "angle":
-        return summary.direction
+    """Of an angle the circular one, or where its sines are not known that of the unwrapped one."""
+    if summary.turn_of(signal.turn) is not None:
+        return summary.centre(signal.turn)
     if signal.turn is None or course is summary or course.mean is None:
         return summary.mean
     return (

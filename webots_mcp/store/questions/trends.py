@@ -165,16 +165,16 @@ def _trend_of_pieces(signal: Signal, pieces: Pieces) -> Trend | None:
     summary = pieces.whole(signal.name)
     if summary.sum is None:
         return None
-    angle = signal.kind == "angle"
+    turn = summary.turn_of(signal.turn)
     middles: list[float] = []
     means: list[float] = []
     inner: list[float] = []
     for _, part in pieces.of(signal.name):
-        centre = part.direction if angle else part.mean
+        centre = part.centre(turn)
         if centre is not None and part.first_sim_time_s is not None:
             middles.append((part.first_sim_time_s + (part.last_sim_time_s or 0.0)) / 2)
             means.append(centre)
-            inner.append((part.circular_deviation if angle else part.deviation) or 0.0)
+            inner.append(part.deviation_in(turn) or 0.0)
     variance = statistics.fmean(deviation**2 for deviation in inner)
     course = np.array(middles), np.array(means)
     return judge(signal, summary, *course, None, variance, pieces.piece_s)

@@ -57,6 +57,22 @@ def test_a_signal_gives_all_its_values_and_their_times(story: Recording) -> None
     assert front.at(0.3) is None
 
 
+def test_a_condition_is_asked_of_the_run_and_of_the_running_robot(
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
+) -> None:
+    webots_bridge.breakpoint("front_m < 0.5 for 0.2", action="log")
+    for step in range(10):
+        webots_robot.step(96)
+        webots_bridge.publish({"front_m": 0.9 - 0.1 * step})
+
+    (held,) = webots_recording.held("front_m < 0.5 for 0.2")
+    (hit,) = webots_recording.events("breakpoint")
+    assert held.start_s == hit.sim_time_s == pytest.approx(9 * 0.096)
+    assert webots_recording.held("front_m > 2") == []
+    with pytest.raises(UnknownSignalError, match="there is front_m"):
+        webots_recording.held("fornt_m > 2")
+
+
 def test_changes_leave_repetitions_out(story: Recording) -> None:
     mode = story.signal("mode")
     assert mode.changes() == ["cruise", "turn", "cruise"]

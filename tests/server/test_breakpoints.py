@@ -36,6 +36,7 @@ async def test_a_breakpoint_pauses_at_the_step_and_is_listed_and_removed(
                 await anyio.sleep(0.02)
         state = await ask(client, "webots_get_robot_state")
         assert state["state"]["steps"] == at
+        assert state["why"] == f"breakpoint at {state['sim_time_s']:.3f} s: steps == {at}"
 
         listed = await ask(client, "webots_list_breakpoints")
         row = dict(zip(listed["breakpoints"]["columns"], listed["breakpoints"]["rows"][0]))  # noqa: B905

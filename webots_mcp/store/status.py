@@ -47,6 +47,11 @@ _ENDED: Final = {
     "replaced": "a newer session took its place",
 }
 _RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
+_BREAKPOINT_AT: Final = (
+    "SELECT CASE WHEN json_valid(data) THEN json_extract(data, '$.condition') END, sim_time_s "
+    "FROM event WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) AND kind = 'pause' "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
 _LEFT_PAUSED: Final = (
     "robot {0!r} paused the simulation, and its controller has ended since: press play in Webots, "
     "or start that controller again and resume it there"
@@ -96,7 +101,9 @@ def judge(
     if not session.is_alive(now_s):
         return _stopped(session, moved_s, now_s, _why_ended(session))
     if holder := find_holder(connection, session, now_s):
-        return Status(PAUSED, None if holder is session else _held_elsewhere(connection, holder))
+        here = holder is session
+        why = _breakpoint_at(connection, session) if here else _held_elsewhere(connection, holder)
+        return Status(PAUSED, why)
     fresh = session.heartbeat_is_fresh(now_s)
     if fresh and _hold_since_beat(connection, session) == "resume":
         return Status(RUNNING)
@@ -159,6 +166,14 @@ def _why_standing(
         return _STANDING
     left = left_holding(connection, session, now_s)
     return _SILENT if left is None else _LEFT_PAUSED.format(robot_name(connection, left.robot_id))
+
+
+def _breakpoint_at(connection: sqlite3.Connection, session: Session) -> str | None:
+    """Which breakpoint paused a session; None where a command did."""
+    found = connection.execute(_BREAKPOINT_AT, (session.id,)).fetchone()
+    if found is None or found[0] is None:
+        return None
+    return f"breakpoint at {found[1]:.3f} s: {found[0]}"
 
 
 def handler_at_work(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:

@@ -135,6 +135,16 @@ class Recording:
                 raise NothingRecordedError(f"{kind} could not be looked for: {why}")
         return list(found.events)
 
+    def held(self, condition: str) -> list[FoundEvent]:
+        """The stretches of the run in which a condition held, as `front_m < 0.1 for 0.5`.
+
+        Raises:
+            InvalidInputError: The condition is not of the language in docs/conditions.md, or cannot
+                be asked of the values.
+            UnknownSignalError: It names a signal that was never published.
+        """
+        return self.find_events("condition", where=condition)
+
     def logs(self, level: str = "debug", text: str = "") -> list[LogLine]:
         """The lines that were logged in the run, in order.
 

@@ -17,8 +17,14 @@ REDUCTIONS: Final = ("count", "min", "max", "mean", "argmin")
 INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
 FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer of 400 digits)
 
-_BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location", "")
+_BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
 _AXES: Final = (("0", "1"), ("x", "y"), ("x_m", "y_m"))
+_MODES: Final = ("mode", "behaviour", "behavior", "action", "task", "phase")
+_STATES: Final = ("state", "status")  # of anything, often of an arm
+USUAL_POSITIONS: Final = (
+    *((f"{branch}.{x}", f"{branch}.{y}") for branch in _BRANCHES for x, y in _AXES),
+    *_AXES[1:],  # at the top
+)
 _LONGEST_COMPARED: Final = 100  # characters of a name
 
 
@@ -26,30 +32,30 @@ def flatten(state: dict[str, Any]) -> dict[str, Value]:
     """Every number, flag, text and null of a state, by its dotted name.
 
     Arrays of more than 16 items become `name.count`, `.min`, `.max`, `.mean` and `.argmin` (of
-    their numbers; `count` and `argmin` of all items). Where two leaves share a name (a key that
+    their numbers; `count` and `argmin` of all items). Where two values share a name (a key that
     holds a dot), the last counts.
     """
-    leaves: dict[str, Value] = {}
-    _spread("", state.items(), leaves)
-    return leaves
+    values: dict[str, Value] = {}
+    _spread("", state.items(), values)
+    return values
 
 
-def _spread(prefix: str, items: Iterable[tuple[str, Any]], leaves: dict[str, Value]) -> None:
+def _spread(prefix: str, items: Iterable[tuple[str, Any]], values: dict[str, Value]) -> None:
     for key, value in items:
         kind = value.__class__
         if kind is dict:
-            _spread(f"{prefix}{key}.", value.items(), leaves)
+            _spread(f"{prefix}{key}.", value.items(), values)
         elif kind is not list:
-            leaves[prefix + key] = value
+            values[prefix + key] = value
         elif len(value) <= LONGEST_SPREAD_ARRAY:
-            _spread(f"{prefix}{key}.", zip(INDEXES, value, strict=False), leaves)
+            _spread(f"{prefix}{key}.", zip(INDEXES, value, strict=False), values)
         else:
-            _reduce(prefix + key, value, leaves)
+            _reduce(prefix + key, value, values)
 
 
-def _reduce(name: str, array: list[Any], leaves: dict[str, Value]) -> None:
+def _reduce(name: str, array: list[Any], values: dict[str, Value]) -> None:
     for reduction, value in zip(REDUCTIONS, reduce_array(array), strict=True):
-        leaves[f"{name}.{reduction}"] = value
+        values[f"{name}.{reduction}"] = value
 
 
 def reduce_array(array: list[Any]) -> tuple[Value, ...]:
@@ -79,14 +85,29 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
 
     It is what is called `pose`, `position`, `pos`, `gps`, `odometry`, `odom` or `location` (in
     this order), or `x` and `y` at the top, or else the first branch by name that has an x and y.
+    The views robot_now and robot_trajectory have the same rule, row by row.
     """
     others = sorted(name[:-2] for name in numeric if name.endswith(".x"))
-    for branch in (*_BRANCHES, *others):
-        for x, y in _AXES if branch else _AXES[1:]:
-            names = (f"{branch}.{x}", f"{branch}.{y}") if branch else (x, y)
-            if names[0] in numeric and names[1] in numeric:
-                return names
+    pairs = (*USUAL_POSITIONS, *((f"{branch}.x", f"{branch}.y") for branch in others))
+    return next((pair for pair in pairs if pair[0] in numeric and pair[1] in numeric), None)
+
+
+def find_mode(texts: Collection[str]) -> str | None:
+    """The name of what a robot is doing, among those of its texts; None without any.
+
+    It is `mode`, `behaviour`, `behavior`, `action`, `task` or `phase` (in this order), or else the
+    shortest name that ends in one of them, as `nav.mode` does; then the same of `state` and
+    `status`. The views robot_now and robot_trajectory have the same rule, row by row.
+    """
+    for words in (_MODES, _STATES):
+        ending = [name for name in texts if name.rpartition(".")[2].lower() in words]
+        if ending:
+            return next((word for word in words if word in texts), min(ending, key=_shortest))
     return None
+
+
+def _shortest(name: str) -> tuple[int, str]:
+    return len(name), name
 
 
 def nearest_first(name: str, known: Iterable[str]) -> list[str]:

@@ -192,85 +192,6 @@ CREATE TABLE watermark (
 	state_id INTEGER NOT NULL, 
 	PRIMARY KEY (name)
 );
-CREATE VIEW robot_now AS
-/* The newest state of each robot and how old it is. Lengths and angles as published. */
-SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.5) * 86400.0 - wall_time_s, 1) AS age_s,
-  coalesce(
-    json_extract(j, '$.pose[0]'),
-    json_extract(j, '$.pose.x'),
-    json_extract(j, '$.position[0]'),
-    json_extract(j, '$.position.x'),
-    json_extract(j, '$.gps[0]'),
-    json_extract(j, '$.gps.x'),
-    json_extract(j, '$.x')) AS x_m,
-  coalesce(
-    json_extract(j, '$.pose[1]'),
-    json_extract(j, '$.pose.y'),
-    json_extract(j, '$.position[1]'),
-    json_extract(j, '$.position.y'),
-    json_extract(j, '$.gps[1]'),
-    json_extract(j, '$.gps.y'),
-    json_extract(j, '$.y')) AS y_m,
-  CASE json_array_length(j, '$.pose')
-    WHEN 3 THEN json_extract(j, '$.pose[2]')
-    WHEN 4 THEN json_extract(j, '$.pose[3]')
-    WHEN 6 THEN json_extract(j, '$.pose[5]')
-    ELSE coalesce(
-    json_extract(j, '$.pose.yaw'),
-    json_extract(j, '$.pose.theta'),
-    json_extract(j, '$.pose.heading'),
-    json_extract(j, '$.yaw'),
-    json_extract(j, '$.theta'),
-    json_extract(j, '$.heading'))
-  END AS yaw_rad,
-  CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode')
-    WHEN json_type(j, '$.state') = 'text' THEN json_extract(j, '$.state') END AS mode,
-  data, odd
-FROM (
-  SELECT r.name AS robot, u.id AS run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd,
-    u.end_reason, CASE WHEN json_valid(s.data) THEN s.data END AS j
-  FROM robot r
-  LEFT JOIN run u ON u.id = (SELECT max(id) FROM run WHERE robot_id = r.id)
-  LEFT JOIN state s ON s.id = (
-    SELECT id FROM state WHERE run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1)
-);
-CREATE VIEW robot_trajectory AS
-/* Where each robot was and in which mode, row by row: ask with run_id = ... and a time. */
-SELECT (
-  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = s.run_id) AS robot,
-  s.run_id, s.id AS state_id, s.sim_time_s,
-  strftime('%Y-%m-%d %H:%M:%f', s.wall_time_s, 'unixepoch') AS utc,
-  coalesce(
-    json_extract(j, '$.pose[0]'),
-    json_extract(j, '$.pose.x'),
-    json_extract(j, '$.position[0]'),
-    json_extract(j, '$.position.x'),
-    json_extract(j, '$.gps[0]'),
-    json_extract(j, '$.gps.x'),
-    json_extract(j, '$.x')) AS x_m,
-  coalesce(
-    json_extract(j, '$.pose[1]'),
-    json_extract(j, '$.pose.y'),
-    json_extract(j, '$.position[1]'),
-    json_extract(j, '$.position.y'),
-    json_extract(j, '$.gps[1]'),
-    json_extract(j, '$.gps.y'),
-    json_extract(j, '$.y')) AS y_m,
-  CASE json_array_length(j, '$.pose')
-    WHEN 3 THEN json_extract(j, '$.pose[2]')
-    WHEN 4 THEN json_extract(j, '$.pose[3]')
-    WHEN 6 THEN json_extract(j, '$.pose[5]')
-    ELSE coalesce(
-    json_extract(j, '$.pose.yaw'),
-    json_extract(j, '$.pose.theta'),
-    json_extract(j, '$.pose.heading'),
-    json_extract(j, '$.yaw'),
-    json_extract(j, '$.theta'),
-    json_extract(j, '$.heading'))
-  END AS yaw_rad,
-  CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode')
-    WHEN json_type(j, '$.state') = 'text' THEN json_extract(j, '$.state') END AS mode, s.odd
-FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
 CREATE VIEW robot_run AS
 /* Runs: how long in simulation and in wall time, how fast, what is left of the rows. */
 SELECT r.name AS robot, u.id AS run_id, u.label, strftime('%Y-%m-%d %H:%M:%f', u.started_wall_time_s, 'unixepoch') AS started_utc,
@@ -455,4 +376,101 @@ SELECT r.name AS robot, v.run_id, v.name,
 FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
 JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
+CREATE VIEW robot_now AS
+/* The newest state of each robot and how old it is. Lengths and angles as published. */
+SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.5) * 86400.0 - wall_time_s, 1) AS age_s,
+  coalesce(
+    (SELECT json_extract(j, '$.' || p.key) FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "x": "y", "x_m": "y_m"}') p
+      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
+      LIMIT 1),
+    (SELECT x.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
+      WHERE x.key = 'x' AND y.key = 'y' AND x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
+      ORDER BY replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS x_m,
+  coalesce(
+    (SELECT json_extract(j, '$.' || p.value) FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "x": "y", "x_m": "y_m"}') p
+      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
+      LIMIT 1),
+    (SELECT y.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
+      WHERE x.key = 'x' AND y.key = 'y' AND x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
+      ORDER BY replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS y_m,
+  CASE json_array_length(j, '$.pose')
+    WHEN 3 THEN json_extract(j, '$.pose[2]')
+    WHEN 4 THEN json_extract(j, '$.pose[3]')
+    WHEN 6 THEN json_extract(j, '$.pose[5]')
+    ELSE coalesce(
+    json_extract(j, '$.pose.yaw'),
+    json_extract(j, '$.pose.theta'),
+    json_extract(j, '$.pose.heading'),
+    json_extract(j, '$.yaw'),
+    json_extract(j, '$.theta'),
+    json_extract(j, '$.heading'))
+  END AS yaw_rad,
+  coalesce(
+    CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode') END,
+    CASE WHEN json_type(j, '$.behaviour') = 'text' THEN json_extract(j, '$.behaviour') END,
+    CASE WHEN json_type(j, '$.behavior') = 'text' THEN json_extract(j, '$.behavior') END,
+    CASE WHEN json_type(j, '$.action') = 'text' THEN json_extract(j, '$.action') END,
+    CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
+    CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
+    (SELECT value FROM json_tree(j) WHERE type = 'text' AND lower(key) IN ('mode', 'behaviour', 'behavior', 'action', 'task', 'phase')
+      ORDER BY length(replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '')), replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') LIMIT 1),
+    CASE WHEN json_type(j, '$.state') = 'text' THEN json_extract(j, '$.state') END,
+    CASE WHEN json_type(j, '$.status') = 'text' THEN json_extract(j, '$.status') END,
+    (SELECT value FROM json_tree(j) WHERE type = 'text' AND lower(key) IN ('state', 'status')
+      ORDER BY length(replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '')), replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS mode,
+  data, odd
+FROM (
+  SELECT r.name AS robot, u.id AS run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd,
+    u.end_reason, CASE WHEN json_valid(s.data) THEN s.data END AS j
+  FROM robot r
+  LEFT JOIN run u ON u.id = (SELECT max(id) FROM run WHERE robot_id = r.id)
+  LEFT JOIN state s ON s.id = (
+    SELECT id FROM state WHERE run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1)
+);
+CREATE VIEW robot_trajectory AS
+/* Where each robot was and in which mode, row by row: ask with run_id = ... and a time. */
+SELECT (
+  SELECT r.name FROM run u JOIN robot r ON r.id = u.robot_id WHERE u.id = s.run_id) AS robot,
+  s.run_id, s.id AS state_id, s.sim_time_s,
+  strftime('%Y-%m-%d %H:%M:%f', s.wall_time_s, 'unixepoch') AS utc,
+  coalesce(
+    (SELECT json_extract(j, '$.' || p.key) FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "x": "y", "x_m": "y_m"}') p
+      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
+      LIMIT 1),
+    (SELECT x.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
+      WHERE x.key = 'x' AND y.key = 'y' AND x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
+      ORDER BY replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS x_m,
+  coalesce(
+    (SELECT json_extract(j, '$.' || p.value) FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "x": "y", "x_m": "y_m"}') p
+      WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
+      LIMIT 1),
+    (SELECT y.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
+      WHERE x.key = 'x' AND y.key = 'y' AND x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
+      ORDER BY replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS y_m,
+  CASE json_array_length(j, '$.pose')
+    WHEN 3 THEN json_extract(j, '$.pose[2]')
+    WHEN 4 THEN json_extract(j, '$.pose[3]')
+    WHEN 6 THEN json_extract(j, '$.pose[5]')
+    ELSE coalesce(
+    json_extract(j, '$.pose.yaw'),
+    json_extract(j, '$.pose.theta'),
+    json_extract(j, '$.pose.heading'),
+    json_extract(j, '$.yaw'),
+    json_extract(j, '$.theta'),
+    json_extract(j, '$.heading'))
+  END AS yaw_rad,
+  coalesce(
+    CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode') END,
+    CASE WHEN json_type(j, '$.behaviour') = 'text' THEN json_extract(j, '$.behaviour') END,
+    CASE WHEN json_type(j, '$.behavior') = 'text' THEN json_extract(j, '$.behavior') END,
+    CASE WHEN json_type(j, '$.action') = 'text' THEN json_extract(j, '$.action') END,
+    CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
+    CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
+    (SELECT value FROM json_tree(j) WHERE type = 'text' AND lower(key) IN ('mode', 'behaviour', 'behavior', 'action', 'task', 'phase')
+      ORDER BY length(replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '')), replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') LIMIT 1),
+    CASE WHEN json_type(j, '$.state') = 'text' THEN json_extract(j, '$.state') END,
+    CASE WHEN json_type(j, '$.status') = 'text' THEN json_extract(j, '$.status') END,
+    (SELECT value FROM json_tree(j) WHERE type = 'text' AND lower(key) IN ('state', 'status')
+      ORDER BY length(replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '')), replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS mode, s.odd
+FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
 INSERT INTO alembic_version (version_num) VALUES ('0005');

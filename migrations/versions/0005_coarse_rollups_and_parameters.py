@@ -3,11 +3,14 @@
 They are made from those of 10 s while the server maintains the database, also of older recordings.
 
 And parameters that a controller declares, and the values that they had in each run; breakpoints;
-how many of its publish() calls a session records.
+how many of its publish() calls a session records. The views robot_now and robot_trajectory know all
+the names under which the tools look for a robot's position and mode.
 
 Revision ID: 0005
 Revises: 0004
 """
+
+import json
 
 import sqlalchemy as sa
 from alembic import op
@@ -47,6 +50,57 @@ JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name"""
 
 
+def first_of(paths: str) -> str:
+    """The first of these places in a state that holds something; null where it is no JSON."""
+    found = ",\n    ".join(f"json_extract(j, '$.{path}')" for path in paths.split())
+    return f"coalesce(\n    {found})"
+
+
+def coordinate(usual: str, other: str) -> str:
+    """The x (`key`) or y (`value`) of the first usual pair of two numbers, or of any branch."""
+    return f"""coalesce(
+    (SELECT json_extract(j, '$.' || {usual}) FROM json_each('{PAIRS}') p
+      WHERE json_type(j, '$.' || p.key) {IS_NUMBER} AND json_type(j, '$.' || p.value) {IS_NUMBER}
+      LIMIT 1),
+    (SELECT {other}.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
+      WHERE x.key = 'x' AND y.key = 'y' AND x.type {IS_NUMBER} AND y.type {IS_NUMBER}
+      ORDER BY {NAME.format("x.path")} LIMIT 1))"""
+
+
+def word(words: str) -> str:
+    """The text at the first of these names, or else at the shortest name that ends in one."""
+    usual = ",\n    ".join(
+        f"CASE WHEN json_type(j, '$.{each}') = 'text' THEN json_extract(j, '$.{each}') END"
+        for each in words.split()
+    )
+    listed = ", ".join(f"'{each}'" for each in words.split())
+    return f"""{usual},
+    (SELECT value FROM json_tree(j) WHERE type = 'text' AND lower(key) IN ({listed})
+      ORDER BY length({NAME.format("fullkey")}), {NAME.format("fullkey")} LIMIT 1)"""
+
+
+# As webots_mcp/naming.py had them; a later change there takes a migration of its own.
+IS_NUMBER = "IN ('integer', 'real')"
+BRANCHES = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
+AXES = (("[0]", "[1]"), (".x", ".y"), (".x_m", ".y_m"))
+USUAL = [(branch + x, branch + y) for branch in BRANCHES for x, y in AXES]
+PAIRS = json.dumps(dict([*USUAL, ("x", "y"), ("x_m", "y_m")]))
+NAME = """replace(replace(replace({}, '"', ''), '[', '.'), ']', '')"""
+OLD_POSITION = f"""
+  {first_of("pose[0] pose.x position[0] position.x gps[0] gps.x x")} AS x_m,
+  {first_of("pose[1] pose.y position[1] position.y gps[1] gps.y y")} AS y_m,"""
+OLD_MODE = """
+  CASE WHEN json_type(j, '$.mode') = 'text' THEN json_extract(j, '$.mode')
+    WHEN json_type(j, '$.state') = 'text' THEN json_extract(j, '$.state') END AS mode"""
+POSITION = f"""
+  {coordinate("p.key", "x")} AS x_m,
+  {coordinate("p.value", "y")} AS y_m,"""
+MODE = f"""
+  coalesce(
+    {word("mode behaviour behavior action task phase")},
+    {word("state status")}) AS mode"""
+
+
 def upgrade() -> None:
     op.add_column(
         "run",
@@ -68,7 +122,20 @@ def upgrade() -> None:
     create_parameter_value()
     if op.get_context().dialect.name == "sqlite":
         op.get_bind().exec_driver_sql(ROBOT_PARAMETER.strip())
+        for view in ("robot_now", "robot_trajectory"):
+            replace_in_view(view, {OLD_POSITION: POSITION, OLD_MODE: MODE})
         op.execute("PRAGMA user_version = 5")
+
+
+def replace_in_view(view: str, texts: dict[str, str]) -> None:
+    """Make a view again with other texts in their places."""
+    connection = op.get_bind()
+    found = f"SELECT sql FROM sqlite_master WHERE type = 'view' AND name = '{view}'"
+    sql: str = connection.exec_driver_sql(found).scalar_one()
+    connection.exec_driver_sql(f"DROP VIEW {view}")
+    for old, new in texts.items():
+        sql = sql.replace(old, new)
+    connection.exec_driver_sql(sql)
 
 
 def create_coarse_rollup() -> None:
@@ -213,6 +280,8 @@ def downgrade() -> None:
     op.drop_column("session", "throttle_interval")
     if op.get_context().dialect.name == "sqlite":
         op.execute("DROP VIEW robot_parameter")
+        for view in ("robot_now", "robot_trajectory"):
+            replace_in_view(view, {POSITION: OLD_POSITION, MODE: OLD_MODE})
     op.drop_table("parameter_value")
     op.drop_table("parameter")
     op.drop_table("coarse_rollup")

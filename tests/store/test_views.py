@@ -14,7 +14,12 @@ import pytest
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
 from webots_mcp.connection import connect
+from webots_mcp.naming import USUAL_POSITIONS, flatten
+from webots_mcp.store.analysis.motion import find_motion
+from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.migrate import downgrade, upgrade
+from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.signals.catalogue import catalogue
 
 POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
     ({"pose": [1, 2, 0.5], "mode": "cruise"}, (1, 2, 0.5, "cruise")),
@@ -57,6 +62,57 @@ def test_the_usual_ways_to_publish_a_pose_are_understood(
     recorder.publish(1.0, state)
     for view in ("robot_trajectory", "robot_now"):
         assert rows(recorder.connection, f"SELECT x_m, y_m, yaw_rad, mode FROM {view}") == [flat]
+
+
+def nested(name: str, value: Any) -> dict[str, Any]:
+    """`arm.mode` as {"arm": {"mode": value}}."""
+    outer, _, rest = name.partition(".")
+    return {outer: nested(rest, value) if rest else value}
+
+
+def placed(x_name: str, y_name: str) -> dict[str, Any]:
+    """A state whose x is 1 and y is 2, at these names."""
+    branch, _, key = x_name.rpartition(".")
+    if key == "0":
+        return {branch: [1, 2]}
+    coordinates = {key: 1, y_name.rpartition(".")[2]: 2}
+    return nested(branch, coordinates) if branch else coordinates
+
+
+PLACES = [
+    *(placed(*pair) for pair in USUAL_POSITIONS),
+    {"robot": {"truth": {"x": 1, "y": 2}}, "zone": {"x": 7, "y": 8}},
+    {"corners": [{"x": 1, "y": 2}, {"x": 7, "y": 8}]},
+    {"gps": {"x": 1, "y": 2}, "x": 7, "y": 8},
+    {"odom": [1, 2], "pos": {"x": 7}, "pose": {"x": "near", "y": "far"}},
+    {"pose": [7], "position": {"y": 7}, "gps": [1, 2]},
+    {"x": 7, "y": None, "a b": {"x": 1, "y": 2}, 'a"b': {"x": 7, "y": 8}},
+]
+MODES = [
+    *({name: "go"} for name in ("mode", "behaviour", "behavior", "action", "task", "phase")),
+    *({name: "go"} for name in ("state", "status", "Mode", "STATE")),
+    {"action": "go", "task": "wait", "state": "ready"},
+    {"nav": {"mode": "go"}, "state": "ready", "gripper": {"action": "wait"}},
+    {"nav": {"mode": "wait"}, "behaviour": "go"},
+    {"arm": {"state": "go"}, "gripper": {"status": "wait"}},
+    {"mode": 3, "task": None, "steps": [{"action": "go"}, {"action": "wait"}]},
+]
+
+
+@pytest.mark.parametrize("state", [*PLACES, *MODES], ids=json.dumps)
+def test_the_views_and_the_tools_find_position_and_mode_under_the_same_names(
+    recorder: Recorder, state: dict[str, Any]
+) -> None:
+    recorder.publish(1.0, state)
+    connection = recorder.connection
+    known = catalogue(connection, Subject(robot_id=1, robot="rover", run_id=1))
+    motion = find_motion(known, EventOptions())
+    told = [*(motion.position or (None, None)), motion.mode]
+    values = flatten(state)
+    found = tuple(values[signal.name] if signal else None for signal in told)
+    assert found in ((1, 2, None), (None, None, "go"))
+    for view in ("robot_trajectory", "robot_now"):
+        assert rows(connection, f"SELECT x_m, y_m, mode FROM {view}") == [found]
 
 
 @pytest.mark.parametrize("data", ["", "no JSON", '{"pose": NaN}', "[1, 2]", "3", "null", '{"a":'])
@@ -166,8 +222,9 @@ def test_a_view_asked_about_one_run_uses_its_index(
 
 def test_the_newest_rows_are_found_without_sorting(reader: sqlite3.Connection) -> None:
     sql = "SELECT * FROM robot_trajectory ORDER BY state_id DESC LIMIT 5"
-    plan = [row[3] for row in rows(reader, f"EXPLAIN QUERY PLAN {sql}")]
-    assert not any("TEMP B-TREE" in line for line in plan)
+    plan = rows(reader, f"EXPLAIN QUERY PLAN {sql}")
+    outermost = [detail for _, parent, _, detail in plan if parent == 0]
+    assert not any("TEMP B-TREE" in line for line in outermost)
 
 
 def test_the_shell_shows_what_each_view_is_for(reader: sqlite3.Connection) -> None:
@@ -188,6 +245,11 @@ def test_the_views_come_and_go_with_their_revision_and_the_data_stays(tmp_path: 
         assert upgrade(file, "0003") == (2, 3)
         assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
         assert rows(connection, "SELECT keep, purged_rows FROM run") == [(0, 0)]
+
+        assert upgrade(file) == (3, 5)
+        assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
+        assert downgrade(file, "0003") == (5, 3)
+        assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
 
         assert downgrade(file, "0002") == (3, 2)
         assert rows(connection, "SELECT name FROM sqlite_master WHERE type = 'view'") == []

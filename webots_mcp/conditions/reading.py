@@ -208,8 +208,8 @@ class PositionReader:
         if len(self._numeric) >= _MOST_NAMES or len(self._keys) >= _MOST_NAMES:
             return
         self._keys.update(state)
-        leaves = flatten(self._plain(state))
-        self._numeric.update(name for name, value in leaves.items() if _may_be_number(value))
+        values = flatten(self._plain(state))
+        self._numeric.update(name for name, value in values.items() if _may_be_number(value))
         if (names := find_position(self._numeric)) != self.names and names is not None:
             self.names = names
             self._x, self._y = (reader(name, self._plain) for name in names)

@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.naming import FARTHEST_M, find_position
+from webots_mcp.naming import FARTHEST_M, find_mode, find_position
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
@@ -19,8 +19,6 @@ from webots_mcp.store.signals.registry import Signal
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.track import Track
 
-_MODE: Final = re.compile(r"(^|\.)(mode|behaviou?r|action|task|phase)$", re.IGNORECASE)
-_STATE: Final = re.compile(r"(^|\.)(state|status)$", re.IGNORECASE)  # of anything, often of an arm
 _TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps))*$"
 _COMMANDED: Final = re.compile(
     rf"(^|[._])(commanded|command|cmd|cmd_vel|target_speed){_TAIL}", re.IGNORECASE
@@ -87,10 +85,9 @@ def find_motion(
         InvalidInputError: A name in them means several.
     """
     own = known if here is None else {name: known[name] for name in known if name in here}
-    mode = _named(known, options.mode)
-    mode = mode or _first(own, _MODE, ("text",)) or _first(own, _STATE, ("text",))
-    commanded = _named(known, options.commanded) or _first(own, _COMMANDED, ("num",))
-    speed = None if commanded else _first(own, _SPEED, ("num",), _is_no_wheel)
+    mode = _named(known, options.mode) or _mode(own)
+    commanded = _named(known, options.commanded) or _first(own, _COMMANDED)
+    speed = None if commanded else _first(own, _SPEED, _is_no_wheel)
     wheels = tuple(
         signal
         for name, signal in own.items()
@@ -126,20 +123,23 @@ def _position(
     if named is not None:
         x, y = (_named(known, name) for name in named)
         return (x, y) if x and y else None
-    names = find_position({name for name, signal in known.items() if signal.is_number})
+    numeric = [name for name, signal in known.items() if signal.is_number]
+    held = [name for name in numeric if known[name].kind != "null"]
+    names = find_position(held) or find_position(numeric)
     return (known[names[0]], known[names[1]]) if names else None
 
 
+def _mode(known: dict[str, Signal]) -> Signal | None:
+    name = find_mode({name for name, signal in known.items() if signal.kind == "text"})
+    return known[name] if name else None
+
+
 def _first(
-    known: dict[str, Signal],
-    name: re.Pattern[str],
-    kinds: tuple[str, ...],
-    wanted: Callable[[str], bool] = bool,
+    known: dict[str, Signal], name: re.Pattern[str], wanted: Callable[[str], bool] = bool
 ) -> Signal | None:
-    """The one with the shortest name that fits: `mode` before `arm.mode`."""
-    fitting = [
-        each for each in known if name.search(each) and known[each].kind in kinds and wanted(each)
-    ]
+    """The number with the shortest name that fits: `speed` before `arm.speed`."""
+    numbers = [each for each, signal in known.items() if signal.kind == "num"]
+    fitting = [each for each in numbers if name.search(each) and wanted(each)]
     return known[min(fitting, key=len)] if fitting else None
 
 

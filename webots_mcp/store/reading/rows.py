@@ -145,11 +145,11 @@ def _read_decoded(
     query = f"SELECT id, sim_time_s, wall_time_s, odd, data {_IN_SEGMENT}"
     for chunk in _chunks(connection, query, parameters, columns, deadline):
         read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
-        leaves = [flatten(parse(data)) for data in read[4]]
+        states = [flatten(parse(data)) for data in read[4]]
         _extend(columns, read[:3])
         for signal in signals:
             name = signal.name
-            columns.values[name].extend([row.get(name) for row in leaves])
+            columns.values[name].extend([row.get(name) for row in states])
         _count_odd(columns, signals, read[3])
 
 

@@ -43,6 +43,7 @@ ACTING = {
     "webots_set_parameters",
     "webots_take_screenshot",
     "webots_simulation_control",
+    "webots_run",
     "webots_world_reload",
     "webots_world_reset",
     "webots_reset_controller_state",
@@ -83,7 +84,7 @@ async def test_every_parameter_is_described_and_flat(connect: Connect) -> None:
         for tool in (await client.list_tools()).tools:
             for name, schema in tool.input_schema.get("properties", {}).items():
                 assert schema.get("description"), f"{tool.name}({name})"
-                flat = schema.get("type") != "object" or name in ("params", "values")
+                flat = schema.get("type") != "object" or name in ("params", "values", "parameters")
                 assert flat, f"{tool.name}({name})"
 
 

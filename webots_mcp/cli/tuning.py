@@ -78,7 +78,7 @@ def _set(arguments: argparse.Namespace) -> CommandAnswer:
     return anyio.run(ask, recording, _silent, values)
 
 
-async def _silent(waited_s: float, of_s: float, text: str) -> None:
+async def _silent(waited_s: float, of_s: float | None, text: str) -> None:
     """It takes a round of the loop, which is too short to report on."""
 
 

@@ -28,6 +28,7 @@ from webots_mcp.server.tools import (
     parameters,
     pictures,
     plot,
+    run,
     runs,
     signals,
     sql,
@@ -55,7 +56,7 @@ _PAUSE_S: Final = 0.002  # between two short writes, for the robots to write the
 # In the order in which clients list them.
 _MODULES: Final = (
     world, state, pictures, logs, monitor, signals, history, trends, events, timeline, runs, plot,
-    sql, control, breakpoints, commands, parameters,
+    sql, control, run, breakpoints, commands, parameters,
 )  # fmt: skip
 
 

@@ -18,7 +18,7 @@ from anyio import to_thread
 from mcp import MCPError
 from mcp.server.mcpserver.exceptions import ToolError
 from mcp.server.mcpserver.tools import Tool
-from mcp.types import CallToolResult, TextContent, ToolAnnotations
+from mcp.types import CallToolResult, ContentBlock, TextContent, ToolAnnotations
 
 from webots_mcp.errors import (
     MalformedRowError,
@@ -187,4 +187,5 @@ def _as_result(answer: Any, unsound: Unsound | None = None) -> Any:
     text = compact_json(data)
     text.encode()  # what UTF-8 cannot hold would end the connection to the client
     bad = isinstance(answer, CommandAnswer) and answer.outcome in _BAD_ENDS
-    return CallToolResult(content=[TextContent(text=text)], structured_content=data, is_error=bad)
+    content: list[ContentBlock] = [TextContent(text=text), *answer.pictures]
+    return CallToolResult(content=content, structured_content=data, is_error=bad)

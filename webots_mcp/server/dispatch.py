@@ -10,7 +10,10 @@ import anyio
 from anyio import to_thread
 
 from webots_mcp.contract import HEARTBEAT_LATE_S
+from webots_mcp.server.history_results import RunAnswer
 from webots_mcp.server.results import CommandAnswer
+from webots_mcp.server.running import ACTION as RUN
+from webots_mcp.server.running import progress_of, told_of_run
 from webots_mcp.server.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
 from webots_mcp.server.target import find_target
 from webots_mcp.store.queue import Command, CommandQueue, fetch_command
@@ -18,7 +21,7 @@ from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.status import handler_at_work
 
-Report = Callable[[float, float, str], Awaitable[None]]
+Report = Callable[[float, float | None, str], Awaitable[None]]
 
 # A look at one row by its key costs microseconds, as little as PRAGMA data_version, and is right
 # for commits of the same connection as well.
@@ -78,7 +81,7 @@ class Dispatcher:
             return await to_thread.run_sync(self._at_the_deadline, command)
         except anyio.get_cancelled_exc_class():
             with anyio.CancelScope(shield=True):
-                await to_thread.run_sync(self._leave, command.id)
+                await to_thread.run_sync(self._leave, command)
             raise
 
     def _enqueue(
@@ -106,7 +109,10 @@ class Dispatcher:
                 if waited_s >= next_report_s:
                     next_report_s += _REPORT_INTERVAL_S
                     await to_thread.run_sync(self._recording.settle)
-                    await self._report(waited_s, timeout_s, _progress(command, waited_s))
+                    if command.action == RUN:
+                        await self._report(*progress_of(connection, command))
+                    else:
+                        await self._report(waited_s, timeout_s, _progress(command, waited_s))
                 await anyio.sleep(_POLL_INTERVAL_S)
             return command
 
@@ -116,9 +122,14 @@ class Dispatcher:
         self._recording.settle()
         return self._take_back(command.id, "nobody claimed it in time; it will not run")
 
-    def _leave(self, command_id: int) -> None:
+    def _leave(self, command: Command) -> None:
+        """Nobody waits any more; a run that has begun ends now, as its `then` says."""
         with self._recording.writer() as connection:
-            CommandQueue(connection).leave(command_id, "the asker went away")
+            queue = CommandQueue(connection)
+            goes_on = queue.leave(command.id, "the asker went away")
+            if goes_on and command.action == RUN:
+                params = {"command_id": command.id}
+                queue.enqueue(command.robot_id, "cancel_run", params, requested_by="mcp")
 
     def _take_back(self, command_id: int, why: str) -> Command:
         with self._recording.writer() as connection:
@@ -128,16 +139,18 @@ class Dispatcher:
     def _answer(self, command: Command, waited_s: float) -> CommandAnswer:
         with self._recording.reader() as connection:
             view = look(connection, robot_name(connection, command.robot_id))
-            return CommandAnswer(
+            facts: dict[str, Any] = {
                 **view.header(),
-                command_id=command.id,
-                action=command.action,
-                outcome=command.status,
-                waited_s=waited_s,
-                result=shown_result(command),
-                error=_error(command),
-                hint=_hint(view, command),
-            )
+                "command_id": command.id,
+                "action": command.action,
+                "outcome": command.status,
+                "waited_s": waited_s,
+                "error": _error(command),
+                "hint": _hint(view, command),
+            }
+            if command.action == RUN:
+                return RunAnswer(**facts, **told_of_run(view, command))
+            return CommandAnswer(**facts, result=shown_result(command))
 
 
 def shown_result(command: Command, budget: int = RESULT_BUDGET) -> Any:

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from webots_mcp.server.results import Answer, Table
+from webots_mcp.server.results import Answer, CommandAnswer, Table
 
 
 class NotedAnswer(Answer):
@@ -183,6 +183,28 @@ class MonitorAnswer(NotedAnswer):
         default=None,
         description="How many of each kind there are beside these, and when they began.",
     )
+
+
+class RunAnswer(CommandAnswer):
+    """What came of a `run` command."""
+
+    stopped: str | None = Field(
+        default=None,
+        description="condition held, time over, run ended, interrupted, or out of wall time.",
+    )
+    why_stopped: str | None = None
+    ran: dict[str, Any] | None = Field(default=None, description="How far simulation time came.")
+    values: dict[str, Any] | None = Field(default=None, description="Of the condition's signals.")
+    mode: str | None = None
+    state: Any = Field(default=None, description="As published at the step where it stopped.")
+    state_at_s: float | None = None
+    shortened: str | None = None
+    movement: dict[str, Any] | None = None
+    trends: RunTrendTables | None = None
+    events: Table | None = None
+    not_shown: dict[str, str] | None = None
+    rows: Table | None = Field(default=None, description="The last rows, of its signals.")
+    picture: dict[str, Any] | None = None
 
 
 class SqlAnswer(Answer):

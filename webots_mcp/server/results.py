@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, Field
+from mcp.types import ImageContent
+from pydantic import BaseModel, Field, PrivateAttr
 
 
 class Table(BaseModel):
@@ -34,6 +35,12 @@ class Answer(BaseModel):
     left_out: list[str] | None = Field(
         default=None, description="Rows and values that no bridge has written; they do not count."
     )
+    _pictures: list[ImageContent] = PrivateAttr(default_factory=list[ImageContent])
+
+    @property
+    def pictures(self) -> list[ImageContent]:
+        """What is shown beside the data, by clients that show both."""
+        return self._pictures
 
 
 class StateAnswer(Answer):

@@ -146,11 +146,16 @@ class CommandQueue:
             )
         return command
 
-    def leave(self, command_id: int, why: str) -> None:
-        """Nobody waits any more: it is taken back, or goes on where it has begun, with a note."""
-        if not self.cancel(command_id, why):
-            values = {"id": command_id, "note": f"{why}; it goes on"}
-            _while_busy(lambda: self._connection.execute(_NOTE, values))
+    def leave(self, command_id: int, why: str) -> bool:
+        """Nobody waits any more: it is taken back, or goes on where it has begun, with a note.
+
+        Returns:
+            Whether it goes on.
+        """
+        if self.cancel(command_id, why):
+            return False
+        values = {"id": command_id, "note": f"{why}; it goes on"}
+        return _while_busy(lambda: self._connection.execute(_NOTE, values)).rowcount == 1
 
     def cancel(self, command_id: int, why: str) -> bool:
         """Take back a command that nobody has claimed; True if it will now never run."""

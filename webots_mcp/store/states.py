@@ -44,6 +44,10 @@ _RECENT_TIMES: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 )
+_UP_TO: Final = (
+    f"SELECT {_COLUMNS} FROM state WHERE run_id = ? AND sim_time_s <= ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
 _BY_ID: Final = f"SELECT {_COLUMNS} FROM state WHERE id = ?"
 _OF_RUN: Final = f"SELECT {_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s, id"
 
@@ -58,6 +62,12 @@ _SHOWN_KEY_CHARACTERS: Final = 40
 def newest_state(connection: sqlite3.Connection, run_id: int) -> State | None:
     """The latest row of a run."""
     row = connection.execute(_NEWEST, (run_id,)).fetchone()
+    return State(*row) if row else None
+
+
+def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> State | None:
+    """The latest row of a run up to that simulation time."""
+    row = connection.execute(_UP_TO, (run_id, sim_time_s)).fetchone()
     return State(*row) if row else None
 
 

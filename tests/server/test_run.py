@@ -1,0 +1,174 @@
+"""webots_run: one call that runs the simulation, waits, and says what happened."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from mcp import Client
+
+from tests.recordings.rows import Recorded
+from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
+
+pytestmark = pytest.mark.anyio
+
+
+async def paused(client: Client) -> dict[str, Any]:
+    return await ask(client, "webots_simulation_control", command="pause")
+
+
+@pytest.mark.parametrize("mode", ["auto", "legacy"])
+async def test_it_says_why_and_where_it_stopped_and_what_happened(
+    connect: Connect, driver: Driver, mode: str
+) -> None:
+    async with connect(mode=mode) as client:
+        goal = (await paused(client))["sim_time_s"] * 1000 // STEP_MS + 60
+        answer = await ask(client, "webots_run", until=f"steps >= {goal}", pace="real_time")
+        assert (answer["outcome"], answer["stopped"]) == ("done", "condition held")
+        assert answer["status"] == "paused"
+        assert answer["values"] == {"steps": goal}
+        assert answer["state"]["steps"] == goal
+        assert answer["state_at_s"] == answer["ran"]["to_s"] == pytest.approx(goal * STEP_MS / 1000)
+        assert [goal - row[1] for row in answer["rows"]["rows"]] == [5, 4, 3, 2, 1, 0]
+        assert {row[0] for row in answer["trends"]["numbers"]["rows"]} >= {"steps"}
+        events = answer["events"]
+        rows = [dict(zip(events["columns"], row, strict=True)) for row in events["rows"]]
+        assert [row["kind"] for row in rows].count("change") >= 2
+        assert "run" not in [row["name"] for row in rows], "it needs no telling"
+        assert len(json.dumps(answer)) < 8_000
+    assert driver.is_alive()
+
+
+async def test_a_time_after_a_reset_is_exact(connect: Connect, driver: Driver) -> None:
+    async with connect() as client:
+        answer = await ask(client, "webots_run", for_s=0.8, reset=True, then="pause")
+        assert answer["stopped"] == "time over"
+        assert answer["ran"]["to_s"] == answer["ran"]["advanced_s"] == pytest.approx(0.8)
+        assert answer["ran"]["run_id"] == answer["run_id"]
+        assert (await ask(client, "webots_get_robot_state"))["status"] == "paused"
+
+
+async def test_out_of_wall_time_it_goes_on_and_a_second_call_gives_the_same_answer(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        first = await ask(client, "webots_run", for_s=1.2, pace=None, timeout_s=0.3)
+        assert (first["outcome"], first["stopped"]) == ("claimed", "out of wall time")
+        number = first["command_id"]
+        assert f"command_id {number}" in first["hint"]
+        assert 0 <= first["ran"]["advanced_s"] < 1.2
+        then = await ask(client, "webots_wait_for_command", command_id=number, timeout_s=30)
+        assert then["stopped"] == "time over"
+        assert then["ran"]["advanced_s"] == pytest.approx(1.2)
+        assert then["state"]
+        assert then["trends"]
+        assert (await ask(client, "webots_get_robot_state"))["status"] == "paused"
+
+
+async def test_progress_is_in_simulated_seconds(connect: Connect, driver: Driver) -> None:
+    reports: list[tuple[float, float | None, str]] = []
+
+    async def on_progress(progress: float, total: float | None, message: str | None) -> None:
+        reports.append((progress, total, message or ""))
+
+    async with connect() as client:
+        arguments = {"for_s": 4, "until": "steps < 0", "then": "go_on"}
+        await client.call_tool("webots_run", arguments, progress_callback=on_progress)
+    assert reports
+    assert [progress for progress, _, _ in reports] == sorted(p for p, _, _ in reports)
+    assert all(0 <= progress <= 4.1 and total == 4 for progress, total, _ in reports)
+    assert "of 4 s simulated, until steps < 0" in reports[-1][2]
+
+
+@pytest.mark.parametrize(("then", "status"), [("pause", "paused"), ("go_on", "running")])
+async def test_a_cancelled_call_leaves_the_simulation_as_then_says(
+    connect: Connect, driver: Driver, then: str, status: str
+) -> None:
+    async with connect() as client:
+        async with anyio.create_task_group() as tasks:
+            arguments = {"until": "steps < 0", "then": then}
+            tasks.start_soon(client.call_tool, "webots_run", arguments)
+            await _until_run_is(client, "claimed")
+            tasks.cancel_scope.cancel()
+        ended = await _until_run_is(client, "done")
+        assert ended["result"]["ended"] == "interrupted"
+        assert ended["result"]["why"] == "it was cancelled"
+        assert (await ask(client, "webots_get_robot_state"))["status"] == status
+    assert driver.is_alive()
+
+
+async def _until_run_is(client: Client, outcome: str) -> dict[str, Any]:
+    """The newest `run` command, once it is that far."""
+    with anyio.fail_after(20):
+        while True:
+            commands = (await ask(client, "webots_list_commands"))["commands"]
+            rows = [dict(zip(commands["columns"], row, strict=True)) for row in commands["rows"]]
+            for row in rows:
+                if row["action"] == "run" and row["outcome"] == outcome:
+                    return row
+            await anyio.sleep(0.02)
+
+
+async def test_a_picture_comes_beside_the_data(
+    connect: Connect, driver: Driver, file: Path
+) -> None:
+    async with connect() as client:
+        result = await client.call_tool("webots_run", {"for_s": 0.1, "picture": True})
+        assert not result.is_error, text_of(result)
+        assert len(pictures_of(result)) == 1
+        assert result.structured_content is not None
+        picture = result.structured_content["picture"]
+        assert Path(picture["file"]).is_file()
+        assert "webots_take_screenshot" in picture["see"]
+
+
+async def test_what_cannot_end_is_refused_before_anything_is_sent(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        with anyio.fail_after(20):
+            while (await ask(client, "webots_get_robot_state"))["sim_time_s"] < 0.5:
+                await anyio.sleep(0.02)
+        misspelt = await fail(client, "webots_run", until="step > 70")
+        assert "steps" in misspelt
+        assert "never published" in misspelt
+        holds = await fail(client, "webots_run", until="steps >= 3")
+        assert "holds already" in holds
+        assert "since 0.048 s" in holds
+        assert "reset=true" in holds
+        assert "until" in await fail(client, "webots_run")
+        assert "column" in await fail(client, "webots_run", until="steps >")
+        assert "pace must" in await fail(client, "webots_run", for_s=1, pace="slow")
+        assert "steps < 'a'" in await fail(client, "webots_run", until="steps < 'a'")
+        undeclared = await fail(client, "webots_run", for_s=1, parameters={"gain": 1})
+        assert "declares no parameters" in undeclared
+        assert (await ask(client, "webots_get_robot_state"))["status"] == "running"
+        sent = (await ask(client, "webots_list_commands"))["commands"]["rows"]
+        assert [row[1] for row in sent] == ["run"], "only the unknown parameter met the bridge"
+        again = await ask(client, "webots_run", until="steps >= 3", reset=True, then="go_on")
+        assert again["ran"]["to_s"] <= 0.064
+
+
+async def test_two_at_once_are_refused(connect: Connect, driver: Driver) -> None:
+    async with connect() as client:
+        first = await ask(client, "webots_run", until="steps < 0", then="go_on", timeout_s=0.3)
+        said = await fail(client, "webots_run", for_s=1)
+        assert f"command {first['command_id']} (run) is under way" in said
+        await paused(client)
+        ended = await ask(client, "webots_wait_for_command", command_id=first["command_id"])
+        assert ended["stopped"] == "interrupted"
+        assert "(pause)" in ended["why_stopped"]
+
+
+async def test_a_robot_that_has_ended_or_is_no_supervisor_is_refused(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot("gone", ended_wall_time_s=time.time()).state(1.0, {"x": 1})
+    recorded.robot("plain", supervisor=False).state(1.0, {"x": 1})
+    async with connect() as client:
+        assert "no live controller" in await fail(client, "webots_run", for_s=1, robot="gone")
+        assert "needs a Supervisor" in await fail(client, "webots_run", for_s=1, robot="plain")

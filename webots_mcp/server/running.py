@@ -1,0 +1,297 @@
+"""Running until a condition holds or a time is over: what is refused, and what came of it."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import time
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple, cast
+
+from webots_mcp.conditions import Condition, parse_condition
+from webots_mcp.conditions.memory import SAME_TIME_S
+from webots_mcp.errors import (
+    CommandRefusedError,
+    ConditionFailedError,
+    InvalidInputError,
+    NothingRecordedError,
+    UnknownSignalError,
+)
+from webots_mcp.naming import flatten
+from webots_mcp.server.budget import figure, seconds, shown, table
+from webots_mcp.server.shortening import shorten
+from webots_mcp.server.target import find_target
+from webots_mcp.server.tools.events import fitting_events, not_shown_of
+from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
+from webots_mcp.server.watching import movement
+from webots_mcp.store.detection.event import Event
+from webots_mcp.store.questions.events import search_events
+from webots_mcp.store.questions.runs import pace
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.queue import Command
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, whole_run
+from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.sessions import fetch_session
+from webots_mcp.store.signals.catalogue import known_signals
+from webots_mcp.store.states import State, state_at
+
+ACTION: Final = "run"
+_ROWS_AROUND: Final = 6
+_STATE_BUDGET: Final = 1_200
+_TRENDS_BUDGET: Final = 1_800
+_EVENTS_BUDGET: Final = 1_700
+_SHOWN_SIGNALS: Final = 8
+_SHOWN_EVENTS: Final = 12
+_MOST_COLUMNS: Final = 8
+_REMEMBERED_S: Final = 60.0  # how far back a condition is asked whether it holds already
+_MOST_REMEMBERED_ROWS: Final = 4_000
+_RUNS_SEARCHED: Final = 5
+
+_OF_SESSION: Final = (
+    "SELECT id, started_sim_time_s, last_sim_time_s, started_wall_time_s FROM run "
+    "WHERE session_id = ? ORDER BY id DESC LIMIT 1"
+)
+_LAST_ROWS: Final = (
+    "SELECT sim_time_s, data FROM state WHERE run_id = ? AND sim_time_s <= ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
+)
+_NEWEST_RUNS: Final = "SELECT id FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT ?"
+
+
+# -- before it is sent ------------------------------------------------------------------------
+
+
+def require_possible(
+    recording: Recording, robot: str | None, until: str | None, for_s: float | None, *, reset: bool
+) -> None:
+    """Refuse what cannot end as it was meant, before anything is sent.
+
+    Raises:
+        InvalidInputError: Neither a condition nor a time is given, the condition is not in the
+            language, reads signals that were never seen, or holds already.
+        CommandRefusedError: No controller of the robot could run it.
+    """
+    if until is None and for_s is None:
+        raise InvalidInputError("give until (a condition), for_s (simulated seconds), or both")
+    condition = None if until is None else parse_condition(until)
+    with recording.reader() as connection:
+        view = find_target(connection, robot, ACTION)
+        if condition is not None:
+            _require_known(view, condition)
+            if not reset:
+                _require_open(view, condition)
+
+
+def _require_known(view: View, condition: Condition) -> None:
+    """A signal that was never seen is most likely misspelt; before the first row any may come."""
+    known = _known_names(view)
+    if known and (unknown := [name for name in condition.signals if name not in known]):
+        raise UnknownSignalError(
+            "; ".join(condition.describe_unknown(known))
+            + f": {'it was' if len(unknown) == 1 else 'they were'} never published by robot "
+            f"{view.robot.name!r}, so the condition could not come true"
+        )
+
+
+def _known_names(view: View) -> set[str]:
+    runs = view.connection.execute(_NEWEST_RUNS, (view.robot.id, _RUNS_SEARCHED)).fetchall()
+    found = (whole_run(view.connection, run_id) for (run_id,) in runs)
+    segments = tuple(segment for segment in found if segment is not None)
+    if not segments:
+        return set()
+    asked = TimeRange(view.robot.id, view.robot.name, segments, "simulation")
+    return set(known_signals(view.connection, asked))
+
+
+def _require_open(view: View, condition: Condition) -> None:
+    """Refuse a condition that holds at the newest row: the run would be over at once."""
+    if view.run is None:
+        return
+    since_s = _holds_since(view.connection, view.run.id, condition)
+    if since_s is None:
+        return
+    raise CommandRefusedError(
+        f"{condition.text!r} holds already, at the newest row since {since_s:.3f} s of simulation "
+        f"time: run until 'not ({condition.text})' first, give for_s alone, or reset=true, with "
+        "which it is asked after the reset"
+    )
+
+
+def _holds_since(connection: sqlite3.Connection, run_id: int, condition: Condition) -> float | None:
+    """Since when a condition holds in the last rows of a run; None where it does not."""
+    newest = connection.execute(_LAST_ROWS, (run_id, 1e300, _MOST_REMEMBERED_ROWS)).fetchall()
+    rows = [row for row in newest if row[0] >= newest[0][0] - _REMEMBERED_S]
+    evaluator, since_s = condition.evaluator(), None
+    try:
+        for sim_time_s, data in reversed(rows):
+            if not evaluator.holds(json.loads(data), sim_time_s):
+                since_s = None
+            elif since_s is None:
+                since_s = float(sim_time_s)
+    except ConditionFailedError as error:
+        raise InvalidInputError(f"{error} (as robots published until now)") from error
+    return since_s
+
+
+# -- while it is under way --------------------------------------------------------------------
+
+
+class Way(NamedTuple):
+    """How far a `run` command has come.
+
+    Attributes:
+        run_id: The run that it is about; None before the controller has claimed it.
+        factor: Simulated per wall seconds; None where nothing tells.
+    """
+
+    run_id: int | None
+    from_s: float
+    to_s: float
+    factor: float | None
+
+    @property
+    def advanced_s(self) -> float:
+        """Simulated seconds."""
+        return max(self.to_s - self.from_s, 0.0)
+
+
+def way_of(connection: sqlite3.Connection, command: Command) -> Way:
+    """How far it came, as the bridge says; while it does not, as far as its heartbeat shows."""
+    if result := _result_of(command):
+        return Way(result["run_id"], result["from_s"], result["sim_time_s"], result.get("factor"))
+    if command.session_id is None:
+        return Way(None, 0.0, 0.0, None)
+    row = connection.execute(_OF_SESSION, (command.session_id,)).fetchone()
+    session = fetch_session(connection, command.session_id)
+    if row is None or session is None:
+        return Way(None, 0.0, 0.0, None)
+    return _seen_way(command, row, session.sim_time_s or 0.0)
+
+
+def _seen_way(command: Command, run: tuple[int, float, float, float], beat_s: float) -> Way:
+    run_id, _, last_s, began_wall_s = run
+    claimed_wall_s, to_s = command.claimed_wall_time_s or 0.0, max(last_s, beat_s)
+    has_reset = began_wall_s >= claimed_wall_s
+    from_s = 0.0 if has_reset else command.claimed_sim_time_s or 0.0
+    wall_s = (command.finished_wall_time_s or time.time()) - max(claimed_wall_s, began_wall_s)
+    if params_of(command).get("reset") and not has_reset:
+        to_s = from_s
+    return Way(run_id, from_s, to_s, pace(to_s - from_s, wall_s))
+
+
+def progress_of(
+    connection: sqlite3.Connection, command: Command
+) -> tuple[float, float | None, str]:
+    """Simulated seconds so far, those asked for, and a word."""
+    way = way_of(connection, command)
+    until, for_s = (params_of(command).get(name) for name in ("until", "for_s"))
+    if way.run_id is None:
+        return 0.0, for_s, "waiting for the controller"
+    of = f" of {for_s:g}" if for_s else ""
+    word = f"{way.advanced_s:.1f}{of} s simulated" + (f", until {until}" if until else "")
+    return way.advanced_s, for_s, word
+
+
+def _result_of(command: Command) -> dict[str, Any]:
+    """What the bridge says of a run that is over; empty where it says nothing."""
+    result = command.decoded_result()
+    return cast("dict[str, Any]", result) if isinstance(result, dict) else {}
+
+
+def params_of(command: Command) -> Mapping[str, Any]:
+    """What a command was sent with."""
+    return json.loads(command.params)
+
+
+# -- when it is over --------------------------------------------------------------------------
+
+
+def told_of_run(view: View, command: Command) -> dict[str, Any]:
+    """What an answer says of a `run` command: why it stopped, how far it came, what happened."""
+    way, result = way_of(view.connection, command), _result_of(command)
+    stopped, why = _why_stopped(command, result)
+    told: dict[str, Any] = {"stopped": stopped, "why_stopped": why}
+    if way.run_id is None or stopped is None:
+        return told
+    told |= {
+        "ran": {
+            "run_id": way.run_id,
+            "from_s": seconds(way.from_s),
+            "to_s": seconds(way.to_s),
+            "advanced_s": seconds(way.advanced_s),
+            "factor": figure(way.factor),
+        },
+        "values": shown(result.get("values")) if result.get("values") else None,
+        "mode": result.get("mode"),
+    }
+    return told | _what_happened(view, command, way) if command.is_final else told
+
+
+def _why_stopped(command: Command, result: Mapping[str, Any]) -> tuple[str | None, str | None]:
+    if command.status == "claimed":
+        return "out of wall time", "it goes on, and ends as it was asked to"
+    if command.status == "lost":
+        return "run ended", command.error
+    return result.get("ended"), result.get("why")
+
+
+def _what_happened(view: View, command: Command, way: Way) -> dict[str, Any]:
+    """The state at the end, trends and events in between, and the rows before the end."""
+    assert way.run_id is not None
+    subject = Subject(view.robot.id, view.robot.name, way.run_id)
+    end_s = way.to_s + SAME_TIME_S
+    told: dict[str, Any] = {"rows": _last_rows(view, command, way, end_s)}
+    if state := state_at(view.connection, way.run_id, end_s):
+        told |= _as_shown(state)
+    scope = Scope(start_s=way.from_s, end_s=max(way.to_s, way.from_s) + 0.001)
+    try:
+        asked = find_range(view.connection, scope, subject)
+    except NothingRecordedError:
+        return told
+    return told | _in_between(view, command, asked)
+
+
+def _as_shown(state: State) -> dict[str, Any]:
+    short = shorten(state.value(), _STATE_BUDGET)
+    return {
+        "state": short.value,
+        "state_at_s": seconds(state.sim_time_s),
+        "shortened": short.rule,
+    }
+
+
+def _in_between(view: View, command: Command, asked: TimeRange) -> dict[str, Any]:
+    (told,) = trends(view.connection, asked, limit=MOST_SIGNALS).runs
+    found = search_events(view.connection, asked)
+    of_others = found.only([each for each in found.events if not _is_own(each, command)])
+    shown_events, events = fitting_events(of_others, _SHOWN_EVENTS, _EVENTS_BUDGET, view)
+    return {
+        "movement": movement(view, asked),
+        "trends": trend_tables(told, _SHOWN_SIGNALS, _TRENDS_BUDGET) if told.rows else None,
+        "events": events,
+        "not_shown": not_shown_of(shown_events),
+    }
+
+
+def _is_own(event: Event, command: Command) -> bool:
+    """Whether it is the command itself, or the pause that it began or ended."""
+    if event.kind == "command":
+        return event.details.get("id") == command.id
+    data: dict[str, Any] = event.details.get("data") or {}
+    return event.kind == "noticed" and data.get("command_id") == command.id
+
+
+def _last_rows(view: View, command: Command, way: Way, end_s: float) -> Any:
+    """The last rows, of the condition's signals."""
+    until = params_of(command).get("until")
+    rows = view.connection.execute(_LAST_ROWS, (way.run_id, end_s, _ROWS_AROUND)).fetchall()
+    if until is None or not rows:
+        return None
+    condition = parse_condition(until)
+    names = condition.signals[:_MOST_COLUMNS]
+    lines: list[list[Any]] = []
+    for sim_time_s, data in reversed(rows):
+        values = flatten(json.loads(data))
+        lines.append([seconds(sim_time_s), *(shown(values.get(name)) for name in names)])
+    return table(("sim_time_s", *names), lines)

@@ -1,0 +1,91 @@
+"""The tool that lets the simulation run until something is the case, and says what happened."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Final, cast
+
+from anyio import to_thread
+from mcp.server.mcpserver import Context
+from pydantic import Field
+
+from webots_mcp.contract import MAX_RUN_S, Pace, Then
+from webots_mcp.errors import WebotsMCPError
+from webots_mcp.server.declaring import RESTARTS, tool
+from webots_mcp.server.dispatch import Dispatcher
+from webots_mcp.server.history_results import RunAnswer
+from webots_mcp.server.parameters import RobotName, TimeoutS
+from webots_mcp.server.pictures import load_picture
+from webots_mcp.server.running import ACTION, require_possible
+from webots_mcp.store.images import inside
+from webots_mcp.store.recording import Recording
+
+_WAIT_S: Final = 60.0
+_PICTURE_WAIT_S: Final = 8.0
+
+
+@tool("Run until", RESTARTS)
+async def webots_run(
+    recording: Recording,
+    ctx: Context[Any],
+    until: Annotated[
+        str | None,
+        Field(max_length=500, description="A condition, as of webots_breakpoint."),
+    ] = None,
+    for_s: Annotated[
+        float | None,
+        Field(
+            gt=0, le=MAX_RUN_S, description="For so many simulated seconds, or until, if before."
+        ),
+    ] = None,
+    reset: Annotated[
+        bool, Field(description="Reset the world first; for_s counts from there.")
+    ] = False,
+    pace: Annotated[Pace | None, Field(description="null: as it runs now.")] = "fast",
+    parameters: Annotated[
+        dict[str, Any] | None,
+        Field(description="Set these first, all or none; see webots_get_parameters."),
+    ] = None,
+    then: Annotated[Then, Field(description="At that very step.")] = "pause",
+    picture: Annotated[bool, Field(description="A screenshot of the end, too.")] = False,
+    robot: RobotName = None,
+    timeout_s: TimeoutS = _WAIT_S,
+) -> RunAnswer:
+    """Let the simulation run until a condition holds or a simulated time is over, then pause it.
+
+    Says why it stopped, how far it came, the state at that step, and what happened meanwhile. Out
+    of wall time it goes on: webots_wait_for_command waits for the same answer. Needs a Supervisor.
+    To watch without steering: webots_monitor.
+    """
+    await to_thread.run_sync(lambda: require_possible(recording, robot, until, for_s, reset=reset))
+    params = {
+        "until": until,
+        "for_s": for_s,
+        "reset": reset,
+        "pace": pace,
+        "parameters": parameters,
+        "then": then,
+    }
+    dispatcher = Dispatcher(recording, ctx.report_progress)
+    asked = {name: value for name, value in params.items() if value is not None}
+    answer = cast("RunAnswer", await dispatcher.ask(robot, ACTION, timeout_s, asked))
+    if picture and answer.outcome == "done":
+        await _add_picture(recording, dispatcher, answer)
+    return answer
+
+
+async def _add_picture(recording: Recording, dispatcher: Dispatcher, answer: RunAnswer) -> None:
+    """A screenshot beside the data; where there is none the answer says why."""
+    try:
+        shot = await dispatcher.ask(answer.robot, "screenshot", _PICTURE_WAIT_S, {"quality": 90})
+        if shot.outcome != "done":
+            answer.picture = {"missing": shot.error or shot.hint}
+            return
+        file = inside(recording.data_dir, str(cast("dict[str, Any]", shot.result)["path"]))
+        image, note = await to_thread.run_sync(load_picture, file)
+    except WebotsMCPError as error:
+        answer.picture = {"missing": str(error)}
+        return
+    answer.pictures.append(image.to_image_content())
+    answer.picture = {"file": str(file), "sim_time_s": shot.sim_time_s}
+    answer.picture |= {"note": note} if note else {}
+    answer.picture["see"] = "beside this answer; if your client drops it, webots_take_screenshot"

@@ -41,6 +41,7 @@ STDLIB = {
 }
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["store"] = STDLIB | {"store"}
+ALLOWED["trials"] = STDLIB | {"store", "trials"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
 ALLOWED["server"] = STDLIB | {"store", "plotting", "server", "__version__"}
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}

@@ -367,6 +367,38 @@ CREATE TABLE parameter_value (
 	CONSTRAINT fk_parameter_value_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 );
 CREATE INDEX ix_parameter_value_run_id_name_id ON parameter_value (run_id, name, id);
+CREATE TABLE trial_set (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	"plan" TEXT NOT NULL /* JSON object: what to try, for how long, and the score */, 
+	created_wall_time_s FLOAT NOT NULL, 
+	host TEXT /* of the process that works on it; null where none does */, 
+	pid INTEGER, 
+	process TEXT /* which process of that pid; null where the system does not tell */
+);
+CREATE UNIQUE INDEX ix_trial_set_uuid ON trial_set (uuid);
+CREATE TABLE trial (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	trial_set_id INTEGER NOT NULL, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	number INTEGER NOT NULL /* its place in the set, from 1 */, 
+	parameters TEXT NOT NULL /* JSON object */, 
+	status TEXT NOT NULL /* waiting, running, then done or failed */, 
+	run_id INTEGER, 
+	score FLOAT /* null unless it is done */, 
+	ended_by TEXT /* for_s or until: which of them was the end */, 
+	ended_sim_time_s FLOAT /* what came later does not count */, 
+	error TEXT /* why it failed */, 
+	started_wall_time_s FLOAT, 
+	finished_wall_time_s FLOAT, 
+	pid INTEGER /* of its simulator, while it runs */, 
+	process TEXT /* which process of that pid; null where the system does not tell */, 
+	CONSTRAINT fk_trial_trial_set_id FOREIGN KEY(trial_set_id) REFERENCES trial_set (id) ON DELETE CASCADE, 
+	CONSTRAINT fk_trial_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE SET NULL, 
+	CONSTRAINT uq_trial_trial_set_id UNIQUE (trial_set_id, number)
+);
+CREATE INDEX ix_trial_run_id ON trial (run_id);
+CREATE UNIQUE INDEX ix_trial_uuid ON trial (uuid);
 CREATE VIEW robot_parameter AS
 /* The values that parameters had in each run, each from a time on; true and false as text. */
 SELECT r.name AS robot, v.run_id, v.name,

@@ -3,8 +3,8 @@
 They are made from those of 10 s while the server maintains the database, also of older recordings.
 
 And parameters that a controller declares, and the values that they had in each run; breakpoints;
-how many of its publish() calls a session records. The views robot_now and robot_trajectory know all
-the names under which the tools look for a robot's position and mode.
+how many of its publish() calls a session records; trials. The views robot_now and robot_trajectory
+know all the names under which the tools look for a robot's position and mode.
 
 Revision ID: 0005
 Revises: 0004
@@ -37,6 +37,8 @@ NUMBERS = {
     "sines": "angles only: sum of sines",
     "cosines": "angles only: sum of cosines",
 }
+UUID = "random (version 4); names the row among those of all machines"
+PROCESS = "which process of that pid; null where the system does not tell"
 NOW_UTC = "strftime('%Y-%m-%d %H:%M:%f', v.wall_time_s, 'unixepoch')"
 ROBOT_PARAMETER = f"""
 CREATE VIEW robot_parameter AS
@@ -120,6 +122,8 @@ def upgrade() -> None:
     create_breakpoint()
     create_parameter()
     create_parameter_value()
+    create_trial_set()
+    create_trial()
     if op.get_context().dialect.name == "sqlite":
         op.get_bind().exec_driver_sql(ROBOT_PARAMETER.strip())
         for view in ("robot_now", "robot_trajectory"):
@@ -275,7 +279,69 @@ def create_breakpoint() -> None:
     op.create_index(op.f("ix_breakpoint_session_id"), "breakpoint", ["session_id"])
 
 
+def create_trial_set() -> None:
+    op.create_table(
+        "trial_set",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("uuid", sa.Text(), nullable=False, comment=UUID),
+        sa.Column(
+            "plan",
+            sa.Text(),
+            nullable=False,
+            comment="JSON object: what to try, for how long, and the score",
+        ),
+        sa.Column("created_wall_time_s", sa.Float(), nullable=False),
+        sa.Column(
+            "host", sa.Text(), comment="of the process that works on it; null where none does"
+        ),
+        sa.Column("pid", sa.Integer()),
+        sa.Column("process", sa.Text(), comment=PROCESS),
+        sa.PrimaryKeyConstraint("id"),
+        sqlite_autoincrement=True,
+    )
+    op.create_index(op.f("ix_trial_set_uuid"), "trial_set", ["uuid"], unique=True)
+
+
+def create_trial() -> None:
+    op.create_table(
+        "trial",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("trial_set_id", sa.Integer(), nullable=False),
+        sa.Column("uuid", sa.Text(), nullable=False, comment=UUID),
+        sa.Column("number", sa.Integer(), nullable=False, comment="its place in the set, from 1"),
+        sa.Column("parameters", sa.Text(), nullable=False, comment="JSON object"),
+        sa.Column(
+            "status", sa.Text(), nullable=False, comment="waiting, running, then done or failed"
+        ),
+        sa.Column("run_id", sa.Integer()),
+        sa.Column("score", sa.Float(), comment="null unless it is done"),
+        sa.Column("ended_by", sa.Text(), comment="for_s or until: which of them was the end"),
+        sa.Column("ended_sim_time_s", sa.Float(), comment="what came later does not count"),
+        sa.Column("error", sa.Text(), comment="why it failed"),
+        sa.Column("started_wall_time_s", sa.Float()),
+        sa.Column("finished_wall_time_s", sa.Float()),
+        sa.Column("pid", sa.Integer(), comment="of its simulator, while it runs"),
+        sa.Column("process", sa.Text(), comment=PROCESS),
+        sa.ForeignKeyConstraint(
+            ["trial_set_id"],
+            ["trial_set.id"],
+            name=op.f("fk_trial_trial_set_id"),
+            ondelete="CASCADE",
+        ),
+        sa.ForeignKeyConstraint(
+            ["run_id"], ["run.id"], name=op.f("fk_trial_run_id"), ondelete="SET NULL"
+        ),
+        sa.PrimaryKeyConstraint("id"),
+        sa.UniqueConstraint("trial_set_id", "number", name=op.f("uq_trial_trial_set_id")),
+        sqlite_autoincrement=True,
+    )
+    op.create_index(op.f("ix_trial_run_id"), "trial", ["run_id"])
+    op.create_index(op.f("ix_trial_uuid"), "trial", ["uuid"], unique=True)
+
+
 def downgrade() -> None:
+    op.drop_table("trial")
+    op.drop_table("trial_set")
     op.drop_table("breakpoint")
     op.drop_column("session", "throttle_interval")
     if op.get_context().dialect.name == "sqlite":

@@ -415,6 +415,46 @@ class ParameterValue(SQLModel, table=True):
     )
 
 
+class TrialSet(SQLModel, table=True):
+    """Runs with chosen parameters, each scored, of which the best is looked for."""
+
+    __tablename__: ClassVar[Any] = "trial_set"
+    __table_args__ = (Index(None, "uuid", unique=True), _KEEP_IDS)
+    id: int | None = _id()
+    uuid: str = _text(_UUID, nullable=False)
+    plan: str = _text("JSON object: what to try, for how long, and the score", nullable=False)
+    created_wall_time_s: float = _number(nullable=False)
+    host: str | None = _text("of the process that works on it; null where none does")
+    pid: int | None = _column(Integer)
+    process: str | None = _text("which process of that pid; null where the system does not tell")
+
+
+class Trial(SQLModel, table=True):
+    """One run of a trial set, before, while and after it happens."""
+
+    __table_args__ = (
+        UniqueConstraint("trial_set_id", "number"),
+        Index(None, "run_id"),
+        Index(None, "uuid", unique=True),
+        _KEEP_IDS,
+    )
+    id: int | None = _id()
+    trial_set_id: int = _to("trial_set")
+    uuid: str = _text(_UUID, nullable=False)
+    number: int = _column(Integer, "its place in the set, from 1", nullable=False)
+    parameters: str = _text("JSON object", nullable=False)
+    status: str = _text("waiting, running, then done or failed", nullable=False)
+    run_id: int | None = _to("run", nullable=True)
+    score: float | None = _number("null unless it is done")
+    ended_by: str | None = _text("for_s or until: which of them was the end")
+    ended_sim_time_s: float | None = _number("what came later does not count")
+    error: str | None = _text("why it failed")
+    started_wall_time_s: float | None = _number()
+    finished_wall_time_s: float | None = _number()
+    pid: int | None = _column(Integer, "of its simulator, while it runs")
+    process: str | None = _text("which process of that pid; null where the system does not tell")
+
+
 class Lease(SQLModel, table=True):
     """Who alone may do a job (today: `maintainer`) until when."""
 

@@ -49,7 +49,18 @@ def chance_of(
     variance = max(squares / freedom, least_variance) * (1 / len(first) + 1 / len(other))
     if math.isclose(apart, 0, abs_tol=1e-9 * max(map(abs, (*first, *other)))):
         return 1.0
-    return _student_tail(apart / math.sqrt(variance), freedom) if variance > 0 else 0.0
+    return chance_beyond(apart, variance, freedom)
+
+
+def chance_beyond(apart: float, variance: float, freedom: int) -> float:
+    """How often chance alone makes a difference this large, of a known variance: Student's t.
+
+    Args:
+        apart: The difference, 0 or more.
+        variance: That of such differences, as far as so many degrees of freedom tell it.
+        freedom: 1 or more.
+    """
+    return _student_tail(apart / math.sqrt(variance), freedom) if variance > 0 else float(not apart)
 
 
 def verdicts_on(

@@ -1,0 +1,148 @@
+"""A recording takes in another one: once, whole, and without what is still going on."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.recordings.runs import Recorded
+from webots_mcp.connection import connect
+from webots_mcp.contract import new_uuid
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.schema import create_schema
+from webots_mcp.store.merging import merge
+from webots_mcp.store.rollup.rolling import roll
+
+TABLES = ("session", "run", "state", "log", "event", "image", "parameter_value", "command")
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    """Two sessions of one run each, with pictures, commands and parameters."""
+    folder = tmp_path / "there"
+    folder.mkdir()
+    with closing(connect(folder / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+        recorded = Recorded(connection, folder)
+        recorded.add_run(10)
+        recorded.add_run(6)
+        for table in ("session", "run"):
+            for (key,) in connection.execute(f"SELECT id FROM {table}").fetchall():
+                connection.execute(f"UPDATE {table} SET uuid = ? WHERE id = ?", (new_uuid(), key))
+        connection.execute("UPDATE parameter_value SET command_id = 2 WHERE run_id = 2")
+    return folder / "webots.db"
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Iterator[sqlite3.Connection]:
+    """With a run of its own."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    with closing(connect(folder / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+        Recorded(connection, folder).add_run(3)
+        yield connection
+
+
+def counts(connection: sqlite3.Connection) -> dict[str, int]:
+    return {
+        table: connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0] for table in TABLES
+    }
+
+
+def of_run(connection: sqlite3.Connection, run_id: int) -> list[Any]:
+    wanted = "sim_time_s, wall_time_s"
+    tables = {"state": "data", "log": "message", "event": "kind", "parameter_value": "value"}
+    return [
+        connection.execute(
+            f"SELECT {wanted}, {column} FROM {table} WHERE run_id = ? ORDER BY id", (run_id,)
+        ).fetchall()
+        for table, column in tables.items()
+    ]
+
+
+def test_all_of_a_recording_comes_in_and_comes_in_once(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    merged = merge(target, tmp_path / "here", source)
+    after = counts(target)
+
+    assert list(merged.values()) == [2, 3]
+    with closing(connect(source, "reader")) as there:
+        assert [of_run(target, run_id) for run_id in (2, 3)] == [of_run(there, 1), of_run(there, 2)]
+    assert merge(target, tmp_path / "here", source) == merged
+    assert counts(target) == after
+    (command,) = target.execute(
+        "SELECT command_id FROM parameter_value WHERE run_id = 3"
+    ).fetchone()
+    assert target.execute("SELECT session_id FROM command WHERE id = ?", (command,)).fetchone() == (
+        target.execute("SELECT session_id FROM run WHERE id = 3").fetchone()
+    )
+    for (path,) in target.execute("SELECT path FROM image WHERE run_id > 1").fetchall():
+        assert (tmp_path / "here" / path).read_bytes() == b"picture"
+
+
+def test_its_rows_are_rolled_up_here(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    assert roll(target, 100_000).done
+    merge(target, tmp_path / "here", source)
+
+    assert roll(target, 100_000).done
+    rolled = (
+        "SELECT sum(a.rows) FROM all_rollup a JOIN signal s ON s.id = a.signal_id "
+        "WHERE s.name = 'x' AND a.run_id = 2"
+    )
+    assert target.execute(rolled).fetchone() == (10,)
+
+
+def test_what_broke_off_is_not_there_at_all(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    before = counts(target)
+    target.execute(
+        "CREATE TEMP TRIGGER full BEFORE INSERT ON main.image "
+        "BEGIN SELECT raise(ABORT, 'the disk is full'); END"
+    )
+    with pytest.raises(sqlite3.Error, match="the disk is full"):
+        merge(target, tmp_path / "here", source)
+    assert counts(target) == before
+
+    target.execute("DROP TRIGGER full")
+    assert len(merge(target, tmp_path / "here", source)) == 2
+
+
+def test_a_robot_that_records_here_just_now_keeps_its_name_for_itself(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    target.execute("UPDATE session SET ended_wall_time_s = NULL")
+
+    merge(target, tmp_path / "here", source)
+
+    robots = "SELECT DISTINCT name FROM robot JOIN run ON robot_id = robot.id WHERE run.id > 1"
+    assert target.execute(robots).fetchall() == [("rover#2",)]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ("UPDATE session SET ended_wall_time_s = NULL WHERE id = 2", "still records"),
+        ("UPDATE run SET purged_rows = 3 WHERE id = 1", "purged rows"),
+    ],
+)
+def test_what_goes_on_or_is_purged_is_refused(
+    target: sqlite3.Connection, source: Path, tmp_path: Path, change: str, said: str
+) -> None:
+    with closing(connect(source, "writer")) as there:
+        there.execute(change)
+    before = counts(target)
+
+    with pytest.raises(InvalidInputError, match=said):
+        merge(target, tmp_path / "here", source)
+
+    assert counts(target) == before

@@ -1,0 +1,74 @@
+"""A Webots project with a robot whose speed is a parameter, and plans to try."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from webots_mcp.standin.in_process import DEFAULT_WORLD
+
+# It drives off a table at speed 3, and ends by itself at speed 4.
+CONTROLLER = """
+import os
+from controller import Supervisor
+from webots_mcp import MCPBridge
+
+robot = Supervisor()
+bridge = MCPBridge(robot, throttle_interval=1)
+speed = bridge.parameter("speed", 1.0, low=0.0, high=10.0)
+x = 0.0
+while robot.step(16) != -1:
+    x += 0.016 * speed.value
+    bridge.publish({"x": x, "on_table": x < 20})
+    bridge.get_command()
+    if speed.value == 3.0 and x > 1.0:
+        os._exit(1)
+    if speed.value == 4.0 and x > 1.0:
+        break
+"""
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """With a data folder `data` in it."""
+    (tmp_path / "worlds").mkdir()
+    (tmp_path / "controllers" / "rover").mkdir(parents=True)
+    shutil.copy(DEFAULT_WORLD, tmp_path / "worlds" / "table.wbt")
+    (tmp_path / "controllers" / "rover" / "rover.py").write_text(CONTROLLER)
+    return tmp_path
+
+
+@pytest.fixture
+def plan(project: Path) -> Callable[[str], Path]:
+    """Write a plan for the project's world."""
+
+    def write(text: str) -> Path:
+        file = project / "plan.toml"
+        file.write_text(f'world = "worlds/table.wbt"\n{text}')
+        return file
+
+    return write
+
+
+def command(project: Path, *options: str) -> list[str]:
+    program = [sys.executable, "-m", "webots_mcp", "trials", str(project / "plan.toml")]
+    return [*program, "--stand-in", "--data-dir", str(project / "data"), *options]
+
+
+@pytest.fixture
+def run(project: Path) -> Run:
+    """Run the plan on the stand-in."""
+
+    def run_plan(*options: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            command(project, *options), capture_output=True, text=True, timeout=120, check=False
+        )
+
+    return run_plan

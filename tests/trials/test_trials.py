@@ -1,0 +1,188 @@
+"""Trials from the shell, with real simulators and controllers."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import sqlite3
+import subprocess
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.trials.conftest import Run, command
+from webots_mcp.liveness import process_identity
+from webots_mcp.trials.plan import read_plan
+
+Plan = Callable[[str], Path]
+
+
+def rows(project: Path, sql: str) -> list[Any]:
+    with closing(sqlite3.connect(project / "data" / "webots.db")) as connection:
+        return connection.execute(sql).fetchall()
+
+
+def test_sets_are_tried_scored_ranked_and_their_runs_kept(
+    project: Path, plan: Plan, run: Run
+) -> None:
+    plan('score = "last(x)"\nfor_s = 2\nrepeats = 2\n[grid]\nspeed = [1.0, 2.0, 3.0]')
+
+    answer = json.loads(run("--jobs", "2", "--json").stdout)
+
+    best, next_, crashed = answer["sets"]
+    assert [each["parameters"]["speed"] for each in answer["sets"]] == [2.0, 1.0, 3.0]
+    assert best["scores"] == [pytest.approx(4.0, abs=0.05)] * 2
+    assert next_["score"]["median"] == pytest.approx(2.0, abs=0.05)
+    assert len(crashed["failures"]) == 2
+    assert "never reached its end, but 0.3" in crashed["failures"][0]
+    assert answer["better"]
+    runs = rows(
+        project,
+        "SELECT t.number, r.label, p.value, t.ended_by, t.ended_sim_time_s, t.pid FROM trial t "
+        "JOIN run r ON r.id = t.run_id JOIN parameter_value p ON p.run_id = r.id ORDER BY t.number",
+    )
+    assert runs[0] == (1, "trial 1 of set 1: speed 1.0", "1.0", "for_s", 2.0, None)
+    assert [value for _, _, value, *_ in runs] == ["1.0", "2.0", "3.0"] * 2
+    assert list((project / "data" / "trials").iterdir()) == []
+
+
+def test_a_trial_ends_at_the_very_state_in_which_the_condition_holds(
+    project: Path, plan: Plan, run: Run
+) -> None:
+    plan('score = "duration"\nuntil = "x > 1"\nbest = "lowest"\n[[parameters]]\nspeed = 2.0')
+
+    answer = json.loads(run("--json").stdout)
+
+    (only,) = answer["sets"]
+    assert only["scores"] == [pytest.approx(0.512)] * 2  # one set is tried twice nevertheless
+    assert rows(project, "SELECT DISTINCT ended_by FROM trial") == [("until",)]
+
+
+def test_a_finished_plan_is_only_shown_and_again_begins_anew(
+    project: Path, plan: Plan, run: Run
+) -> None:
+    plan('score = "max(x)"\nfor_s = 0.5\n[grid]\nspeed = [1.0]')
+
+    first, shown, again = run(), run(), run("--again")
+
+    assert first.stdout == shown.stdout
+    assert "2 of 2 trials were done before" in shown.stderr
+    assert "note: one parameter set" in shown.stdout
+    assert "trial set 2" in again.stdout
+    assert rows(project, "SELECT count(*) FROM run") == [(4,)]
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
+def test_who_is_ended_in_the_middle_is_gone_on_from(
+    project: Path, plan: Plan, run: Run, number: int
+) -> None:
+    plan('score = "last(x)"\nfor_s = 3\nrepeats = 2\n[grid]\nspeed = [1.0, 2.0]')
+    process = subprocess.Popen(
+        command(project), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    pid = _second_simulator(project)
+    process.send_signal(number)
+    _, said = process.communicate(timeout=30)
+
+    if number == signal.SIGINT:
+        assert process.returncode == 130
+        assert said.endswith("ended by Ctrl-C\n")
+        assert rows(project, "SELECT status FROM trial WHERE number = 2") == [("waiting",)]
+        assert process_identity(pid) is None
+    answer = json.loads(run("--json").stdout)
+
+    assert process_identity(pid) is None
+    assert [len(each["scores"]) for each in answer["sets"]] == [2, 2]
+    assert rows(project, "SELECT count(*), count(DISTINCT uuid) FROM run") == [(4, 4)]
+    assert rows(project, "SELECT count(*) FROM trial_set") == [(1,)]
+
+
+def _second_simulator(project: Path) -> int:
+    """The process of the second trial's simulator, once it runs."""
+    sql = "SELECT pid FROM trial WHERE number = 2 AND status = 'running'"
+    until_s = time.monotonic() + 60
+    while time.monotonic() < until_s:
+        with_tables = "SELECT 1 FROM sqlite_master WHERE name = 'trial'"
+        if (project / "data" / "webots.db").exists() and rows(project, with_tables):
+            found = rows(project, sql)
+            if found:
+                return int(found[0][0])
+        time.sleep(0.01)
+    raise TimeoutError("the second trial did not begin")
+
+
+def test_what_no_trial_can_have_ends_all_of_them_with_a_sentence(plan: Plan, run: Run) -> None:
+    plan('score = "last(x)"\nfor_s = 0.2\n[grid]\nsped = [1.0, 2.0]')
+    refused = run()
+    assert refused.returncode == 2
+    assert "the controller declares no parameter 'sped': it declares speed" in refused.stderr
+
+    plan('score = "1 + last(y)"\nfor_s = 0.2\n[grid]\nspeed = [1.0, 2.0]')
+    refused = run()
+    assert refused.returncode == 2
+    assert "score '1 + last(y)', column 10: no signal 'y' is recorded" in refused.stderr
+
+
+def test_a_value_that_was_not_taken_is_a_failure_and_not_a_score(plan: Plan, run: Run) -> None:
+    plan('score = "last(x)"\nfor_s = 0.2\n[grid]\nspeed = [11.0]')
+
+    answer = json.loads(run("--json").stdout)
+
+    assert answer["sets"][0]["scores"] == []
+    assert "speed=11.0 was not taken (from 0.0 to 10.0)" in answer["sets"][0]["failures"][0]
+
+
+def test_two_cannot_work_on_one_set(project: Path, plan: Plan, run: Run) -> None:
+    plan('score = "last(x)"\nuntil = "x > 1e6"\n[grid]\nspeed = [1.0, 2.0]')
+    process = subprocess.Popen(command(project, "--jobs", "2"), stderr=subprocess.DEVNULL)
+    try:
+        _second_simulator(project)
+        refused = run()
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(30)
+
+    assert refused.returncode == 2
+    assert f"process {process.pid} on " in refused.stderr
+
+
+def test_the_example_tries_five_speeds_three_times() -> None:
+    plan = read_plan(Path(__file__).parents[2] / "examples" / "trials" / "speed.toml")
+
+    assert len(plan.trials) == 15
+    assert len({each["speed"] for each in plan.trials}) == 5
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('score = "last(x)"\n[grid]\nspeed = [1.0]', "give for_s, until or both"),
+        ('for_s = 1\n[grid]\nspeed = [1.0]', "score is missing"),
+        ('score = "last(x)"\nfor_s = 1', "parameters is missing: give a .grid."),
+        ('score = "last(x)"\nfor_s = 1\n[grid]\nspeed = 1.0', "must be an array of values"),
+        ('score = "last(x"\nfor_s = 1\n[grid]\nspeed = [1.0]', "column 5: '(' was never closed"),
+        ('score = "x"\nfor_s = 1\n[grid]\nspeed = [1.0]', "a signal has a value in each state"),
+        ('score = "last(x)"\nfor_s = -1\n[grid]\nspeed = [1.0]', "for_s=-1 must be a number"),
+        ('score = "last(x)"\nfor_s = "1"\n[grid]\nspeed = [1.0]', "for_s='1' is a str"),
+        ('score = "last(x)"\nfors = 1\n[grid]\nspeed = [1.0]', "unknown 'fors'; there is for_s"),
+        ('score = "last(x)"\nfor_s = 1\n[grid]\nspeed = [1.0, 1.0]', "given twice: use repeats"),
+        ('score = "last(x)"\nfor_s = 1\nbest = "most"\n[grid]\nspeed = [1]', "highest, lowest"),
+        ("score = ", "is no TOML"),
+    ],
+)  # fmt: skip
+def test_a_plan_that_is_none_is_refused_before_anything_is_written(
+    project: Path, plan: Plan, run: Run, text: str, said: str
+) -> None:
+    plan(text)
+
+    refused = run()
+
+    assert (refused.returncode, refused.stdout) == (2, "")
+    assert said.replace(".grid.", "[grid]") in refused.stderr
+    assert not (project / "data").exists()

@@ -1,0 +1,126 @@
+"""Trials of a plan file, each in a simulator of its own."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from webots_mcp.cli.command import (
+    DATA_DIR,
+    DATABASE,
+    JSON,
+    argument,
+    command,
+    count,
+    open_recording,
+)
+from webots_mcp.cli.tables import print_notes, print_table, text_of
+
+if TYPE_CHECKING:
+    from webots_mcp.store.analysis.ranking import Ranking
+    from webots_mcp.store.recording import Recording
+    from webots_mcp.store.trials import Result, Trial
+    from webots_mcp.trials.plan import Plan
+
+
+@command(
+    "trials", DATA_DIR, DATABASE, JSON,
+    argument("plan", metavar="PLAN", help="a .toml file: see docs/trials.md"),
+    count("--jobs", "at most N trials at once, each in a simulator of its own", default=1,
+          dest="jobs"),
+    argument("--stand-in", action="store_true", help="on the stand-in instead of Webots"),
+    argument("--again", action="store_true",
+             help="from the start, also where all trials of the plan are done"),
+)  # fmt: skip
+def trials(arguments: argparse.Namespace) -> None:
+    """Try sets of parameters in runs of their own, score each run, and rank the sets.
+
+    Each trial runs in a simulator and a data folder of its own; what it recorded is merged into
+    the recording, where its run can be looked at like any other.
+
+    Ended by Ctrl-C or killed, the same command goes on with what is left.
+    """
+    from webots_mcp.trials.plan import read_plan
+    from webots_mcp.trials.runner import Workshop, run_trials
+    from webots_mcp.trials.simulators import stand_in, webots
+
+    plan = read_plan(Path(arguments.plan))
+    command_of = stand_in if arguments.stand_in else webots
+    command_of(plan.world)  # before anything is written: is there such a program?
+    recording = replace(open_recording(arguments), read_only=False)
+    recording.create()
+    set_id = _set_of(recording, plan, arguments)
+    workshop = Workshop(recording, plan, command_of, threading.Event())
+    run_trials(workshop, set_id, arguments.jobs, _Progress(recording, set_id).tell)
+    _show(recording, set_id, plan, as_json=arguments.json)
+
+
+def _set_of(recording: Recording, plan: Plan, arguments: argparse.Namespace) -> int:
+    """The set that was begun with this plan, or a new one."""
+    from webots_mcp.store.trials import create_trial_set, find_trial_set
+
+    text = json.dumps({"stand_in": arguments.stand_in, **json.loads(plan.text)}, sort_keys=True)
+    with recording.writer() as connection:
+        known = None if arguments.again else find_trial_set(connection, text)
+        return known or create_trial_set(connection, text, plan.trials)
+
+
+class _Progress:
+    """A line on stderr for each trial that is over."""
+
+    def __init__(self, recording: Recording, set_id: int) -> None:
+        from webots_mcp.store.trials import trials_of
+
+        with recording.reader() as connection:
+            known = trials_of(connection, set_id)
+        self._of, self._over = len(known), sum(each.is_over for each in known)
+        if self._over:
+            print(f"trial set {set_id}: {self._over} of {self._of} trials were done before",
+                  file=sys.stderr)  # fmt: skip
+
+    def tell(self, trial: Trial, result: Result) -> None:
+        """That a trial is over, and what came of it."""
+        self._over += 1
+        came = (
+            f"failed: {result.error}" if result.score is None else f"score {text_of(result.score)}"
+        )
+        said = f"{self._over}/{self._of}  {text_of(trial.values)}: {came}"
+        print(said, file=sys.stderr, flush=True)
+
+
+def _show(recording: Recording, set_id: int, plan: Plan, *, as_json: bool) -> None:
+    from webots_mcp.store.trials import ranking_of, trials_of
+
+    with recording.reader() as connection:
+        found = trials_of(connection, set_id)
+    ranking = ranking_of(found, plan.best)
+    runs = {each.number: each.run_id for each in found}
+    if as_json:
+        print(json.dumps({"trial_set_id": set_id, **_as_json(ranking), "runs": runs}))
+        return
+    print_table(
+        ("rank", "parameters", "median", "least", "greatest", "scores", "failed", "why"),
+        [_row(number, each) for number, each in enumerate(ranking.sets, 1)],
+    )
+    ids = [each.run_id for each in found if each.run_id is not None]
+    where = f"runs {min(ids)} to {max(ids)}" if ids else "no run was recorded"
+    print_notes([ranking.verdict, f"trial set {set_id}, {where}; score: {plan.score}"])
+
+
+def _row(number: int, ranked: Any) -> list[Any]:
+    spread = ranked.score or (None, None, None)
+    failures = ranked.failures
+    return [number, ranked.parameters, *spread, len(ranked.scores), len(failures) or None,
+            failures[0] if failures else None]  # fmt: skip
+
+
+def _as_json(ranking: Ranking) -> dict[str, Any]:
+    sets = [
+        {**each._asdict(), "score": each.score and each.score._asdict()} for each in ranking.sets
+    ]
+    return {**ranking._asdict(), "sets": sets, "noise": ranking.noise._asdict()}

@@ -1,0 +1,278 @@
+"""Runs the trials of a set, each in a simulator of its own, and merges what they recorded.
+
+Whoever works on a set may be killed at any moment: the next one ends its simulators, scores a trial
+that had come to its end from its recording, and runs any other again.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+import threading
+import time
+from collections.abc import Callable, Generator
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+from webots_mcp.adoption import adopt
+from webots_mcp.contract import (
+    DATA_DIR_VARIABLE,
+    DATABASE_NAME,
+    PARAMETERS_VARIABLE,
+    make_folder,
+)
+from webots_mcp.errors import (
+    ConditionFailedError,
+    NoDatabaseError,
+)
+from webots_mcp.settlement import settle
+from webots_mcp.store.merging import merge
+from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.questions.score import score_run
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.trials import (
+    Result,
+    Trial,
+    begin_trial,
+    finish_trial,
+    lay_down,
+    put_back,
+    take_up,
+    trials_of,
+)
+from webots_mcp.trials.plan import Plan
+from webots_mcp.trials.simulators import Simulator, end_left_over
+from webots_mcp.trials.watching import End, Watch
+
+FOLDER: Final = "trials"
+_LOOK_EVERY_S: Final = 0.05
+_PATIENCE_S: Final = 0.5  # between two looks at whether somebody wants to stop
+
+Command = Callable[[str], list[str]]
+Told = Callable[[Trial, Result], object]
+
+
+class StoppedError(Exception):
+    """Somebody wants the trials to stop."""
+
+
+@dataclass(frozen=True)
+class Workshop:
+    """Where and how trials are run.
+
+    Attributes:
+        recording: Takes in what they record.
+        plan: What is tried.
+        command: Of a world's simulator.
+        stopping: Once it is set, running trials end soon and wait to be run again.
+    """
+
+    recording: Recording
+    plan: Plan
+    command: Command
+    stopping: threading.Event
+
+    def folder(self, trial: Trial) -> Path:
+        """The data folder of a trial."""
+        return self.recording.data_dir / FOLDER / trial.uuid
+
+
+def run_trials(workshop: Workshop, set_id: int, jobs: int, told: Told) -> None:
+    """Run the trials of a set that are not over.
+
+    Args:
+        workshop: Where and how.
+        set_id: The set.
+        jobs: How many at once.
+        told: Is called in this thread with each trial that is over.
+
+    Raises:
+        CommandRefusedError: Another process works on the set.
+        InvalidInputError: No trial of the set can succeed; nothing else is tried.
+        KeyboardInterrupt: As it came; what ran waits to be run again.
+    """
+    with _at_work(workshop, set_id):
+        with workshop.recording.reader() as connection:
+            trials = trials_of(connection, set_id)
+        for trial in trials:
+            if trial.is_over:
+                shutil.rmtree(workshop.folder(trial), ignore_errors=True)
+        left = [trial for trial in trials if not trial.is_over]
+        with ThreadPoolExecutor(jobs) as pool:
+            running = {pool.submit(run_trial, workshop, trial): trial for trial in left}
+            try:
+                _gather(running, told)
+            finally:
+                workshop.stopping.set()
+                for future in running:
+                    future.cancel()
+
+
+@contextmanager
+def _at_work(workshop: Workshop, set_id: int) -> Generator[None]:
+    with workshop.recording.writer() as connection:
+        take_up(connection, set_id)
+    try:
+        yield
+    finally:
+        with workshop.recording.writer() as connection:
+            lay_down(connection, set_id)
+
+
+def _gather(running: dict[Future[Result], Trial], told: Told) -> None:
+    left = set(running)
+    while left:
+        over, left = wait(left, _PATIENCE_S, FIRST_COMPLETED)
+        for future in over:
+            told(running[future], future.result())
+
+
+def run_trial(workshop: Workshop, trial: Trial) -> Result:
+    """Run one trial, or only score and merge it where it has run to its end already.
+
+    Raises:
+        StoppedError: It waits to be run again.
+        InvalidInputError: No trial of the set can succeed.
+    """
+    folder = workshop.folder(trial)
+    result = None
+    if trial.status == "running":
+        if trial.pid is not None and trial.started_wall_time_s is not None:
+            end_left_over(trial.pid, trial.process, trial.started_wall_time_s)
+        result = _recorded_result(workshop, trial)
+    if result is None:
+        result = _run(workshop, trial)
+    with workshop.recording.writer() as connection:
+        if result.run_id is not None:
+            merged = merge(connection, workshop.recording.data_dir, folder / DATABASE_NAME)
+            result = _with_run(result, merged, folder)
+        finish_trial(connection, trial, result)
+    shutil.rmtree(folder, ignore_errors=True)
+    return result
+
+
+def _with_run(result: Result, merged: dict[str, int], folder: Path) -> Result:
+    """With the id that its run has where it was merged."""
+    with Recording(folder / DATABASE_NAME, folder).reader() as connection:
+        row = connection.execute("SELECT uuid FROM run WHERE id = ?", (result.run_id,)).fetchone()
+    return replace(result, run_id=merged[row[0]])
+
+
+def _recorded_result(workshop: Workshop, trial: Trial) -> Result | None:
+    """Of a trial whose end was recorded before somebody was killed."""
+    watch = Watch(workshop.plan)
+    recording = _settled(workshop.folder(trial))
+    if recording is None:
+        return None
+    with recording.reader() as connection:
+        end = watch.look(connection)
+        return _scored(connection, workshop.plan, trial, watch, end) if end else None
+
+
+def _run(workshop: Workshop, trial: Trial) -> Result:
+    folder, plan = workshop.folder(trial), workshop.plan
+    shutil.rmtree(folder, ignore_errors=True)
+    make_folder(folder)
+    if workshop.stopping.is_set():
+        raise StoppedError
+    parameters = {plan.robot: trial.values} if plan.robot else trial.values
+    environment = {
+        DATA_DIR_VARIABLE: str(folder),
+        PARAMETERS_VARIABLE: json.dumps(parameters),
+    }
+    simulator = Simulator(workshop.command(plan.world), folder, environment)
+    watch = Watch(plan)
+    try:
+        with workshop.recording.writer() as connection:
+            begin_trial(connection, trial, simulator.pid)
+        end, why = _watched(workshop, watch, simulator, folder)
+    except BaseException:
+        simulator.end()
+        with workshop.recording.writer() as connection:
+            put_back(connection, trial)
+        raise
+    simulator.end()
+    return _concluded(folder, plan, trial, watch, end, why)
+
+
+def _watched(
+    workshop: Workshop, watch: Watch, simulator: Simulator, folder: Path
+) -> tuple[End | None, str]:
+    """Until the trial is over; the end that it reached, or why it reached none."""
+    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    until_s = time.monotonic() + workshop.plan.timeout_s
+    while True:
+        over = simulator.is_over  # before the look: what came last is seen
+        try:
+            with recording.reader() as connection:
+                end = watch.look(connection)
+        except NoDatabaseError:
+            end = None
+        except ConditionFailedError as error:
+            return None, str(error)
+        if end is not None:
+            return end, ""
+        if over:
+            return None, f"its simulator ended ({simulator.last_line()})"
+        if time.monotonic() > until_s:
+            return None, f"it took longer than {workshop.plan.timeout_s:g} s of wall time"
+        if workshop.stopping.wait(_LOOK_EVERY_S):
+            raise StoppedError
+        ended = _ended(recording, watch)
+        if ended is not None:
+            return None, ended
+
+
+def _ended(recording: Recording, watch: Watch) -> str | None:
+    """Why the run cannot go on: its controller's process is gone."""
+    if watch.run_id is None:
+        return None
+    with recording.reader() as connection:
+        reason = run_info(connection, watch.run_id).end_reason
+        if reason is None or watch.look(connection) is not None:
+            return None
+    return f"its run ended ({reason})"
+
+
+def _concluded(
+    folder: Path, plan: Plan, trial: Trial, watch: Watch, end: End | None, why: str
+) -> Result:
+    recording = _settled(folder)
+    if recording is None:
+        said = "the controller recorded nothing in its data folder: does it name another one?"
+        return Result(None, None, f"{why}; {said}" if why else said)
+    with recording.reader() as connection:
+        end = end or watch.look(connection)  # what waited beside the database is in it now
+        if end is not None:
+            return _scored(connection, plan, trial, watch, end)
+    reached = "nothing" if watch.reached_s is None else f"{watch.reached_s:.3f} s"
+    return Result(watch.run_id, None, f"never reached its end, but {reached}: {why}")
+
+
+def _scored(
+    connection: sqlite3.Connection, plan: Plan, trial: Trial, watch: Watch, end: End
+) -> Result:
+    assert watch.run_id is not None  # it has an end
+    ended: tuple[Any, Any] = (end.by, end.sim_time_s)
+    try:
+        watch.require_parameters(connection, trial.values)
+    except ValueError as error:
+        return Result(watch.run_id, None, str(error), *ended)
+    scored = score_run(connection, watch.run_id, plan.score, end_s=end.sim_time_s)
+    return Result(watch.run_id, scored.value, scored.why, *ended)
+
+
+def _settled(folder: Path) -> Recording | None:
+    """The recording of a trial whose processes are gone, with all that waited beside it."""
+    recording = Recording(folder / DATABASE_NAME, folder)
+    try:
+        with recording.writer() as connection:
+            adopt(connection, folder / DATABASE_NAME)
+            settle(connection, time.time())
+    except NoDatabaseError:
+        return None
+    return recording

@@ -1,0 +1,111 @@
+"""Where a trial ends, as its recording tells: when the condition holds, or the time is over."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from typing import Any, Final, Literal, NamedTuple
+
+from webots_mcp.conditions import Evaluator, parse_condition
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.signals.flatten import parse
+from webots_mcp.trials.plan import Plan
+
+_SAME_TIME_S: Final = 1e-6
+_ROBOTS: Final = "SELECT id, name FROM robot ORDER BY id"
+_FIRST_RUN: Final = "SELECT id, started_sim_time_s FROM run WHERE robot_id = ? ORDER BY id LIMIT 1"
+_NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"
+_ROWS: Final = "SELECT id, sim_time_s, data FROM state WHERE run_id = ? AND id > ? ORDER BY id"
+_START_VALUES: Final = (
+    "SELECT name, value FROM parameter_value WHERE run_id = ? AND id IN "
+    "(SELECT min(id) FROM parameter_value WHERE run_id = ? GROUP BY name)"
+)
+_DECLARED: Final = "SELECT name, low, high, choices FROM parameter WHERE robot_id = ?"
+
+
+class End(NamedTuple):
+    """The simulation time at which a trial was over, and by what."""
+
+    sim_time_s: float
+    by: Literal["for_s", "until"]
+
+
+class Watch:
+    """Follows the recording of one trial."""
+
+    def __init__(self, plan: Plan) -> None:
+        self._plan = plan
+        self._last_id = 0
+        self._evaluator: Evaluator | None = None
+        if plan.until is not None:
+            self._evaluator = parse_condition(plan.until).evaluator()
+        self.robot_id: int | None = None
+        self.run_id: int | None = None
+        self.reached_s: float | None = None
+        self._started_s = 0.0
+
+    def look(self, connection: sqlite3.Connection) -> End | None:
+        """Its end, as far as it is recorded; None before.
+
+        Raises:
+            InvalidInputError: Nobody can tell which robot is meant, or its controller does not
+                have the parameters that are to be tried.
+            ConditionFailedError: `until` cannot be asked of the signals.
+        """
+        if self.run_id is None and not self._find_run(connection):
+            return None
+        self.reached_s = connection.execute(_NEWEST, (self.run_id,)).fetchone()[0]
+        if self._evaluator is None:
+            return self._by_time(self.reached_s)
+        for row_id, sim_time_s, data in connection.execute(_ROWS, (self.run_id, self._last_id)):
+            self._last_id = row_id
+            if (end := self._by_time(sim_time_s)) and sim_time_s > end.sim_time_s + _SAME_TIME_S:
+                return end
+            if self._evaluator.holds(parse(data), sim_time_s):
+                return End(sim_time_s, "until")
+        return self._by_time(self.reached_s)
+
+    def require_parameters(self, connection: sqlite3.Connection, wanted: dict[str, Any]) -> None:
+        """See that the run began with the values that it should have begun with.
+
+        Raises:
+            InvalidInputError: The controller has not declared one.
+            ValueError: It did not take one.
+        """
+        if self.run_id is None:
+            return
+        taken = dict(connection.execute(_START_VALUES, (self.run_id, self.run_id)).fetchall())
+        declared = {row[0]: row[1:] for row in connection.execute(_DECLARED, (self.robot_id,))}
+        for name, value in wanted.items():
+            if name not in taken:
+                known = ", ".join(sorted(declared)) or "none"
+                raise InvalidInputError(
+                    f"the controller declares no parameter {name!r}: it declares {known}; see "
+                    "bridge.parameter() in docs/trials.md"
+                )
+            if json.loads(taken[name]) != value:
+                low, high, choices = declared.get(name, (None, None, None))
+                allowed = f"choices {choices}" if choices else f"from {low} to {high}"
+                raise ValueError(
+                    f"{name}={value!r} was not taken ({allowed}); it ran with {taken[name]}"
+                )
+
+    def _by_time(self, sim_time_s: float | None) -> End | None:
+        if self._plan.for_s is None or sim_time_s is None:
+            return None
+        end_s = self._started_s + self._plan.for_s
+        return End(end_s, "for_s") if sim_time_s >= end_s - _SAME_TIME_S else None
+
+    def _find_run(self, connection: sqlite3.Connection) -> bool:
+        robots = connection.execute(_ROBOTS).fetchall()
+        wanted = self._plan.robot
+        chosen = [row for row in robots if wanted in (None, row[1])]
+        if wanted is None and len(robots) > 1:
+            names = ", ".join(name for _, name in robots)
+            raise InvalidInputError(f"several robots record ({names}): name one as robot = '...'")
+        for robot_id, _ in chosen:
+            row = connection.execute(_FIRST_RUN, (robot_id,)).fetchone()
+            if row is not None:
+                self.robot_id = robot_id
+                self.run_id, self._started_s = row
+        return self.run_id is not None

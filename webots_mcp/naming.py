@@ -18,6 +18,14 @@ INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
 FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer of 400 digits)
 
 _BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
+# Words of what is no place, or the place of something else.
+_ELSEWHERE: Final = frozenset((
+    "accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass",
+    "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed",
+    "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired",
+    "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel",
+    "reference", "setpoint", "target", "waypoint",
+))  # fmt: skip
 _AXES: Final = (("0", "1"), ("x", "y"), ("x_m", "y_m"))
 _MODES: Final = ("mode", "behaviour", "behavior", "action", "task", "phase")
 _STATES: Final = ("state", "status")  # of anything, often of an arm
@@ -84,10 +92,12 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
     """The names of a robot's x and y in metres, among those of its numbers; None without any.
 
     It is what is called `pose`, `position`, `pos`, `gps`, `odometry`, `odom` or `location` (in
-    this order), or `x` and `y` at the top, or else the first branch by name that has an x and y.
-    The views robot_now and robot_trajectory have the same rule, row by row.
+    this order), or `x` and `y` at the top, or else the first branch by name that has an x and y:
+    one that ends in such a name before others, and none of what is elsewhere (`goal`, `ball`) or
+    no place (`velocity`). The views robot_now and robot_trajectory have the same rule, row by row.
     """
-    others = sorted(name[:-2] for name in numeric if name.endswith(".x"))
+    branches = {name[:-2] for name in numeric if name.endswith(".x")}
+    others = sorted(filter(_may_be_own_place, branches), key=_place_first)
     pairs = (*USUAL_POSITIONS, *((f"{branch}.x", f"{branch}.y") for branch in others))
     return next((pair for pair in pairs if pair[0] in numeric and pair[1] in numeric), None)
 
@@ -108,6 +118,14 @@ def find_mode(texts: Collection[str]) -> str | None:
 
 def _shortest(name: str) -> tuple[int, str]:
     return len(name), name
+
+
+def _may_be_own_place(branch: str) -> bool:
+    return _ELSEWHERE.isdisjoint(branch.lower().replace("_", ".").split("."))
+
+
+def _place_first(branch: str) -> tuple[bool, str]:
+    return branch.rpartition(".")[2] not in _BRANCHES, branch
 
 
 def nearest_first(name: str, known: Iterable[str]) -> list[str]:

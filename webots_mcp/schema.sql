@@ -417,14 +417,20 @@ SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.
       LIMIT 1),
     (SELECT x.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
       WHERE x.key = 'x' AND y.key = 'y' AND x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-      ORDER BY replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS x_m,
+        AND NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE
+          instr(replace(lower(replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '')), '_', '.') || '.', '.' || w.value || '.'))
+      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w
+        WHERE replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIKE '%.' || w.value), replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS x_m,
   coalesce(
     (SELECT json_extract(j, '$.' || p.value) FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "x": "y", "x_m": "y_m"}') p
       WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
       LIMIT 1),
     (SELECT y.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
       WHERE x.key = 'x' AND y.key = 'y' AND x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-      ORDER BY replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS y_m,
+        AND NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE
+          instr(replace(lower(replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '')), '_', '.') || '.', '.' || w.value || '.'))
+      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w
+        WHERE replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIKE '%.' || w.value), replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS y_m,
   CASE json_array_length(j, '$.pose')
     WHEN 3 THEN json_extract(j, '$.pose[2]')
     WHEN 4 THEN json_extract(j, '$.pose[3]')
@@ -471,14 +477,20 @@ SELECT (
       LIMIT 1),
     (SELECT x.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
       WHERE x.key = 'x' AND y.key = 'y' AND x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-      ORDER BY replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS x_m,
+        AND NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE
+          instr(replace(lower(replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '')), '_', '.') || '.', '.' || w.value || '.'))
+      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w
+        WHERE replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIKE '%.' || w.value), replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS x_m,
   coalesce(
     (SELECT json_extract(j, '$.' || p.value) FROM json_each('{"pose[0]": "pose[1]", "pose.x": "pose.y", "pose.x_m": "pose.y_m", "position[0]": "position[1]", "position.x": "position.y", "position.x_m": "position.y_m", "pos[0]": "pos[1]", "pos.x": "pos.y", "pos.x_m": "pos.y_m", "gps[0]": "gps[1]", "gps.x": "gps.y", "gps.x_m": "gps.y_m", "odometry[0]": "odometry[1]", "odometry.x": "odometry.y", "odometry.x_m": "odometry.y_m", "odom[0]": "odom[1]", "odom.x": "odom.y", "odom.x_m": "odom.y_m", "location[0]": "location[1]", "location.x": "location.y", "location.x_m": "location.y_m", "x": "y", "x_m": "y_m"}') p
       WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
       LIMIT 1),
     (SELECT y.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
       WHERE x.key = 'x' AND y.key = 'y' AND x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
-      ORDER BY replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS y_m,
+        AND NOT EXISTS (SELECT 1 FROM json_each('["accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass", "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed", "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired", "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel", "reference", "setpoint", "target", "waypoint"]') w WHERE
+          instr(replace(lower(replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '')), '_', '.') || '.', '.' || w.value || '.'))
+      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('["pose", "position", "pos", "gps", "odometry", "odom", "location"]') w
+        WHERE replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIKE '%.' || w.value), replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS y_m,
   CASE json_array_length(j, '$.pose')
     WHEN 3 THEN json_extract(j, '$.pose[2]')
     WHEN 4 THEN json_extract(j, '$.pose[3]')

@@ -66,7 +66,10 @@ def coordinate(usual: str, other: str) -> str:
       LIMIT 1),
     (SELECT {other}.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
       WHERE x.key = 'x' AND y.key = 'y' AND x.type {IS_NUMBER} AND y.type {IS_NUMBER}
-      ORDER BY {NAME.format("x.path")} LIMIT 1))"""
+        AND NOT EXISTS (SELECT 1 FROM json_each('{ELSEWHERE}') w WHERE
+          instr(replace(lower({NAME.format("x.path")}), '_', '.') || '.', '.' || w.value || '.'))
+      ORDER BY NOT EXISTS (SELECT 1 FROM json_each('{json.dumps(BRANCHES)}') w
+        WHERE {NAME.format("x.path")} LIKE '%.' || w.value), {NAME.format("x.path")} LIMIT 1))"""
 
 
 def word(words: str) -> str:
@@ -85,6 +88,13 @@ def word(words: str) -> str:
 IS_NUMBER = "IN ('integer', 'real')"
 BRANCHES = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
 AXES = (("[0]", "[1]"), (".x", ".y"), (".x_m", ".y_m"))
+ELSEWHERE = json.dumps([
+    "accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass",
+    "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed",
+    "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired",
+    "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel",
+    "reference", "setpoint", "target", "waypoint",
+])  # fmt: skip
 USUAL = [(branch + x, branch + y) for branch in BRANCHES for x, y in AXES]
 PAIRS = json.dumps(dict([*USUAL, ("x", "y"), ("x_m", "y_m")]))
 NAME = """replace(replace(replace({}, '"', ''), '[', '.'), ']', '')"""

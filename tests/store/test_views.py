@@ -83,6 +83,8 @@ PLACES = [
     *(placed(*pair) for pair in USUAL_POSITIONS),
     {"robot": {"truth": {"x": 1, "y": 2}}, "zone": {"x": 7, "y": 8}},
     {"corners": [{"x": 1, "y": 2}, {"x": 7, "y": 8}]},
+    {"goal": {"x": 7, "y": 8}, "cmd_vel": {"linear": {"x": 7, "y": 8}}, "rover": {"x": 1, "y": 2}},
+    {"base": {"x": 7, "y": 8}, "odometry": {"position": {"x": 1, "y": 2}}},
     {"gps": {"x": 1, "y": 2}, "x": 7, "y": 8},
     {"odom": [1, 2], "pos": {"x": 7}, "pose": {"x": "near", "y": "far"}},
     {"pose": [7], "position": {"y": 7}, "gps": [1, 2]},

@@ -33,6 +33,7 @@ _NO_SPEED: Final = re.compile(  # of a wheel or a motor; and motors that move no
     r"|arm|gripper|hand|head|neck|joint|finger|lidar|camera|mast|lift)([._]|$)",
     re.IGNORECASE,
 )
+_THIRD_AXES: Final = {"x": "z", "x_m": "z_m", "0": "2"}
 _HEADING: Final = ("heading", "yaw", "theta", "bearing")
 
 
@@ -47,6 +48,7 @@ class Motion:
         mode: What it is doing.
         heading: Where it looks, in radians.
         wheels: Speeds of its wheels or driving motors, commanded or measured.
+        height: z in metres: a robot that climbs does not stand still.
     """
 
     position: tuple[Signal, Signal] | None
@@ -55,6 +57,7 @@ class Motion:
     mode: Signal | None
     heading: Signal | None = None
     wheels: tuple[Signal, ...] = ()
+    height: Signal | None = None
 
     @property
     def signals(self) -> list[Signal]:
@@ -65,7 +68,7 @@ class Motion:
     @property
     def evidence(self) -> list[Signal]:
         """All of them."""
-        others = filter(None, (self.commanded, self.speed, self.mode, self.heading))
+        others = filter(None, (self.height, self.commanded, self.speed, self.mode, self.heading))
         return [*(self.position or ()), *others, *self.wheels]
 
 
@@ -96,11 +99,22 @@ def find_motion(
     )
     position = _position(known, options.position) if options.position else _position(own, None)
     position = position or _position(known, None)  # it may be missing in the rows that were seen
-    return Motion(position, commanded, speed, mode, _heading(own, position), wheels)
+    heading, height = _heading(own, position), _height(own, position)
+    return Motion(position, commanded, speed, mode, heading, wheels, height)
 
 
 def _is_no_wheel(name: str) -> bool:
     return not _WHEEL.search(name)
+
+
+def _height(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:
+    """The third of the position's numbers; that of a pose of three is where it looks."""
+    branch, _, axis = position[0].name.rpartition(".") if position else ("", "", "")
+    name = f"{branch}.{_THIRD_AXES.get(axis, '')}".removeprefix(".")
+    if name == "pose.2" and "pose.3" not in known:
+        return None
+    signal = known.get(name)
+    return signal if signal and signal.kind == "num" else None
 
 
 def _heading(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:

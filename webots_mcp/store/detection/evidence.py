@@ -28,6 +28,7 @@ ON_THE_SPOT: Final = 0.2  # of the fastest wheel: where the mean of all is less,
 TURNED_RAD: Final = 0.1  # from a second before to a second after
 HEADING_NOISE: Final = 6.0  # standard deviations
 MOSTLY: Final = 0.5
+TOLD_SHARE: Final = 0.1  # of the rows: what holds in fewer, at the ends, shows nothing
 
 
 @dataclass(frozen=True)
@@ -48,13 +49,13 @@ class Evidence:
 def weigh(columns: Columns, motion: Motion, options: EventOptions, moved_in: MovedIn) -> Evidence:
     """Weigh what the rows of one standstill tell."""
     told, told_why, stop, stop_why = _by_command(columns, motion, options)
-    ahead, ahead_why, spot = _by_wheels(columns, motion)
+    ahead, ahead_why, spot, rest_why = _by_wheels(columns, motion)
     mode, mode_why, mode_against = _by_mode(columns, motion, options, moved_in)
     turning = turns(columns, motion.heading)
     # Wheels that turn it on the spot move it nowhere; where it looks tells whether they do.
     turning |= spot if motion.heading is None else False
     should_move = (told | ahead | mode) & ~stop & ~turning
-    against = [*stop_why, *mode_against]
+    against = [*stop_why, *rest_why, *mode_against]
     against += ["it turned in place"] if _mostly(turning) else []
     if not should_move.any() and not against:
         against = ["nothing that is published shows that it should have moved"]
@@ -77,17 +78,21 @@ def _by_command(
     told = speeds >= options.min_commanded
     stop = (speeds < options.min_commanded) & (motion.commanded is not None)
     said = f"{signal.name} {{:.3g}}"
-    why = [said.format(np.median(numbers(columns, signal)[told]))] if told.any() else []
+    shown = told.mean() > TOLD_SHARE if len(told) else False
+    why = [said.format(np.median(numbers(columns, signal)[told]))] if shown else []
     against = [said.format(np.median(numbers(columns, signal)[stop]))] if _mostly(stop) else []
     return told, why, stop, against
 
 
-def _by_wheels(columns: Columns, motion: Motion) -> tuple[Flags, list[str], Flags]:
-    """Rows in which the wheels drive it ahead or back, and in which they turn it on the spot."""
+def _by_wheels(columns: Columns, motion: Motion) -> tuple[Flags, list[str], Flags, list[str]]:
+    """Rows in which the wheels drive it ahead or back, and in which they turn it on the spot.
+
+    Each with the reason; the last one is that they mostly rest.
+    """
     wheels = [wheel for wheel in motion.wheels if wheel.name in columns.values]
     if not wheels:
         none = np.zeros(len(columns.times), np.bool_)
-        return none, [], none
+        return none, [], none, []
     speeds = np.nan_to_num(np.stack([numbers(columns, wheel) for wheel in wheels]))
     fastest, mean = np.abs(speeds).max(axis=0), np.abs(speeds.mean(axis=0))
     turn = fastest >= WHEELS_TURN
@@ -96,7 +101,8 @@ def _by_wheels(columns: Columns, motion: Motion) -> tuple[Flags, list[str], Flag
     unit = " rad/s" if all(wheel.unit == "rad/s" for wheel in wheels) else ""
     driving = ahead if ahead.any() else spot
     why = [f"wheels at {np.median(fastest[driving]):.3g}{unit}"] if driving.any() else []
-    return (ahead | spot) if motion.heading else ahead, why, spot
+    against = ["wheels rest"] if _mostly(~turn) else []
+    return (ahead | spot) if motion.heading else ahead, why, spot, against
 
 
 def _by_mode(

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from webots_mcp.store.analysis.motion import position_noise, tracks_in
+from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.standstill import find_standstills
-from webots_mcp.store.analysis.track import Track
+from webots_mcp.store.analysis.track import Track, tracks_of
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.evidence import Evidence, Flags, turned_rad, usual, weigh
 from webots_mcp.store.detection.habits import MovedIn
@@ -109,6 +110,8 @@ def _stuck(search: Search, standing: Standing, evidence: Evidence, rows: slice) 
     if commanded is not None and commanded.name in part.values:
         details["commanded"] = usual(part.values[commanded.name])
     details["evidence"] = "; ".join(evidence.shown_by)
+    if evidence.against:
+        details["against"] = "; ".join(evidence.against)
     return search.event("stuck", start_s, end_s, None, **details)
 
 
@@ -148,7 +151,22 @@ def _in_track(search: Search, track: Track, columns: Columns, least_s: float) ->
     for each in find_standstills(track, search.options.stuck_m, least_s):
         start_s, end_s = float(track.times[each.start]), float(track.times[each.last])
         rows = slice(bisect_left(columns.times, start_s), bisect_right(columns.times, end_s))
-        yield Standing(start_s, end_s, each.x_m, each.y_m, _rows(columns, rows))
+        place = Standing(start_s, end_s, each.x_m, each.y_m, _rows(columns, rows))
+        yield from _at_one_height(search, place, least_s)
+
+
+def _at_one_height(search: Search, standing: Standing, least_s: float) -> Iterator[Standing]:
+    """The parts of a standstill in which it neither climbs nor sinks."""
+    height, columns = search.motion.height, standing.columns
+    times, heights = columns.numbers(height.name) if height else (np.empty(0), np.empty(0))
+    if not len(times) or np.ptp(heights) <= search.options.stuck_m:
+        yield standing
+        return
+    for track in tracks_of(times, heights, np.zeros(len(times)), noise_of(heights)):
+        for each in find_standstills(track, search.options.stuck_m, least_s):
+            first_s, last_s = float(track.times[each.start]), float(track.times[each.last])
+            rows = slice(bisect_left(columns.times, first_s), bisect_right(columns.times, last_s))
+            yield replace(standing, start_s=first_s, end_s=last_s, columns=_rows(columns, rows))
 
 
 def _from_rows(search: Search, rough: Standing) -> list[Standing]:
@@ -212,7 +230,9 @@ def _nearest(search: Search, tracks: Sequence[Track]) -> tuple[float, str] | Non
     ]
     if short:
         lasted_s, start_s = max(short)
-        return lasted_s / least_s, f"stood for {lasted_s:.2g} s at most, from {start_s:.1f} s on"
+        climbed = ", but climbed or sank" if lasted_s >= least_s else ""
+        what = f"stood for {lasted_s:.2g} s at most, from {start_s:.1f} s on{climbed}"
+        return lasted_s / least_s, what
     ways = [each for track in tracks for each in _ways(track, least_s)]
     if not ways:
         return None

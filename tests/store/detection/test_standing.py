@@ -1,0 +1,72 @@
+"""Who stands still, and what shows, or speaks against it, that it should have moved."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import Recorder
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+
+OPTIONS = EventOptions(kinds=("still", "stuck"))
+
+
+def ask(connection: sqlite3.Connection, state: Callable[[float], dict[str, Any]]) -> Events:
+    """What is told of 60 s with a row every 0.1 s."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    connection.execute("BEGIN")
+    for step in range(600):
+        recorder.publish(round(step * 0.1, 6), state(step * 0.1))
+    connection.execute("COMMIT")
+    roll(connection, 100_000)
+    return find_events(connection, resolve_range(connection), OPTIONS)
+
+
+def flight(time_s: float) -> dict[str, Any]:
+    """Climbs for 10 s, hovers for 10 s, flies for 10 s, sinks."""
+    height_m = min(5.0, 0.5 * time_s) - max(0.0, 0.1 * (time_s - 30))
+    x_m = 0.5 * min(10.0, max(0.0, time_s - 20))
+    return {"pose": {"x": x_m, "y": 0.0, "z": height_m}, "mode": "fly"}
+
+
+def test_a_drone_that_climbs_or_sinks_does_not_stand_still(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    (hovers,) = ask(empty, flight).events
+    assert (hovers.start_s, hovers.end_s) == pytest.approx((10.0, 20.0), abs=0.3)
+
+
+def test_who_only_climbs_is_said_to_have_climbed(empty: sqlite3.Connection) -> None:
+    found = ask(empty, lambda time_s: {"gps": [0.0, 0.0, 0.5 * time_s]})
+    assert found.verdicts.absent["still"].endswith("but climbed or sank")
+
+
+def test_wheels_that_rest_speak_against_being_stuck(empty: sqlite3.Connection) -> None:
+    def drives_then_waits(time_s: float) -> dict[str, Any]:
+        speed = 5.0 if time_s < 30 else 0.0
+        x_m = 0.2 * min(30.0, time_s)
+        return {"pose": [x_m, 0.0], "mode": "drive", "wheels": [speed, speed]}
+
+    (stuck,) = ask(empty, drives_then_waits).events
+    assert stuck.kind == "stuck"
+    assert stuck.details["evidence"].startswith("in mode drive")
+    assert stuck.details["against"] == "wheels rest"
+
+
+def test_a_command_that_was_in_force_for_a_moment_is_no_evidence(
+    empty: sqlite3.Connection,
+) -> None:
+    def drives_then_hovers(time_s: float) -> dict[str, Any]:
+        speed_m_s = 0.2 if time_s < 30.05 else 0.0
+        return {"pose": [0.2 * min(30.0, time_s), 0.0], "speed": speed_m_s, "mode": "go"}
+
+    (stuck,) = ask(empty, drives_then_hovers).events
+    assert stuck.details["evidence"] == "in mode go, in which it moved at 0.2 m/s"

@@ -70,3 +70,14 @@ def test_a_command_that_was_in_force_for_a_moment_is_no_evidence(
 
     (stuck,) = ask(empty, drives_then_hovers).events
     assert stuck.details["evidence"] == "in mode go, in which it moved at 0.2 m/s"
+
+
+def test_who_stands_while_rows_come_seldom_stands(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    times = [0.032 * step for step in range(1000)] + [32.0 + 0.5 * step for step in range(60)]
+    for time_s in times:
+        recorder.publish(time_s, {"pose": [0.2 * min(time_s, 32.0), 0.0]})
+    (still,) = find_events(empty, resolve_range(empty), OPTIONS).events
+    assert (still.start_s, still.end_s) == (32.0, 61.5)

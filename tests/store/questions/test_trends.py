@@ -217,3 +217,20 @@ def test_a_signal_without_a_value_in_the_range_is_named(rover: sqlite3.Connectio
 def test_an_empty_range_has_empty_trends(rover: sqlite3.Connection) -> None:
     run = ask(rover, start_s=91.0, end_s=94.0)
     assert run.numbers == () and run.rows == 0
+
+
+def test_a_step_is_told_with_its_time_and_without_a_slope(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, rows=1000, interval_s=0.1, gear=lambda time_s: 1 if time_s < 80 else 2)
+    assert one(empty, "gear").says == "steps from 1 to 2 at 80 s"
+
+
+def test_what_grows_ever_faster_has_no_slope(empty: sqlite3.Connection) -> None:
+    record(empty, rows=600, interval_s=0.1, x=lambda time_s: 10 ** (time_s / 10))
+    assert "/s)" not in one(empty, "x").says
+
+
+def test_the_ends_of_what_rises_are_told_apart(empty: sqlite3.Connection) -> None:
+    record(empty, rows=601, interval_s=0.1, stamp=lambda time_s: 1.7e9 + time_s)
+    assert one(empty, "stamp").says == "rises from 1700000000 to 1700000060 (1/s)"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
 
 GAP_INTERVALS: Final = 3.0  # a gap is longer than so many usual intervals
+ANOTHER_RATE: Final = 5  # so many long intervals one after the other are no gaps
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,23 @@ class Rhythm:
 def rhythm_of(times: Sequence[float] | Array) -> Rhythm:
     """The rhythm of the given times; a gap is an interval of more than three median ones."""
     interval_s = usual_interval_s(times)
-    return Rhythm(interval_s, gaps_in(times, interval_s) if interval_s else ())
+    return Rhythm(interval_s, interruptions(gaps_in(times, interval_s)) if interval_s else ())
+
+
+def interruptions(gaps: Sequence[Gap]) -> tuple[Gap, ...]:
+    """The gaps without those that are the intervals of another, slower rate.
+
+    Where five or more follow one another directly, only what is longer than three of them is one.
+    """
+    cuts = [at for at in range(1, len(gaps)) if gaps[at].start_s != gaps[at - 1].end_s]
+    edges = pairwise([0, *cuts, len(gaps)]) if gaps else ()
+    return tuple(gap for start, end in edges for gap in _longest(gaps[start:end]))
+
+
+def _longest(chain: Sequence[Gap]) -> Iterator[Gap]:
+    lengths_s = sorted(gap.end_s - gap.start_s for gap in chain)
+    usual_s = lengths_s[len(chain) // 2] if len(chain) >= ANOTHER_RATE else 0.0
+    return (gap for gap in chain if gap.end_s - gap.start_s > GAP_INTERVALS * usual_s * (1 + 1e-6))
 
 
 def usual_interval_s(times: Sequence[float] | Array) -> float | None:

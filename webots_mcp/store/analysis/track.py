@@ -8,9 +8,9 @@ from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.noise import noise_of, smooth
+from webots_mcp.store.analysis.rhythm import rhythm_of
 
 LEG_NOISE: Final = 8.0  # a leg is longer than so many deviations of the smoothed position
-GAP_INTERVALS: Final = 3.0
 FINEST_LEG_M: Final = 0.02  # smoothing that makes legs so short is enough
 LONGEST_SMOOTHING_S: Final = 2.0  # beyond, it would cut corners
 _PARABOLA_GAIN: Final = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it
@@ -75,9 +75,8 @@ def tracks_of(times: Array, x: Array, y: Array, noise_m: float | None = None) ->
     A gap is an interval of more than three median ones: nobody knows what happened in it. The
     noise is that of the longest stretch, unless it is given.
     """
-    steps = np.diff(times)
-    usual_s = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    cuts = np.flatnonzero(steps > GAP_INTERVALS * usual_s * (1 + 1e-6)) + 1
+    ends_s = [gap.end_s for gap in rhythm_of(times).gaps]
+    cuts = np.unique(np.searchsorted(times, ends_s))
     edges = [0, *cuts.tolist(), len(times)]
     parts = [slice(start, end) for start, end in pairwise(edges) if end > start]
     if noise_m is None and parts:

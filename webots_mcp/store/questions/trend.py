@@ -260,7 +260,7 @@ def _remarks(trend: Trend) -> Iterator[str]:
     elif trend.fast:
         yield f"varies faster than {trend.resolution_s:g} s: ask for a shorter range"
     yield from _beyond_ends(trend)
-    if trend.flat_since_s is not None and trend.shape != "constant":
+    if trend.flat_since_s is not None and trend.shape != "constant" and summary.changes != 1:
         yield f"flat at {_told(summary.last, summary)} since {trend.flat_since_s:.6g} s"
     if trend.spikes:
         largest = max(trend.spikes, key=lambda spike: abs(spike.value - (trend.mean or 0.0)))
@@ -279,16 +279,24 @@ def _course(trend: Trend, unit: str) -> str:
     if trend.swings:
         return _swinging(trend, unit)
     if trend.shape in ("rising", "falling"):
-        slope = f" ({trend.slope_per_s:.3g}{unit}/s)" if trend.slope_per_s is not None else ""
+        slope = f" ({trend.slope_per_s:.3g}{unit}/s)" if _is_straight(trend) else ""
         if trend.turned is not None:
             return f"turns by {trend.turned:.3g}{unit}{slope}"
         verb = "rises" if trend.shape == "rising" else "falls"
         first, last = _told(summary.first, summary), _told(summary.last, summary)
+        if summary.changes == 1:
+            extreme_s = (summary.min_sim_time_s, summary.max_sim_time_s)[trend.shape == "rising"]
+            return f"steps from {first} to {last}{unit} at {extreme_s:.6g} s"
         return f"{verb} from {first} to {last}{unit}{slope}"
     low, high = _told(summary.min, summary), _told(summary.max, summary)
     return f"between {low} (at {summary.min_sim_time_s:.6g} s) and {high}{unit} " + (
         f"(at {summary.max_sim_time_s:.6g} s)"
     )
+
+
+def _is_straight(trend: Trend) -> bool:
+    """Whether its slope tells its course: what stepped, or grew ever faster, has none."""
+    return trend.slope_per_s is not None and (trend.r2 or 0.0) >= STRAIGHT_R2
 
 
 def _beyond_ends(trend: Trend) -> Iterator[str]:
@@ -308,9 +316,16 @@ def _beyond_ends(trend: Trend) -> Iterator[str]:
 
 
 def _told(value: float | None, summary: Summary) -> str:
-    """A value with four digits; 0 where it is only what adding leaves beside the extremes."""
+    """A value with four digits, or so many that the range is told with two.
+
+    0 where it is only what adding leaves beside the extremes.
+    """
     largest = max(abs(summary.min or 0.0), abs(summary.max or 0.0))
-    return f"{value:.4g}" if value is not None and abs(value) > _DUST * largest else "0"
+    if value is None or abs(value) <= _DUST * largest:
+        return "0"
+    share = _relative_range(summary)
+    digits = max(4, 2 - math.floor(math.log10(share))) if share else 4
+    return f"{value:.{min(digits, 15)}g}"
 
 
 def _swinging(trend: Trend, unit: str) -> str:

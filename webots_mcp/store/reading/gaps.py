@@ -9,7 +9,14 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final
 
-from webots_mcp.store.analysis.rhythm import GAP_INTERVALS, Gap, Rhythm, gaps_in, usual_interval_s
+from webots_mcp.store.analysis.rhythm import (
+    GAP_INTERVALS,
+    Gap,
+    Rhythm,
+    gaps_in,
+    interruptions,
+    usual_interval_s,
+)
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, Grain, bucket_of
 
@@ -66,7 +73,7 @@ def rhythm_in(connection: sqlite3.Connection, segment: Segment) -> Rhythm:
     irregular = _irregular(connection, segment, interval_s)
     parts = [segment] if len(irregular) > _MOST_BUCKETS else irregular
     gaps = [gap for part in parts for gap in _gaps(connection, part, interval_s)]
-    return Rhythm(interval_s, tuple(dict.fromkeys(gaps)))
+    return Rhythm(interval_s, interruptions(tuple(dict.fromkeys(gaps))))
 
 
 def _irregular(

@@ -214,7 +214,8 @@ def _moving_mean(values: Array, rows: int) -> Array:
     for _ in range(2):
         before = 2 * values[0] - values[reach:0:-1]
         after = 2 * values[-1] - values[-2 : -reach - 2 : -1]
-        sums = np.concatenate(([0.0], np.cumsum(np.concatenate((before, values, after)))))
+        sums: Array = np.concatenate(([0.0], before, values, after))
+        np.cumsum(sums, out=sums)
         values = (sums[2 * reach + 1 :] - sums[: -2 * reach - 1]) / (2 * reach + 1)
     return values
 
@@ -287,10 +288,12 @@ def _fitted(
     period_s = 2 * (end_s - start_s) / count
     start, end = np.searchsorted(times, [start_s, end_s])
     rows = slice(max(0, int(start) - 1), min(len(times), int(end) + 1))
-    noise = noise_of(values[rows])
-    if REACHES * float(crossings.reaches.mean()) < _least_amplitude(
-        noise, period_s, interval_s, count
-    ):
+    farthest = REACHES * float(crossings.reaches.mean())
+    resolution = _resolution(values[rows])  # first: rounded courses have most candidates by far
+    if farthest <= resolution:
+        return
+    least = _least_amplitude(noise_of(values[rows]), period_s, interval_s, count)
+    if farthest < least:
         return
     best = _best_sine(times[rows], values[rows], period_s, interval_s)
     if best[0] < _least_explained(count):
@@ -298,8 +301,7 @@ def _fitted(
         if best[0] < STRAIGHTENED_EXPLAINED:
             return
     explained, period_s, amplitude = best
-    least = _least_amplitude(noise, period_s, interval_s, count)
-    if amplitude >= least and amplitude > _resolution(values[rows]):
+    if amplitude >= least and amplitude > resolution:
         yield Swing(start_s, end_s, count, period_s, amplitude, explained)
 
 
@@ -398,11 +400,10 @@ def _fit(times: Array, values: Array, periods: Array) -> _Fit:
         periods: That are tried.
     """
     moments = times - times.mean(axis=1, keepdims=True)
-    place = moments / np.maximum(np.ptp(moments, axis=1, keepdims=True), 1e-9)
-    basis: Array = np.linalg.qr(np.stack((place**2, place, np.ones_like(place)), axis=2))[0]
     angles: Array = 2 * np.pi * moments[:, None, :] / periods[:, None]
     waves = np.concatenate((np.sin(angles), np.cos(angles), values[:, None, :]), axis=1)
-    rest: Array = waves - (waves @ basis) @ np.swapaxes(basis, 1, 2)
+    basis = _parabolas(moments)
+    rest: Array = waves - (waves @ np.swapaxes(basis, 1, 2)) @ basis
     sines, cosines, left = np.split(rest, [len(periods), 2 * len(periods)], axis=1)
     ss, cc, sc = (_products(*pair) for pair in ((sines,) * 2, (cosines,) * 2, (sines, cosines)))
     sy, cy, of_course = (_products(each, left) for each in (sines, cosines, left))
@@ -412,8 +413,23 @@ def _fit(times: Array, values: Array, periods: Array) -> _Fit:
     return _Fit(of_course, of_course - of_sine * sy - of_cosine * cy, amplitudes)
 
 
+def _parabolas(moments: Array) -> Array:
+    """Per piece three courses of length 1 at right angles: level, straight and bent."""
+    straight = _of_length_one(moments)
+    bent = straight**2
+    bent -= bent.mean(axis=1, keepdims=True)
+    bent -= np.einsum("ij,ij->i", bent, straight)[:, None] * straight
+    level = np.full_like(moments, moments.shape[1] ** -0.5)
+    return np.stack((level, straight, _of_length_one(bent)), axis=1)
+
+
+def _of_length_one(courses: Array) -> Array:
+    return courses / np.sqrt(np.einsum("ij,ij->i", courses, courses))[:, None]
+
+
 def _products(one: Array, other: Array) -> Array:
-    return np.einsum("ijk,ijk->ij", *np.broadcast_arrays(one, other))
+    """Sums along the rows, of as many courses or of many and one."""
+    return np.einsum("ijk,ijk->ij" if one.shape == other.shape else "ijk,ilk->ij", one, other)
 
 
 def _best(found: list[Swing]) -> list[Swing]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
+from contextlib import closing
 from typing import Any
 
 import pytest
@@ -213,6 +214,10 @@ def test_a_stored_one_that_cannot_be_read_is_off_and_keeps_no_other(
     robot: InProcessSupervisor, bridge: MCPBridge, database: MemoryDatabase, recording: Recording
 ) -> None:
     odd, good = store(database, "n = 1"), store(database, "n == 1")
+    for column, value in (("after_hits", "'often'"), ("condition", "CAST(x'ff22' AS TEXT)")):
+        number = store(database, "n == 1")
+        with closing(connect(database, "writer")) as connection:
+            connection.execute(f"UPDATE breakpoint SET {column} = {value} WHERE id = {number}")
     arm = recording.send("arm_breakpoints")
 
     drive(robot, bridge, counted(range(3)))

@@ -65,6 +65,7 @@ READING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_find_events", {}),
     ("webots_get_timeline", {}),
     ("webots_list_runs", {}),
+    ("webots_list_breakpoints", {}),
     ("webots_compare_runs", {"run_ids": [1, 2]}),
 )
 DRAWING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
@@ -129,6 +130,10 @@ def _fill(robot: RecordedRobot, folder: Path) -> None:
     Image.new("RGB", (32, 24)).save(folder / "eye.png")
     robot.image(2.0, "eye.png")
     now = time.time()
+    insert(robot.connection, "breakpoint", {
+        "robot_id": robot.id, "condition": "front < 0.5", "action": "log", "hits": 1,
+        "created_wall_time_s": now, "created_by": "mcp",
+    })  # fmt: skip
     for status in ("done", "claimed", "pending"):
         insert(robot.connection, "command", {
             "robot_id": robot.id, "action": "dance", "params": '{"speed": 1}', "status": status,

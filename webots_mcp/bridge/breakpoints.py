@@ -28,7 +28,8 @@ _OF_CONTROLLER: Final = "controller"
 # that is no UTF-8 would fail the statement.
 _ARMED: Final = (
     "SELECT id, CAST(condition AS BLOB), CAST(action AS BLOB), after_hits FROM breakpoint "
-    "WHERE robot_id = ? AND enabled AND (created_by IS NOT ? OR session_id = ?) ORDER BY id LIMIT ?"
+    "WHERE robot_id = ? AND enabled AND typeof(after_hits) = 'integer' "
+    "AND (created_by IS NOT ? OR session_id = ?) ORDER BY id LIMIT ?"
 )
 _FORGET: Final = (
     "DELETE FROM breakpoint WHERE robot_id = ? AND created_by = ? AND session_id IS NOT ?"

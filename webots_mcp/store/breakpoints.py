@@ -13,11 +13,19 @@ from webots_mcp.contract import MAX_BREAKPOINTS, BreakpointAction
 from webots_mcp.errors import InvalidInputError
 
 # Those of a controller's own code end with its session.
+_OF_ROBOT: Final = (
+    "FROM breakpoint b LEFT JOIN session s ON s.id = b.session_id WHERE b.robot_id = ? "
+    "AND (b.created_by IS NOT 'controller' OR (s.id IS NOT NULL AND s.ended_wall_time_s IS NULL))"
+)
 _LISTED: Final = (
     "SELECT b.id, b.robot_id, b.condition, b.action, b.after_hits, b.enabled, b.hits, "
-    "b.created_wall_time_s, b.created_by, b.error FROM breakpoint b "
-    "LEFT JOIN session s ON s.id = b.session_id WHERE b.robot_id = ? AND (b.created_by "
-    "IS NOT 'controller' OR (s.id IS NOT NULL AND s.ended_wall_time_s IS NULL)) ORDER BY b.id"
+    f"b.created_wall_time_s, b.created_by, b.error {_OF_ROBOT} ORDER BY b.id"
+)
+_IDS: Final = f"SELECT b.id {_OF_ROBOT} ORDER BY b.id"
+_COUNT: Final = f"SELECT count(*) {_OF_ROBOT} AND b.enabled"
+_LIKE: Final = (
+    f"SELECT b.id {_OF_ROBOT} AND b.enabled AND b.condition = ? AND b.action = ? "
+    "AND b.after_hits = ?"
 )
 _SET: Final = (
     "INSERT INTO breakpoint (robot_id, condition, action, after_hits, created_wall_time_s, "
@@ -71,18 +79,15 @@ def set_breakpoint(
         InvalidInputError: The robot has as many as there may be.
     """
     with transaction(connection):
-        there = [each for each in list_breakpoints(connection, robot_id) if each.enabled]
-        for each in there:
-            if (each.condition, each.action, each.after_hits) == (
-                condition.text, action, after_hits,
-            ):  # fmt: skip
-                return each.id
-        if len(there) >= MAX_BREAKPOINTS:
+        asked = (condition.text, action, after_hits)
+        if (like := connection.execute(_LIKE, (robot_id, *asked)).fetchone()) is not None:
+            return int(like[0])
+        if connection.execute(_COUNT, (robot_id,)).fetchone()[0] >= MAX_BREAKPOINTS:
             raise InvalidInputError(
                 f"this robot has {MAX_BREAKPOINTS} breakpoints: remove one with "
                 "webots_remove_breakpoint"
             )
-        values = (robot_id, condition.text, action, after_hits, time.time(), created_by)
+        values = (robot_id, *asked, time.time(), created_by)
         return int(connection.execute(_SET, values).fetchall()[0][0])
 
 
@@ -94,7 +99,7 @@ def remove_breakpoint(connection: sqlite3.Connection, robot_id: int, breakpoint_
     """
     if connection.execute(_REMOVE, (breakpoint_id, robot_id)).fetchall():
         return
-    there = [str(each.id) for each in list_breakpoints(connection, robot_id)]
+    there = [str(number) for (number,) in connection.execute(_IDS, (robot_id,)).fetchall()]
     known = f"there are {', '.join(there)}" if there else "it has none"
     raise InvalidInputError(f"this robot has no breakpoint {breakpoint_id}; {known}")
 

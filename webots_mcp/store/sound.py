@@ -40,7 +40,7 @@ _REFERENCES: Final = {
 }
 _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
                   "signal", "rollup", "coarse_rollup", "change", "watermark",
-                  "parameter", "parameter_value")  # fmt: skip
+                  "parameter", "parameter_value", "breakpoint")  # fmt: skip
 # What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
 # be stored, a run that is not there.
 _UNSTORABLE: Final = (

@@ -158,6 +158,7 @@ def test_a_home_where_nothing_can_be_written_is_one_line_at_once(
 ) -> None:
     home = tmp_path / "home"
     home.write_text("a file, in which no folder can be made")
+    (tmp_path / "status.json").write_text('{"mode": "drive"}')  # so that there is what to import
     began_s = time.monotonic()
     ended = subprocess.run(
         [sys.executable, "-m", "webots_mcp", *command],

@@ -82,12 +82,13 @@ def movement(view: View, found: TimeRange) -> dict[str, Any] | None:
 
 def _way(part: Columns, position: tuple[Signal, Signal]) -> dict[str, Any] | None:
     """From where to where it went in one run; a lost position is no place."""
-    places = places_of(part, position)
-    if len(places) < 2:
+    times, x, y = places_of(part, position)
+    if len(times) < 2:
         return None
+    first, last = ((float(x[row]), float(y[row])) for row in (0, -1))
     return {
-        "from": [figure(value) for value in places[0]],
-        "to": [figure(value) for value in places[-1]],
+        "from": [figure(value) for value in first],
+        "to": [figure(value) for value in last],
         "distance": figure(path_length(part, position)),
-        "displacement": figure(math.dist(places[0], places[-1])),
+        "displacement": figure(math.dist(first, last)),
     }

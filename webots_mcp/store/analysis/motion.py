@@ -11,6 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import FARTHEST_M, find_mode, find_position
+from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.summary import aligned_numbers
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
@@ -157,33 +159,21 @@ def _first(
     return known[min(fitting, key=len)] if fitting else None
 
 
-def places_of(columns: Columns, position: tuple[Signal, Signal]) -> list[tuple[float, float]]:
-    """Where it was, of the rows that have a position."""
-    return [(x, y) for _, x, y in _placed(columns, position)]
-
-
-def _placed(columns: Columns, position: tuple[Signal, Signal]) -> list[tuple[float, float, float]]:
+def places_of(columns: Columns, position: tuple[Signal, Signal]) -> tuple[Array, Array, Array]:
     """Time, x and y of the rows that have a position."""
-    x, y = (columns.values[signal.name] for signal in position)
-    return [
-        (time_s, float(a), float(b))
-        for time_s, a, b in zip(columns.times, x, y, strict=True)
-        if isinstance(a, (float, int)) and isinstance(b, (float, int))
-        if max(abs(a), abs(b)) <= FARTHEST_M
-    ]
+    x, y = (aligned_numbers(columns.values[signal.name]) for signal in position)
+    there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
+    times: Array = np.array(columns.times, np.float64)
+    return times[there], x[there], y[there]
 
 
 def tracks_in(
     columns: Columns, position: tuple[Signal, Signal], noise_m: float | None = None
 ) -> list[Track]:
     """The way of the robot in each stretch without a gap; see `track.tracks_of`."""
-    import numpy as np
-
     from webots_mcp.store.analysis.track import tracks_of
 
-    placed = _placed(columns, position)
-    times, x, y = (np.array([row[of] for row in placed], np.float64) for of in range(3))
-    return tracks_of(times, x, y, noise_m)
+    return tracks_of(*places_of(columns, position), noise_m)
 
 
 def path_length(

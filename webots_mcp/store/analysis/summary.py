@@ -210,14 +210,24 @@ def usable_numbers(
 
 def usable_arrays(times: Sequence[float], values: Sequence[Value]) -> tuple[Array, Array]:
     """The same as arrays."""
-    try:
-        numbers: Array = np.array(values, np.float64)  # null becomes NaN
-    except (OverflowError, TypeError, ValueError):
-        some_times, some = usable_numbers(times, values)
-        return np.array(some_times, np.float64), np.array(some, np.float64)
+    numbers = aligned_numbers(values)
     moments: Array = np.array(times, np.float64)
     usable = np.abs(numbers) <= _LARGEST
     return (moments, numbers) if usable.all() else (moments[usable], numbers[usable])
+
+
+def aligned_numbers(values: Sequence[Value]) -> Array:
+    """One number per value; NaN where it is none, or is too large for one."""
+    try:
+        return np.array(values, np.float64)  # null becomes NaN
+    except (OverflowError, TypeError, ValueError):
+        return np.array([_number(value) for value in values], np.float64)
+
+
+def _number(value: Value) -> float:
+    if type(value) in _NUMBERS and -_LARGEST <= cast("float", value) <= _LARGEST:
+        return float(cast("float", value))
+    return math.nan
 
 
 def _usable(numbers: Sequence[float]) -> bool:

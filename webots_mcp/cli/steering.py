@@ -1,0 +1,169 @@
+"""Commands that steer a simulation: what an assistant can ask for, a person can."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from typing import TYPE_CHECKING, Any, Final
+
+from webots_mcp.cli.command import DATA_DIR, DATABASE, JSON, ROBOT, argument, command, settings_of
+from webots_mcp.cli.tables import print_table, text_of
+from webots_mcp.errors import CommandRefusedError
+
+if TYPE_CHECKING:
+    from webots_mcp.server.history_results import RunAnswer
+    from webots_mcp.server.results import CommandAnswer, Table
+    from webots_mcp.store.recording import Recording
+
+_WHERE: Final = (DATA_DIR, DATABASE, ROBOT, JSON)
+TIMEOUT: Final = argument(
+    "--timeout", type=float, default=600.0, metavar="S", help="wait so many wall seconds (600)"
+)
+
+
+@command(
+    "run",
+    *_WHERE,
+    TIMEOUT,
+    argument("--until", metavar="CONDITION", help="such as 'front_m < 0.1 for 0.5'"),
+    argument("--for", dest="for_s", type=float, metavar="S", help="for so many simulated seconds"),
+    argument("--reset", action="store_true", help="reset the world first"),
+    argument("--pace", choices=["fast", "real_time", "as_it_is"], default="fast"),
+    argument("--then", choices=["pause", "go_on", "as_before"], default="pause"),
+    argument(
+        "--set",
+        dest="settings",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="set this parameter first; may be given several times",
+    ),
+)
+def run(arguments: argparse.Namespace) -> None:
+    """Let the simulation run until a condition holds or a simulated time is over, then pause it.
+
+    It pauses at that very step, or does what --then says; Ctrl-C ends it the same way.
+
+    webots-mcp run --until 'front_m < 0.1' --for 20 --reset --set kp=2
+    """
+    import anyio
+
+    from webots_mcp.server.running import require_possible
+
+    recording, until, for_s = _writable(arguments), arguments.until, arguments.for_s
+    require_possible(recording, arguments.robot, until, for_s, reset=arguments.reset)
+    wanted: dict[str, Any] = {
+        "until": until,
+        "for_s": for_s,
+        "reset": arguments.reset,
+        "pace": None if arguments.pace == "as_it_is" else arguments.pace,
+        "parameters": settings_of(arguments.settings) or None,
+        "then": arguments.then,
+    }
+    params = {name: value for name, value in wanted.items() if value is not None}
+    answer: Any = anyio.run(_ask, recording, arguments, "run", params)
+    _require_done(answer)
+    _print(answer, arguments) if arguments.json else _print_run(answer)
+
+
+@command(
+    "send", *_WHERE, TIMEOUT,
+    argument("action", metavar="ACTION", help="of the controller's own, or built in"),
+    argument("settings", nargs="*", metavar="NAME=VALUE", help="its parameters"),
+)  # fmt: skip
+def send(arguments: argparse.Namespace) -> None:
+    """Have a controller run an action, and print its answer.
+
+    webots-mcp send set_speed speed=3.5
+    """
+    import anyio
+
+    params = settings_of(arguments.settings)
+    answer = anyio.run(_ask, _writable(arguments), arguments, arguments.action, params)
+    _require_done(answer)
+    _print(answer, arguments)
+
+
+@command("pause", *_WHERE, TIMEOUT)
+def pause(arguments: argparse.Namespace) -> None:
+    """Pause the simulation; its controller goes on answering."""
+    arguments.action, arguments.settings = "pause", []
+    send(arguments)
+
+
+@command("resume", *_WHERE, TIMEOUT)
+def resume(arguments: argparse.Namespace) -> None:
+    """Let a paused simulation go on, in real time."""
+    arguments.action, arguments.settings = "resume", []
+    send(arguments)
+
+
+@command(
+    "step", *_WHERE, TIMEOUT,
+    argument("steps", nargs="?", default="1", metavar="N", help="so many rounds of its loop (1)"),
+)  # fmt: skip
+def step(arguments: argparse.Namespace) -> None:
+    """Let the controller's own loop come round N times, then pause."""
+    arguments.action, arguments.settings = "step", [f"steps={arguments.steps}"]
+    send(arguments)
+
+
+async def _ask(
+    recording: Recording, arguments: argparse.Namespace, action: str, params: dict[str, Any]
+) -> CommandAnswer:
+    from webots_mcp.server.dispatch import Dispatcher
+
+    try:
+        dispatcher = Dispatcher(recording, _show_progress)
+        return await dispatcher.ask(arguments.robot, action, arguments.timeout, params)
+    finally:
+        if sys.stderr.isatty():
+            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+
+
+async def _show_progress(progress: float, total: float | None, text: str) -> None:
+    """On a terminal one line that changes; in a pipe nothing, as for all commands."""
+    if sys.stderr.isatty():
+        print(f"\r{text}", end="\x1b[K", file=sys.stderr, flush=True)
+
+
+def _writable(arguments: argparse.Namespace) -> Recording:
+    from webots_mcp.contract import resolve_database
+    from webots_mcp.store.recording import Recording
+
+    return Recording(*resolve_database(arguments.database, arguments.data_dir))
+
+
+def _require_done(answer: CommandAnswer) -> None:
+    if answer.outcome == "done":
+        return
+    why = "; ".join(filter(None, (answer.error, answer.hint))) or "no answer in time"
+    raise CommandRefusedError(f"{answer.action} is not done ({answer.outcome}): {why}")
+
+
+def _print(answer: CommandAnswer, arguments: argparse.Namespace) -> None:
+    if arguments.json:
+        print(json.dumps(answer.model_dump(mode="json", exclude_none=True), indent=2))
+    else:
+        print(text_of(answer.result) or "done")
+
+
+def _print_run(answer: RunAnswer) -> None:
+    ran = answer.ran or {}
+    why = f" ({answer.why_stopped})" if answer.why_stopped else ""
+    factor = f", {ran['factor']} times real time" if ran.get("factor") else ""
+    print(
+        f"{answer.stopped}{why} at {ran.get('to_s')} s of run {ran.get('run_id')}: "
+        f"{ran.get('advanced_s')} s simulated{factor}; mode {answer.mode}"
+    )
+    print(f"state: {json.dumps(answer.state, ensure_ascii=False)}")
+    trends = answer.trends.numbers if answer.trends else None
+    for name, table in (("last rows", answer.rows), ("events", answer.events), ("trends", trends)):
+        _print_table(name, table)
+
+
+def _print_table(name: str, table: Table | None) -> None:
+    if table is not None:
+        print(f"\n{name}:")
+        print_table(table.columns, table.rows)

@@ -44,9 +44,9 @@ CONVERSATION: Final[tuple[tuple[str, str, dict[str, Any]], ...]] = (
     ("Go on.", "webots_simulation_control", {"command": "resume"}),
     ("Show me the arena.", "webots_take_screenshot", {}),
     (
-        "Go on as fast as you can until it avoids something, at most 20 s.",
+        "Go on as fast as you can until its mode changes, at most 20 s.",
         "webots_run",
-        {"until": "changed(mode) and mode != 'cruise'", "for_s": 20, "then": "as_before"},
+        {"until": "changed(mode)", "for_s": 20, "then": "as_before"},
     ),
     ("Watch it for five seconds.", "webots_monitor", {"duration_s": 5}),
     ("What has each signal done since the start?", "webots_get_trends", {}),

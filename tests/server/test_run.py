@@ -13,6 +13,9 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
+from webots_mcp.errors import CommandRefusedError
+from webots_mcp.server.running import require_possible
+from webots_mcp.store.recording import Recording
 
 pytestmark = pytest.mark.anyio
 
@@ -151,6 +154,17 @@ async def test_what_cannot_end_is_refused_before_anything_is_sent(
         assert [row[1] for row in sent] == ["run"], "only the unknown parameter met the bridge"
         again = await ask(client, "webots_run", until="steps >= 3", reset=True, then="go_on")
         assert again["ran"]["to_s"] <= 0.064
+
+
+def test_a_change_in_the_newest_row_is_not_the_one_that_is_waited_for(recorded: Recorded) -> None:
+    robot = recorded.robot()
+    for n, mode in enumerate(("cruise", "turn")):
+        robot.state(1.0 + n, {"mode": mode})
+    assert isinstance(recorded.database, Path)
+    recording = Recording(recorded.database, recorded.database.parent)
+    require_possible(recording, None, "changed(mode)", None, reset=False)
+    with pytest.raises(CommandRefusedError, match=r"since 2\.000 s"):
+        require_possible(recording, None, "mode == 'turn'", None, reset=False)
 
 
 async def test_two_at_once_are_refused(connect: Connect, driver: Driver) -> None:

@@ -105,8 +105,11 @@ def _known_names(view: View) -> set[str]:
 
 
 def _require_open(view: View, condition: Condition) -> None:
-    """Refuse a condition that holds at the newest row: the run would be over at once."""
-    if view.run is None:
+    """Refuse a condition that holds at the newest row: the run would be over at once.
+
+    A change is of one step only: whoever asks for it means the next one.
+    """
+    if view.run is None or "changed(" in condition.text:
         return
     since_s = _holds_since(view.connection, view.run.id, condition)
     if since_s is None:

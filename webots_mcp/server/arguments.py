@@ -19,6 +19,7 @@ from pydantic_core import ErrorDetails
 from webots_mcp.naming import nearest_first
 
 _MOST_FAULTS: Final = 3
+_UNSAID: Final = ("title", "anyOf", "maxLength", "maxProperties")
 _LONGEST_VALUE: Final = 80
 
 
@@ -51,12 +52,17 @@ class CheckedTool(Tool):
 
 
 def _slim(schema: dict[str, Any]) -> dict[str, Any]:
-    """A parameter's schema without its name once more, and without null for "may be left out"."""
-    kept = {key: value for key, value in schema.items() if key not in ("title", "anyOf")}
+    """A parameter's schema without what says nothing.
+
+    That is its name once more, null or an empty default for "may be left out", and the longest
+    text, which only an absurd one exceeds.
+    """
     choices = [choice for choice in schema.get("anyOf", ()) if choice != {"type": "null"}]
-    if kept.get("default", ...) is None:
+    whole = schema | (choices[0] if len(choices) == 1 else {})
+    kept = {key: value for key, value in whole.items() if key not in _UNSAID}
+    if kept.get("default", ...) in (None, ""):
         del kept["default"]
-    return kept | (choices[0] if len(choices) == 1 else {"anyOf": choices} if choices else {})
+    return kept | ({"anyOf": choices} if len(choices) > 1 else {})
 
 
 def _require_known(arguments: Iterable[str], known: Iterable[str]) -> None:

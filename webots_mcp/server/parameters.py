@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Final
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, WithJsonSchema
 
 from webots_mcp import contract
 from webots_mcp.store.detection.registry import KINDS, kind_names
@@ -32,59 +32,53 @@ def _as_seconds(value: float) -> float:
     return value
 
 
-def _as_name(value: str) -> str:
-    if len(value) > LONGEST_NAME:
-        raise ValueError(f"have at most {LONGEST_NAME} characters")
-    return value
-
-
-# Bounds that only an absurd value meets stay out of the schemas, which every client carries along.
-# The others stand before a validator of ours: behind it pydantic does not know JSON Schema's words.
-_RowId = Annotated[int, Field(ge=1), AfterValidator(_as_id)]
+# Bounds that only an absurd value meets stay out of the schemas, which every client carries along:
+# `CheckedTool` leaves the lengths of texts out, a validator has the others. The bounds beside a
+# validator stand before it: behind it pydantic does not know JSON Schema's words.
+Id = Annotated[int, Field(ge=1), AfterValidator(_as_id)]
 _Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]
 _Seconds = Annotated[float, AfterValidator(_as_seconds)]
 _Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
 RobotName = Annotated[
-    Annotated[str, AfterValidator(_as_name)] | None,
-    Field(description="Its name, where several are live."),
+    Annotated[str, Field(max_length=LONGEST_NAME)] | None,
+    Field(description="Where several are live."),
 ]
-RunId = Annotated[_RowId | None, Field(description="Instead of its current run.")]
+RunId = Annotated[Id | None, Field(description="Instead of its current run.")]
 LastS = Annotated[
     _Duration | None,
-    Field(description="Only the last seconds of simulation time."),
+    Field(description="The last seconds of simulation time."),
 ]
-StartS = Annotated[_Seconds | None, Field(description="From this simulation time on, s.")]
-EndS = Annotated[_Seconds | None, Field(description="Before this simulation time, s.")]
+StartS = Annotated[_Seconds | None, Field(description="From this simulation time on.")]
+EndS = Annotated[_Seconds | None, Field(description="Before this simulation time.")]
 TimeoutS = Annotated[
     float,
-    Field(ge=0.1, le=MAX_WAIT_S, description="Longest wait for the outcome, wall seconds."),
+    Field(ge=0.1, le=MAX_WAIT_S, description="Longest wait, wall seconds."),
 ]
-_CURSOR: Final = "From the previous answer, to go on there."
+_CURSOR: Final = "From the last answer, to go on."
 Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
-Since = Annotated[
-    float | str | None,
-    Field(description="From this wall time on, across runs: ISO 8601 or Unix seconds."),
-]
-Until = Annotated[float | str | None, Field(description="Before this wall time; see since.")]
+# A number is as good; one type that holds both is shorter than two.
+_WallTime = Annotated[float | str | None, WithJsonSchema({"type": "string"})]
+Since = Annotated[_WallTime, Field(description="From this wall time on: ISO 8601, Unix seconds.")]
+Until = Annotated[_WallTime, Field(description="Before this wall time.")]
 Names = Annotated[
     list[str],
     Field(
         min_length=1,
         max_length=50,
-        description="Signal names (webots_list_signals); 'pose' means all below it, '*' any text.",
+        description="Their names (webots_list_signals); 'pose' is all below it, '*' any text.",
     ),
 ]
 AnyNames = Annotated[
     list[str] | None,
-    Field(max_length=50, description="Only these signals (webots_list_signals); '*' any text."),
+    Field(max_length=50, description="Only these; '*' is any text."),
 ]
 MaxPoints = Annotated[
     int | None,
     Field(
         ge=1,
         le=500,
-        description="At most so many buckets (with raw: rows); by default as many as fit.",
+        description="At most so many buckets, or rows with raw.",
     ),
 ]
 Kind = Annotated[
@@ -101,17 +95,17 @@ Kinds = Annotated[
 ]
 TimelineKinds = Annotated[
     list[Annotated[str, AfterValidator(_as_kind)]] | None,
-    Field(description="Only these kinds of webots_find_events; by default all that were stored."),
+    Field(description="Of those of webots_find_events; by default all that were stored."),
 ]
 ShownLimit = Annotated[
     int | None,
-    Field(ge=1, le=500, description="At most so many; by default what a short answer holds."),
+    Field(ge=1, le=500, description="At most so many; by default a short answer."),
 ]
-LogLevel = Annotated[contract.LogLevel, Field(description="Log lines of this level and above.")]
+LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: this level and above.")]
 Limit = Annotated[int, Field(ge=1, le=500, description="At most so many.")]
 RunIds = Annotated[
-    list[_RowId] | None,
-    Field(max_length=10, description="Several runs by their ids (webots_list_runs)."),
+    list[Id] | None,
+    Field(max_length=10, description="From webots_list_runs."),
 ]
 # What a client gives for a `Scope`, which tools take whole.
 SCOPE: Final = {

@@ -15,7 +15,7 @@ from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.parameters import RobotName
+from webots_mcp.server.parameters import Id, RobotName
 from webots_mcp.server.results import BreakpointAnswer, BreakpointsAnswer, CommandAnswer, Table
 from webots_mcp.server.shortening import cut_text
 from webots_mcp.store.breakpoints import (
@@ -37,7 +37,7 @@ _ARM: Final = "arm_breakpoints"
 _WAIT_S: Final = 5.0
 _LONGEST_TEXT: Final = 300
 
-BreakpointId = Annotated[int, Field(ge=1, le=2**63 - 1, description="From webots_breakpoint.")]
+BreakpointId = Annotated[Id, Field(description="From webots_breakpoint.")]
 
 
 @tool("Set a breakpoint", ACTS)

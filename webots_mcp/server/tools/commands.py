@@ -11,7 +11,7 @@ from pydantic import Field
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
 from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.dispatch import Dispatcher, shown_result
-from webots_mcp.server.parameters import Cursor, RobotName, TimeoutS
+from webots_mcp.server.parameters import Cursor, Id, RobotName, TimeoutS
 from webots_mcp.server.results import CommandAnswer, CommandsAnswer, Table
 from webots_mcp.server.shortening import DETAIL_BUDGET, cut_text, shorten
 from webots_mcp.store.queue import Command, list_commands
@@ -30,12 +30,10 @@ async def webots_send_command(
     recording: Recording,
     action: Annotated[
         str,
-        Field(min_length=1, max_length=200, description="Its name, see webots_list_commands."),
+        Field(min_length=1, max_length=200, description="As in webots_list_commands."),
     ],
     ctx: Context[Any],
-    params: Annotated[
-        dict[str, Any] | None, Field(description="Its parameters, as its docstring says.")
-    ] = None,
+    params: Annotated[dict[str, Any] | None, Field(description="As its docstring says.")] = None,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
@@ -50,7 +48,7 @@ async def webots_send_command(
 @tool("Wait for a command", READS)
 async def webots_wait_for_command(
     recording: Recording,
-    command_id: Annotated[int, Field(ge=1, le=2**63 - 1, description="From its answer.")],
+    command_id: Annotated[Id, Field(description="From its answer.")],
     ctx: Context[Any],
     timeout_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:

@@ -42,8 +42,7 @@ async def webots_simulation_control(
         Field(
             ge=0.1,
             le=MAX_WAIT_S,
-            description="By default 10 s, for reload 30, for step up to 90; then "
-            "webots_wait_for_command goes on waiting.",
+            description="Longest wait; by default 10 s, for reload 30, for step up to 90.",
         ),
     ] = None,
 ) -> CommandAnswer:

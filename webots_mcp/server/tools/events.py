@@ -57,19 +57,13 @@ def webots_find_events(
     above: Annotated[
         float | None, Field(description="Short for where: the signals were above this ...")
     ] = None,
-    below: Annotated[float | None, Field(description="... or below this ...")] = None,
-    for_s: Annotated[
-        float, Field(ge=0, description="... for at least so many simulated seconds.")
-    ] = 0,
+    below: Annotated[float | None, Field(description="... or below this")] = None,
+    for_s: Annotated[float, Field(ge=0, description="... for at least so long.")] = 0,
     stuck_s: Annotated[
-        float, Field(gt=0, description="Still, or stuck, is who for so long ...")
+        float, Field(gt=0, description="Still is who for so long ...")
     ] = EventOptions.stuck_s,
     stuck_m: Annotated[
-        float,
-        Field(
-            gt=0,
-            description="... stays within so many metres (more where the position is noisy).",
-        ),
+        float, Field(gt=0, description="... stays within so many metres (more if noisy).")
     ] = EventOptions.stuck_m,
     log_level: LogLevel = "warning",
     limit: ShownLimit = None,

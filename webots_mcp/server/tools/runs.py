@@ -125,7 +125,7 @@ def webots_compare_runs(
     Without run_ids: the runs before and after the last edit of the controller's file. Over the
     same stretch of each run: distance, mean speed, share of time per mode, events per minute,
     and the signals that differ most. `different` is true only beyond the spread of like runs,
-    which takes several runs of each: null says that it cannot be told.
+    so it takes several runs of each; null: it cannot be told.
     """
     with recording.view(robot, run_ids[0] if run_ids else None) as view:
         return answer_about(

@@ -38,11 +38,9 @@ _ERROR_CHARACTERS: Final = 300
 
 PagePath = Annotated[
     str,
-    Field(max_length=1000, description="Dotted path of a part, e.g. 'sensors.lidar'; '' is all."),
+    Field(max_length=1000, description="Dotted path, as sensors.lidar."),
 ]
-Offset = Annotated[
-    int, Field(ge=0, description="First item (array) or character (text) at the path.")
-]
+Offset = Annotated[int, Field(ge=0, description="First item or character at the path.")]
 PageSize = Annotated[
     int, Field(ge=1, le=2000, description="How many items or characters at the path.")
 ]
@@ -52,9 +50,9 @@ PageSize = Annotated[
 def webots_get_robot_state(
     recording: Recording, robot: RobotName = None, run_id: RunId = None
 ) -> StateAnswer:
-    """The newest state that the robot's controller published, shortened where it is long.
+    """The robot now, at a glance: its newest published state, rounded, long arrays summed up.
 
-    Long arrays come as count, min, max, mean, argmin; webots_get_full_state has them whole.
+    webots_get_full_state has a part of it whole and exact.
     """
     with recording.view(robot, run_id) as view:
         if view.state is None:
@@ -99,10 +97,10 @@ def webots_get_full_state(
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> FullStateAnswer:
-    """The newest state with exact numbers, or a part of it, in pages where it is long.
+    """A part of the newest state, whole and exact, in pages: what webots_get_robot_state shortens.
 
-    Without a path also the newest events and the recorder's health: rows waiting and dropped,
-    last error, version of the controller's code.
+    Without a path all of it, the newest events and the recorder's health: rows waiting and
+    dropped, last error, version of the controller's code.
     """
     with recording.view(robot, run_id) as view:
         if view.state is None:

@@ -52,7 +52,7 @@ def webots_get_trends(
     """What each signal did, in words, by default over the whole run; values: webots_query_history.
 
     What changed most comes first: rises, falls, swings (period, amplitude), rests since when,
-    spikes, missing values; of modes and flags the changes and the time in each value.
+    spikes, missing values; of modes and flags the time in each value.
     """
     with recording.view(scope.robot, scope.run_id) as view:
         return answer_about(

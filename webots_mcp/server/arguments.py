@@ -57,6 +57,7 @@ def _slim(schema: dict[str, Any]) -> dict[str, Any]:
     That is its name once more, null or an empty default for "may be left out", and the longest
     text, which only an absurd one exceeds.
     """
+    choices: list[dict[str, Any]]
     choices = [choice for choice in schema.get("anyOf", ()) if choice != {"type": "null"}]
     whole = schema | (choices[0] if len(choices) == 1 else {})
     kept = {key: value for key, value in whole.items() if key not in _UNSAID}

@@ -219,6 +219,22 @@ def test_the_noise_of_a_position_is_no_way(
         assert distance_m == pytest.approx(way_m, abs=0.03 * way_m + 0.6)
 
 
+@pytest.mark.parametrize("name", ["bearing_rad", "heading_deg", "level_m"])
+def test_what_is_left_of_adding_equal_numbers_is_no_difference(
+    empty: sqlite3.Connection, name: str
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    for rows in (25, 75):
+        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        for step in range(100):
+            value = -1.3862943611198906 if step < rows else -1.386294361119891
+            recorder.publish(step * 0.1, {name: value})
+    (found,) = compare_runs(empty, [1, 2], names=[name]).differences
+    assert medians(found.deviation) == [0, 0]
+    assert (found.effect, found.deviation_ratio) == ([0, 0], [None, None])
+
+
 def test_runs_before_and_after_the_last_edit_are_compared(rover: sqlite3.Connection) -> None:
     comparison = compare_code(rover)
     before, after = comparison.groups

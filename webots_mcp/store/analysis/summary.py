@@ -17,6 +17,7 @@ from webots_mcp.store.analysis.arrays import Array, inner, np
 
 _NUMBERS: Final = frozenset({int, float, bool})
 _LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
+_LENGTH_DUST: Final = 1e-14  # what adding unit vectors leaves; less than 1.5e-7 rad
 _INTEGERS: Final = 2**63  # SQLite takes no larger ones: they become floats
 
 
@@ -82,7 +83,7 @@ class Summary(NamedTuple):
         """The standard deviation of the sample, with n - 1."""
         if self.squares is None or self.present < 2:
             return None
-        return math.sqrt(self.squares / (self.present - 1))
+        return 0.0 if self.min == self.max else math.sqrt(self.squares / (self.present - 1))
 
     @property
     def circular_deviation(self) -> float | None:
@@ -92,7 +93,9 @@ class Summary(NamedTuple):
         """
         if self.sines is None or self.cosines is None or self.present < 2:
             return None
-        length = min(1.0, math.hypot(self.sines, self.cosines) / self.present)
+        length = math.hypot(self.sines, self.cosines) / self.present
+        if length > 1 - _LENGTH_DUST:
+            return 0.0
         return math.sqrt(-2 * math.log(length)) if length > 0 else None
 
     def deviation_in(self, turn: float | None) -> float | None:

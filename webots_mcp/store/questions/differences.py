@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 from webots_mcp.store.analysis.spread import Spread, spread_of, verdicts_on
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.signals.registry import Signal
+
+_DUST: Final = 1e-9  # of a signal's largest value: what varies by less does not vary
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,14 @@ def _means(turn: float | None, groups: Sequence[Sequence[Summary]]) -> list[list
 def _deviations(
     turn: float | None, groups: Sequence[Sequence[Summary]]
 ) -> list[list[float | None]]:
-    return [[each.deviation_in(turn) for each in group] for group in groups]
+    return [[_without_dust(each.deviation_in(turn), each) for each in group] for group in groups]
+
+
+def _without_dust(deviation: float | None, summary: Summary) -> float | None:
+    """What adding floats leaves is the 0 that it means."""
+    if deviation is None or summary.min is None or summary.max is None:
+        return deviation
+    return deviation if deviation > _DUST * max(abs(summary.min), abs(summary.max)) else 0.0
 
 
 def _either(one: bool | None, other: bool | None) -> bool | None:

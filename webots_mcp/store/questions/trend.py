@@ -55,7 +55,7 @@ class Trend:
         resolution_s: Length of the means in which swings were seen; None where rows were.
         flat_since_s: Since when it rests; None if it does not.
         spikes: Values that stand out from both neighbours; None where rows were not looked at.
-        missing_share: Rows without a value.
+        missing: Of the rows, those without a value.
         change: How much it changed with time, 0 to 2: the share of its variance that is slow
             (`time_effect`) times its range in units of its largest magnitude. Free of units.
         says: What a person would notice.
@@ -78,7 +78,7 @@ class Trend:
     resolution_s: float | None
     flat_since_s: float | None
     spikes: tuple[Spike, ...] | None
-    missing_share: float
+    missing: int
     change: float
     says: str
 
@@ -136,7 +136,7 @@ def judge(
         resolution_s=resolution_s,
         flat_since_s=rest_s,
         spikes=None if spikes is None else tuple(spikes),
-        missing_share=1 - summary.present / summary.rows,
+        missing=summary.rows - summary.present,
         change=time_effect(times, course, inner.mean or 0.0, inner.squares or 0.0)
         * slow
         * _relative_range(summary),
@@ -268,8 +268,8 @@ def _remarks(trend: Trend) -> Iterator[str]:
             f"{len(trend.spikes)} spike{'s' if len(trend.spikes) > 1 else ''}, the largest "
             f"{largest.value:.4g} at {largest.sim_time_s:.6g} s"
         )
-    if trend.missing_share > TOLD_MISSING_SHARE:
-        yield f"no value in {100 * trend.missing_share:.3g} % of the rows"
+    if trend.missing > TOLD_MISSING_SHARE * summary.rows:
+        yield f"no value in {trend.missing} of {summary.rows} rows"
 
 
 def _course(trend: Trend, unit: str) -> str:

@@ -255,7 +255,7 @@ def _in_simulation_time(
         )
     first_s, newest_s = bounds
     if last_s is not None:
-        start_s = newest_s - last_s
+        start_s = newest_s - last_s if last_s < newest_s - first_s else None
     start = first_s if start_s is None else _bound(connection, subject, start_s)
     # An end that is left out holds the newest row, also where the start lies beyond it.
     end = just_after(max(newest_s, start)) if end_s is None else _bound(connection, subject, end_s)

@@ -298,12 +298,10 @@ def create_trial_set() -> None:
             "plan",
             sa.Text(),
             nullable=False,
-            comment="JSON object: what to try, for how long, and the score",
+            comment="JSON object",
         ),
         sa.Column("created_wall_time_s", sa.Float(), nullable=False),
-        sa.Column(
-            "host", sa.Text(), comment="of the process that works on it; null where none does"
-        ),
+        sa.Column("host", sa.Text(), comment="of the process at work"),
         sa.Column("pid", sa.Integer()),
         sa.Column("process", sa.Text(), comment=PROCESS),
         sa.PrimaryKeyConstraint("id"),
@@ -324,9 +322,9 @@ def create_trial() -> None:
             "status", sa.Text(), nullable=False, comment="waiting, running, then done or failed"
         ),
         sa.Column("run_id", sa.Integer()),
-        sa.Column("score", sa.Float(), comment="null unless it is done"),
-        sa.Column("ended_by", sa.Text(), comment="for_s or until: which of them was the end"),
-        sa.Column("ended_sim_time_s", sa.Float(), comment="what came later does not count"),
+        sa.Column("score", sa.Float(), comment="if it is done"),
+        sa.Column("ended_by", sa.Text(), comment="for_s or until"),
+        sa.Column("ended_sim_time_s", sa.Float(), comment="the end"),
         sa.Column("error", sa.Text(), comment="why it failed"),
         sa.Column("started_wall_time_s", sa.Float()),
         sa.Column("finished_wall_time_s", sa.Float()),

@@ -9,6 +9,7 @@ from importlib import metadata
 from typing import Final
 
 _NAME: Final = re.compile(r"[\w.-]+")
+_OLD_PYTHON: Final = re.compile(r"""python_version < ['"]3\.(\d+)['"]""")
 
 
 def explain_missing(error: ModuleNotFoundError) -> str:
@@ -35,8 +36,18 @@ def _missing_requirements() -> Iterator[str]:
     except metadata.PackageNotFoundError:  # used without being installed
         return
     for requirement in requirements:
-        if "extra ==" not in requirement and not _is_installed(_name(requirement)):
+        if (
+            "extra ==" not in requirement
+            and _is_for_us(requirement)
+            and not _is_installed(_name(requirement))
+        ):
             yield requirement
+
+
+def _is_for_us(requirement: str) -> bool:
+    """Whether this Python is old enough to need it."""
+    older_than = _OLD_PYTHON.search(requirement)
+    return older_than is None or sys.version_info < (3, int(older_than[1]))
 
 
 def _name(requirement: str) -> str:

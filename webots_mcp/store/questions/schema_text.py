@@ -29,11 +29,16 @@ def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:
 
 
 def describe_schema(connection: sqlite3.Connection) -> str:
-    """One line per table and view: its columns, with their comments in brackets."""
+    """One line per table and view: its columns, with their comments in brackets.
+
+    What is said of a column is not repeated for one of the same name in a later table.
+    """
     columns = columns_by_table(connection)
-    lines = [_RULES]
+    lines, told = [_RULES], set[tuple[str, str]]()
     for name, kind, sql in connection.execute(_OBJECTS).fetchall():
-        comments = dict(_COMMENT.findall(sql)) if kind == "table" else {}
+        found = dict.fromkeys(_COMMENT.findall(sql) if kind == "table" else ())
+        comments = dict(each for each in found if each not in told)
+        told.update(found)
         listed = (
             f"{column} [{comments[column]}]" if column in comments else column
             for column in columns[name]

@@ -11,12 +11,14 @@ _OBJECTS: Final = (
     "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' ORDER BY type, rowid"
 )
 _COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
-_COMMENT: Final = re.compile(r'^\s*"?(\w+)"?\s[^\n]*?/\* (.*?) \*/', re.MULTILINE)
+# A column that was added later stands on the line of the last one, after a comma.
+# A column that was added later stands on the line of the last one, after a comma.
+_COMMENT: Final = re.compile(r'(?:^|,)\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.MULTILINE)
 _RULES: Final = (
     "Times are seconds: sim_time_s of the simulation, wall_time_s Unix. state.data is JSON: "
     "json_extract(data, '$.pose[0]'); signal.path has the path of each name. A range of a run is "
     "fast by run_id and sim_time_s; for a long one use all_rollup (10 s buckets) "
-    "or coarse_rollup (500 s)."
+    "or coarse_rollup (500 s; bucket = floor(sim_time_s / 500))."
 )
 
 
@@ -29,19 +31,24 @@ def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:
 
 
 def describe_schema(connection: sqlite3.Connection) -> str:
-    """One line per table and view: its columns, with their comments in brackets.
+    """One line for tables and views with the same columns: those of the first, with comments.
 
     What is said of a column is not repeated for one of the same name in a later table.
     """
     columns = columns_by_table(connection)
-    lines, told = [_RULES], set[tuple[str, str]]()
+    names: dict[frozenset[str], list[str]] = {}
+    listed: dict[frozenset[str], str] = {}
+    told = set[tuple[str, str]]()
     for name, kind, sql in connection.execute(_OBJECTS).fetchall():
-        found = dict.fromkeys(_COMMENT.findall(sql) if kind == "table" else ())
-        comments = dict(each for each in found if each not in told)
-        told.update(found)
-        listed = (
-            f"{column} [{comments[column]}]" if column in comments else column
-            for column in columns[name]
-        )
-        lines.append(f"{kind} {name}: {', '.join(listed)}")
-    return "\n".join(lines)
+        same = frozenset(columns[name])
+        names.setdefault(same, []).append(f"{kind} {name}")
+        if same not in listed:
+            found = dict.fromkeys(_COMMENT.findall(sql) if kind == "table" else ())
+            listed[same] = _listed(columns[name], dict(each for each in found if each not in told))
+            told.update(found)
+    lines = (f"{', '.join(alike)}: {listed[same]}" for same, alike in names.items())
+    return "\n".join((_RULES, *lines))
+
+
+def _listed(columns: list[str], comments: dict[str, str]) -> str:
+    return ", ".join(f"{name} [{comments[name]}]" if name in comments else name for name in columns)

@@ -169,3 +169,12 @@ def test_large_steps_that_are_how_a_signal_is_are_not_judged(empty: sqlite3.Conn
     answer = ask(empty, "jump")
     assert answer.events == ()
     assert "not in nearest" in answer.verdicts.not_searched["jump"]
+
+
+def test_a_freeze_that_is_too_short_to_count_is_told_as_what_came_nearest(
+    empty: sqlite3.Connection,
+) -> None:
+    record(empty, lambda t: {"front": range_m(min(t, 45)), "gear": int(t / 15)}, until_s=60.0)
+    nearest = ask(empty, "flat").verdicts.absent["flat"]
+    assert nearest.startswith("front stayed at ")
+    assert nearest.endswith(" for 14.9 s from 45 s")

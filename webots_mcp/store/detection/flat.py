@@ -31,16 +31,30 @@ def flat_events(search: Search) -> Iterator[Event]:
         if search.is_over("flat", search.numbers[index:]):
             return
         spans = search.view.spans(signal, Flat())
-        flat = [span for span in spans if span.end_s - span.start_s >= least_s]
+        flat = [span for span in spans if _length_s(span) >= least_s]
         if flat and (_changes_otherwise(search, here, flat) or _is_lively(search, signal)):
             for span in flat:
                 yield search.event("flat", span.start_s, span.end_s, signal.name, value=span.key)
+        elif spans and not flat and not search.view.shortest_rest_s:
+            _note_longest(search, signal, here, max(spans, key=_length_s))
+
+
+def _note_longest(search: Search, signal: Signal, here: Summary, span: Span) -> None:
+    """What came nearest, where all rests are known and it is not how the signal is."""
+    if _changes_otherwise(search, here, [span]):
+        lasted_s = _length_s(span)
+        what = f"{signal.name} stayed at {span.key} for {lasted_s:.3g} s from {span.start_s:.6g} s"
+        search.came_near("flat", lasted_s / search.options.flat_s, what)
+
+
+def _length_s(span: Span) -> float:
+    return span.end_s - span.start_s
 
 
 def _changes_otherwise(search: Search, here: Summary, flat: Sequence[Span]) -> bool:
     """Whether it changed in most of the rows outside of those spans, and in ten at least."""
     whole_s = min(search.segment.end_s, search.ended_s) - search.segment.start_s
-    flat_s = sum(span.end_s - span.start_s for span in flat)
+    flat_s = sum(map(_length_s, flat))
     rows = here.present * max(0.0, 1 - flat_s / whole_s) if whole_s > 0 else 0.0
     return here.changes >= max(LEAST_CHANGES, MOSTLY * rows)
 

@@ -51,3 +51,10 @@ def test_who_looks_at_more_time_finds_no_less(
     ]
     middle_s = before_s + 13.0
     assert sum(start_s < middle_s < end_s for start_s, end_s in spans) == 1
+
+
+@pytest.mark.parametrize("speed_m_s", [0.001, 0.003])
+def test_a_very_slow_robot_stands_from_when_it_stops(speed_m_s: float) -> None:
+    track, _ = noisy_track([(60.0, speed_m_s, 0.0), (60.0, 0.0, 0.0)], 0.032, 0.0002)
+    (found,) = find_standstills(track, RADIUS_M, LEAST_S)
+    assert track.times[found.start] == pytest.approx(60.0, abs=0.001 / speed_m_s)

@@ -154,14 +154,24 @@ def _begin_of_rest(track: Track, first: int, last: int, x_m: float, y_m: float) 
         y_m: As well.
     """
     reach = max(_LEAST_RAMP_ROWS, track.smoothed_rows)
-    start, end = max(0, first - reach), min((first + last) // 2, first + reach)
-    if first == 0 or end <= start:
-        return first
-    rows = slice(start, end)
+    latest = (first + last) // 2
+    while first > 0:
+        rows = slice(max(0, first - reach), min(latest, first + reach))
+        if rows.stop <= rows.start:
+            break
+        best = rows.start + _end_of_ramp(track, rows, x_m, y_m)
+        if best < rows.stop - 1 or rows.stop == latest:
+            return best
+        first = best  # a slow robot is near its place long before it rests
+    return first
+
+
+def _end_of_ramp(track: Track, rows: slice, x_m: float, y_m: float) -> int:
+    """Of ramps that end in rest, each in another of the rows, the one that explains them best."""
     off = np.stack((track.raw_x[rows] - x_m, track.raw_y[rows] - y_m), axis=1)
     times = track.times[rows]
     ramps = np.minimum(times[None, :] - times[:, None], 0.0)  # one a row, for each end
     squares = np.einsum("ij,ij->i", ramps, ramps)
     explained = ((ramps @ off) ** 2).sum(axis=1)
     gain = np.divide(explained, squares, out=np.zeros_like(squares), where=squares > 0)
-    return start + int(np.argmax(gain))
+    return int(np.argmax(gain))

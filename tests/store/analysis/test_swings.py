@@ -102,3 +102,9 @@ def test_what_is_switched_to_and_fro_swings(levels: tuple[float, ...]) -> None:
     at = (times / (2.0 / len(levels))).astype(np.int64) % len(levels)
     (swing,) = swings_of(times, np.array(levels)[at])
     assert swing.period_s == pytest.approx(2.0, rel=0.02)
+
+
+@pytest.mark.parametrize("seed", [7, 19, 23, 30, 32, 39])
+def test_a_random_walk_that_looks_regular_for_a_while_does_not_swing(seed: int) -> None:
+    steps = np.random.default_rng(seed).normal(0, 1, 6000)
+    assert swings_of(np.linspace(0, 300, 6001)[:-1], np.cumsum(steps)) == []

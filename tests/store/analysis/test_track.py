@@ -79,3 +79,17 @@ def test_the_length_of_a_way_hangs_neither_on_where_nor_on_whither(
     y = sin * track.raw_x + cos * track.raw_y + north_m
     elsewhere = path_length_m(track_of(track.times, x, y))
     assert elsewhere == pytest.approx(path_length_m(track), rel=0.05)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.002, 0.005])
+def test_in_bends_the_way_is_longer_than_the_straight_lines_between_its_rows(
+    noise_m: float,
+) -> None:
+    track, length_m = noisy_track([(60.0, 0.3, 1.5)], 0.5, noise_m)
+    assert path_length_m(track) == pytest.approx(length_m, rel=0.015)
+
+
+@pytest.mark.parametrize("noise_m", [0.002, 0.005, 0.02])
+def test_noise_across_the_way_adds_nothing_to_it(noise_m: float) -> None:
+    track, length_m = noisy_track([(120.0, 0.25, 0.0)], 0.008, noise_m)
+    assert path_length_m(track) == pytest.approx(length_m, rel=0.008)

@@ -12,6 +12,7 @@ _ORDER: Final = 4
 _GAIN: Final = 0.6745 * 70**0.5
 _BLOCK_ROWS: Final = 128
 LEAST_ROWS: Final = 3 * _ORDER
+FEWEST_SMOOTHED: Final = 5  # rows: through fewer a parabola leaves the noise
 
 
 def noise_of(values: Array) -> float:
@@ -49,14 +50,30 @@ def smooth(values: Array, rows: int) -> tuple[Array, float]:
     parabola through the first or last window is taken.
     """
     rows = min(rows, len(values) - 1 + len(values) % 2)
-    if rows < 5:
+    if rows < FEWEST_SMOOTHED:
         return values, 1.0
-    place = np.arange(rows, dtype=np.float64) - rows // 2
-    basis = np.stack((place**2, place, np.ones(rows)), axis=1)
-    fit = basis @ np.linalg.lstsq(basis, np.eye(rows), rcond=None)[0]
-    middle = fit[rows // 2]
-    smoothed = np.asarray(np.convolve(values, middle[::-1], "same"), np.float64)
+    fit = _parabola(rows)
     half = rows // 2
+    smoothed = np.asarray(np.convolve(values, fit[half, ::-1], "same"), np.float64)
     smoothed[:half] = (fit @ values[:rows])[:half]
     smoothed[-half:] = (fit @ values[-rows:])[-half:]
-    return smoothed, float(np.sqrt(middle @ middle))
+    return smoothed, float(np.sqrt(fit[half] @ fit[half]))
+
+
+def kept_alike(rows: int) -> Array:
+    """Correlation of the noise in two smoothed values that lie 0, 1, 2, ... rows apart.
+
+    The last one, 0, holds for all that lie farther apart.
+    """
+    if rows < FEWEST_SMOOTHED:
+        return np.array([1.0, 0.0])
+    middle = _parabola(rows)[rows // 2]
+    alike = np.correlate(middle, middle, "full")[rows - 1 :]
+    return np.append(alike / alike[0], 0.0)
+
+
+def _parabola(rows: int) -> Array:
+    """The matrix that turns so many values into those of the parabola of least squares."""
+    place = np.arange(rows, dtype=np.float64) - rows // 2
+    basis: Array = np.stack((place**2, place, np.ones(rows)), axis=1)
+    return np.asarray(basis @ np.linalg.pinv(basis), np.float64)

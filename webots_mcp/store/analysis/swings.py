@@ -8,6 +8,7 @@ asking for more time never finds less.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -39,6 +40,8 @@ NOISE_BENDS: Final = 10.0  # deviations of the noise, over the root of the rows;
 TRIED_PERIODS: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)
 NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
 MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
+WALK_CHANCE: Final = 1e-5  # that a random walk swings so far; it is asked thousands of times
+_QUARTILE: Final = 0.3186  # what a quarter of the magnitudes of a normal variable is below
 SAME_NUMBER: Final = 1e-9  # of the value: what adding up floating-point numbers makes of one
 SWITCHED_VALUES: Final = 3
 REACHES: Final = 2.0  # times as far as in its band a swing reaches at most
@@ -295,12 +298,20 @@ def _fitted(
     least = _least_amplitude(noise_of(values[rows]), period_s, interval_s, count)
     if farthest < least:
         return
+    around, inner = _surroundings(rows, len(values))
+    course = values[around]
     best = _best_sine(times[rows], values[rows], period_s, interval_s)
     if best[0] < _least_explained(count):
-        best = _best_sine_of_straightened(times, values, rows, period_s, interval_s)
+        bare = _straightened(times[around], course, round(2 * period_s / interval_s))
+        if bare is None:
+            return
+        course = bare
+        best = _best_sine(times[rows], course[inner], period_s, interval_s)
         if best[0] < STRAIGHTENED_EXPLAINED:
             return
     explained, period_s, amplitude = best
+    if _is_as_of_walk(amplitude, count, _walked(course, period_s / interval_s)):
+        return
     if amplitude >= least and amplitude > resolution:
         yield Swing(start_s, end_s, count, period_s, amplitude, explained)
 
@@ -332,17 +343,44 @@ def _least_explained(half_swings: int) -> float:
     return float(np.interp(half_swings, (6, 10), LEAST_EXPLAINED))
 
 
-def _best_sine_of_straightened(
-    times: Array, values: Array, rows: slice, period_s: float, interval_s: float
-) -> tuple[float, float, float]:
-    around = round(2 * period_s / interval_s)
-    start = max(0, rows.start - around)
-    wide = slice(start, rows.stop + around)
-    course = _straightened(times[wide], values[wide], around)
-    if course is None:
-        return 0.0, period_s, 0.0
-    inner = course[rows.start - start : rows.stop - start]
-    return _best_sine(times[rows], inner, period_s, interval_s)
+def _surroundings(rows: slice, count: int) -> tuple[slice, slice]:
+    """The rows with thrice as many before and after them, and where among those they are."""
+    length = 3 * (rows.stop - rows.start)
+    around = slice(max(0, rows.start - length), min(count, rows.stop + length))
+    return around, slice(rows.start - around.start, rows.stop - around.start)
+
+
+def _walked(course: Array, rows: float) -> float:
+    """How far a random walk beneath a swing of so many rows goes in one of its periods.
+
+    In the difference to one period later the swing is gone. How much more that bends over an
+    eighth of a period than over a sixteenth tells of the walk: noise bends both alike.
+    """
+    step = max(1, int(rows / ROWS_PER_PERIOD))
+    means, period = _means(course, step), round(rows / step)
+    apart = means[period:] - means[:-period]
+    lag = max(1, period // ROWS_PER_PERIOD)
+    grown = _bending(apart, 2 * lag) - _bending(apart, lag)
+    return math.sqrt(max(0.0, grown) / 4 * period / lag)
+
+
+def _bending(values: Array, lag: int) -> float:
+    """The variance of second differences; what happens now and then does not move a quartile."""
+    bends = np.abs(values[2 * lag :] - 2 * values[lag:-lag] + values[: -2 * lag])
+    quarter = len(bends) // 4
+    return float(np.partition(bends, quarter)[quarter] / _QUARTILE) ** 2 if len(bends) else 0.0
+
+
+def _is_as_of_walk(amplitude: float, half_swings: int, walked: float) -> bool:
+    """Whether a random walk swings as far now and then, as red noise does in climate series.
+
+    Its power spectrum falls with the square of the frequency: where it goes `walked` in a period
+    (standard deviation), a sine fitted to half swings of that period has the mean square amplitude
+    2 walked**2 / (pi**2 half_swings), and exceeds k times that with the chance exp(-k) (D. L.
+    Gilman, F. J. Fuglister, J. M. Mitchell, On the power spectrum of "red noise", Journal of the
+    Atmospheric Sciences 20, 1963).
+    """
+    return amplitude**2 < -math.log(WALK_CHANCE) * 2 * walked**2 / (np.pi**2 * half_swings)
 
 
 def _best_sine(

@@ -6,13 +6,14 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.noise import noise_of, smooth
+from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.noise import FEWEST_SMOOTHED, kept_alike, noise_of, smooth
 from webots_mcp.store.analysis.rhythm import rhythm_of
 
-LEG_NOISE: Final = 8.0  # a leg is longer than so many deviations of the smoothed position
+LEG_NOISE: Final = 7.0  # a leg is longer than so many deviations of the smoothed position
 FINEST_LEG_M: Final = 0.02  # smoothing that makes legs so short is enough
-LONGEST_SMOOTHING_S: Final = 2.0  # beyond, it would cut corners
+SHARPEST_ARC_RAD: Final = 1.6  # from leg to leg; who turns farther turned on the spot
+LONGEST_SMOOTHING_S: Final = 1.2  # a turn of 1.5 rad/s is cut by 0.7 % then, by 5 % in 2 s
 _PARABOLA_GAIN: Final = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it
 
 
@@ -90,27 +91,42 @@ def _smoothing_rows(times: Array, noise_m: float) -> int:
     if noise_m == 0 or interval_s <= 0:
         return 1
     wanted = _PARABOLA_GAIN * (LEG_NOISE * noise_m / FINEST_LEG_M) ** 2
-    return 2 * int(min(wanted, LONGEST_SMOOTHING_S / interval_s) / 2) + 1
+    most = max(FEWEST_SMOOTHED, LONGEST_SMOOTHING_S / interval_s)
+    return 2 * int(min(wanted, most) / 2) + 1
 
 
 def path_length_m(track: Track) -> float:
     """Metres travelled: the sum of legs that are longer than noise makes them.
 
     From row to row a noise of 1 cm would add up to metres while the robot stands still. A leg ends
-    where the smoothed position is 8 standard deviations of what is left of the noise away from
-    where it began; what is shorter at the end is left out.
+    where the smoothed position is 7 standard deviations of what is left of the noise away from
+    where it began; what is shorter at the end is left out. Across its direction that noise makes a
+    leg longer (along it the next one makes up for it), which is taken off again; and the way is
+    longer than a leg by as much as an arc is, that turns from one leg to the next as they do.
     """
-    if len(track.times) == 0:
-        return 0.0
+    corners = _corners(track)
+    along, across = np.diff(track.x[corners]), np.diff(track.y[corners])
+    alike = kept_alike(track.smoothed_rows)
+    alike = alike[np.minimum(np.diff(corners), len(alike) - 1)]
+    legs_m = np.sqrt(along**2 + across**2 - 2 * (1 - alike) * track.left_m**2)
+    if len(legs_m) < 2:
+        return float(legs_m.sum())
+    turns = np.angle(np.exp(1j * np.diff(np.arctan2(across, along))))
+    turns[np.abs(turns) > SHARPEST_ARC_RAD] = 0.0
+    arcs = np.concatenate((turns[:1], (turns[:-1] + turns[1:]) / 2, turns[-1:]))
+    return float(np.sum(legs_m / np.sinc(arcs / (2 * np.pi))))
+
+
+def _corners(track: Track) -> Indexes:
+    """The rows in which one leg ends and the next begins."""
     shortest_m2 = (LEG_NOISE * track.left_m) ** 2
-    places = zip(track.x.tolist(), track.y.tolist(), strict=True)
-    length_m, (from_x, from_y) = 0.0, (float(track.x[0]), float(track.y[0]))
-    for x, y in places:
-        square_m2 = (x - from_x) ** 2 + (y - from_y) ** 2
-        if square_m2 > shortest_m2:
-            length_m += square_m2**0.5
+    corners: list[int] = []
+    from_x = from_y = np.inf
+    for row, (x, y) in enumerate(zip(track.x.tolist(), track.y.tolist(), strict=True)):
+        if (x - from_x) ** 2 + (y - from_y) ** 2 > shortest_m2:
+            corners.append(row)
             from_x, from_y = x, y
-    return length_m
+    return np.array(corners, np.intp)
 
 
 def travelled_m(tracks: list[Track]) -> float:

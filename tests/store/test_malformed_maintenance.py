@@ -161,7 +161,7 @@ def test_a_lease_that_nobody_of_ours_wrote_is_taken(
     try:
         assert maintainer.tick()
         assert maintainer.tick()
+        held = recorded.connection.execute("SELECT holder, until_wall_time_s FROM lease").fetchone()
     finally:
         maintainer.stop()
-    held = recorded.connection.execute("SELECT holder, until_wall_time_s FROM lease").fetchone()
     assert held[0].startswith("server ") and held[1] > 1e9

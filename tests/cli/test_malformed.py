@@ -23,6 +23,7 @@ DAMAGES = (
 ASKED = (
     ("status",), ("status", "--json"), ("runs",), ("events",), ("trends",), ("history", "pose.0"),
     ("compare", "1", "2"), ("tail", "--no-follow"), ("export",), ("export", "--format", "jsonl"),
+    ("signals",), ("logs",), ("sql", "SELECT * FROM run"),
     ("prune", "--dry-run"), ("prune", "--dry-run", "--keep-states", "10rows"),
 )  # fmt: skip
 

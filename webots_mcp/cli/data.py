@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from webots_mcp.cli.command import (
     DATA_DIR,
     DATABASE,
+    JSON,
     argument,
     command,
     open_recording,
@@ -21,7 +22,7 @@ from webots_mcp.cli.command import (
     past_wrong_values,
     reading,
 )
-from webots_mcp.cli.history import RANGE, range_of
+from webots_mcp.cli.history import RANGE, print_json, range_of
 from webots_mcp.cli.limits import LIMITS, limits_of
 from webots_mcp.cli.progress import shown_progress
 from webots_mcp.cli.tables import print_notes, print_table
@@ -157,6 +158,26 @@ def keep(arguments: argparse.Namespace) -> None:
     with _writable(arguments) as (_, connection):
         mark_kept(connection, arguments.run_ids, keep=not arguments.release)
         set_limits(connection, limits, "keep")
+
+
+@command(
+    "label", DATA_DIR, DATABASE, JSON,
+    argument("run_id", type=int, metavar="RUN", help="as 'webots-mcp runs' lists them"),
+    argument("label", nargs="?", metavar="TEXT", help="short; '-' takes it away"),
+    argument("--note", metavar="TEXT", help="any text; '-' takes it away"),
+)  # fmt: skip
+def label(arguments: argparse.Namespace) -> None:
+    """Give a run a label to find it by, or a note; nothing of such a run is ever pruned."""
+    from webots_mcp.store.questions.runs import annotate_run, run_info
+
+    said = {name: getattr(arguments, name) for name in ("label", "note")}
+    changes = {name: "" if text == "-" else text for name, text in said.items()}
+    with _writable(arguments) as (_, connection):
+        annotate_run(connection, arguments.run_id, **changes)
+        run = run_info(connection, arguments.run_id)
+    if arguments.json:
+        return print_json(run)
+    print_table(("run", "robot", "label", "note"), [[run.run_id, run.robot, run.label, run.note]])
 
 
 @contextmanager

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 RUN: Final = argument(
     "--run", type=int, dest="run_id", metavar="ID", help="that run instead of the newest one"
 )
-TIMES: Final[tuple[Argument, ...]] = (
+SIMULATION_TIMES: Final[tuple[Argument, ...]] = (
     argument(
         "--last",
         type=float,
@@ -56,6 +56,9 @@ TIMES: Final[tuple[Argument, ...]] = (
         metavar="S",
         help="up to, not including, this simulation time",
     ),
+)
+TIMES: Final[tuple[Argument, ...]] = (
+    *SIMULATION_TIMES,
     argument("--since", metavar="TIME", help="from this wall time on (ISO 8601 or Unix seconds)"),
     argument("--until", metavar="TIME", help="up to, not including, this wall time"),
 )
@@ -79,7 +82,7 @@ def runs(arguments: argparse.Namespace) -> None:
             connection, robot=arguments.robot, limit=arguments.limit, parameters=wanted
         )
     if arguments.json:
-        return _print_json(found)
+        return print_json(found)
     rows = [
         [
             run.run_id, run.robot, run.label, run.parameters or None,
@@ -113,7 +116,7 @@ def history(arguments: argparse.Namespace) -> None:
             max_points=arguments.max_points,
         )  # fmt: skip
     if arguments.json:
-        return _print_json(found)
+        return print_json(found)
     for run in found.runs:
         _print_history(run)
     print_notes(found.notes)
@@ -133,7 +136,7 @@ def trends(arguments: argparse.Namespace) -> None:
             limit=arguments.limit,
         )  # fmt: skip
     if arguments.json:
-        return _print_json(found)
+        return print_json(found)
     for run in found.runs:
         _print_trends(run)
     print_notes(found.notes)
@@ -162,7 +165,7 @@ def events(arguments: argparse.Namespace) -> None:
             after=arguments.after,
         )  # fmt: skip
     if arguments.json:
-        return _print_json(found)
+        return print_json(found)
     several = len({event.run_id for event in found.events}) > 1
     rows = [
         [
@@ -238,7 +241,7 @@ def compare(arguments: argparse.Namespace) -> None:
         else:
             found = compare_code(connection, robot=arguments.robot, **wanted)
     if arguments.json:
-        return _print_json(found)
+        return print_json(found)
     _print_comparison(found)
 
 
@@ -272,7 +275,8 @@ def _options(arguments: argparse.Namespace) -> EventOptions:
     )
 
 
-def _print_json(found: Any) -> None:
+def print_json(found: Any) -> None:
+    """Print the answer of a question, a dataclass, as one object."""
     assert is_dataclass(found)
     assert not isinstance(found, type)
     print(json.dumps(asdict(found), ensure_ascii=False))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from typing import Annotated, Any, Final
@@ -54,7 +53,7 @@ async def webots_query_sql(
     header = await to_thread.run_sync(_header, recording)
     found = await _run(recording, sql, limit or DEFAULT_ROWS, budget)
     columns = [cut_text(name, LONGEST_NAME) for name in found.columns[:_MOST_COLUMNS]]
-    rows = [[_cell(cell) for cell in row[:_MOST_COLUMNS]] for row in found.rows]
+    rows = [list(row[:_MOST_COLUMNS]) for row in found.rows]
     more = len(found.columns) > _MOST_COLUMNS
     return SqlAnswer(
         **header,
@@ -100,11 +99,6 @@ async def _turn() -> AsyncGenerator[None]:
         yield
     finally:
         turns.release()
-
-
-def _cell(cell: Cell) -> Cell:
-    """A value that JSON can hold."""
-    return str(cell) if isinstance(cell, float) and not math.isfinite(cell) else cell
 
 
 def _truncated(found: Result) -> str | None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import math
 import re
 import sqlite3
 import sys
@@ -184,6 +185,8 @@ class _Budget:
     def _shown(self, value: object) -> Cell:
         if isinstance(value, bytes):
             return f"<blob of {len(value)} bytes>"
+        if isinstance(value, float) and not math.isfinite(value):
+            return str(value)  # JSON has no such number
         return value if isinstance(value, (int, float, str)) else None
 
     def _text(self, stored: bytes) -> str:

@@ -1,0 +1,117 @@
+"""The commands that list what a recording holds, and the one that labels a run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from tests.cli.test_history_commands import line_with
+from tests.recordings.rows import Recorded
+from tests.server.story import copy_of, write_story
+from webots_mcp.cli import main
+
+Say = Callable[..., str]
+
+
+@pytest.fixture(scope="module")
+def story(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_story(tmp_path_factory.mktemp("story") / "webots.db")
+
+
+@pytest.fixture
+def say(story: Path, capsys: pytest.CaptureFixture[str]) -> Say:
+    """What a command prints when it succeeds."""
+
+    def said(*arguments: str, database: Path = story) -> str:
+        assert main([*arguments, "--database", str(database)]) == 0
+        return capsys.readouterr().out
+
+    return said
+
+
+def test_signals_have_their_kind_and_range(say: Say) -> None:
+    assert "num" in line_with(say("signals", "--run", "1"), "pose.0 ", "12.78")
+    some = say("signals", "po*", "--run", "1")
+    assert "pose.0" in some
+    assert "mode" not in some
+    assert "more signals: -n shows them" in say("signals", "-n", "1")
+    told = json.loads(say("signals", "pose.0", "--run", "1", "--json"))
+    assert [(each["name"], each["kind"]) for each in told["signals"]] == [("pose.0", "num")]
+
+
+def test_logs_are_those_of_all_runs_or_of_a_range(tmp_path: Path, say: Say) -> None:
+    recording = Recorded(tmp_path / "webots.db")
+    robot = recording.robot("rover")
+    robot.state(1.0, {"x": 1})
+    robot.log(1.0, "begun")
+    robot.log(2.0, "battery low", level="warning")
+    robot.end_run("reset")
+    robot.begin_run("reset")
+    robot.state(5.0, {"x": 1})
+    robot.log(1.0, "begun again")
+    robot.log(4.5, "wheel lost", level="error")
+    recording.close()
+    database = tmp_path / "webots.db"
+
+    def lines(*arguments: str) -> list[str]:
+        told = json.loads(say("logs", *arguments, "--json", database=database))
+        return [line["message"] for line in told["lines"]]
+
+    assert lines() == ["begun", "battery low", "begun again", "wheel lost"]
+    assert lines("--level", "warning") == ["battery low", "wheel lost"]
+    assert lines("--run", "1") == ["begun", "battery low"]
+    assert lines("--last", "1") == ["wheel lost"]
+    assert lines("--end", "2") == ["begun again"]
+    assert lines("--text", "BEGUN", "-n", "1") == ["begun again"]
+    table = say("logs", "-n", "1", database=database)
+    assert line_with(table, "4.5", "error", "2", "wheel lost")
+    assert "3 older lines" in table
+    assert "no line matches" in say("logs", "--text", "fire", database=database)
+
+
+def test_sql_reads_and_a_null_is_seen(say: Say) -> None:
+    table = say("sql", "SELECT id, label, 1e999 AS big FROM run ORDER BY id")
+    assert line_with(table, "id", "label", "big")
+    assert line_with(table, "1", "NULL", "inf")
+    assert "only the first 1 rows" in say("sql", "SELECT id FROM run", "-n", "1")
+    told = json.loads(say("sql", "SELECT 1e999, 'a'", "--json"))
+    assert told["rows"] == [["inf", "a"]]
+    assert "no row" in say("sql", "SELECT id FROM run WHERE id > 99")
+
+
+def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, say: Say) -> None:
+    database = copy_of(story, tmp_path / "webots.db")
+    given = say("label", "2", "kp 3", "--note", "on ice", database=database)
+    assert line_with(given, "2", "rover", "kp 3", "on ice")
+    assert line_with(say("runs", database=database), "  2  rover", "kp 3")
+    told = json.loads(say("label", "2", "-", "--json", database=database))
+    assert (told["label"], told["note"]) == (None, "on ice")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["signals", "moed"], "mode"),
+        (["signals", "--run", "99"], "newest runs are [3, 2, 1]"),
+        (["logs", "--last", "-3"], "--last -3.0 must be"),
+        (["logs", "--start", "9", "--end", "3"], "reversed"),
+        (["logs", "--robot", "rovr"], "did you mean 'rover'"),
+        (["sql", "DELETE FROM run"], "only one reading statement"),
+        (["sql", "WITH a AS (SELECT 1) DELETE FROM run"], "only reading is allowed"),
+        (["sql", "SELECT lable FROM run"], "label"),
+        (["sql", "SELECT 1", "-n", "5000"], "must be from 1 to 1000"),
+        (["label", "1"], "give a label or a note"),
+        (["label", "99", "x"], "newest runs are"),
+        (["label", "1", "x" * 101], "at most 100"),
+    ],
+)
+def test_bad_input_is_one_line_and_exit_code_2(
+    story: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], words: str
+) -> None:
+    assert main([*arguments, "--database", str(story)]) == 2
+    said = capsys.readouterr()
+    assert words in said.err
+    assert said.err.count("\n") == 1

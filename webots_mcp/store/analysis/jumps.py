@@ -136,22 +136,18 @@ def _with_return(jumps: Sequence[Jump]) -> Iterator[Jump]:
             index += 1
 
 
-def find_leaps(
-    times: Sequence[float], places: Sequence[tuple[float, float]], at_least_m: float
-) -> list[tuple[float, float]]:
+def find_leaps(times: Array, x: Array, y: Array, at_least_m: float) -> list[tuple[float, float]]:
     """Times and lengths of steps of a position that no driving explains.
 
     Longer than `at_least_m`, and than five times the 99th percentile of all steps; after a gap, by
     as many times as it is longer than the usual interval.
     """
-    if len(places) < 2:
+    if len(times) < 2:
         return []
-    moments: Array = np.array(times, np.float64)
-    x, y = (np.array([place[axis] for place in places], np.float64) for axis in (0, 1))
     steps = np.hypot(np.diff(x), np.diff(y))
     place = min(len(steps) - 1, int(0.99 * len(steps)))
     usual_m = float(np.partition(steps, place)[place])
     limit_m = max(at_least_m, POSITION_STEPS * usual_m if len(steps) > 100 else 0.0)
     long = np.flatnonzero(steps > limit_m)
-    long = long[steps[long] > limit_m * _intervals(moments, long)]
-    return list(zip(moments[long + 1].tolist(), steps[long].tolist(), strict=True))
+    long = long[steps[long] > limit_m * _intervals(times, long)]
+    return list(zip(times[long + 1].tolist(), steps[long].tolist(), strict=True))

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
+from webots_mcp.store.analysis.summary import aligned_numbers
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
@@ -60,14 +62,10 @@ def _leaps(search: Search) -> Iterator[Event]:
 def _leaps_in(
     columns: Columns, position: tuple[Signal, Signal], at_least_m: float
 ) -> dict[float, float]:
-    x, y = (columns.values[signal.name] for signal in position)
-    rows = [
-        (time_s, (float(a), float(b)))
-        for time_s, a, b in zip(columns.times, x, y, strict=True)
-        if isinstance(a, (int, float)) and isinstance(b, (int, float))
-    ]
-    times, places = [time_s for time_s, _ in rows], [place for _, place in rows]
-    return dict(find_leaps(times, places, at_least_m))
+    x, y = (aligned_numbers(columns.values[signal.name]) for signal in position)
+    times: Array = np.array(columns.times, np.float64)
+    known = np.isfinite(x) & np.isfinite(y)
+    return dict(find_leaps(times[known], x[known], y[known], at_least_m))
 
 
 def _alike(events: Sequence[Event], unit: str) -> str:

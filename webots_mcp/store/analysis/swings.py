@@ -168,9 +168,9 @@ def _in_stretch(
         moments, means = _means(times, step), _means(values, step)
         of_means = noise[: len(means) * step : step] / step**0.5
         for band in _bands(moments, means, round(rows / step), of_means):
-            for crossings in _regular(
-                _crossings(moments, band, rounding), rows * interval_s, least_half_swings
-            ):
+            if max(band.max(), -band.min()) <= rounding:
+                continue
+            for crossings in _regular(moments, band, rows * interval_s, least_half_swings):
                 if not any(_is_same(crossings, each) for each in found):
                     found += _fitted(times, values, crossings, interval_s)
         rows *= SCALE_RATIO
@@ -204,9 +204,10 @@ def _bands(times: Array, values: Array, rows: int, noise: Array) -> Iterator[Arr
 
 def _bends(slow: Array, rows: int, noise: Array) -> bool:
     """Whether a course of means over so many rows bends anywhere by more than noise makes it."""
-    bends = np.abs(slow[2 * rows :] - 2 * slow[rows:-rows] + slow[: -2 * rows])
-    limits = NOISE_BENDS * noise[rows:-rows] / rows**0.5
-    return not len(bends) or bool(np.any(bends > limits))
+    bends = slow[2 * rows :] - 2 * slow[rows:-rows]
+    bends += slow[: -2 * rows]
+    limits = noise[rows:-rows] * (NOISE_BENDS / rows**0.5)
+    return not len(bends) or bool(np.any(np.abs(bends, out=bends) > limits))
 
 
 def _moving_mean(values: Array, rows: int) -> Array:
@@ -214,12 +215,16 @@ def _moving_mean(values: Array, rows: int) -> Array:
     reach = min(rows // 2, len(values) - 1)
     if reach < 1:
         return values
+    window = 2 * reach + 1
+    sums: Array = np.empty(len(values) + window)
     for _ in range(2):
-        before = 2 * values[0] - values[reach:0:-1]
-        after = 2 * values[-1] - values[-2 : -reach - 2 : -1]
-        sums: Array = np.concatenate(([0.0], before, values, after))
+        sums[0] = 0.0
+        sums[1 : reach + 1] = 2 * values[0] - values[reach:0:-1]
+        sums[reach + 1 : -reach] = values
+        sums[-reach:] = 2 * values[-1] - values[-2 : -reach - 2 : -1]
         np.cumsum(sums, out=sums)
-        values = (sums[2 * reach + 1 :] - sums[: -2 * reach - 1]) / (2 * reach + 1)
+        values = sums[window:] - sums[:-window]
+        values /= window
     return values
 
 
@@ -240,30 +245,35 @@ def _straightened(times: Array, values: Array, rows: int) -> Array | None:
     return values - np.interp(times, moments, np.concatenate(([0.0], np.cumsum(slopes))))
 
 
-def _crossings(times: Array, band: Array, rounding: float) -> _Crossings:
-    """Between two rows the band is taken to be straight; what comes of rounding is none."""
-    before = np.flatnonzero(np.diff(band >= 0))
-    if len(before) < 2 or np.abs(band).max() <= rounding:
-        return _Crossings(np.empty(0), np.empty(0), np.empty(0))
+def _regular(times: Array, band: Array, period_s: float, least: int) -> Iterator[_Crossings]:
+    """Stretches of at least so many half swings of about that period that reach equally far.
+
+    Between two rows the band is taken to be straight.
+    """
+    above = band >= 0
+    before = np.flatnonzero(above[1:] != above[:-1])
     share = band[before] / (band[before] - band[before + 1])
     moments = times[before] + share * (times[before + 1] - times[before])
-    reaches = np.maximum.reduceat(np.abs(band), before + 1)[:-1]
-    return _Crossings(moments, np.diff(moments), reaches)
-
-
-def _regular(crossings: _Crossings, period_s: float, least: int) -> Iterator[_Crossings]:
-    """Stretches of at least so many half swings of about that period that reach equally far."""
-    low, high = (share * period_s for share in HALF_PERIODS)
-    fitting = (crossings.halves > low) & (crossings.halves < high)
-    edges = np.flatnonzero(np.diff(fitting, prepend=False, append=False)).tolist()
-    for first, last in zip(edges[::2], edges[1::2], strict=True):
-        if last - first < least:
-            continue
-        for start, end in pairwise(_uneven(crossings.reaches[first:last].tolist())):
+    halves = np.diff(moments)
+    for first, last in _fitting(halves, period_s, least):
+        rows = before[first : last + 1] + 1
+        reaches = np.maximum.reduceat(np.abs(band[rows[0] : rows[-1]]), rows[:-1] - rows[0])
+        for start, end in pairwise(_uneven(reaches.tolist())):
             if end - start >= least:
                 part = slice(first + start, first + end)
-                moments = crossings.moments[part.start : part.stop + 1]
-                yield _Crossings(moments, crossings.halves[part], crossings.reaches[part])
+                ends = slice(part.start, part.stop + 1)
+                yield _Crossings(moments[ends], halves[part], reaches[start:end])
+
+
+def _fitting(halves: Array, period_s: float, least: int) -> list[tuple[int, int]]:
+    """Where [start, end) at least so many half periods that follow each other are as long."""
+    low, high = (share * period_s for share in HALF_PERIODS)
+    fitting = np.zeros(len(halves) + 2, np.bool_)
+    fitting[1:-1] = (halves > low) & (halves < high)
+    edges = np.flatnonzero(fitting[1:] != fitting[:-1])
+    starts, ends = edges[::2], edges[1::2]
+    long = ends - starts >= least
+    return list(zip(starts[long].tolist(), ends[long].tolist(), strict=True))
 
 
 def _uneven(reaches: list[float]) -> list[int]:

@@ -44,6 +44,21 @@ def test_parameters_are_shown_and_set(
     assert json.loads(capsys.readouterr().out)[1]["next"] == 4
 
 
+def test_a_text_that_looks_like_a_number_stays_a_text(
+    tunable: TunableDriver, database: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ("--database", str(database))
+    tag = tunable.bridge.parameter("tag", "none")
+    ran = ["run", *where, "--for", "0.1", "--then", "go_on"]
+    assert main([*ran, "--set", "tag=7", "--set", "kp=3"]) == 0
+    assert (tag.value, tunable.kp.value) == ("7", 3.0)
+    assert main(["parameters", *where, "tag=true"]) == 0
+    assert tag.value == "true"
+    capsys.readouterr()
+    assert main(["runs", *where, "--parameter", "tag=7", "--parameter", "kp=3", "--json"]) == 0
+    assert [run["run_id"] for run in json.loads(capsys.readouterr().out)["runs"]] == [1]
+
+
 @pytest.mark.usefixtures("tunable")
 @pytest.mark.parametrize(
     ("settings", "said"),

@@ -6,8 +6,9 @@ import argparse
 import functools
 import json
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 from webots_mcp.errors import InvalidInputError, MalformedRowError, WebotsMCPError
@@ -131,10 +132,16 @@ DATA_DIR: Final = argument(
 DATABASE: Final = argument("--database", metavar="FILE", help="the database file itself")
 ROBOT: Final = argument("--robot", metavar="NAME", help="only this robot")
 JSON: Final = argument("--json", action="store_true", help="print it as JSON")
+_NO_KINDS: Final[Mapping[str, str]] = MappingProxyType({})
 
 
-def settings_of(texts: Sequence[str]) -> dict[str, Any]:
+def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> dict[str, Any]:
     """Values by name, of texts NAME=VALUE; a value that is no JSON is a text.
+
+    Args:
+        texts: As they were typed.
+        kinds: Of parameters, by name: the value of one of kind `str` is a text, also one that looks
+            like a number.
 
     Raises:
         InvalidInputError: One has no `=`.
@@ -144,11 +151,15 @@ def settings_of(texts: Sequence[str]) -> dict[str, Any]:
         name, equals, value = text.partition("=")
         if not equals:
             raise InvalidInputError(f"{text!r} names no value: write {name}=VALUE")
-        try:
-            values[name] = json.loads(value)
-        except (ValueError, RecursionError):
-            values[name] = value
+        values[name] = value if kinds.get(name) == "str" else _value_of(value)
     return values
+
+
+def _value_of(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return text
 
 
 @contextmanager

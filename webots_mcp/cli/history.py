@@ -74,10 +74,11 @@ SIGNALS: Final = argument("signals", nargs="*", metavar="SIGNAL", help="names, w
 )  # fmt: skip
 def runs(arguments: argparse.Namespace) -> None:
     """List the runs: when, with which code, how long, how fast, how they ended."""
+    from webots_mcp.store.parameters import kinds_of
     from webots_mcp.store.questions.runs import list_runs
 
     with reading(arguments) as connection:
-        wanted = settings_of(arguments.parameter or [])
+        wanted = settings_of(arguments.parameter or [], kinds_of(connection))
         found = list_runs(
             connection, robot=arguments.robot, limit=arguments.limit, parameters=wanted
         )

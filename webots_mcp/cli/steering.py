@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, JSON, ROBOT, argument, command, settings_of
 from webots_mcp.cli.tables import print_table, text_of
+from webots_mcp.cli.tuning import parameters_of
 from webots_mcp.errors import CommandRefusedError
 
 if TYPE_CHECKING:
@@ -58,7 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
         "for_s": for_s,
         "reset": arguments.reset,
         "pace": None if arguments.pace == "as_it_is" else arguments.pace,
-        "parameters": settings_of(arguments.settings) or None,
+        "parameters": parameters_of(recording, arguments) if arguments.settings else None,
         "then": arguments.then,
     }
     params = {name: value for name, value in wanted.items() if value is not None}

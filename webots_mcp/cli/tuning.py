@@ -24,6 +24,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 if TYPE_CHECKING:
     from webots_mcp.server.results import CommandAnswer
     from webots_mcp.server.tuning import When
+    from webots_mcp.store.recording import Recording
 
 
 @command(
@@ -64,18 +65,23 @@ def _set(arguments: argparse.Namespace) -> CommandAnswer:
     import anyio
 
     from webots_mcp.contract import resolve_database
-    from webots_mcp.server.tuning import set_parameters, settable
+    from webots_mcp.server.tuning import set_parameters
     from webots_mcp.store.recording import Recording
 
     recording = Recording(*resolve_database(arguments.database, arguments.data_dir))
-    declared = settable(recording, arguments.robot)
-    values = settings_of(arguments.settings)
-    for name, _, text in (setting.partition("=") for setting in arguments.settings):
-        if name in declared and declared[name].declaration.kind == "str":
-            values[name] = text  # also one that looks like a number
+    values = parameters_of(recording, arguments)
     when: When = "reset" if arguments.from_reset else "now"
     ask = partial(set_parameters, when=when, robot=arguments.robot)
     return anyio.run(ask, recording, _silent, values)
+
+
+def parameters_of(recording: Recording, arguments: argparse.Namespace) -> dict[str, Any]:
+    """The typed settings as values of the kinds that the living controller declares."""
+    from webots_mcp.server.tuning import settable
+
+    declared = settable(recording, arguments.robot)
+    kinds = {name: each.declaration.kind for name, each in declared.items()}
+    return settings_of(arguments.settings, kinds)
 
 
 async def _silent(waited_s: float, of_s: float | None, text: str) -> None:

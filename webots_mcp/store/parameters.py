@@ -21,6 +21,7 @@ _DECLARED: Final = (
     "SELECT name, kind, default_value, low, high, choices, doc, unit, next_value FROM parameter "
     "WHERE session_id = ? ORDER BY id"
 )
+_KINDS: Final = "SELECT name, kind FROM parameter ORDER BY id"
 _NAMES: Final = "SELECT DISTINCT name FROM parameter ORDER BY name"
 # Of a run `r`, and with the JSON object :parameters: whether it had all these values at some time.
 HAD_VALUES: Final = (
@@ -155,6 +156,11 @@ def differing(runs: Sequence[RunParameters]) -> list[str]:
 def _ordered(had: RunParameters, unlike: Sequence[str]) -> list[str]:
     first = [name for name in unlike if name in had]
     return first + [name for name in had if not had[name].is_default and name not in first]
+
+
+def kinds_of(connection: sqlite3.Connection) -> dict[str, str]:
+    """The kinds of all parameters by name, each as it was declared last."""
+    return dict(connection.execute(_KINDS).fetchall())
 
 
 def as_filter(connection: sqlite3.Connection, values: Mapping[str, Value]) -> str:

@@ -24,9 +24,10 @@ from webots_mcp.store.reading.ranges import resolve_range
 
 
 def tilted(search: Search) -> Iterator[Event]:
-    (columns,) = search.view.stretches([search.known["tilt"]], 1.0)
-    for time_s, tilt in zip(columns.times, columns.values["tilt"], strict=True):
-        if isinstance(tilt, float) and tilt > 1:
+    (numbers,) = search.view.stretches([search.known["tilt"]], 1.0)
+    times, tilts = numbers.of("tilt")
+    for time_s, tilt in zip(times.tolist(), tilts.tolist(), strict=True):
+        if tilt > 1:
             yield search.event("tilted", time_s, time_s, "tilt", tilt=tilt)
 
 

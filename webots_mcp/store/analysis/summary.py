@@ -213,10 +213,13 @@ def usable_numbers(
 
 def usable_arrays(times: Sequence[float], values: Sequence[Value]) -> tuple[Array, Array]:
     """The same as arrays."""
-    numbers = aligned_numbers(values)
-    moments: Array = np.array(times, np.float64)
+    return usable_part(np.array(times, np.float64), aligned_numbers(values))
+
+
+def usable_part(times: Array, numbers: Array) -> tuple[Array, Array]:
+    """The usable ones of numbers that may be NaN, with their times."""
     usable = np.abs(numbers) <= _LARGEST
-    return (moments, numbers) if usable.all() else (moments[usable], numbers[usable])
+    return (times, numbers) if usable.all() else (times[usable], numbers[usable])
 
 
 def aligned_numbers(values: Sequence[Value]) -> Array:

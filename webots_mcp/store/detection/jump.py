@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
-from webots_mcp.store.analysis.summary import aligned_numbers
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.rows import Columns
+from webots_mcp.store.reading.rows import Numbers
 from webots_mcp.store.signals.registry import Signal
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
@@ -53,19 +52,18 @@ def _leaps(search: Search) -> Iterator[Event]:
     if search.motion.position is None:
         return
     leaps: dict[float, float] = {}
-    for columns in search.view.stretches(search.motion.position, LEAPS_SHARE):
-        leaps |= _leaps_in(columns, search.motion.position, search.options.jump_m)
+    for numbers in search.view.stretches(search.motion.position, LEAPS_SHARE):
+        leaps |= _leaps_in(numbers, search.motion.position, search.options.jump_m)
     for time_s in sorted(leaps):
         yield search.event("jump", time_s, time_s, "position", distance_m=leaps[time_s])
 
 
 def _leaps_in(
-    columns: Columns, position: tuple[Signal, Signal], at_least_m: float
+    numbers: Numbers, position: tuple[Signal, Signal], at_least_m: float
 ) -> dict[float, float]:
-    x, y = (aligned_numbers(columns.values[signal.name]) for signal in position)
-    times: Array = np.array(columns.times, np.float64)
+    x, y = (numbers.values[signal.name] for signal in position)
     known = np.isfinite(x) & np.isfinite(y)
-    return dict(find_leaps(times[known], x[known], y[known], at_least_m))
+    return dict(find_leaps(numbers.times[known], x[known], y[known], at_least_m))
 
 
 def _alike(events: Sequence[Event], unit: str) -> str:
@@ -90,5 +88,6 @@ JUMP: Final = EventKind(
     least_s=lambda options: REACH_S,
     of_numbers=True,
     drawn=1,
+    reads_through=lambda search: search.motion.position or (),
     says_alike=_alike,
 )

@@ -11,6 +11,7 @@ from webots_mcp.store.detection.event import Event, EventOptions
 
 if TYPE_CHECKING:
     from webots_mcp.store.detection.search import Search
+    from webots_mcp.store.signals.registry import Signal
 
 
 class NotSearchableError(NothingRecordedError):
@@ -19,6 +20,10 @@ class NotSearchableError(NothingRecordedError):
 
 def _no_time(options: EventOptions) -> float:
     return 0.0
+
+
+def _nothing(search: Search) -> Sequence[Signal]:
+    return ()
 
 
 def _always(options: EventOptions) -> bool:
@@ -51,6 +56,7 @@ class EventKind:
         says_alike: What many alike events of one signal are, given with the unit of the signal;
             None where each is always told by itself.
         of_arrays: What several items of one array did at once is one event.
+        reads_through: Signals of which it reads all rows, also of a long segment.
     """
 
     name: str
@@ -66,3 +72,4 @@ class EventKind:
     drawn: int | None = None
     says_alike: Callable[[Sequence[Event], str], str] | None = None
     of_arrays: bool = False
+    reads_through: Callable[[Search], Sequence[Signal]] = _nothing

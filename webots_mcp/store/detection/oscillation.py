@@ -11,7 +11,7 @@ from webots_mcp.store.analysis.swings import Swing, find_swings, joined_swings
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.rows import Columns
+from webots_mcp.store.reading.rows import Numbers
 from webots_mcp.store.signals.registry import Signal
 
 # What a robot swings with; sensors swing by nature while it drives.
@@ -24,9 +24,8 @@ _SWINGING: Final = re.compile(
 
 def oscillation_events(search: Search) -> Iterator[Event]:
     """Of heading, wheels, speed, position and the like, and of what is asked for."""
-    asked = search.options.signals != EventOptions.signals
-    signals = [each for each in search.required_numbers() if asked or _SWINGING.search(each.name)]
-    left = len(search.numbers) - len(signals)
+    signals = _swinging(search)
+    left = len(search.required_numbers()) - len(signals)
     if left:
         search.not_searched(
             "oscillation",
@@ -34,11 +33,11 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             "swings with: name them in signals",
         )
     found: dict[str, list[Swing]] = {}
-    for columns in search.view.stretches(signals, 1.0):
+    for numbers in search.view.stretches(signals, 1.0):
         for index, signal in enumerate(signals):
             if search.is_over("oscillation", signals[index:]):
                 break
-            found.setdefault(signal.name, []).extend(_swings(search, signal, columns))
+            found.setdefault(signal.name, []).extend(_swings(search, signal, numbers))
     for name, swings in found.items():
         for swing in joined_swings(swings):
             details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
@@ -46,11 +45,16 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             yield search.event("oscillation", *ends, name, turns=swing.half_swings, **details)
 
 
-def _swings(search: Search, signal: Signal, columns: Columns) -> list[Swing]:
-    times, numbers = columns.numbers(signal.name)
+def _swinging(search: Search) -> list[Signal]:
+    asked = search.options.signals != EventOptions.signals
+    return [each for each in search.numbers if asked or _SWINGING.search(each.name)]
+
+
+def _swings(search: Search, signal: Signal, numbers: Numbers) -> list[Swing]:
+    times, values = numbers.of(signal.name)
     return find_swings(
         times,
-        unwrap(numbers, signal.turn) if signal.turn else numbers,
+        unwrap(values, signal.turn) if signal.turn else values,
         least_half_swings=search.options.oscillation_turns,
         longest_period_s=search.options.oscillation_period_s,
     )
@@ -67,4 +71,5 @@ OSCILLATION: Final = EventKind(
     least_s=_least_s,
     of_numbers=True,
     drawn=3,
+    reads_through=_swinging,
 )

@@ -127,7 +127,8 @@ class Search:
             for signal in resolve_signals(self.known, [threshold.signal])
         ]
         needed = {each.name: each for each in (*self.numbers, *self.motion.evidence, *limits)}
-        return view_of(self.connection, self.segment, list(needed.values()), self.deadline)
+        through = [each for kind in self.kinds for each in kind.reads_through(self)]
+        return view_of(self.connection, self.segment, list(needed.values()), self.deadline, through)
 
     @cached_property
     def standings(self) -> Standings:

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from webots_mcp.naming import Value, flatten
-from webots_mcp.store.analysis.arrays import Array
-from webots_mcp.store.analysis.summary import usable_arrays
+from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.summary import aligned_numbers, usable_arrays, usable_part
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.batch import is_odd, odd_names
@@ -56,6 +56,28 @@ class Columns:
     def numbers(self, name: str) -> tuple[Array, Array]:
         """Times and numbers of a numeric signal, of the rows that have a usable one."""
         return usable_arrays(self.times, self.values[name])
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """Numeric signals of rows, in order: a quarter of the memory that `Columns` take.
+
+    Attributes:
+        values: Per signal one number per row; NaN where the row has none that is usable.
+    """
+
+    times: Array
+    values: dict[str, Array]
+
+    def of(self, name: str) -> tuple[Array, Array]:
+        """Times and numbers of a signal, of the rows that have a usable one."""
+        return usable_part(self.times, self.values[name])
+
+
+def numbers_of(columns: Columns, signals: Sequence[Signal]) -> Numbers:
+    """The numbers of some signals."""
+    values = {each.name: aligned_numbers(columns.values[each.name]) for each in signals}
+    return Numbers(np.array(columns.times, np.float64), values)
 
 
 def exceeds(connection: sqlite3.Connection, segment: Segment) -> bool:

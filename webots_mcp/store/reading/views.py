@@ -26,7 +26,7 @@ from webots_mcp.store.reading.intervals import (
 )
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rollups import read_pieces, rows_after
-from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
+from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of, read_columns
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, totals
 from webots_mcp.store.rollup.rolling import watermark
@@ -38,6 +38,7 @@ JUMP_RANGE: Final = 3.0  # times the usual range of a bucket: there may be a jum
 SAMPLES_PER_STAY: Final = 5
 SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
 STRETCH_ROWS: Final = 10_000  # at once, of all rows of a long segment
+MOST_KEPT: Final = 10_000_000  # numbers of 8 bytes, of stretches that are asked for again
 ACROSS_S: Final = 20.0  # of the next stretch: longer than six half swings of the longest period
 LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
 
@@ -101,7 +102,7 @@ class View(Protocol):
         """Where a jump may be."""
         ...
 
-    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Columns]:
+    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Numbers]:
         """All rows in stretches, the newest first, as many as a share of the time allows.
 
         Each reaches so far into the one after it that what lies across the border is whole in one.
@@ -114,10 +115,19 @@ def view_of(
     segment: Segment,
     signals: Sequence[Signal],
     deadline: Deadline,
+    through: Sequence[Signal] = (),
 ) -> View:
-    """The view that suits the length of the segment."""
+    """The view that suits the length of the segment.
+
+    Args:
+        connection: Any.
+        segment: What is looked at.
+        signals: That are looked at.
+        deadline: For all reading.
+        through: Those of which `stretches` will be asked, to be read together.
+    """
     if exceeds(connection, segment):
-        return LongView(connection, segment, signals, deadline)
+        return LongView(connection, segment, signals, deadline, through)
     return RowView(read_columns(connection, segment, signals, deadline.part(READING_SHARE)))
 
 
@@ -169,9 +179,9 @@ class RowView:
         """All of it."""
         yield Course(*self._columns.numbers(signal.name))
 
-    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Columns]:
+    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Numbers]:
         """All rows at once."""
-        yield self._columns
+        yield numbers_of(self._columns, signals)
 
 
 class LongView:
@@ -185,8 +195,11 @@ class LongView:
         segment: Segment,
         signals: Sequence[Signal],
         deadline: Deadline,
+        through: Sequence[Signal] = (),
     ) -> None:
         self.notes: list[str] = []
+        self._through = through
+        self._kept: dict[Segment, Numbers] = {}
         self._connection = connection
         self._segment = segment
         self._deadline = deadline
@@ -283,7 +296,7 @@ class LongView:
                 return
             yield Course(*self._numbers(signal, bucket), self._usual_steps(signal))
 
-    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Columns]:
+    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Numbers]:
         """What there is no time for is noted."""
         self._note_purged()
         deadline = self._deadline.part(share)
@@ -298,10 +311,23 @@ class LongView:
                 )
                 return
             end_s = min(self._segment.end_s, part.end_s + ACROSS_S)
-            yield read_columns(self._connection, replace(part, end_s=end_s), signals, deadline)
+            yield self._stretch(replace(part, end_s=end_s), signals, deadline)
             if part.start_s <= first_s:
                 return
             left = replace(left, end_s=part.start_s)
+
+    def _stretch(self, part: Segment, signals: Sequence[Signal], deadline: Deadline) -> Numbers:
+        """Read with what other kinds will ask of the same rows, and kept for them."""
+        kept = self._kept.get(part)
+        if kept is not None and all(signal.name in kept.values for signal in signals):
+            return kept
+        wanted = list({each.name: each for each in (*signals, *self._through)}.values())
+        columns = read_columns(self._connection, part, wanted, deadline)
+        numbers = numbers_of(columns, wanted)
+        held = sum(len(each.times) * len(each.values) for each in self._kept.values())
+        if not columns.cut and held < MOST_KEPT:
+            self._kept[part] = numbers
+        return numbers
 
     @functools.cached_property
     def _totals(self) -> dict[int, Summary]:

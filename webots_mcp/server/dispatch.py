@@ -185,8 +185,16 @@ def _hint(view: View, command: Command) -> str | None:
             f"command_id {command.id}; do not send it again"
         )
     if command.status == "lost":
-        return "it may have run in part: look at the robot before you send it again"
+        return _after_loss(view)
     return _after_no_answer(view)
+
+
+def _after_loss(view: View) -> str:
+    """A command may be sent again only to a controller that runs, and to a robot one has seen."""
+    look = "look at the robot before you send it again"
+    if view.robot.live:
+        return look
+    return f"start its controller (reload the world in Webots; an extern one by hand), then {look}"
 
 
 def _instructions(view: View, action: str) -> str | None:

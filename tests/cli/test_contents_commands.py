@@ -106,6 +106,8 @@ def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, say:
         (["label", "1"], "give a label or a note"),
         (["label", "99", "x"], "newest runs are"),
         (["label", "1", "x" * 101], "at most 100"),
+        (["label", "1", "\udcff"], "cannot be written as utf-8"),
+        (["logs", "--text", "\udcff"], "cannot be written as utf-8"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(

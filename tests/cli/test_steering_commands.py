@@ -75,6 +75,7 @@ def test_send_pause_step_and_resume(
         (["run", "--for", "1", "--set", "kp"], "names no value"),
         (["run", "--for", "1", "--set", "kp=1"], "declares no parameters"),
         (["run", "--until", "stepz > 1000"], "steps"),
+        (["run", "--for", "900", "--pace", "real_time", "--timeout", "0.5"], "'webots-mcp tail'"),
         (["step", "many"], "whole number"),
     ],
 )

@@ -44,6 +44,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             sys.stdout.flush()
     except WebotsMCPError as error:
         return _end(EXIT_BAD_INPUT, as_typed(str(error)))
+    except UnicodeEncodeError as error:  # bytes of the command line that are no text
+        said = f"{error.object!r} cannot be written as {error.encoding}: {error.reason}"
+        return _end(EXIT_BAD_INPUT, said)
     except ModuleNotFoundError as error:
         return _end(EXIT_SYSTEM, _explain_missing(error))
     except KeyboardInterrupt as interrupt:

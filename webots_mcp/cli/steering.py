@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from webots_mcp.store.recording import Recording
 
 _WHERE: Final = (DATA_DIR, DATABASE, ROBOT, JSON)
+_UNDER_WAY: Final = (
+    "the controller is still at it and goes on: do not send it again; 'webots-mcp tail' shows what "
+    "it does, --timeout waits longer"
+)
 TIMEOUT: Final = argument(
     "--timeout", type=float, default=600.0, metavar="S", help="wait so many wall seconds (600)"
 )
@@ -139,7 +143,8 @@ def _writable(arguments: argparse.Namespace) -> Recording:
 def _require_done(answer: CommandAnswer) -> None:
     if answer.outcome == "done":
         return
-    why = "; ".join(filter(None, (answer.error, answer.hint))) or "no answer in time"
+    hint = _UNDER_WAY if answer.outcome == "claimed" else answer.hint  # which names tools
+    why = "; ".join(filter(None, (answer.error, hint))) or "no answer in time"
     raise CommandRefusedError(f"{answer.action} is not done ({answer.outcome}): {why}")
 
 

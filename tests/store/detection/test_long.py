@@ -55,6 +55,21 @@ def test_swings_and_leaps_are_searched_in_the_whole_of_a_long_run(long: sqlite3.
     assert "not before" not in str(found.verdicts.not_searched)
 
 
+def test_who_looks_for_swings_besides_leaps_reads_no_more_rows(long: sqlite3.Connection) -> None:
+    assert reads(long, "jump", "oscillation") == reads(long, "jump") > 0
+
+
+def reads(connection: sqlite3.Connection, *kinds: str) -> int:
+    """How many statements read values of rows."""
+    statements: list[str] = []
+    connection.set_trace_callback(statements.append)
+    find_events(connection, resolve_range(connection), EventOptions(kinds=kinds))
+    connection.set_trace_callback(None)
+    return sum(
+        "json_extract(data" in each and "ORDER BY sim_time_s, id" in each for each in statements
+    )
+
+
 def test_what_there_was_no_time_for_is_told_by_time(long: sqlite3.Connection) -> None:
     ticks = count()
     asked = resolve_range(long)

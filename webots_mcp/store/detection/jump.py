@@ -14,7 +14,7 @@ from webots_mcp.store.reading.rows import Numbers
 from webots_mcp.store.signals.registry import Signal
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
-LEAPS_SHARE: Final = 0.3  # of the time that is left: the kinds after it need some as well
+LEAPS_SHARE: Final = 0.5  # of the time that is left; what is read in it serves swings as well
 _ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to the same value
 
 

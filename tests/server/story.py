@@ -52,4 +52,5 @@ def rows_of(table: dict[str, Any] | None) -> list[dict[str, Any]]:
     """A table as one dict per row."""
     if table is None:
         return []
-    return [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+    shared = table.get("in_every_row", {})
+    return [shared | dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]

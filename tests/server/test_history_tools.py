@@ -68,14 +68,17 @@ async def test_every_answer_says_about_which_robot_and_run_and_as_of_when(story:
         assert answer["age_s"] > 0, tool
 
 
-async def test_signals_have_kinds_ranges_and_the_share_of_nulls(story: Path) -> None:
+async def test_signals_have_kinds_ranges_and_rows_without_a_value(
+    story: Path,
+) -> None:
     answer = await tell(story, "webots_list_signals", run_id=STORY)
     signals = {row["signal"]: row for row in rows_of(answer["signals"])}
     assert answer["total"] == len(signals) == 15
     assert (signals["mode"]["kind"], signals["mode"]["last"]) == ("text", "cruise")
     assert (signals["battery_v"]["unit"], signals["battery_v"]["max"]) == ("V", 12.6)
     assert signals["sensors.bumper"]["last"] is False
-    assert signals["sensors.front"]["null_share"] == pytest.approx(40 / 1150, abs=1e-4)
+    assert signals["sensors.front"]["missing"] == "in 40 of 1150 rows; values from 0.0 to 119.9 s"
+    assert signals["mode"]["missing"] is None
     assert "lidar.argmin" in signals
 
 
@@ -157,7 +160,7 @@ async def test_trends_say_in_one_line_what_a_person_would_notice(story: Path) ->
     assert "rises from 0 to 12.78" in says["pose.0"]
     assert "every 2 s" in says["heading"]
     assert "1 spike, the largest 5 at 70 s" in says["ir"]
-    assert "no value in 3.48 %" in says["sensors.front"]
+    assert "no value in 40 of 1150 rows" in says["sensors.front"]
     modes = {row["signal"]: row for row in rows_of(run["states"])}
     assert modes["mode"]["time_by_value_s"]["back_up"] == pytest.approx(8.0, abs=0.2)
     assert run["numbers"]["columns"] == ["signal", "says", "last", "mean", "deviation"]
@@ -269,10 +272,10 @@ async def test_a_label_is_kept_and_can_be_taken_away(story: Path, tmp_path: Path
     file = copy_of(story, tmp_path / "webots.db")
     async with client_on(file, read_only=False) as client:
         answer = await ask(client, "webots_annotate_run", run_id=2, label="7", note="too slow")
-        (run,) = rows_of(answer["runs"])
+        run = answer["run"]
         assert (run["run_id"], run["label"], run["note"]) == (2, "7", "too slow")
         answer = await ask(client, "webots_annotate_run", run_id=2, label="-")
-        (run,) = rows_of(answer["runs"])
+        run = answer["run"]
         assert (run.get("label"), run["note"]) == (None, "too slow")
         assert "give a label or a note" in await fail(client, "webots_annotate_run", run_id=2)
         assert "no run 9" in await fail(client, "webots_annotate_run", run_id=9, label="x")
@@ -327,7 +330,7 @@ async def test_the_schema_is_told_before_anything_was_recorded(tmp_path: Path) -
         ("webots_get_trends", {"since": 1700000100, "until": 1.7e9}, "until=1700000000"),
         ("webots_query_history", {"signals": ["mode"], "max_points": 10**9}, "less than or equal"),
         ("webots_find_events", {"kinds": ["threshold"]}, "above or below"),
-        ("webots_find_events", {"kinds": ["explosion"]}, "must be one of run, gap"),
+        ("webots_find_events", {"kinds": ["explosion"]}, "must be one of 'run', 'gap'"),
         ("webots_get_timeline", {"cursor": "xyz"}, "no cursor"),
         ("webots_compare_runs", {"run_ids": [1]}, "2 to 10"),
         ("webots_compare_runs", {"run_ids": [1, 99]}, "no run 99"),

@@ -304,7 +304,7 @@ async def test_a_camera_frame_comes_as_a_picture_with_its_age(
         assert caption["picture_age_s"] >= 0
         assert [picture.mime_type for picture in pictures_of(result)] == ["image/png"]
         other = await client.call_tool("webots_get_camera", {"camera": "left"})
-        assert "['eye']" in text_of(other)
+        assert "there are some of run_id=1: eye" in text_of(other)
 
 
 async def test_a_big_picture_is_scaled_and_the_original_named(
@@ -448,3 +448,16 @@ async def test_a_read_only_server_does_not_migrate(connect: Connect, file: Path)
     upgrade(file, "0001")
     async with connect(read_only=True) as client:
         assert "webots-mcp migrate" in await fail(client, "webots_list_robots")
+
+
+async def test_where_a_run_has_no_frame_those_that_have_some_are_named(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    robot.image(1.0, "camera/a.png")
+    second = recorded.robot()
+    second.state(1.0, {"x": 1})
+    async with connect() as client:
+        for camera in ("", "eye", "left"):
+            told = text_of(await client.call_tool("webots_get_camera", {"camera": camera}))
+            assert f"there are some of run_id={robot.run_id}: eye" in told

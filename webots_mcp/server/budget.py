@@ -102,6 +102,21 @@ def without_empty(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | 
     return table([columns[index] for index in kept], [[row[i] for i in kept] for row in rows])
 
 
+def condensed(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | None:
+    """A table that says once what all its rows share; the first column names the row."""
+    full = without_empty(columns, rows)
+    if full is None or len(rows) < 2:
+        return full
+    values = [[row[index] for row in full.rows] for index in range(len(full.columns))]
+    kept = [i for i, column in enumerate(values) if not i or len({*map(compact_json, column)}) > 1]
+    shared = {name: values[i][0] for i, name in enumerate(full.columns) if i not in kept}
+    told = Table(
+        columns=[full.columns[i] for i in kept], rows=[[row[i] for i in kept] for row in full.rows]
+    )
+    told.in_every_row = shared or None
+    return told
+
+
 def notes_of(notes: Sequence[str]) -> list[str] | None:
     """The notes of an answer; None without any."""
     return [cut_text(note, _LONGEST_NOTE) for note in notes[:_MOST_NOTES]] or None

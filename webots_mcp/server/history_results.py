@@ -20,7 +20,9 @@ class NotedAnswer(Answer):
 class SignalsAnswer(NotedAnswer):
     """The signals of a run."""
 
-    signals: Table | None = None
+    signals: Table | None = Field(
+        default=None, description="missing: rows of the run without a value of it."
+    )
     total: int | None = Field(default=None, description="How many match.")
     cursor: int | None = Field(default=None, description="Ask again with this cursor for more.")
 
@@ -218,6 +220,7 @@ class RunsAnswer(Answer):
     """Runs, the newest first."""
 
     runs: Table | None = None
+    run: dict[str, Any] | None = Field(default=None, description="The one that was annotated.")
     total: int | None = None
     cursor: int | None = Field(
         default=None, description="Ask again with this cursor for older ones."
@@ -239,8 +242,9 @@ class ComparisonAnswer(NotedAnswer):
     differences: Table | None = Field(
         default=None,
         description="Signals, most different first; lists are in the order of the groups. Of each "
-        "group but the first: effect, how far the mean is from the first group's, in standard "
-        "deviations (0.8 is large, null: unequal constants), deviation_ratio, different.",
+        "group but the first (a list where there are several): effect, how far the mean is from "
+        "the first group's, in standard deviations (0.8 is large, null: unequal constants), "
+        "deviation_ratio, different. min and max where signals were named.",
     )
     total: int | None = Field(default=None, description="Numeric signals that all groups have.")
     only_in: dict[str, list[str]] | None = Field(

@@ -13,6 +13,9 @@ class Table(BaseModel):
 
     columns: list[str]
     rows: list[list[Any]]
+    in_every_row: dict[str, Any] | None = Field(
+        default=None, description="Columns with the same value in all rows."
+    )
 
 
 class Answer(BaseModel):

@@ -46,8 +46,9 @@ _NEWEST: Final = (
     f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND kind = :kind "
     "AND (:device IS NULL OR device = :device) ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
-_DEVICES: Final = (
-    "SELECT DISTINCT device FROM image WHERE run_id = ? AND kind = 'camera' AND device IS NOT NULL"
+_CAMERAS: Final = (
+    "SELECT run_id, group_concat(DISTINCT device) FROM image WHERE kind = 'camera' AND run_id IN "
+    "(SELECT id FROM run WHERE robot_id = ?) GROUP BY run_id ORDER BY run_id DESC"
 )
 
 
@@ -114,6 +115,6 @@ def newest_camera_image(
     return StoredImage(*row) if row else None
 
 
-def camera_names(connection: sqlite3.Connection, run_id: int) -> list[str]:
-    """The cameras whose frames the run recorded."""
-    return [row[0] for row in connection.execute(_DEVICES, (run_id,)).fetchall()]
+def cameras(connection: sqlite3.Connection, robot_id: int) -> dict[int, str]:
+    """The cameras whose frames there are, by run of the robot, the newest run first."""
+    return dict(connection.execute(_CAMERAS, (robot_id,)).fetchall())

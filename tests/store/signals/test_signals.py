@@ -52,7 +52,7 @@ def test_the_list_says_what_each_signal_did(rover: sqlite3.Connection) -> None:
     assert battery.max == 12.6 and battery.min == pytest.approx(12.6 - 0.1199)
     assert (battery.first_s, battery.last_s) == (0.0, 119.9)
     front = by_name["sensors.front"]
-    assert front.null_share == pytest.approx(40 / 1150)
+    assert front.missing == 40
     assert by_name["heading"].kind == "angle"
     assert by_name["sensors.bumper"].kind == "bool"
     assert (by_name["mode"].kind, by_name["mode"].last) == ("text", "cruise")
@@ -124,11 +124,11 @@ def test_rows_that_do_not_hold_a_signal_have_no_value_of_it(empty: sqlite3.Conne
     for step in range(40):
         recorder.publish(float(step), {"x": step} | ({"lidar": 1.0} if step < 10 else {}))
         if step in (4, 25):
-            shares = {signal.name: signal.null_share for signal in list_signals(empty).signals}
+            missing = {signal.name: signal.missing for signal in list_signals(empty).signals}
             roll(empty)
-            rolled = {signal.name: signal.null_share for signal in list_signals(empty).signals}
-            assert shares == rolled == {"lidar": max(0, 1 - 10 / (step + 1)), "x": 0.0}
-    assert list_signals(empty).signals[0].null_share == pytest.approx(0.75)
+            rolled = {signal.name: signal.missing for signal in list_signals(empty).signals}
+            assert missing == rolled == {"lidar": max(0, step + 1 - 10), "x": 0}
+    assert list_signals(empty).signals[0].missing == 30
 
 
 @pytest.mark.parametrize("course", ["tn", "nt", "_t", "_n", "bn"])
@@ -157,4 +157,4 @@ def test_rows_not_rolled_up_yet_are_in_the_list(empty: sqlite3.Connection) -> No
     recorder.publish(1.0, {"x": 5.0, "y": None})
     x, y = list_signals(empty).signals
     assert (x.rows, x.min, x.max, x.last) == (2, 1.0, 5.0, 5.0)
-    assert (y.rows, y.kind, y.null_share) == (1, "null", 1.0)
+    assert (y.rows, y.kind, y.missing) == (1, "null", 2)

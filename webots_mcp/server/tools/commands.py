@@ -9,10 +9,11 @@ from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
+from webots_mcp.server.budget import condensed
 from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.dispatch import Dispatcher, shown_result
 from webots_mcp.server.parameters import Cursor, Id, RobotName, TimeoutS
-from webots_mcp.server.results import CommandAnswer, CommandsAnswer, Table
+from webots_mcp.server.results import CommandAnswer, CommandsAnswer
 from webots_mcp.server.shortening import DETAIL_BUDGET, cut_text, shorten
 from webots_mcp.store.queue import Command, list_commands
 from webots_mcp.store.recording import Recording, View
@@ -86,7 +87,7 @@ def command_row(command: Command, now_s: float) -> list[Any]:
     return [
         command.id,
         command.action,
-        shorten(json.loads(command.params), DETAIL_BUDGET).value,
+        shorten(json.loads(command.params), DETAIL_BUDGET).value or None,
         command.status,
         round(now_s - command.created_wall_time_s, 1),
         took_s,
@@ -99,7 +100,7 @@ def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
     rows = [command_row(command, view.now_s) for command in commands]
     return CommandsAnswer(
         **view.header(),
-        commands=Table(columns=list(COMMAND_COLUMNS), rows=rows),
+        commands=condensed(COMMAND_COLUMNS, rows),
         cursor=commands[-1].id if len(commands) == limit else None,
         actions=_actions(view),
         built_in=list(BUILT_IN_ACTIONS),

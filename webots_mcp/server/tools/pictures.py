@@ -9,16 +9,18 @@ from mcp.server.mcpserver import Context, Image
 from pydantic import Field
 
 from webots_mcp.errors import CommandRefusedError
+from webots_mcp.server.budget import some
 from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.parameters import RobotName, RunId, TimeoutS
 from webots_mcp.server.pictures import load_picture
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.shortening import compact_json
-from webots_mcp.store.images import camera_names, inside, newest_camera_image
+from webots_mcp.store.images import cameras, inside, newest_camera_image
 from webots_mcp.store.recording import Recording, View
 
 _WAIT_S: Final = 15.0
+_MOST_RUNS: Final = 5
 
 
 @tool("Get the camera picture", READS)
@@ -82,11 +84,13 @@ def _caption(facts: dict[str, Any]) -> str:
 
 def _no_frame(view: View, camera: str) -> str:
     """Why there is no picture, in the form of a caption."""
-    known = camera_names(view.connection, view.require_run().id)
+    known = cameras(view.connection, view.robot.id)
+    saved = [f"run_id={run_id}: {names}" for run_id, names in known.items()]
+    of_it = f" of {camera!r}" if camera else ""
     hint = (
-        f"no frame of that camera; saved in this run: {known}"
-        if camera and known
-        else "no camera frame was saved in this run: call bridge.save_camera_frame(camera) in the "
+        f"no frame{of_it} in this run; there are some of {some(saved, _MOST_RUNS)}"
+        if known
+        else "no camera frame was saved: call bridge.save_camera_frame(camera) in the "
         "controller's loop now and then, with the camera enabled"
     )
     return _caption(view.header() | {"camera": camera, "hint": hint})

@@ -13,6 +13,7 @@ from webots_mcp.server.budget import (
     BUDGET,
     LARGE_BUDGET,
     answer_about,
+    condensed,
     figure,
     figures,
     fitting,
@@ -65,8 +66,8 @@ GROUP_COLUMNS: Final = (
 )  # fmt: skip
 MEASURE_COLUMNS: Final = ("name", "median", "range", "different")
 DIFFERENCE_COLUMNS: Final = (
-    "signal", "unit", "mean", "mean_range", "deviation", "deviation_ratio", "min", "max",
-    "effect", "different",
+    "signal", "unit", "mean", "mean_range", "deviation", "effect", "deviation_ratio", "different",
+    "min", "max",
 )  # fmt: skip
 DEFAULT_DIFFERENCES: Final = 15
 _SHOWN_HASH: Final = 10
@@ -105,7 +106,7 @@ def webots_list_runs(
         older = len(rows) < len(found.runs)
         return RunsAnswer(
             **header,
-            runs=without_empty(RUN_COLUMNS, rows),
+            runs=condensed(RUN_COLUMNS, rows),
             total=found.total,
             cursor=found.runs[len(rows) - 1].run_id if older else found.cursor,
             hint=None if rows else _no_runs(parameters),
@@ -159,7 +160,8 @@ def webots_annotate_run(
         annotate_run(connection, run.id, label=_change(label), note=_change(note))
     with recording.view(robot, run.id) as view:
         told = run_info(view.connection, run.id)
-        return RunsAnswer(**view.header(), runs=without_empty(RUN_COLUMNS, [run_row(told)]))
+        named = zip(RUN_COLUMNS, run_row(told), strict=True)
+        return RunsAnswer(**view.header(), run={k: v for k, v in named if v is not None})
 
 
 def _change(text: str) -> str | None:
@@ -228,7 +230,8 @@ def _compared(
     groups, measures = _groups(found), _measures(found)
     told = "".join(str(table.rows) for table in (groups, measures) if table)
     room = (BUDGET if limit is None else LARGE_BUDGET) - len(told)
-    rows = fitting([_difference_row(difference) for difference in differing], room)
+    rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
+    rows = fitting(rows, room)
     only_in = list(found.only_in.items())
     return {
         "groups": groups,
@@ -244,8 +247,8 @@ def _compared(
 
 def _differs(difference: Difference) -> bool:
     """Whether mean or deviation of any group is another one than in the first."""
-    ratios = [each for each in difference.deviation_ratio[1:] if each is not None]
-    return any(each != 0 for each in difference.effect[1:]) or any(each != 1 for each in ratios)
+    first, *others = difference.deviation
+    return any(each != 0 for each in difference.effect[1:]) or any(each != first for each in others)
 
 
 def _measures(found: Comparison) -> Table | None:
@@ -275,7 +278,7 @@ def _ranges(spreads: Sequence[Spread | None]) -> list[list[float | None] | None]
 def _groups(found: Comparison) -> Table | None:
     robots = {run.robot for group in found.groups for run in group.runs}
     rows = [_group_row(group, told_robot=len(robots) > 1) for group in found.groups]
-    return without_empty(GROUP_COLUMNS, rows)
+    return condensed(GROUP_COLUMNS, rows)
 
 
 def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
@@ -295,25 +298,31 @@ def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
     ]
 
 
-def _difference_row(difference: Difference) -> list[Any]:
+def _difference_row(difference: Difference, *, with_extremes: bool) -> list[Any]:
+    """A row under `DIFFERENCE_COLUMNS`; only an angle's name leaves its unit open."""
     return [
         short_name(difference.name),
-        difference.unit,
+        difference.unit if difference.kind == "angle" else None,
         _medians(difference.mean),
         _ranges(difference.mean),
         _medians(difference.deviation),
-        figures(difference.deviation_ratio[1:]),
-        figures(difference.min),
-        figures(difference.max),
-        figures(difference.effect[1:]),
+        _against_first(figures(difference.effect)),
+        _against_first(figures(difference.deviation_ratio)),
         _told(difference.different),
+        figures(difference.min) if with_extremes else None,
+        figures(difference.max) if with_extremes else None,
     ]
 
 
-def _told(different: Sequence[bool | None]) -> list[bool | None] | None:
+def _against_first(figures: Sequence[Any]) -> Any:
+    """What is said of each group but the first; of a single one without a list around it."""
+    others = list(figures[1:])
+    return others[0] if len(others) == 1 else others
+
+
+def _told(different: Sequence[bool | None]) -> Any:
     """The verdict on each group but the first; None where there is none on any."""
-    verdicts = list(different[1:])
-    return verdicts if any(each is not None for each in verdicts) else None
+    return _against_first(different) if any(each is not None for each in different[1:]) else None
 
 
 def _hint(found: Comparison, told: int, differing: int, only_in: int) -> str | None:

@@ -22,9 +22,7 @@ from webots_mcp.server.parameters import Cursor, Limit, RobotName, RunId
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.signals.catalogue import SignalInfo, list_signals
 
-SIGNAL_COLUMNS: Final = (
-    "signal", "kind", "unit", "last", "min", "max", "first_s", "last_s", "null_share",
-)  # fmt: skip
+SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
 
 
 @tool("List the signals", READS)
@@ -38,7 +36,7 @@ def webots_list_signals(
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> SignalsAnswer:
-    """The dotted names of all that was published in a run: kind, last value, range, nulls.
+    """The dotted names of all that was published in a run: kind, last value, range, missing values.
 
     Arrays of more than 16 items are kept as .count, .min, .max, .mean and .argmin.
     """
@@ -46,19 +44,29 @@ def webots_list_signals(
         return answer_about(view, SignalsAnswer, lambda: _found(view, pattern, limit, cursor or 0))
 
 
-def signal_row(info: SignalInfo) -> list[Any]:
-    """A signal as a row under `SIGNAL_COLUMNS`."""
+def signal_row(info: SignalInfo, rows: int) -> list[Any]:
+    """A signal of a run of so many rows, as a row under `SIGNAL_COLUMNS`."""
     return [
         short_name(info.name),
         info.kind,
         info.unit,
-        shown(info.last if info.kind != "bool" or info.last is None else bool(info.last)),
-        figure(info.min),
-        figure(info.max),
-        seconds(info.first_s),
-        seconds(info.last_s),
-        figure(info.null_share),
+        *(_value(info, each) for each in (shown(info.last), figure(info.min), figure(info.max))),
+        _missing(info, rows),
     ]
+
+
+def _value(info: SignalInfo, value: Any) -> Any:
+    return bool(value) if info.kind == "bool" and value is not None else value
+
+
+def _missing(info: SignalInfo, rows: int) -> str | None:
+    """In how many rows it has no value, and between which times it has some."""
+    if not info.missing:
+        return None
+    if info.first_s is None:
+        return f"in all {rows} rows"
+    told = f"in {info.missing} of {rows} rows; values"
+    return f"{told} from {seconds(info.first_s)} to {seconds(info.last_s)} s"
 
 
 def _found(view: View, pattern: str, limit: int, start: int) -> dict[str, Any]:
@@ -69,7 +77,7 @@ def _found(view: View, pattern: str, limit: int, start: int) -> dict[str, Any]:
         pattern=pattern,
         limit=start + limit,
     )
-    rows = fitting([signal_row(info) for info in found.signals[start:]])
+    rows = fitting([signal_row(info, found.rows) for info in found.signals[start:]])
     end = start + len(rows)
     more = end < found.total
     return {

@@ -49,7 +49,7 @@ class SignalInfo:
 
     Attributes:
         rows: State rows that held it.
-        null_share: Of the run's rows, those without a value.
+        missing: Of the run's rows, those without a value.
         first_s: Simulation time of the first value; `last_s` of the last one.
         last: The value in the run's newest row; None where that has none.
     """
@@ -58,7 +58,7 @@ class SignalInfo:
     kind: Kind
     unit: str | None
     rows: int
-    null_share: float
+    missing: int
     first_s: float | None
     last_s: float | None
     last: Value
@@ -71,12 +71,14 @@ class SignalList:
     """The signals of a run.
 
     Attributes:
+        rows: State rows of the run.
         total: How many match, of which `signals` are the first.
         notes: What the asker should know.
     """
 
     robot: str
     run_id: int
+    rows: int
     signals: tuple[SignalInfo, ...]
     total: int
     notes: tuple[str, ...]
@@ -250,7 +252,7 @@ def list_signals(
     )
     if len(known) >= MAX_SIGNALS:
         notes.append(f"only the first {MAX_SIGNALS} names of a robot are kept")
-    return SignalList(subject.robot, subject.run_id, infos, len(matching), tuple(notes))
+    return SignalList(subject.robot, subject.run_id, rows, infos, len(matching), tuple(notes))
 
 
 def _stored(connection: sqlite3.Connection, run_id: int) -> dict[int | None, Summary]:
@@ -299,7 +301,7 @@ def _info(
         kind=signal.kind,
         unit=signal.unit,
         rows=sum(part.rows for part in parts),
-        null_share=1 - sum(part.present for part in parts) / run_rows,
+        missing=run_rows - sum(part.present for part in parts),
         first_s=held[0].first_sim_time_s if held else None,
         last_s=held[-1].last_sim_time_s if held else None,
         last=last,

@@ -13,6 +13,7 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
+from tests.server.story import rows_of
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.server.running import require_possible
 from webots_mcp.store.recording import Recording
@@ -108,9 +109,8 @@ async def _until_run_is(client: Client, outcome: str) -> dict[str, Any]:
     """The newest `run` command, once it is that far."""
     with anyio.fail_after(20):
         while True:
-            commands = (await ask(client, "webots_list_commands"))["commands"]
-            rows = [dict(zip(commands["columns"], row, strict=True)) for row in commands["rows"]]
-            for row in rows:
+            answer = await ask(client, "webots_list_commands")
+            for row in rows_of(answer.get("commands")):
                 if row["action"] == "run" and row["outcome"] == outcome:
                     return row
             await anyio.sleep(0.02)
@@ -150,8 +150,8 @@ async def test_what_cannot_end_is_refused_before_anything_is_sent(
         undeclared = await fail(client, "webots_run", for_s=1, parameters={"gain": 1})
         assert "declares no parameters" in undeclared
         assert (await ask(client, "webots_get_robot_state"))["status"] == "running"
-        sent = (await ask(client, "webots_list_commands"))["commands"]["rows"]
-        assert [row[1] for row in sent] == ["run"], "only the unknown parameter met the bridge"
+        sent = rows_of((await ask(client, "webots_list_commands"))["commands"])
+        assert [row["action"] for row in sent] == ["run"], "only the parameter met the bridge"
         again = await ask(client, "webots_run", until="steps >= 3", reset=True, then="go_on")
         assert again["ran"]["to_s"] <= 0.064
 

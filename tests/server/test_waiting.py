@@ -13,6 +13,7 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, Driver, ask, fail
+from tests.server.story import rows_of
 from webots_mcp.connection import connect as open_database
 
 pytestmark = pytest.mark.anyio
@@ -102,9 +103,8 @@ async def test_a_command_whose_asker_went_away_says_that_it_goes_on(
         claiming.join()
         with anyio.fail_after(10):
             while True:
-                commands = (await ask(client, "webots_list_commands"))["commands"]
-                row = dict(zip(commands["columns"], commands["rows"][0], strict=True))
-                if row["error"]:
+                (row,) = rows_of((await ask(client, "webots_list_commands"))["commands"])
+                if row.get("error"):
                     break
         assert (row["outcome"], row["error"]) == ("claimed", "the asker went away; it goes on")
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.signals.catalogue import SignalInfo
 
 _SIGNAL_COLUMNS: Final = (
-    "signal", "kind", "unit", "last", "min", "max", "first_s", "last_s", "null_share",
+    "signal", "kind", "unit", "last", "min", "max", "first_s", "last_s", "missing",
 )  # fmt: skip
 _LOG_COLUMNS: Final = ("sim_time_s", "level", "run", "message")
 
@@ -40,7 +40,7 @@ _LOG_COLUMNS: Final = ("sim_time_s", "level", "run", "message")
     count("-n", "the first N by name", default=100),
 )  # fmt: skip
 def signals(arguments: argparse.Namespace) -> None:
-    """List what was published in a run: kind, last value, range, share of rows without a value."""
+    """List what was published in a run: kind, last value, range, rows without a value."""
     from webots_mcp.store.signals.catalogue import list_signals
 
     with reading(arguments) as connection:
@@ -57,7 +57,7 @@ def signals(arguments: argparse.Namespace) -> None:
 
 def _signal_row(info: SignalInfo) -> list[Any]:
     last = bool(info.last) if info.kind == "bool" and info.last is not None else info.last
-    figures = (info.min, info.max, info.first_s, info.last_s, info.null_share or None)
+    figures = (info.min, info.max, info.first_s, info.last_s, info.missing or None)
     return [info.name, info.kind, info.unit, last, *figures]
 
 

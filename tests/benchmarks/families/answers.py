@@ -34,6 +34,7 @@ _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
     "webots_send_command": {"action": "set_speed", "params": {"speed": 6.0}},
     "webots_simulation_control": {"command": "resume"},
     "webots_annotate_run": {"label": "benchmark"},
+    "webots_run": {"for_s": 0.5, "then": "go_on"},
     "webots_set_parameters": {"values": {"speed": 6.0}},
     "webots_compare_runs": {"run_ids": [1, 2]},
     "webots_wait_for_command": {"command_id": 1},

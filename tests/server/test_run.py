@@ -15,6 +15,7 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
 from tests.server.story import rows_of
 from webots_mcp.errors import CommandRefusedError
+from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.running import require_possible
 from webots_mcp.store.recording import Recording
 
@@ -103,6 +104,21 @@ async def test_a_cancelled_call_leaves_the_simulation_as_then_says(
         assert ended["result"]["why"] == "it was cancelled"
         assert (await ask(client, "webots_get_robot_state"))["status"] == status
     assert driver.is_alive()
+
+
+async def test_an_interrupt_that_meets_the_waiting_itself_ends_the_run(
+    connect: Connect, driver: Driver, file: Path
+) -> None:
+    async def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    async with connect() as client:
+        with pytest.raises(KeyboardInterrupt):
+            await Dispatcher(Recording(file, file.parent), interrupt).ask(
+                None, "run", 60, {"for_s": 900.0}
+            )
+        ended = await _until_run_is(client, "done")
+        assert ended["result"]["why"] == "it was cancelled"
 
 
 async def _until_run_is(client: Client, outcome: str) -> dict[str, Any]:

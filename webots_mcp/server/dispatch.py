@@ -79,7 +79,8 @@ class Dispatcher:
         try:
             command = await self._watch(command.id, timeout_s)
             return await to_thread.run_sync(self._at_the_deadline, command)
-        except anyio.get_cancelled_exc_class():
+        except (anyio.get_cancelled_exc_class(), KeyboardInterrupt):
+            # A signal's interrupt is raised wherever the main thread is: also in this very task.
             with anyio.CancelScope(shield=True):
                 await to_thread.run_sync(self._leave, command)
             raise

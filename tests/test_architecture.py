@@ -24,7 +24,8 @@ ALLOWED = {
     "liveness": set[str](),
     "notice": set[str](),
     "naming": set[str](),
-    "conditions": {"conditions", "errors", "naming"},
+    "units": set[str](),
+    "conditions": {"conditions", "errors", "naming", "units"},
     "parameter": {"errors", "naming"},
     "settlement": {"contract", "entries", "liveness"},
     "entries": set[str](),
@@ -32,7 +33,7 @@ ALLOWED = {
     "maintenance": {"adoption", "connection", "errors", "notice", "schema"},
     "standin": {"standin", "bundled"},
 }
-ENTRIES = {"bundled", "conditions", "maintenance", "naming", "parameter", "settlement"}
+ENTRIES = {"bundled", "conditions", "maintenance", "naming", "parameter", "settlement", "units"}
 STDLIB = {
     *ENTRIES,
     *ALLOWED["maintenance"],

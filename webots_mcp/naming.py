@@ -26,11 +26,13 @@ _ELSEWHERE: Final = frozenset((
     "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel",
     "reference", "setpoint", "target", "waypoint",
 ))  # fmt: skip
-_AXES: Final = (("0", "1"), ("x", "y"), ("x_m", "y_m"))
+_LENGTHS: Final = ("m", "cm", "mm")  # units that a place is published in
+_AXES: Final = (("0", "1"), ("x", "y"), *((f"x_{unit}", f"y_{unit}") for unit in _LENGTHS))
 _MODES: Final = ("mode", "behaviour", "behavior", "action", "task", "phase")
 _STATES: Final = ("state", "status")  # of anything, often of an arm
 USUAL_POSITIONS: Final = (
     *((f"{branch}.{x}", f"{branch}.{y}") for branch in _BRANCHES for x, y in _AXES),
+    *((f"{branch}_{unit}.0", f"{branch}_{unit}.1") for branch in _BRANCHES for unit in _LENGTHS),
     *_AXES[1:],  # at the top
 )
 _LONGEST_COMPARED: Final = 100  # characters of a name
@@ -89,7 +91,9 @@ def mean_of(numbers: Collection[int | float]) -> float | None:
 
 
 def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
-    """The names of a robot's x and y in metres, among those of its numbers; None without any.
+    """The names of a robot's x and y, among those of its numbers; None without any.
+
+    In metres, unless the names have another unit: see `units.metres_in`.
 
     It is what is called `pose`, `position`, `pos`, `gps`, `odometry`, `odom` or `location` (in
     this order), or `x` and `y` at the top, or else the first branch by name that has an x and y:

@@ -61,15 +61,24 @@ def first_of(paths: str) -> str:
 def coordinate(usual: str, other: str) -> str:
     """The x (`key`) or y (`value`) of the first usual pair of two numbers, or of any branch."""
     return f"""coalesce(
-    (SELECT json_extract(j, '$.' || {usual}) FROM json_each('{PAIRS}') p
+    (SELECT json_extract(j, '$.' || {usual}) * {metres("p.key")}
+      FROM json_each('{PAIRS}') p
       WHERE json_type(j, '$.' || p.key) {IS_NUMBER} AND json_type(j, '$.' || p.value) {IS_NUMBER}
       LIMIT 1),
-    (SELECT {other}.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
+    (SELECT {other}.value * {metres("x.path")}
+      FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
       WHERE x.key = 'x' AND y.key = 'y' AND x.type {IS_NUMBER} AND y.type {IS_NUMBER}
         AND NOT EXISTS (SELECT 1 FROM json_each('{ELSEWHERE}') w WHERE
           instr(replace(lower({NAME.format("x.path")}), '_', '.') || '.', '.' || w.value || '.'))
       ORDER BY NOT EXISTS (SELECT 1 FROM json_each('{json.dumps(BRANCHES)}') w
         WHERE {NAME.format("x.path")} LIKE '%.' || w.value), {NAME.format("x.path")} LIMIT 1))"""
+
+
+def metres(path: str) -> str:
+    """What one of the unit that stands in a path is in metres: 1 where there is none."""
+    name = f"{NAME.format(path)} || '.'"
+    cases = " ".join(f"WHEN {name} GLOB '*_{unit}.*' THEN {size}" for unit, size in UNITS.items())
+    return f"CASE {cases} ELSE 1 END"
 
 
 def word(words: str) -> str:
@@ -87,7 +96,10 @@ def word(words: str) -> str:
 # As webots_mcp/naming.py had them; a later change there takes a migration of its own.
 IS_NUMBER = "IN ('integer', 'real')"
 BRANCHES = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
-AXES = (("[0]", "[1]"), (".x", ".y"), (".x_m", ".y_m"))
+UNITS = {"mm": 0.001, "cm": 0.01}
+LENGTHS = ("m", "cm", "mm")
+NAMED = [(f"x_{unit}", f"y_{unit}") for unit in LENGTHS]
+AXES = (("[0]", "[1]"), (".x", ".y"), *((f".{x}", f".{y}") for x, y in NAMED))
 ELSEWHERE = json.dumps([
     "accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass",
     "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed",
@@ -95,8 +107,11 @@ ELSEWHERE = json.dumps([
     "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel",
     "reference", "setpoint", "target", "waypoint",
 ])  # fmt: skip
-USUAL = [(branch + x, branch + y) for branch in BRANCHES for x, y in AXES]
-PAIRS = json.dumps(dict([*USUAL, ("x", "y"), ("x_m", "y_m")]))
+USUAL = [
+    *((branch + x, branch + y) for branch in BRANCHES for x, y in AXES),
+    *((f"{branch}_{unit}[0]", f"{branch}_{unit}[1]") for branch in BRANCHES for unit in LENGTHS),
+]
+PAIRS = json.dumps(dict([*USUAL, ("x", "y"), *NAMED]))
 NAME = """replace(replace(replace({}, '"', ''), '[', '.'), ']', '')"""
 OLD_POSITION = f"""
   {first_of("pose[0] pose.x position[0] position.x gps[0] gps.x x")} AS x_m,

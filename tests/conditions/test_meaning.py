@@ -163,6 +163,17 @@ def test_a_displacement_takes_the_position_that_the_tools_take() -> None:
     assert evaluator.values(states[2]) == {"position.x_m": 4.0, "position.y_m": 1.0}
 
 
+def test_a_displacement_is_in_metres_whatever_the_unit_of_the_position() -> None:
+    evaluator = parse_condition("displacement(0.1) > 0.5").evaluator()
+    states = [{"x_mm": 400.0 * i * i, "y_mm": 0.0} for i in range(3)]
+
+    assert [evaluator.holds(state, i * 0.1) for i, state in enumerate(states)] == [
+        False,
+        False,
+        True,
+    ]
+
+
 @pytest.mark.parametrize(
     "text", ["changed(x)", "rate(x) > 0", "x == 0 for 0.1", "displacement(0.1) >= 0"]
 )

@@ -223,7 +223,7 @@ async def test_looking_back_reports_at_once_on_exactly_those_rows(story: Path) -
     (trend,) = answer["trends"]
     assert answer["rows"] == trend["rows"] == 301
     assert (trend["start_s"], trend["end_s"]) == (29.9, 59.9)
-    assert answer["movement"]["distance"] == pytest.approx(9.0, abs=0.01)
+    assert answer["movement"]["distance_m"] == pytest.approx(9.0, abs=0.01)
     assert [row["details"]["what"] for row in rows_of(answer["events"])] == ["ended"]
 
 
@@ -237,7 +237,7 @@ async def test_looking_back_over_a_reset_tells_of_both_runs_and_no_way_between(
     answer = await tell(file, "webots_monitor", lookback_s=20)
     assert [trend["run_id"] for trend in answer["trends"]] == [1, 2]
     ways = answer["movement"]["runs"]
-    assert sum(way["distance"] for way in ways) < 12  # the jump back would add 12.8
+    assert sum(way["distance_m"] for way in ways) < 12  # the jump back would add 12.8
 
 
 async def test_runs_tell_their_code_and_how_they_ended(story: Path) -> None:

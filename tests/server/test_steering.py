@@ -94,7 +94,7 @@ async def test_watching_reports_what_was_recorded_meanwhile(
         answer |= json.loads(text_of(await watch))
     assert answer["rows"] > 10
     assert answer["movement"]["position"] == ["pose.0", "pose.1"]
-    assert answer["movement"]["distance"] > 0
+    assert answer["movement"]["distance_m"] > 0
     (trend,) = answer["trends"]
     assert trend["rows"] == answer["rows"]
     assert {row[0] for row in trend["numbers"]["rows"]} == {"pose.0", "steps"}

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, ask
 from tests.server.story import rows_of
+from webots_mcp.server.watching import movement
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.recording import Recording
 
 pytestmark = pytest.mark.anyio
 
@@ -27,8 +32,8 @@ async def test_a_way_there_and_back_has_a_distance_and_no_displacement(
     drive(rover, [0, 0], [3, 4], [0, 0])
     async with connect() as client:
         answer = await ask(client, "webots_monitor", lookback_s=60)
-    assert answer["movement"]["distance"] == 10.0
-    assert answer["movement"]["displacement"] == 0.0
+    assert answer["movement"]["distance_m"] == 10.0
+    assert answer["movement"]["displacement_m"] == 0.0
     assert answer["rows"] == 3
 
 
@@ -38,7 +43,7 @@ async def test_a_lost_position_does_not_count_as_a_way(
     drive(rover, [0, 0], [None, 1], [0, 1])
     async with connect() as client:
         answer = await ask(client, "webots_monitor", lookback_s=60)
-    assert answer["movement"]["distance"] == 1.0
+    assert answer["movement"]["distance_m"] == 1.0
 
 
 async def test_a_robot_without_a_position_has_no_movement(
@@ -100,6 +105,19 @@ async def test_over_a_reset_the_movement_is_told_run_by_run(
     async with connect() as client:
         answer = await ask(client, "webots_monitor", lookback_s=60)
     first, second = answer["movement"]["runs"]
-    assert (first["to"], first["distance"], first["displacement"]) == ([3, 4], 5.0, 5.0)
-    assert (second["to"], second["distance"], second["displacement"]) == ([0, 1], 1.0, 1.0)
+    assert (first["to_m"], first["distance_m"], first["displacement_m"]) == ([3, 4], 5.0, 5.0)
+    assert (second["to_m"], second["distance_m"], second["displacement_m"]) == ([0, 1], 1.0, 1.0)
     assert second["run_id"] == first["run_id"] + 1
+
+
+def test_a_movement_says_from_when_on_rows_were_not_read(
+    recorded: Recorded, rover: RecordedRobot, tmp_path: Path
+) -> None:
+    recorded.connection.execute("BEGIN")
+    drive(rover, *([0.01 * step, 0] for step in range(3000)))
+    recorded.connection.execute("COMMIT")
+    with Recording(recorded.database, tmp_path).view(None, None) as view:
+        whole = resolve_range(view.connection)
+        answer = movement(view, whole, 0)
+    assert answer is not None
+    assert answer["rows_missing_from_s"] < 1499.5

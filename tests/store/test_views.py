@@ -9,13 +9,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
 from webots_mcp.connection import connect
 from webots_mcp.naming import USUAL_POSITIONS, flatten
-from webots_mcp.store.analysis.motion import find_motion
+from webots_mcp.store.analysis.motion import find_motion, in_metres
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.migrate import downgrade, upgrade
 from webots_mcp.store.reading.subject import Subject
@@ -81,6 +82,8 @@ def placed(x_name: str, y_name: str) -> dict[str, Any]:
 
 PLACES = [
     *(placed(*pair) for pair in USUAL_POSITIONS),
+    {"robot_mm": {"truth": {"x": 1, "y": 2}}},
+    {"robot": {"truth_cm": {"x": 1, "y": 2}, "comm": {"x": None}}},
     {"robot": {"truth": {"x": 1, "y": 2}}, "zone": {"x": 7, "y": 8}},
     {"corners": [{"x": 1, "y": 2}, {"x": 7, "y": 8}]},
     {"goal": {"x": 7, "y": 8}, "cmd_vel": {"linear": {"x": 7, "y": 8}}, "rover": {"x": 1, "y": 2}},
@@ -113,6 +116,9 @@ def test_the_views_and_the_tools_find_position_and_mode_under_the_same_names(
     values = flatten(state)
     found = tuple(values[signal.name] if signal else None for signal in told)
     assert found in ((1, 2, None), (None, None, "go"))
+    if motion.position:
+        x, y = (in_metres(each, np.array([values[each.name]])) for each in motion.position)
+        found = (x[0], y[0], None)
     for view in ("robot_trajectory", "robot_now"):
         assert rows(connection, f"SELECT x_m, y_m, mode FROM {view}") == [found]
 

@@ -21,6 +21,7 @@ from webots_mcp.naming import (
     mean_of,
     reduce_array,
 )
+from webots_mcp.units import metres_in
 
 State: TypeAlias = Any  # what a controller publishes: usually a dict, with anything in it
 Read: TypeAlias = Callable[[State], Value]
@@ -185,6 +186,7 @@ class PositionReader:
         self._looks = 0
         self._x: Read | None = None
         self._y: Read | None = None
+        self._metres = 1.0  # in one of their unit
         self.names: tuple[str, str] | None = None
 
     def read(self, state: State) -> tuple[float, float] | None:
@@ -198,7 +200,7 @@ class PositionReader:
             near = -FARTHEST_M <= x <= FARTHEST_M and -FARTHEST_M <= y <= FARTHEST_M
         except TypeError:  # a text, or no value
             return None
-        return (x, y) if near else None
+        return (x * self._metres, y * self._metres) if near else None
 
     def _look(self, state: State) -> None:
         """Find out the names, at first and when there are keys that were not there before."""
@@ -211,7 +213,7 @@ class PositionReader:
         values = flatten(self._plain(state))
         self._numeric.update(name for name, value in values.items() if _may_be_number(value))
         if (names := find_position(self._numeric)) != self.names and names is not None:
-            self.names = names
+            self.names, self._metres = names, metres_in(names[0])
             self._x, self._y = (reader(name, self._plain) for name in names)
 
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from webots_mcp.server.bounds import newest_runs
-from webots_mcp.server.budget import figure
+from webots_mcp.server.budget import figure, seconds
 from webots_mcp.store.analysis.motion import find_motion, path_length, places_of
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.recording import View
@@ -60,21 +60,26 @@ def _standing(view: View, wall_start_s: float) -> Segment:
     return Segment(run.id, newest_s, math.inf, wall_start_s)
 
 
-def movement(view: View, found: TimeRange) -> dict[str, Any] | None:
-    """Distance along the way and displacement, in the unit of the position; None without one.
+def movement(
+    view: View, found: TimeRange, deadline_s: float = QUESTION_DEADLINE_S
+) -> dict[str, Any] | None:
+    """Distance along the way and displacement, in metres; None without a position.
 
     Over several runs they are told run by run: the jump to the start at a reset was not travelled.
+    Where reading took longer than the deadline, it is said from when on rows are missing.
     """
     known = known_signals(view.connection, found)
     position = find_motion(known, EventOptions()).position
     if position is None:
         return None
-    deadline = Deadline()
-    parts = [
-        read_columns(view.connection, segment, position, deadline) for segment in found.segments
-    ]
+    deadline = Deadline(deadline_s)
     names = {"position": [signal.name for signal in position]}
-    ways = {part.run_id: way for part in parts if (way := _way(part, position))}
+    ways: dict[int, dict[str, Any]] = {}
+    for segment in found.segments:
+        part = read_columns(view.connection, segment, position, deadline)
+        missing = {"rows_missing_from_s": seconds((part.times or [segment.start_s])[-1])}
+        if way := (_way(part, position) or {}) | (missing if part.cut else {}):
+            ways[segment.run_id] = way
     if len(ways) > 1:
         return names | {"runs": [{"run_id": run_id, **way} for run_id, way in ways.items()]}
     return next((names | way for way in ways.values()), None)
@@ -87,8 +92,8 @@ def _way(part: Columns, position: tuple[Signal, Signal]) -> dict[str, Any] | Non
         return None
     first, last = ((float(x[row]), float(y[row])) for row in (0, -1))
     return {
-        "from": [figure(value) for value in first],
-        "to": [figure(value) for value in last],
-        "distance": figure(path_length(part, position)),
-        "displacement": figure(math.dist(first, last)),
+        "from_m": [figure(value) for value in first],
+        "to_m": [figure(value) for value in last],
+        "distance_m": figure(path_length(part, position)),
+        "displacement_m": figure(math.dist(first, last)),
     }

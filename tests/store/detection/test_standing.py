@@ -81,3 +81,29 @@ def test_who_stands_while_rows_come_seldom_stands(empty: sqlite3.Connection) -> 
         recorder.publish(time_s, {"pose": [0.2 * min(time_s, 32.0), 0.0]})
     (still,) = find_events(empty, resolve_range(empty), OPTIONS).events
     assert (still.start_s, still.end_s) == (32.0, 61.5)
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "per_m"),
+    [("x_mm", "y_mm", 1000), ("x_cm", "y_cm", 100), ("odom.x_mm", "odom.y_mm", 1000)],
+)
+def test_a_position_in_another_unit_is_understood_by_its_name(
+    empty: sqlite3.Connection, tier: str, x: str, y: str, per_m: float
+) -> None:
+    def drives_then_stands(time_s: float) -> dict[str, Any]:
+        return {x: 0.02 * min(30.0, time_s) * per_m, y: 0.0}
+
+    (still,) = ask(empty, drives_then_stands).events
+    assert (still.start_s, still.end_s) == pytest.approx((30.0, 59.9), abs=0.3)
+    assert still.details["x_m"] == pytest.approx(0.6, abs=0.01)
+
+
+def test_who_turns_in_place_is_not_stuck_in_degrees_either(empty: sqlite3.Connection) -> None:
+    def drives_then_turns(time_s: float) -> dict[str, Any]:
+        turned_deg = 30.0 * max(0.0, time_s - 30) % 360
+        pose = {"x": 0.2 * min(30.0, time_s), "y": 0.0}
+        return {"pose": pose, "headingDeg": turned_deg, "mode": "go"}
+
+    (still,) = ask(empty, drives_then_turns).events
+    assert still.kind == "still"
+    assert "it turned in place" in still.details["not_stuck"]

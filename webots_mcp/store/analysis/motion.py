@@ -17,6 +17,7 @@ from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal
+from webots_mcp.units import METRES, metres_in
 
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.track import Track
@@ -35,8 +36,9 @@ _NO_SPEED: Final = re.compile(  # of a wheel or a motor; and motors that move no
     r"|arm|gripper|hand|head|neck|joint|finger|lidar|camera|mast|lift)([._]|$)",
     re.IGNORECASE,
 )
-_THIRD_AXES: Final = {"x": "z", "x_m": "z_m", "0": "2"}
-_HEADING: Final = ("heading", "yaw", "theta", "bearing")
+_PLACES: Final = ("rad", "deg", *METRES)  # units of where a wheel is, not of how fast it turns
+_THIRD_AXES: Final = {"0": "2", "x": "z", "x_m": "z_m", "x_cm": "z_cm", "x_mm": "z_mm"}
+_HEADING: Final = re.compile(r"(^|\.)(deg\w*_)?(heading|yaw|theta|bearing)[^.]*", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -44,13 +46,13 @@ class Motion:
     """The signals that tell of a robot's motion; None or empty where there is none.
 
     Attributes:
-        position: x and y in metres.
+        position: x and y; see `places_of` for them in metres.
         commanded: Speed that it should have; `speed` is one of which the name leaves open whether
             it is commanded or measured.
         mode: What it is doing.
-        heading: Where it looks, in radians.
+        heading: Where it looks; an angle.
         wheels: Speeds of its wheels or driving motors, commanded or measured.
-        height: z in metres: a robot that climbs does not stand still.
+        height: z: a robot that climbs does not stand still.
     """
 
     position: tuple[Signal, Signal] | None
@@ -97,7 +99,7 @@ def find_motion(
         signal
         for name, signal in own.items()
         if signal.kind == "num" and _WHEEL.search(name) and not _NO_SPEED.search(name)
-        if signal.unit not in ("rad", "deg", "m") and signal not in (commanded, speed)
+        if signal.unit not in _PLACES and signal not in (commanded, speed)
     )
     position = _position(known, options.position) if options.position else _position(own, None)
     position = position or _position(known, None)  # it may be missing in the rows that were seen
@@ -121,10 +123,10 @@ def _height(known: dict[str, Signal], position: tuple[Signal, Signal] | None) ->
 
 def _heading(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:
     """An angle beside the position, or else the one with the shortest name that says so."""
-    angles = [name for name, signal in known.items() if signal.kind == "angle"]
+    angles = [name for name, signal in known.items() if signal.turn is not None]
     branch = position[0].name.rpartition(".")[0] if position else ""
     beside = [name for name in angles if name.rpartition(".")[0] == branch and branch]
-    named = [name for name in angles if name.rpartition(".")[2].split("_")[0] in _HEADING]
+    named = [name for name in angles if _HEADING.search(name)]
     found = beside or named
     return known[min(found, key=len)] if found else None
 
@@ -159,9 +161,14 @@ def _first(
     return known[min(fitting, key=len)] if fitting else None
 
 
+def in_metres(signal: Signal, lengths: Array) -> Array:
+    """Lengths that a signal holds, in metres; they are metres where its name has no unit."""
+    return lengths * metres_in(signal.name)
+
+
 def places_of(columns: Columns, position: tuple[Signal, Signal]) -> tuple[Array, Array, Array]:
-    """Time, x and y of the rows that have a position."""
-    x, y = (aligned_numbers(columns.values[signal.name]) for signal in position)
+    """Time, and x and y in metres, of the rows that have a position."""
+    x, y = (in_metres(each, aligned_numbers(columns.values[each.name])) for each in position)
     there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
     times: Array = np.array(columns.times, np.float64)
     return times[there], x[there], y[there]

@@ -6,6 +6,7 @@ and that it moved in the same mode before is evidence; a measured speed of 0 is 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -138,7 +139,7 @@ def turns(columns: Columns, heading: Signal | None) -> Flags:
     none = np.zeros(len(columns.times), np.bool_)
     if heading is None or heading.name not in columns.values:
         return none
-    angles = numbers(columns, heading)
+    angles = _radians(columns, heading)
     present = np.flatnonzero(~np.isnan(angles))
     if len(present) < 2:
         return none
@@ -154,12 +155,16 @@ def turned_rad(columns: Columns, heading: Signal | None) -> float | None:
     """How far it turned from the first rows to the last; None where that is not known."""
     if heading is None or heading.name not in columns.values:
         return None
-    angles = numbers(columns, heading)
+    angles = _radians(columns, heading)
     course = np.unwrap(angles[~np.isnan(angles)])
     if not len(course):
         return None
     rows = max(1, min(5, len(course) // 2))
     return float(np.median(course[-rows:]) - np.median(course[:rows]))
+
+
+def _radians(columns: Columns, angle: Signal) -> Array:
+    return numbers(columns, angle) * (math.tau / (angle.turn or math.tau))
 
 
 def numbers(columns: Columns, signal: Signal) -> Array:

@@ -7,6 +7,7 @@ from typing import Final
 
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
+from webots_mcp.store.analysis.motion import in_metres
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
@@ -61,7 +62,7 @@ def _leaps(search: Search) -> Iterator[Event]:
 def _leaps_in(
     numbers: Numbers, position: tuple[Signal, Signal], at_least_m: float
 ) -> dict[float, float]:
-    x, y = (numbers.values[signal.name] for signal in position)
+    x, y = (in_metres(signal, numbers.values[signal.name]) for signal in position)
     known = np.isfinite(x) & np.isfinite(y)
     return dict(find_leaps(numbers.times[known], x[known], y[known], at_least_m))
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from webots_mcp.store.analysis.motion import position_noise, tracks_in
+from webots_mcp.store.analysis.motion import in_metres, position_noise, tracks_in
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.standstill import find_standstills
 from webots_mcp.store.analysis.track import Track, tracks_of
@@ -159,7 +159,11 @@ def _at_one_height(search: Search, standing: Standing, least_s: float) -> Iterat
     """The parts of a standstill in which it neither climbs nor sinks."""
     height, columns = search.motion.height, standing.columns
     times, heights = columns.numbers(height.name) if height else (np.empty(0), np.empty(0))
-    if not len(times) or np.ptp(heights) <= search.options.stuck_m:
+    if height is None or not len(times):
+        yield standing
+        return
+    heights = in_metres(height, heights)
+    if np.ptp(heights) <= search.options.stuck_m:
         yield standing
         return
     for track in tracks_of(times, heights, np.zeros(len(times)), noise_of(heights)):

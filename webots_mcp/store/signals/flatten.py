@@ -8,25 +8,14 @@ import re
 from typing import Any, Final, Literal, NamedTuple, cast
 
 from webots_mcp.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, reduce_array
+from webots_mcp.units import angle_unit, unit_in
 
 Kind = Literal["num", "bool", "text", "angle", "null"]
 MAX_TEXT: Final = 200  # characters of a text value that are kept and compared
 MAX_ANGLE_RAD: Final = 6.3  # a value beyond is in degrees, or turns were counted
 MAX_YAW_RAD: Final = 3.2  # the third item of a pose that goes beyond is no yaw
 
-_ANGLE_NAME: Final = re.compile(
-    r"(^|[._])(yaw|heading|theta|bearing|roll|pitch)(_rad)?(\.\d+)?$", re.IGNORECASE
-)
-_DEGREES_NAME: Final = re.compile(
-    r"(^|[._])(yaw|heading|theta|bearing|course|roll|pitch)_deg(\.\d+)?$", re.IGNORECASE
-)
 _THIRD_OF_POSE: Final = re.compile(r"(^|\.)pose\.2$", re.IGNORECASE)
-_UNIT_SUFFIXES: Final = {
-    "_rad_s": "rad/s", "_radps": "rad/s", "_m_s": "m/s", "_mps": "m/s", "_m_s2": "m/s²",
-    "_mps2": "m/s²", "_rad": "rad",
-    "_deg": "deg", "_mm": "mm", "_m": "m", "_ms": "ms", "_s": "s", "_hz": "Hz", "_v": "V",
-    "_a": "A", "_w": "W", "_nm": "N·m", "_n": "N", "_kg": "kg", "_percent": "%", "_bytes": "B",
-}  # fmt: skip
 
 
 class Place(NamedTuple):
@@ -108,7 +97,7 @@ def kind_of(name: str, value: Value, *, planar: bool = False) -> Kind:
         return "bool"
     if isinstance(value, str):
         return "text"
-    limit = MAX_YAW_RAD if planar else MAX_ANGLE_RAD if _ANGLE_NAME.search(name) else -1.0
+    limit = MAX_YAW_RAD if planar else MAX_ANGLE_RAD if angle_unit(name) == "rad" else -1.0
     return "angle" if abs(value) <= limit else "num"
 
 
@@ -116,7 +105,7 @@ def turn_of(name: str, kind: Kind) -> float | None:
     """A whole turn of an angle: 2 pi, or 360 where the name says degrees; else None."""
     if kind == "angle":
         return math.tau
-    return 360.0 if kind == "num" and _DEGREES_NAME.search(name) else None
+    return 360.0 if kind == "num" and angle_unit(name) == "deg" else None
 
 
 def may_be_yaw(name: str) -> bool:
@@ -137,16 +126,9 @@ def unit_of(name: str, kind: Kind) -> str | None:
     """The unit, where a part of the name ends in one (`speed_m_s`, `distance_m.left`)."""
     if kind == "angle":
         return "rad"
-    parts = name.lower().split(".")
-    if kind != "num" or parts[-1] in ("count", "argmin"):
+    if kind != "num" or name.rpartition(".")[2] in ("count", "argmin"):
         return None
-    units = (
-        unit
-        for part in reversed(parts)
-        for suffix, unit in _UNIT_SUFFIXES.items()
-        if part.endswith(suffix)
-    )
-    return next(units, None)
+    return unit_in(name)
 
 
 def shown(value: Value) -> str | None:

@@ -1,0 +1,79 @@
+"""Units in names: `front_mm`, `speed_m_s`, `heading_deg`, `headingDeg`, `pose_cm.0`.
+
+Recorded rows are judged by these units, and so are the states that a controller publishes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Final, Literal
+
+METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0}  # of lengths
+
+_DEGREES: Final = ("deg", "degs", "degree", "degrees")
+_RADIANS: Final = ("rad", "rads", "radian", "radians")
+_MOVING: Final = (*METRES, "rad", "deg")
+_UNITS: Final = {
+    **{each: each for each in METRES},
+    **dict.fromkeys(_DEGREES, "deg"),
+    **dict.fromkeys(_RADIANS, "rad"),
+    **{f"{unit}{per}": f"{unit}/s" for unit in _MOVING for per in ("_s", "ps", "_per_s")},
+    **{f"{unit}{per}": f"{unit}/s²" for unit in _MOVING for per in ("_s2", "ps2", "_per_s2")},
+    "km_h": "km/h", "kmh": "km/h", "rpm": "rpm", "ms": "ms", "s": "s", "hz": "Hz", "v": "V",
+    "a": "A", "w": "W", "nm": "N·m", "n": "N", "kg": "kg", "percent": "%", "bytes": "B",
+}  # fmt: skip
+_LONGEST_UNIT: Final = 3  # words: m_per_s
+_ANGLES: Final = ("yaw", "heading", "theta", "bearing", "roll", "pitch")
+_ANGLES_IF_UNIT: Final = (*_ANGLES, "course")  # a course without a unit may be of anything
+_HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+_KEPT: Final = 4096  # names whose units are remembered
+
+
+@lru_cache(maxsize=_KEPT)
+def unit_in(name: str) -> str | None:
+    """The unit that the last part of a name ends in, or else one before it; None without any."""
+    units = (_unit_of(part) for part in reversed(name.split(".")))
+    return next(filter(None, units), None)
+
+
+def metres_in(name: str) -> float:
+    """What one of the unit of a length is in metres; Webots' own, 1, where the name has none."""
+    return METRES.get(unit_in(name) or "m", 1.0)
+
+
+@lru_cache(maxsize=_KEPT)
+def angle_unit(name: str) -> Literal["rad", "deg"] | None:
+    """In what an angle is measured by its name, radians unless it says degrees; else None.
+
+    The unit stands after or before the word: `heading_deg`, `deg_heading`, `yawDegrees`,
+    `bearing.rad`.
+    """
+    parts = name.split(".")
+    if parts[-1].isdigit():
+        parts.pop()
+    words = [word for part in parts[-2:] for word in _words(part)]
+    units = (*_DEGREES, *_RADIANS)
+    after, before = words[-1:], words[-2:-1]
+    if after and after[0] in units:
+        word, unit = before, after
+    else:
+        word, unit = after, [each for each in before if each in units]
+    if not word or word[0] not in (_ANGLES_IF_UNIT if unit else _ANGLES):
+        return None
+    return "deg" if unit and unit[0] in _DEGREES else "rad"
+
+
+def _words(part: str) -> Sequence[str]:
+    return _HUMP.sub("_", part).lower().split("_")
+
+
+def _unit_of(part: str) -> str | None:
+    """That of one part of a dotted name; a single letter is one only after an underscore."""
+    words = _words(part)
+    for count in range(min(_LONGEST_UNIT, len(words)), 0, -1):
+        unit = "_".join(words[-count:])
+        if unit in _UNITS and (len(unit) > 1 or part.lower().endswith(f"_{unit}")):
+            return _UNITS[unit]
+    return "deg" if words[0] in _DEGREES else None

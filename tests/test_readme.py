@@ -49,7 +49,7 @@ def test_it_installs_from_what_exists() -> None:
     lines = re.findall(r"(?:pip|uv tool) install ([^#`\n]*)|uvx --from (\S+)", README)
     sources = [(installed or run).split()[-1] for installed, run in lines]
     assert sources.count(".") >= 4
-    others = set(sources) - {".", "/path/to/checkout"}
+    others = set(sources) - {".", "'.[search]'", "/path/to/checkout"}
     assert others <= {"pyarrow"}, "not from a checkout, and no dependency"
     published = re.findall(r"[^.]*\bpackage index\b[^.]*\.[^.]*\.", README)
     assert len(published) == 1

@@ -334,11 +334,14 @@ def create_trial() -> None:
         sa.Column("number", sa.Integer(), nullable=False, comment="its place in the set, from 1"),
         sa.Column("parameters", sa.Text(), nullable=False, comment="JSON object"),
         sa.Column(
-            "status", sa.Text(), nullable=False, comment="waiting, running, then done or failed"
+            "status",
+            sa.Text(),
+            nullable=False,
+            comment="waiting, running, then done, failed or pruned",
         ),
         sa.Column("run_id", sa.Integer()),
         sa.Column("score", sa.Float(), comment="if it is done"),
-        sa.Column("ended_by", sa.Text(), comment="for_s or until"),
+        sa.Column("ended_by", sa.Text(), comment="for_s, until or prune"),
         sa.Column("ended_sim_time_s", sa.Float(), comment="the end"),
         sa.Column("error", sa.Text(), comment="why it failed"),
         sa.Column("started_wall_time_s", sa.Float()),

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 import subprocess
 import sys
+import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,13 +66,37 @@ def command(project: Path, *options: str) -> list[str]:
     return [*program, "--stand-in", "--data-dir", str(project / "data"), *options]
 
 
+def rows(project: Path, sql: str) -> list[Any]:
+    """Of the recording that takes in the trials; none before there is one."""
+    file = project / "data" / "webots.db"
+    if not file.exists():
+        return []
+    with closing(sqlite3.connect(file)) as connection:
+        return connection.execute(sql).fetchall()
+
+
+def wait_for_trial(project: Path, number: int) -> int:
+    """The process of a trial's simulator, once it runs."""
+    tables = "SELECT 1 FROM sqlite_master WHERE name = 'trial'"
+    sql = f"SELECT pid FROM trial WHERE number = {number} AND status = 'running'"
+    until_s = time.monotonic() + 60
+    while time.monotonic() < until_s:
+        if rows(project, tables) and (found := rows(project, sql)):
+            return int(found[0][0])
+        time.sleep(0.01)
+    raise TimeoutError(f"trial {number} did not begin")
+
+
 @pytest.fixture
 def run(project: Path) -> Run:
     """Run the plan on the stand-in."""
 
-    def run_plan(*options: str) -> subprocess.CompletedProcess[str]:
+    def run_plan(
+        *options: str, env: dict[str, str] | None = None
+    ) -> subprocess.CompletedProcess[str]:
+        line = command(project, *options)
         return subprocess.run(
-            command(project, *options), capture_output=True, text=True, timeout=120, check=False
+            line, capture_output=True, text=True, timeout=120, check=False, env=env
         )
 
     return run_plan

@@ -5,26 +5,17 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sqlite3
 import subprocess
-import time
 from collections.abc import Callable
-from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from tests.trials.conftest import Run, command
+from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.liveness import process_identity
 from webots_mcp.trials.plan import read_plan
 
 Plan = Callable[[str], Path]
-
-
-def rows(project: Path, sql: str) -> list[Any]:
-    with closing(sqlite3.connect(project / "data" / "webots.db")) as connection:
-        return connection.execute(sql).fetchall()
 
 
 def test_sets_are_tried_scored_ranked_and_their_runs_kept(
@@ -86,7 +77,7 @@ def test_who_is_ended_in_the_middle_is_gone_on_from(
     process = subprocess.Popen(
         command(project), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
     )
-    pid = _second_simulator(project)
+    pid = wait_for_trial(project, 2)
     process.send_signal(number)
     _, said = process.communicate(timeout=30)
 
@@ -101,20 +92,6 @@ def test_who_is_ended_in_the_middle_is_gone_on_from(
     assert [len(each["scores"]) for each in answer["sets"]] == [2, 2]
     assert rows(project, "SELECT count(*), count(DISTINCT uuid) FROM run") == [(4, 4)]
     assert rows(project, "SELECT count(*) FROM trial_set") == [(1,)]
-
-
-def _second_simulator(project: Path) -> int:
-    """The process of the second trial's simulator, once it runs."""
-    sql = "SELECT pid FROM trial WHERE number = 2 AND status = 'running'"
-    until_s = time.monotonic() + 60
-    while time.monotonic() < until_s:
-        with_tables = "SELECT 1 FROM sqlite_master WHERE name = 'trial'"
-        if (project / "data" / "webots.db").exists() and rows(project, with_tables):
-            found = rows(project, sql)
-            if found:
-                return int(found[0][0])
-        time.sleep(0.01)
-    raise TimeoutError("the second trial did not begin")
 
 
 def test_what_no_trial_can_have_ends_all_of_them_with_a_sentence(plan: Plan, run: Run) -> None:
@@ -142,7 +119,7 @@ def test_two_cannot_work_on_one_set(project: Path, plan: Plan, run: Run) -> None
     plan('score = "last(x)"\nuntil = "x > 1e6"\n[grid]\nspeed = [1.0, 2.0]')
     process = subprocess.Popen(command(project, "--jobs", "2"), stderr=subprocess.DEVNULL)
     try:
-        _second_simulator(project)
+        wait_for_trial(project, 2)
         refused = run()
     finally:
         process.send_signal(signal.SIGTERM)
@@ -164,7 +141,7 @@ def test_the_example_tries_five_speeds_three_times() -> None:
     [
         ('score = "last(x)"\n[grid]\nspeed = [1.0]', "give for_s, until or both"),
         ('for_s = 1\n[grid]\nspeed = [1.0]', "score is missing"),
-        ('score = "last(x)"\nfor_s = 1', "parameters is missing: give a .grid."),
+        ('score = "last(x)"\nfor_s = 1', "give a .grid., as in speed"),
         ('score = "last(x)"\nfor_s = 1\n[grid]\nspeed = 1.0', "must be an array of values"),
         ('score = "last(x"\nfor_s = 1\n[grid]\nspeed = [1.0]', "column 5: '(' was never closed"),
         ('score = "x"\nfor_s = 1\n[grid]\nspeed = [1.0]', "a signal has a value in each state"),

@@ -8,7 +8,7 @@ import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.cli.command import (
     DATA_DIR,
@@ -28,17 +28,24 @@ if TYPE_CHECKING:
     from webots_mcp.trials.plan import Plan
 
 
+_WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
+
+
 @command(
     "trials", DATA_DIR, DATABASE, JSON,
     argument("plan", metavar="PLAN", help="a .toml file: see docs/trials.md"),
     count("--jobs", "at most N trials at once, each in a simulator of its own", default=1,
           dest="jobs"),
+    argument("--search", metavar="SAMPLER",
+             help="search the plan's [ranges]: tpe or random, by Optuna (pip install optuna)"),
     argument("--stand-in", action="store_true", help="on the stand-in instead of Webots"),
     argument("--again", action="store_true",
              help="from the start, also where all trials of the plan are done"),
 )  # fmt: skip
 def trials(arguments: argparse.Namespace) -> None:
     """Try sets of parameters in runs of their own, score each run, and rank the sets.
+
+    webots-mcp trials plan.toml --jobs 4 --search tpe
 
     Each trial runs in a simulator and a data folder of its own; what it recorded is merged into
     the recording, where its run can be looked at like any other.
@@ -47,16 +54,20 @@ def trials(arguments: argparse.Namespace) -> None:
     """
     from webots_mcp.trials.plan import read_plan
     from webots_mcp.trials.runner import Workshop, run_trials
+    from webots_mcp.trials.searching import next_parameters, require_optuna
     from webots_mcp.trials.simulators import stand_in, webots
 
-    plan = read_plan(Path(arguments.plan))
+    plan = read_plan(Path(arguments.plan), arguments.search)
     command_of = stand_in if arguments.stand_in else webots
     command_of(plan.world)  # before anything is written: is there such a program?
+    if plan.search:
+        require_optuna()
     recording = replace(open_recording(arguments), read_only=False)
     recording.create()
     set_id = _set_of(recording, plan, arguments)
-    workshop = Workshop(recording, plan, command_of, threading.Event())
-    run_trials(workshop, set_id, arguments.jobs, _Progress(recording, set_id).tell)
+    search = next_parameters if plan.search else None
+    workshop = Workshop(recording, plan, command_of, threading.Event(), search)
+    run_trials(workshop, set_id, arguments.jobs, _Progress(recording, set_id, plan).tell)
     _show(recording, set_id, plan, as_json=arguments.json)
 
 
@@ -73,12 +84,12 @@ def _set_of(recording: Recording, plan: Plan, arguments: argparse.Namespace) -> 
 class _Progress:
     """A line on stderr for each trial that is over."""
 
-    def __init__(self, recording: Recording, set_id: int) -> None:
+    def __init__(self, recording: Recording, set_id: int, plan: Plan) -> None:
         from webots_mcp.store.trials import trials_of
 
         with recording.reader() as connection:
             known = trials_of(connection, set_id)
-        self._of, self._over = len(known), sum(each.is_over for each in known)
+        self._of, self._over = plan.trial_count, sum(each.is_over for each in known)
         if self._over:
             print(f"trial set {set_id}: {self._over} of {self._of} trials were done before",
                   file=sys.stderr)  # fmt: skip
@@ -86,9 +97,8 @@ class _Progress:
     def tell(self, trial: Trial, result: Result) -> None:
         """That a trial is over, and what came of it."""
         self._over += 1
-        came = (
-            f"failed: {result.error}" if result.score is None else f"score {text_of(result.score)}"
-        )
+        came = text_of(result.score) if result.status == "done" else result.error
+        came = f"{_WORDS[result.status]} {came}"
         said = f"{self._over}/{self._of}  {text_of(trial.values)}: {came}"
         print(said, file=sys.stderr, flush=True)
 
@@ -104,7 +114,7 @@ def _show(recording: Recording, set_id: int, plan: Plan, *, as_json: bool) -> No
         print(json.dumps({"trial_set_id": set_id, **_as_json(ranking), "runs": runs}))
         return
     print_table(
-        ("rank", "parameters", "median", "least", "greatest", "scores", "failed", "why"),
+        ("rank", "parameters", "median", "least", "greatest", "scores", "pruned", "failed", "why"),
         [_row(number, each) for number, each in enumerate(ranking.sets, 1)],
     )
     ids = [each.run_id for each in found if each.run_id is not None]
@@ -115,8 +125,8 @@ def _show(recording: Recording, set_id: int, plan: Plan, *, as_json: bool) -> No
 def _row(number: int, ranked: Any) -> list[Any]:
     spread = ranked.score or (None, None, None)
     failures = ranked.failures
-    return [number, ranked.parameters, *spread, len(ranked.scores), len(failures) or None,
-            failures[0] if failures else None]  # fmt: skip
+    return [number, ranked.parameters, *spread, len(ranked.scores), ranked.pruned or None,
+            len(failures) or None, failures[0] if failures else None]  # fmt: skip
 
 
 def _as_json(ranking: Ranking) -> dict[str, Any]:

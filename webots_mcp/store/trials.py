@@ -24,6 +24,7 @@ _NEW_TRIAL: Final = (
     "VALUES (?, ?, ?, ?, 'waiting')"
 )
 _NEWEST: Final = "SELECT id FROM trial_set WHERE plan = ? ORDER BY id DESC LIMIT 1"
+_SET: Final = "SELECT 1 FROM trial_set WHERE id = ?"
 _WORKER: Final = "SELECT host, pid, process FROM trial_set WHERE id = ?"
 _WORK: Final = "UPDATE trial_set SET host = ?, pid = ?, process = ? WHERE id = ?"
 _BEGIN: Final = (
@@ -70,18 +71,32 @@ class Trial:
     @property
     def is_over(self) -> bool:
         """Whether it need not be run any more."""
-        return self.status in ("done", "failed")
+        return self.status in ("done", "failed", "pruned")
 
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a trial: a score, or an error."""
+    """What became of a trial: a score, or an error.
+
+    Attributes:
+        error: Why there is no score.
+        ended_by: `for_s`, `until` or `prune`; None where it did not come to an end.
+        pruned: It was ended early because it was not worth going on with.
+    """
 
     run_id: int | None
     score: float | None
     error: str | None
     ended_by: str | None = None
     ended_sim_time_s: float | None = None
+    pruned: bool = False
+
+    @property
+    def status(self) -> str:
+        """Of the trial, with this."""
+        if self.pruned:
+            return "pruned"
+        return "failed" if self.score is None else "done"
 
 
 _TRIALS: Final = f"SELECT {columns_of(Trial)} FROM trial WHERE trial_set_id = ? ORDER BY number"
@@ -95,9 +110,22 @@ def create_trial_set(
         row = connection.execute(_NEW_SET, (new_uuid(), plan, time.time())).fetchone()
         set_id = int(row[0])
         for number, values in enumerate(parameters, 1):
-            text = json.dumps(values, ensure_ascii=False)
-            connection.execute(_NEW_TRIAL, (set_id, new_uuid(), number, text))
+            _enter(connection, set_id, number, values)
     return set_id
+
+
+def add_trial(connection: sqlite3.Connection, set_id: int, values: dict[str, Any]) -> Trial:
+    """Enter one more trial of a set that is searched as it goes on."""
+    with transaction(connection):
+        _enter(connection, set_id, len(trials_of(connection, set_id)) + 1, values)
+    return trials_of(connection, set_id)[-1]
+
+
+def _enter(
+    connection: sqlite3.Connection, set_id: int, number: int, values: dict[str, Any]
+) -> None:
+    text = json.dumps(values, ensure_ascii=False)
+    connection.execute(_NEW_TRIAL, (set_id, new_uuid(), number, text))
 
 
 def find_trial_set(connection: sqlite3.Connection, plan: str) -> int | None:
@@ -112,10 +140,9 @@ def trials_of(connection: sqlite3.Connection, set_id: int) -> list[Trial]:
     Raises:
         InvalidInputError: There is no such set.
     """
-    trials = [Trial(*row) for row in connection.execute(_TRIALS, (set_id,)).fetchall()]
-    if not trials:
+    if connection.execute(_SET, (set_id,)).fetchone() is None:
         raise InvalidInputError(f"there is no trial set {set_id}")
-    return trials
+    return [Trial(*row) for row in connection.execute(_TRIALS, (set_id,)).fetchall()]
 
 
 def take_up(connection: sqlite3.Connection, set_id: int) -> None:
@@ -159,7 +186,7 @@ def finish_trial(connection: sqlite3.Connection, trial: Trial, result: Result) -
             {
                 **vars(result),
                 "id": trial.id,
-                "status": "failed" if result.score is None else "done",
+                "status": result.status,
                 "now": time.time(),
             },
         )
@@ -169,5 +196,10 @@ def finish_trial(connection: sqlite3.Connection, trial: Trial, result: Result) -
 def ranking_of(trials: list[Trial], best: Best) -> Ranking:
     """The parameter sets of the trials that are over, the best first."""
     return rank(
-        [Outcome(each.values, each.score, each.error) for each in trials if each.is_over], best
+        [
+            Outcome(each.values, each.score, each.error, pruned=each.status == "pruned")
+            for each in trials
+            if each.is_over
+        ],
+        best,
     )

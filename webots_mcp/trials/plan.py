@@ -6,20 +6,22 @@ import itertools
 import json
 import math
 import sys
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final, cast, get_args
+from typing import Any, Final, Literal, cast, get_args
 
 from webots_mcp.conditions import parse_condition
 from webots_mcp.conditions.score import parse_score
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.naming import nearest_first
 from webots_mcp.store.analysis.ranking import Best
+from webots_mcp.trials.ranges import Range, as_plain, read_ranges, require_kinds
 
+Search = Literal["tpe", "random"]
 MOST_TRIALS: Final = 10_000
+_MOST_SEED: Final = 2**63
 _GRID: Final = "grid"
-_REQUIRED: Final = ("world", "score", "parameters")
+_REQUIRED: Final = ("world", "score")
 
 
 @dataclass(frozen=True)
@@ -29,32 +31,43 @@ class Plan:
     Attributes:
         world: The world file, with its full path.
         score: See docs/trials.md.
-        parameters: The sets that are tried.
+        parameters: The sets that are tried; empty where they are searched for.
         best: Which scores are the best.
         for_s: A trial ends after so many simulated seconds ...
         until: ... or when this condition holds, whichever comes first.
+        prune: A trial in which this condition holds is ended early, without a score.
         repeats: How often each set is tried. With 1, the first one is tried twice nevertheless:
             that tells by how much like trials differ.
         robot: Whose signals, events and parameters are meant, where a world has several.
         timeout_s: A trial that takes longer, in wall time, has failed.
+        ranges: What is searched, by parameter.
+        search: Who says which sets are tried: a sampler of Optuna.
+        sets: How many are searched for.
+        seed: Of the sampler: the same one says the same of the same trials.
     """
 
     world: str
     score: str
-    parameters: list[dict[str, Any]]
+    parameters: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     best: Best = "highest"
     for_s: float | None = None
     until: str | None = None
     repeats: int = 1
     robot: str | None = None
     timeout_s: float = 300.0
+    prune: str | None = None
+    ranges: dict[str, Range] = field(default_factory=dict[str, Range])
+    search: Search | None = None
+    sets: int = 0
+    seed: int = 0
 
     def __post_init__(self) -> None:
         if not Path(self.world).is_file():
             raise InvalidInputError(f"world: there is no file {self.world}")
         parse_score(self.score)
-        if self.until is not None:
-            parse_condition(self.until)
+        for condition in (self.until, self.prune):
+            if condition is not None:
+                parse_condition(condition)
         if self.for_s is None and self.until is None:
             raise InvalidInputError("give for_s, until or both: when does a trial end?")
         if self.best not in get_args(Best):
@@ -65,23 +78,50 @@ class Plan:
             value = getattr(self, name)
             if value is not None and not 0 < value < math.inf:
                 raise InvalidInputError(f"{name}={value} must be a number of seconds above 0")
-        if not (self.parameters and 1 <= self.repeats * len(self.parameters) <= MOST_TRIALS):
+        if self.search or self.ranges or self.sets or self.seed:
+            self._require_searchable()
+        if not 1 <= self.repeats * (self.sets or len(self.parameters)) <= MOST_TRIALS:
             raise InvalidInputError(f"there must be 1 to {MOST_TRIALS} trials")
+
+    def _require_searchable(self) -> None:
+        if self.search not in get_args(Search):
+            known = ", ".join(get_args(Search))
+            raise InvalidInputError(
+                f"[ranges], sets and seed are for a search: --search takes {known}"
+            )
+        if not self.ranges or self.parameters:
+            raise InvalidInputError(
+                "--search takes [ranges], as in speed = { low = 0.5, high = 10.0 }, and neither "
+                "[grid] nor [[parameters]]"
+            )
+        if self.sets < 1:
+            raise InvalidInputError("sets is missing: how many sets are to be searched for?")
+        if not 0 <= self.seed < _MOST_SEED:
+            raise InvalidInputError(f"seed={self.seed} must be 0 or more, and less than 2**63")
 
     @property
     def text(self) -> str:
         """All of it, always written alike: by it a set is found again."""
-        return json.dumps(asdict(self), sort_keys=True, ensure_ascii=False)
+        said = asdict(self) | {"ranges": as_plain(self.ranges)}
+        return json.dumps(said, sort_keys=True, ensure_ascii=False)
 
     @property
     def trials(self) -> list[dict[str, Any]]:
-        """The parameters of each trial; all sets come once before any is repeated."""
+        """The parameters of each trial that is known from the start.
+
+        All sets come once before any is repeated.
+        """
         once = self.parameters[:1] if self.repeats == 1 else []
         return [*(each for _ in range(self.repeats) for each in self.parameters), *once]
 
+    @property
+    def trial_count(self) -> int:
+        """How many trials there are in the end."""
+        return (self.sets or len(self.parameters)) * self.repeats + (self.repeats == 1)
 
-def read_plan(file: Path) -> Plan:
-    """Read a plan.
+
+def read_plan(file: Path, search: Search | None = None) -> Plan:
+    """Read a plan, for a search or without one.
 
     Raises:
         InvalidInputError: It is no TOML, or says something that is not possible; the text names it.
@@ -93,34 +133,26 @@ def read_plan(file: Path) -> Plan:
     except ValueError as error:  # also what is not UTF-8
         raise InvalidInputError(f"{file} is no TOML: {error}") from error
     try:
-        return _plan_of(found, file.resolve().parent)
+        return _plan_of(found, file.resolve().parent, search)
     except InvalidInputError as error:
         raise InvalidInputError(f"{file}: {error}") from error
 
 
-def _plan_of(found: dict[str, Any], folder: Path) -> Plan:
-    kinds = {each.name: _KINDS[each.name] for each in fields(Plan)} | {_GRID: dict}
-    for name, value in found.items():
-        if name not in kinds:
-            raise InvalidInputError(f"unknown {name!r}; there is {', '.join(_near(name, kinds))}")
-        if not isinstance(value, kinds[name]) or isinstance(value, bool):
-            raise InvalidInputError(f"{name}={value!r} is a {type(value).__name__}")
-    if _GRID in found and "parameters" in found:
-        raise InvalidInputError("give [grid] or [[parameters]], not both")
+def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> Plan:
+    require_kinds(found, _KINDS)
+    if len(given := [_WRITTEN[name] for name in _WRITTEN if name in found]) != 1:
+        raise InvalidInputError(_HOW_MANY + (f", not {' and '.join(given)}" if given else ""))
     if _GRID in found:
         found = found | {"parameters": _combinations(found[_GRID])}
     found = {name: value for name, value in found.items() if name != _GRID}
     for name in _REQUIRED:
         if name not in found:
-            raise InvalidInputError(f"{name} is missing" + _HINTS.get(name, ""))
-    parameters = cast("list[Any]", found["parameters"])
-    _require_tables(parameters)
+            raise InvalidInputError(f"{name} is missing")
+    _require_tables(cast("list[Any]", found.get("parameters", [])))
+    if "ranges" in found:
+        found["ranges"] = read_ranges(found["ranges"])
     found["world"] = str((folder / found["world"]).resolve())
-    return Plan(**found)
-
-
-def _near(name: str, known: Any) -> list[str]:
-    return nearest_first(name, list(known))[:3]
+    return Plan(**found, search=search)
 
 
 def _combinations(grid: dict[str, Any]) -> list[dict[str, Any]]:
@@ -143,6 +175,8 @@ def _require_tables(parameters: list[Any]) -> None:
 
 _KINDS: Final[dict[str, Any]] = {
     "world": str, "score": str, "parameters": list, "best": str, "for_s": (int, float),
-    "until": str, "repeats": int, "robot": str, "timeout_s": (int, float),
+    "until": str, "repeats": int, "robot": str, "timeout_s": (int, float), "prune": str,
+    "ranges": dict, "sets": int, "seed": int, _GRID: dict,
 }  # fmt: skip
-_HINTS: Final = {"parameters": ": give a [grid], as in speed = [2.0, 4.0], or [[parameters]]"}
+_WRITTEN: Final = {_GRID: "[grid]", "parameters": "[[parameters]]", "ranges": "[ranges]"}
+_HOW_MANY: Final = "give a [grid], as in speed = [2.0, 4.0], [[parameters]], or [ranges] to search"

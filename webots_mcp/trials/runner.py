@@ -11,10 +11,12 @@ import shutil
 import sqlite3
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -37,6 +39,7 @@ from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import (
     Result,
     Trial,
+    add_trial,
     begin_trial,
     finish_trial,
     lay_down,
@@ -54,6 +57,7 @@ _PATIENCE_S: Final = 0.5  # between two looks at whether somebody wants to stop
 
 Command = Callable[[str], list[str]]
 Told = Callable[[Trial, Result], object]
+Search = Callable[[Plan, list[Trial]], "dict[str, Any] | None"]
 
 
 class StoppedError(Exception):
@@ -69,12 +73,15 @@ class Workshop:
         plan: What is tried.
         command: Of a world's simulator.
         stopping: Once it is set, running trials end soon and wait to be run again.
+        search: Says the parameters of the trial after those that there are, or None where there is
+            none; None where all were entered with the set.
     """
 
     recording: Recording
     plan: Plan
     command: Command
     stopping: threading.Event
+    search: Search | None = None
 
     def folder(self, trial: Trial) -> Path:
         """The data folder of a trial."""
@@ -101,15 +108,23 @@ def run_trials(workshop: Workshop, set_id: int, jobs: int, told: Told) -> None:
         for trial in trials:
             if trial.is_over:
                 shutil.rmtree(workshop.folder(trial), ignore_errors=True)
-        left = [trial for trial in trials if not trial.is_over]
+        left = deque(trial for trial in trials if not trial.is_over)
         with ThreadPoolExecutor(jobs) as pool:
-            running = {pool.submit(run_trial, workshop, trial): trial for trial in left}
             try:
-                _gather(running, told)
+                _run_all(workshop, pool, jobs, partial(_next_trial, workshop, set_id, left), told)
             finally:
                 workshop.stopping.set()
-                for future in running:
-                    future.cancel()
+
+
+def _next_trial(workshop: Workshop, set_id: int, left: deque[Trial]) -> Trial | None:
+    """One that waits, or a new one of a search; None where there is none, or none yet."""
+    if left:
+        return left.popleft()
+    if workshop.search is None:
+        return None
+    with workshop.recording.writer() as connection:
+        values = workshop.search(workshop.plan, trials_of(connection, set_id))
+        return None if values is None else add_trial(connection, set_id, values)
 
 
 @contextmanager
@@ -123,12 +138,21 @@ def _at_work(workshop: Workshop, set_id: int) -> Generator[None]:
             lay_down(connection, set_id)
 
 
-def _gather(running: dict[Future[Result], Trial], told: Told) -> None:
-    left = set(running)
-    while left:
-        over, left = wait(left, _PATIENCE_S, FIRST_COMPLETED)
-        for future in over:
-            told(running[future], future.result())
+def _run_all(
+    workshop: Workshop,
+    pool: ThreadPoolExecutor,
+    jobs: int,
+    next_trial: Callable[[], Trial | None],
+    told: Told,
+) -> None:
+    running: dict[Future[Result], Trial] = {}
+    while True:
+        while len(running) < jobs and (trial := next_trial()) is not None:
+            running[pool.submit(run_trial, workshop, trial)] = trial
+        if not running:
+            return
+        for future in wait(running, _PATIENCE_S, FIRST_COMPLETED).done:
+            told(running.pop(future), future.result())
 
 
 def run_trial(workshop: Workshop, trial: Trial) -> Result:
@@ -262,6 +286,9 @@ def _scored(
         watch.require_parameters(connection, trial.values)
     except ValueError as error:
         return Result(watch.run_id, None, str(error), *ended)
+    if end.by == "prune":
+        why = f"{plan.prune!r} held at {end.sim_time_s:.3f} s"
+        return Result(watch.run_id, None, why, *ended, pruned=True)
     scored = score_run(connection, watch.run_id, plan.score, end_s=end.sim_time_s)
     return Result(watch.run_id, scored.value, scored.why, *ended)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 from webots_mcp.conditions import Evaluator, parse_condition
 from webots_mcp.errors import InvalidInputError
@@ -23,11 +23,14 @@ _START_VALUES: Final = (
 _DECLARED: Final = "SELECT name, low, high, choices FROM parameter WHERE robot_id = ?"
 
 
+Ending: TypeAlias = Literal["for_s", "until", "prune"]
+
+
 class End(NamedTuple):
     """The simulation time at which a trial was over, and by what."""
 
     sim_time_s: float
-    by: Literal["for_s", "until"]
+    by: Ending
 
 
 class Watch:
@@ -36,9 +39,11 @@ class Watch:
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
         self._last_id = 0
-        self._evaluator: Evaluator | None = None
+        self._evaluators: list[tuple[Ending, Evaluator]] = []
         if plan.until is not None:
-            self._evaluator = parse_condition(plan.until).evaluator()
+            self._evaluators.append(("until", parse_condition(plan.until).evaluator()))
+        if plan.prune is not None:
+            self._evaluators.append(("prune", parse_condition(plan.prune).evaluator()))
         self.robot_id: int | None = None
         self.run_id: int | None = None
         self.reached_s: float | None = None
@@ -50,20 +55,25 @@ class Watch:
         Raises:
             InvalidInputError: Nobody can tell which robot is meant, or its controller does not
                 have the parameters that are to be tried.
-            ConditionFailedError: `until` cannot be asked of the signals.
+            ConditionFailedError: `until` or `prune` cannot be asked of the signals.
         """
         if self.run_id is None and not self._find_run(connection):
             return None
         self.reached_s = connection.execute(_NEWEST, (self.run_id,)).fetchone()[0]
-        if self._evaluator is None:
+        if not self._evaluators:
             return self._by_time(self.reached_s)
         for row_id, sim_time_s, data in connection.execute(_ROWS, (self.run_id, self._last_id)):
             self._last_id = row_id
             if (end := self._by_time(sim_time_s)) and sim_time_s > end.sim_time_s + _SAME_TIME_S:
                 return end
-            if self._evaluator.holds(parse(data), sim_time_s):
-                return End(sim_time_s, "until")
+            if by := self._condition_at(parse(data), sim_time_s):
+                return End(sim_time_s, by)
         return self._by_time(self.reached_s)
+
+    def _condition_at(self, state: Any, sim_time_s: float) -> Ending | None:
+        """Which condition holds first; each of them takes in every state."""
+        held: list[Ending] = [by for by, each in self._evaluators if each.holds(state, sim_time_s)]
+        return held[0] if held else None
 
     def require_parameters(self, connection: sqlite3.Connection, wanted: dict[str, Any]) -> None:
         """See that the run began with the values that it should have begun with.

@@ -14,11 +14,12 @@ MOST_CHANCE: Final = 0.01  # that a set is called better than the next one, and 
 
 
 class Outcome(NamedTuple):
-    """What became of a trial: a score, or why there is none."""
+    """What became of a trial: a score, or why there is none; one that was pruned has not failed."""
 
     parameters: dict[str, Any]
     score: float | None
     failure: str | None = None
+    pruned: bool = False
 
 
 class Ranked(NamedTuple):
@@ -27,13 +28,20 @@ class Ranked(NamedTuple):
     Attributes:
         score: Median, least and greatest of those that gave one; None if none did.
         scores: Of each of them.
-        failures: Why the others gave none.
+        failures: Why others gave none.
+        pruned: How many were ended early because they were not worth going on with.
     """
 
     parameters: dict[str, Any]
     score: Spread | None
     scores: list[float]
     failures: list[str]
+    pruned: int = 0
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether every trial gave a score."""
+        return not self.failures and not self.pruned
 
 
 class Noise(NamedTuple):
@@ -49,7 +57,7 @@ class Noise(NamedTuple):
 
 
 class Ranking(NamedTuple):
-    """Parameter sets, the best first; those with failures come after those without.
+    """Parameter sets, the best first; those of which every trial gave a score come first.
 
     Attributes:
         better: Whether the best beats the next by more than the noise; None if nobody can tell.
@@ -83,15 +91,18 @@ def _grouped(outcomes: Sequence[Outcome]) -> list[Ranked]:
 
 def _ranked(group: Sequence[Outcome]) -> Ranked:
     scores = [each.score for each in group if each.score is not None]
-    failures = [each.failure or "no score" for each in group if each.score is None]
-    return Ranked(group[0].parameters, spread_of(scores), scores, failures)
+    failures = [
+        each.failure or "no score" for each in group if each.score is None and not each.pruned
+    ]
+    pruned = sum(each.pruned for each in group)
+    return Ranked(group[0].parameters, spread_of(scores), scores, failures, pruned)
 
 
 def _place(ranked: Ranked, best: Best) -> tuple[bool, bool, float]:
     if ranked.score is None:
         return True, True, 0.0
     median = ranked.score.median
-    return False, bool(ranked.failures), -median if best == "highest" else median
+    return False, not ranked.is_whole, -median if best == "highest" else median
 
 
 def _noise(sets: Sequence[Ranked]) -> Noise:
@@ -103,8 +114,8 @@ def _noise(sets: Sequence[Ranked]) -> Noise:
 
 
 def _chance(sets: Sequence[Ranked], noise: Noise) -> float | None:
-    """Of the best and the next; sets with failures are not compared by their scores."""
-    if len(sets) < 2 or sets[1].failures or not sets[1].scores or not noise.freedom:
+    """Of the best and the next; where one is not whole, they are not compared by their scores."""
+    if len(sets) < 2 or not sets[1].is_whole or not noise.freedom:
         return None
     first, other = sets[0].scores, sets[1].scores
     apart = abs(statistics.fmean(first) - statistics.fmean(other))
@@ -119,12 +130,11 @@ def _verdict(sets: Sequence[Ranked], noise: Noise, better: bool | None) -> str:
         return "no trial gave a score"
     if len(sets) == 1:
         return "one parameter set: there is nothing to compare it with"
-    if sets[1].failures:
-        return (
-            "every other parameter set had failures"
-            if not sets[0].failures
-            else ("every parameter set had failures")
-        )
+    if not sets[1].is_whole:
+        which = "every other" if sets[0].is_whole else "every"
+        failed = ["had failures"] if any(each.failures for each in sets) else []
+        pruned = ["was pruned"] if any(each.pruned for each in sets) else []
+        return f"{which} parameter set {' or '.join(failed + pruned)}"
     if not noise.freedom:
         return "nothing was repeated with success: how much like trials differ is not known"
     if better:

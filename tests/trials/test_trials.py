@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 from collections.abc import Callable
@@ -12,7 +11,6 @@ from pathlib import Path
 import pytest
 
 from tests.trials.conftest import Run, command, rows, wait_for_trial
-from webots_mcp.liveness import process_identity
 from webots_mcp.trials.plan import read_plan
 
 Plan = Callable[[str], Path]
@@ -66,32 +64,6 @@ def test_a_finished_plan_is_only_shown_and_again_begins_anew(
     assert "note: one parameter set" in shown.stdout
     assert "trial set 2" in again.stdout
     assert rows(project, "SELECT count(*) FROM run") == [(4,)]
-
-
-@pytest.mark.skipif(os.name != "posix", reason="signals")
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_who_is_ended_in_the_middle_is_gone_on_from(
-    project: Path, plan: Plan, run: Run, number: int
-) -> None:
-    plan('score = "last(x)"\nfor_s = 3\nrepeats = 2\n[grid]\nspeed = [1.0, 2.0]')
-    process = subprocess.Popen(
-        command(project), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
-    )
-    pid = wait_for_trial(project, 2)
-    process.send_signal(number)
-    _, said = process.communicate(timeout=30)
-
-    if number == signal.SIGINT:
-        assert process.returncode == 130
-        assert said.endswith("ended by Ctrl-C\n")
-        assert rows(project, "SELECT status FROM trial WHERE number = 2") == [("waiting",)]
-        assert process_identity(pid) is None
-    answer = json.loads(run("--json").stdout)
-
-    assert process_identity(pid) is None
-    assert [len(each["scores"]) for each in answer["sets"]] == [2, 2]
-    assert rows(project, "SELECT count(*), count(DISTINCT uuid) FROM run") == [(4, 4)]
-    assert rows(project, "SELECT count(*) FROM trial_set") == [(1,)]
 
 
 def test_what_no_trial_can_have_ends_all_of_them_with_a_sentence(plan: Plan, run: Run) -> None:

@@ -7,9 +7,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from types import FrameType
-from typing import Final
+from typing import Final, TypeAlias
+
+Handler: TypeAlias = Callable[[int, "FrameType | None"], None]
 
 _GRACE_S: Final = 0.5  # for giving back the lease and for commands that nobody waits for any more
 _WORDS: Final = {signal.SIGINT: "ended by Ctrl-C", signal.SIGTERM: "ended by SIGTERM"}
@@ -18,14 +20,31 @@ _WORDS: Final = {signal.SIGINT: "ended by Ctrl-C", signal.SIGTERM: "ended by SIG
 @contextlib.contextmanager
 def ending_by_signals() -> Generator[None]:
     """Let SIGTERM clean up as Ctrl-C does: by a KeyboardInterrupt, which carries the signal."""
-    if threading.current_thread() is not threading.main_thread():  # only that one gets signals
+    with _handling(_interrupt, signal.SIGTERM):
         yield
-        return
-    before = signal.signal(signal.SIGTERM, _interrupt)
+
+
+@contextlib.contextmanager
+def ending_by_event(stopping: threading.Event) -> Generator[None]:
+    """Let a signal only set an event, and end the command when what watches it is over.
+
+    This is for work in threads: two exceptions out of handlers break the locks that they meet. A
+    second signal ends the process at once.
+    """
+    came: list[int] = []
+
+    def end(number: int, _: FrameType | None) -> None:
+        if came:
+            _exit(number)
+        came.append(number)
+        threading.Thread(target=stopping.set).start()  # whoever holds its lock was interrupted here
+
     try:
-        yield
+        with _handling(end, *_WORDS):
+            yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        if came:
+            raise KeyboardInterrupt(came[0])
 
 
 @contextlib.contextmanager
@@ -44,14 +63,25 @@ def ending_in_time() -> Generator[None]:
         late.start()
         _interrupt(number, frame)
 
-    before = [(number, signal.signal(number, end)) for number in _WORDS]
+    with _handling(end, *_WORDS):
+        try:
+            yield
+        except KeyboardInterrupt as interrupt:
+            _exit(*interrupt.args)
+
+
+@contextlib.contextmanager
+def _handling(handler: Handler, *numbers: int) -> Generator[None]:
+    """Handle signals; not in a thread that does not get them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = [(number, signal.signal(number, handler)) for number in numbers]
     try:
         yield
-    except KeyboardInterrupt as interrupt:
-        _exit(*interrupt.args)
     finally:
-        for number, handler in before:
-            signal.signal(number, handler)
+        for number, handled in before:
+            signal.signal(number, handled)
 
 
 def ended_by(interrupt: KeyboardInterrupt) -> tuple[int, str]:

@@ -19,6 +19,7 @@ from webots_mcp.cli.command import (
     count,
     open_recording,
 )
+from webots_mcp.cli.ending import ending_by_event
 from webots_mcp.cli.tables import print_notes, print_table, text_of
 
 if TYPE_CHECKING:
@@ -67,7 +68,8 @@ def trials(arguments: argparse.Namespace) -> None:
     set_id = _set_of(recording, plan, arguments)
     search = next_parameters if plan.search else None
     workshop = Workshop(recording, plan, command_of, threading.Event(), search)
-    run_trials(workshop, set_id, arguments.jobs, _Progress(recording, set_id, plan).tell)
+    with ending_by_event(workshop.stopping):
+        run_trials(workshop, set_id, arguments.jobs, _Progress(recording, set_id, plan).tell)
     _show(recording, set_id, plan, as_json=arguments.json)
 
 

@@ -12,9 +12,8 @@ import sqlite3
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator
+from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -100,20 +99,23 @@ def run_trials(workshop: Workshop, set_id: int, jobs: int, told: Told) -> None:
     Raises:
         CommandRefusedError: Another process works on the set.
         InvalidInputError: No trial of the set can succeed; nothing else is tried.
-        KeyboardInterrupt: As it came; what ran waits to be run again.
+        StoppedError: Somebody wanted them to stop; what ran waits to be run again.
     """
-    with _at_work(workshop, set_id):
-        with workshop.recording.reader() as connection:
-            trials = trials_of(connection, set_id)
-        for trial in trials:
-            if trial.is_over:
-                shutil.rmtree(workshop.folder(trial), ignore_errors=True)
-        left = deque(trial for trial in trials if not trial.is_over)
-        with ThreadPoolExecutor(jobs) as pool:
-            try:
-                _run_all(workshop, pool, jobs, partial(_next_trial, workshop, set_id, left), told)
-            finally:
-                workshop.stopping.set()
+    with workshop.recording.writer() as connection:
+        take_up(connection, set_id)
+        trials = trials_of(connection, set_id)
+    for trial in trials:
+        if trial.is_over:
+            shutil.rmtree(workshop.folder(trial), ignore_errors=True)
+    left = deque(trial for trial in trials if not trial.is_over)
+    pool = ThreadPoolExecutor(jobs)
+    try:
+        _run_all(workshop, pool, jobs, partial(_next_trial, workshop, set_id, left), told)
+    finally:
+        workshop.stopping.set()
+        pool.shutdown()  # the set is ours as long as a trial of it runs
+        with workshop.recording.writer() as connection:
+            lay_down(connection, set_id)
 
 
 def _next_trial(workshop: Workshop, set_id: int, left: deque[Trial]) -> Trial | None:
@@ -125,17 +127,6 @@ def _next_trial(workshop: Workshop, set_id: int, left: deque[Trial]) -> Trial | 
     with workshop.recording.writer() as connection:
         values = workshop.search(workshop.plan, trials_of(connection, set_id))
         return None if values is None else add_trial(connection, set_id, values)
-
-
-@contextmanager
-def _at_work(workshop: Workshop, set_id: int) -> Generator[None]:
-    with workshop.recording.writer() as connection:
-        take_up(connection, set_id)
-    try:
-        yield
-    finally:
-        with workshop.recording.writer() as connection:
-            lay_down(connection, set_id)
 
 
 def _run_all(
@@ -213,6 +204,7 @@ def _run(workshop: Workshop, trial: Trial) -> Result:
     try:
         with workshop.recording.writer() as connection:
             begin_trial(connection, trial, simulator.pid)
+        simulator.start()
         end, why = _watched(workshop, watch, simulator, folder)
     except BaseException:
         simulator.end()

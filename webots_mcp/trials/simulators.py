@@ -16,9 +16,9 @@ from typing import Final
 
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.liveness import process_alive
+from webots_mcp.trials import keeper
 
 CONSOLE: Final = "simulator.log"
-_GRACE_S: Final = 5.0  # Webots gives its controllers 1 s, and ends them after another
 
 
 def stand_in(world: str) -> list[str]:
@@ -54,20 +54,31 @@ def _free_port() -> int:
 
 
 class Simulator:
-    """A running simulator; what it prints goes to a file of its folder."""
+    """A simulator, which ends with this process at the latest; it prints to a file of its folder.
+
+    Nothing runs before `start`, but its process is there: whoever notes its pid in between leaves
+    no simulator behind that nobody knows.
+    """
 
     def __init__(self, command: list[str], folder: Path, environment: Mapping[str, str]) -> None:
         with (folder / CONSOLE).open("wb") as console:
             self._process = subprocess.Popen(
-                command,
+                [sys.executable, "-I", "-S", keeper.__file__, *command],
                 env={**os.environ, **environment},
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE,
                 stdout=console,
                 stderr=subprocess.STDOUT,
                 start_new_session=os.name == "posix",  # Ctrl-C is for us alone
             )
         self.pid = self._process.pid
         self._folder = folder
+
+    def start(self) -> None:
+        """Let it run."""
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):  # somebody has ended it already
+            self._process.stdin.write(b"!")
+            self._process.stdin.flush()
 
     @property
     def is_over(self) -> bool:
@@ -76,13 +87,14 @@ class Simulator:
 
     def end(self) -> None:
         """End it with its controllers, the hard way if need be."""
-        if not self.is_over:
-            _signal(self.pid, hard=False)
-            try:
-                self._process.wait(_GRACE_S)
-            except subprocess.TimeoutExpired:
-                _signal(self.pid, hard=True)
-                self._process.wait()
+        assert self._process.stdin is not None
+        with contextlib.suppress(BrokenPipeError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(2 * keeper.GRACE_S)
+        except subprocess.TimeoutExpired:
+            _signal(self.pid, hard=True)
+            self._process.wait()
 
     def last_line(self) -> str:
         """What it printed last; empty if nothing."""
@@ -96,7 +108,7 @@ def end_left_over(pid: int, process: str | None, started_wall_time_s: float) -> 
     if not process_alive(*seen):
         return
     _signal(pid, hard=False)
-    until_s = time.monotonic() + _GRACE_S
+    until_s = time.monotonic() + keeper.GRACE_S
     while process_alive(*seen):
         if time.monotonic() > until_s:
             _signal(pid, hard=True)

@@ -23,6 +23,7 @@ SCREENSHOT_FOLDER: Final = "screenshots"
 DATA_DIR_VARIABLE: Final = "WEBOTS_MCP_DATA_DIR"
 STRICT_VARIABLE: Final = "WEBOTS_MCP_STRICT"
 THROTTLE_VARIABLE: Final = "WEBOTS_MCP_THROTTLE_INTERVAL"
+KEEP_LAST_VARIABLE: Final = "WEBOTS_MCP_KEEP_LAST_S"
 PARAMETERS_VARIABLE: Final = "WEBOTS_MCP_PARAMETERS"
 
 PRIVATE_FOLDER: Final = 0o700  # recordings hold pictures and logs: they are their owner's alone
@@ -73,9 +74,11 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),
 }
 
-BreakpointAction = Literal["pause", "log"]
+BreakpointAction = Literal["pause", "log", "keep"]
 BREAKPOINT_ACTIONS: Final[tuple[BreakpointAction, ...]] = get_args(BreakpointAction)
 MAX_BREAKPOINTS: Final = 32  # of one robot that are armed
+KEEP_LAST_S: Final = 5.0  # before a moment, kept at full rate
+KEEP_AFTER_S: Final = 2.0  # after it
 LOOPING: Final = ("step", "run")  # actions that let the loop come round; one is under way at most
 Pace = Literal["fast", "real_time"]  # of a `run` command
 Then = Literal["pause", "go_on", "as_before"]  # what it does at its end

@@ -41,6 +41,8 @@ Kind = Literal[
     "reload confirmed",
     "breakpoint hit",
     "breakpoint failed",
+    "kept stretch",
+    "kept state",
 ]
 Values = tuple[Any, ...] | dict[str, Any]
 
@@ -128,6 +130,15 @@ STATEMENTS: Final[dict[Kind, str]] = {
     ),
     "breakpoint hit": "UPDATE breakpoint SET hits = hits + 1 WHERE id = ?",
     "breakpoint failed": "UPDATE breakpoint SET enabled = 0, error = ? WHERE id = ?",
+    "kept stretch": (
+        "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, wall_time_s, "
+        "reason) VALUES (:run, :uuid, :start, :end, :wall_time, :reason) ON CONFLICT (uuid) "
+        "DO UPDATE SET end_sim_time_s = excluded.end_sim_time_s, reason = excluded.reason"
+    ),
+    "kept state": (
+        "INSERT INTO kept_state (run_id, call, sim_time_s, wall_time_s, data, odd) "
+        "VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (run_id, sim_time_s, call) DO NOTHING"
+    ),
 }
 ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction
 FORMAT: Final = 1  # of the file; whoever knows another one leaves the file alone

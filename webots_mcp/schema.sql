@@ -325,7 +325,7 @@ CREATE TABLE breakpoint (
 	robot_id INTEGER NOT NULL, 
 	session_id INTEGER, 
 	condition TEXT NOT NULL /* see docs/conditions.md */, 
-	action TEXT NOT NULL /* pause or log */, 
+	action TEXT NOT NULL /* pause, log or keep */, 
 	after_hits INTEGER DEFAULT 1 NOT NULL /* the action is taken from this hit of a run on */, 
 	enabled INTEGER DEFAULT 1 NOT NULL /* 0 once the condition failed */, 
 	hits INTEGER DEFAULT 0 NOT NULL /* how often it began to hold, in all runs */, 
@@ -399,6 +399,29 @@ CREATE TABLE trial (
 );
 CREATE INDEX ix_trial_run_id ON trial (run_id);
 CREATE UNIQUE INDEX ix_trial_uuid ON trial (uuid);
+CREATE TABLE kept_stretch (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	uuid TEXT NOT NULL /* random (version 4); names the row among those of all machines */, 
+	start_sim_time_s FLOAT NOT NULL, 
+	end_sim_time_s FLOAT NOT NULL /* ahead of the newest row while it goes on */, 
+	wall_time_s FLOAT NOT NULL /* when it was asked for */, 
+	reason TEXT NOT NULL /* why it is kept */, 
+	CONSTRAINT fk_kept_stretch_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
+);
+CREATE INDEX ix_kept_stretch_run_id_start_sim_time_s ON kept_stretch (run_id, start_sim_time_s);
+CREATE UNIQUE INDEX ix_kept_stretch_uuid ON kept_stretch (uuid);
+CREATE TABLE kept_state (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	run_id INTEGER NOT NULL, 
+	call INTEGER /* its number in the session; null where retention moved it here from state */, 
+	sim_time_s FLOAT NOT NULL, 
+	wall_time_s FLOAT NOT NULL, 
+	data TEXT NOT NULL /* JSON object */, 
+	odd TEXT /* as in state */, 
+	CONSTRAINT fk_kept_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE, 
+	CONSTRAINT uq_kept_state_run_id UNIQUE (run_id, sim_time_s, call)
+);
 CREATE VIEW robot_parameter AS
 /* The values that parameters had in each run, each from a time on; true and false as text. */
 SELECT r.name AS robot, v.run_id, v.name,
@@ -408,6 +431,19 @@ SELECT r.name AS robot, v.run_id, v.name,
 FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
 JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
+CREATE VIEW every_state AS
+/* All states of a run, those that only kept stretches have included: they have no state_id. */
+SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
+UNION ALL
+SELECT NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state;
+CREATE VIEW robot_kept AS
+/* Stretches that are kept at full rate: from when to when, why, how many states each has. */
+SELECT r.name AS robot, k.run_id, k.id AS stretch_id, k.start_sim_time_s AS start_s,
+  min(k.end_sim_time_s, max(u.last_sim_time_s, k.start_sim_time_s)) AS end_s,
+  (SELECT count(*) FROM every_state s WHERE s.run_id = k.run_id
+    AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) AS states,
+  strftime('%Y-%m-%d %H:%M:%f', k.wall_time_s, 'unixepoch') AS utc, k.reason
+FROM kept_stretch k JOIN run u ON u.id = k.run_id JOIN robot r ON r.id = u.robot_id;
 CREATE VIEW robot_now AS
 /* The newest state of each robot and how old it is. Lengths and angles as published. */
 SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.5) * 86400.0 - wall_time_s, 1) AS age_s,

@@ -52,6 +52,24 @@ JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name"""
 
 
+EVERY_STATE = """
+CREATE VIEW every_state AS
+/* All states of a run, those that only kept stretches have included: they have no state_id. */
+SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
+UNION ALL
+SELECT NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state"""
+
+ROBOT_KEPT = """
+CREATE VIEW robot_kept AS
+/* Stretches that are kept at full rate: from when to when, why, how many states each has. */
+SELECT r.name AS robot, k.run_id, k.id AS stretch_id, k.start_sim_time_s AS start_s,
+  min(k.end_sim_time_s, max(u.last_sim_time_s, k.start_sim_time_s)) AS end_s,
+  (SELECT count(*) FROM every_state s WHERE s.run_id = k.run_id
+    AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) AS states,
+  strftime('%Y-%m-%d %H:%M:%f', k.wall_time_s, 'unixepoch') AS utc, k.reason
+FROM kept_stretch k JOIN run u ON u.id = k.run_id JOIN robot r ON r.id = u.robot_id"""
+
+
 def first_of(paths: str) -> str:
     """The first of these places in a state that holds something; null where it is no JSON."""
     found = ",\n    ".join(f"json_extract(j, '$.{path}')" for path in paths.split())
@@ -149,8 +167,11 @@ def upgrade() -> None:
     create_parameter_value()
     create_trial_set()
     create_trial()
+    create_kept_stretch()
+    create_kept_state()
     if op.get_context().dialect.name == "sqlite":
-        op.get_bind().exec_driver_sql(ROBOT_PARAMETER.strip())
+        for created in (ROBOT_PARAMETER, EVERY_STATE, ROBOT_KEPT):
+            op.get_bind().exec_driver_sql(created.strip())
         for view in ("robot_now", "robot_trajectory"):
             replace_in_view(view, {OLD_POSITION: POSITION, OLD_MODE: MODE})
         op.execute("PRAGMA user_version = 5")
@@ -261,7 +282,7 @@ def create_breakpoint() -> None:
         sa.Column("robot_id", sa.Integer(), nullable=False),
         sa.Column("session_id", sa.Integer()),
         sa.Column("condition", sa.Text(), nullable=False, comment="see docs/conditions.md"),
-        sa.Column("action", sa.Text(), nullable=False, comment="pause or log"),
+        sa.Column("action", sa.Text(), nullable=False, comment="pause, log or keep"),
         sa.Column(
             "after_hits",
             sa.Integer(),
@@ -365,7 +386,64 @@ def create_trial() -> None:
     op.create_index(op.f("ix_trial_uuid"), "trial", ["uuid"], unique=True)
 
 
+def create_kept_stretch() -> None:
+    op.create_table(
+        "kept_stretch",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("run_id", sa.Integer(), nullable=False),
+        sa.Column("uuid", sa.Text(), nullable=False, comment=UUID),
+        sa.Column("start_sim_time_s", sa.Float(), nullable=False),
+        sa.Column(
+            "end_sim_time_s",
+            sa.Float(),
+            nullable=False,
+            comment="ahead of the newest row while it goes on",
+        ),
+        sa.Column("wall_time_s", sa.Float(), nullable=False, comment="when it was asked for"),
+        sa.Column("reason", sa.Text(), nullable=False, comment="why it is kept"),
+        sa.ForeignKeyConstraint(
+            ["run_id"], ["run.id"], name=op.f("fk_kept_stretch_run_id"), ondelete="CASCADE"
+        ),
+        sa.PrimaryKeyConstraint("id"),
+        sqlite_autoincrement=True,
+    )
+    op.create_index(
+        op.f("ix_kept_stretch_run_id_start_sim_time_s"),
+        "kept_stretch",
+        ["run_id", "start_sim_time_s"],
+    )
+    op.create_index(op.f("ix_kept_stretch_uuid"), "kept_stretch", ["uuid"], unique=True)
+
+
+def create_kept_state() -> None:
+    op.create_table(
+        "kept_state",
+        sa.Column("id", sa.Integer(), nullable=False),
+        sa.Column("run_id", sa.Integer(), nullable=False),
+        sa.Column(
+            "call",
+            sa.Integer(),
+            comment="its number in the session; null where retention moved it here from state",
+        ),
+        sa.Column("sim_time_s", sa.Float(), nullable=False),
+        sa.Column("wall_time_s", sa.Float(), nullable=False),
+        sa.Column("data", sa.Text(), nullable=False, comment="JSON object"),
+        sa.Column("odd", sa.Text(), comment="as in state"),
+        sa.ForeignKeyConstraint(
+            ["run_id"], ["run.id"], name=op.f("fk_kept_state_run_id"), ondelete="CASCADE"
+        ),
+        sa.PrimaryKeyConstraint("id"),
+        sa.UniqueConstraint("run_id", "sim_time_s", "call", name=op.f("uq_kept_state_run_id")),
+        sqlite_autoincrement=True,
+    )
+
+
 def downgrade() -> None:
+    if op.get_context().dialect.name == "sqlite":
+        op.execute("DROP VIEW robot_kept")
+        op.execute("DROP VIEW every_state")
+    op.drop_table("kept_state")
+    op.drop_table("kept_stretch")
     op.drop_table("trial")
     op.drop_table("trial_set")
     op.drop_table("breakpoint")

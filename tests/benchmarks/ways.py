@@ -44,11 +44,21 @@ class BridgeWay:
         NotMeasurableError: orjson is wanted and not installed.
     """
 
-    def __init__(self, robot: Rover, folder: Path, *, orjson: bool = False, every: int = 1) -> None:
+    def __init__(
+        self,
+        robot: Rover,
+        folder: Path,
+        *,
+        orjson: bool = False,
+        every: int = 1,
+        keep_last_s: float = 0.0,
+    ) -> None:
         if orjson and ORJSON is None:
             raise NotMeasurableError("orjson is not installed")
         self._encoder = ORJSON if orjson else None
-        self.bridge = MCPBridge(robot, data_dir=folder, throttle_interval=every)
+        self.bridge = MCPBridge(
+            robot, data_dir=folder, throttle_interval=every, keep_last_s=keep_last_s
+        )
         self.publish = self.bridge.publish
         self.get_command = self.bridge.get_command
 

@@ -63,6 +63,41 @@ bridge.publish({"n": 1})
     assert line.startswith("the controller ended by KeyError: 'speed' (rover.py, line ")
 
 
+@pytest.mark.parametrize(
+    ("end", "reason"),
+    [
+        ('{}["speed"]', "KeyError: 'speed'"),
+        ("raise KeyboardInterrupt", "KeyboardInterrupt"),
+    ],
+)
+def test_each_step_before_an_exception_that_ends_a_controller_is_recorded(
+    start: Start, filed: Recording, end: str, reason: str
+) -> None:
+    simulation = start(
+        f"""
+bridge = MCPBridge(robot, throttle_interval=1_000_000)
+for n in range(1007):
+    robot.step(16)
+    bridge.publish({{"n": n}})
+{end}
+"""
+    )
+    simulation.wait_for(lambda: simulation.controller("rover").exit_code is not None, timeout_s=30)
+    ((start_s, end_s, why),) = filed.rows(
+        "SELECT start_sim_time_s, end_sim_time_s, reason FROM kept_stretch"
+    )
+    assert end_s - start_s == pytest.approx(5, abs=0.02)
+    assert why.startswith(f"the controller ended by {reason}")
+    steps = filed.rows(
+        "SELECT json_extract(data, '$.n') FROM every_state "
+        "WHERE sim_time_s BETWEEN ? AND ? ORDER BY sim_time_s",
+        start_s,
+        end_s,
+    )
+    assert steps == list(range(1007 - len(steps), 1007))
+    assert len(steps) == 313
+
+
 def test_a_killed_controllers_session_is_judged_and_its_command_is_lost(
     start: Start, filed: Recording
 ) -> None:

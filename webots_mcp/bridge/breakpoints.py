@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.encoding import plain
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.run import Run
@@ -94,13 +95,15 @@ class Breakpoints:
         recorder: Recorder,
         journal: Journal,
         pause: Pause,
+        keeper: Keeper,
     ) -> None:
         self._simulation = simulation
         self._clock = clock
         self._recorder = recorder
         self._journal = journal
         self._pause = pause
-        self._run: Run = clock.run
+        self._keeper = keeper
+        self.run: Run = clock.run  # whose breakpoints are armed
         self._off: dict[int, str] = {}
         self.armed: list[Breakpoint] = []
 
@@ -183,12 +186,12 @@ class Breakpoints:
     @property
     def concerned(self) -> bool:
         """Whether the next state has to be looked at: one is armed, or may be in a new run."""
-        return bool(self.armed) or self._clock.run is not self._run
+        return bool(self.armed) or self._clock.run is not self.run
 
     def look(self, state: Any) -> list[Breakpoint]:
         """Those that begin to hold with a state, and whose action is due; usually none."""
         clock, hit = self._clock, list[Breakpoint]()
-        if clock.run is not self._run:
+        if clock.run is not self.run:
             self._begin_run()
         for each in tuple(self.armed):
             try:
@@ -210,13 +213,16 @@ class Breakpoints:
             hit.append(each)
 
     def act(self, hit: list[Breakpoint], state: Any) -> None:
-        """Record the hits, and pause where one of them asks for it."""
+        """Record the hits, keep the seconds around them, and pause where one asks for it."""
         for each in hit:
+            if each.action in _KEEPING:
+                self._keeper.keep(f"breakpoint {each.id or ''}: {each.condition.text}")
             if each.hits - each.after_hits < MOST_EVENTS:
                 self._tell(each, state)
         pausing = [each for each in hit if each.action == "pause"]
         if pausing and self._simulation.supervisor:
             first = pausing[0]
+            self._keeper.write_all()
             self._pause.begin(breakpoint_id=first.id, condition=first.condition.text)
 
     def _tell(self, each: Breakpoint, state: Any) -> None:
@@ -228,10 +234,12 @@ class Breakpoints:
         }
         if each.action == "pause" and not self._simulation.supervisor:
             data["not_paused"] = _CANNOT_PAUSE
+        if each.action == "keep" and not self._keeper.enabled:
+            data["not_kept"] = _CANNOT_KEEP
         self._journal.event("breakpoint", data, each.condition.text)
 
     def _begin_run(self) -> None:
-        self._run = self._clock.run
+        self.run = self._clock.run
         self.load()
         for each in self.armed:
             each.begin_run()
@@ -264,6 +272,8 @@ class Breakpoints:
                 self._journal.log("warning", "bridge", f"breakpoint {each.id or ''}: {said}")
 
 
+_KEEPING: Final = ("pause", "keep")  # who pauses wants to see what came before
+_CANNOT_KEEP: Final = "the bridge holds nothing: keep_last_s is 0"
 _CANNOT_PAUSE: Final = (
     "the robot is no Supervisor: set its field `supervisor` to TRUE in the world file"
 )

@@ -10,6 +10,7 @@ from webots_mcp.bridge.commands import CommandQueue
 from webots_mcp.bridge.goal import Watch
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
@@ -35,3 +36,4 @@ class Context(NamedTuple):
     parameters: Parameters
     breakpoints: Breakpoints
     watch: Watch
+    keeper: Keeper

@@ -22,6 +22,8 @@ from webots_mcp.bridge.stats import BridgeStats
 from webots_mcp.bridge.text import describe
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import (
+    KEEP_LAST_S,
+    KEEP_LAST_VARIABLE,
     LOG_LEVELS,
     STRICT_VARIABLE,
     THROTTLE_VARIABLE,
@@ -37,6 +39,8 @@ if TYPE_CHECKING:
     import logging
 
 _FALSE: Final = ("", "0", "false", "no", "off")
+_MOST_KEEP_LAST_S: Final = 3600.0
+_KEEPING: Final = ("error", "critical")  # log levels
 
 
 class MCPBridge:
@@ -57,12 +61,17 @@ class MCPBridge:
         data_dir: Folder of the database and the pictures; see `resolve_data_dir`.
         throttle_interval: Every so many calls of `publish` one is recorded; the environment
             variable `WEBOTS_MCP_THROTTLE_INTERVAL` overrides it.
+        keep_last_s: Seconds of simulation time before a moment that are kept at full rate: every
+            call of `publish`, also those that the throttle drops (see `keep`). They are held in
+            memory, up to 8 MB, of which the oldest go first. Five seconds hold what leads to a
+            crash or a hit, and cost a throttled call some microseconds. 0 holds and keeps nothing;
+            the environment variable `WEBOTS_MCP_KEEP_LAST_S` overrides it.
         database: A file, `":memory:"`, or a `MemoryDatabase` shared with a server; None for
             `webots.db` in the data folder.
 
     Raises:
         TypeError: `robot` is no robot, or `database` is of another type.
-        ValueError: `throttle_interval` is less than 1.
+        ValueError: `throttle_interval` is less than 1, or `keep_last_s` not from 0 to 3600.
     """
 
     def __init__(
@@ -71,8 +80,10 @@ class MCPBridge:
         data_dir: str | os.PathLike[str] | None = None,
         throttle_interval: int = 5,
         *,
+        keep_last_s: float = KEEP_LAST_S,
         database: str | os.PathLike[str] | MemoryDatabase | None = None,
     ) -> None:
+        keep_last_s = _seconds(os.environ.get(KEEP_LAST_VARIABLE) or keep_last_s)
         throttle = Throttle(int(os.environ.get(THROTTLE_VARIABLE) or throttle_interval))
         self.robot = robot
         self.database: Database
@@ -85,7 +96,7 @@ class MCPBridge:
         simulation = Simulation(robot)
         open_bridges.close_former(robot)
         where = (self.database, self.data_dir)
-        self._session = Session(simulation, *where, throttle, self._errors)
+        self._session = Session(simulation, *where, throttle, keep_last_s, self._errors)
         self._publisher = self._session.publisher
         self._session.begin()
         open_bridges.enter(robot, OpenBridge(self.close, self._leave_to_parent))
@@ -144,6 +155,23 @@ class MCPBridge:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("auto_publish", error)
 
+    def keep(self, reason: str) -> None:
+        """Keep the last `keep_last_s` seconds at full rate, and the two that follow.
+
+        Every call of `publish` in them becomes a row, also those that the throttle drops. It is
+        done by itself where a breakpoint with the action `pause` or `keep` is hit, with a log
+        line of the level `error` or above, and where an exception ends the controller. What was
+        held is written with the calls that follow, a millisecond at a time. Stretches that
+        overlap become one; of a run up to 600 s are kept.
+
+        Args:
+            reason: Why, as it is told with the stretch.
+        """
+        try:
+            self._session.context.keeper.keep(text_of(reason))
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._errors.failed("keep", error)
+
     # -- beside the state ----------------------------------------------------------------------
 
     def log(self, message: object, level: str | int = "info") -> None:
@@ -177,9 +205,10 @@ class MCPBridge:
             if known is None:
                 names = ", ".join(LOG_LEVELS)
                 self._errors.warn("level", f"log level {level!r:.80} is none of {names}")
-            self._session.context.journal.log(
-                known or "info", "controller", text_of(message), logger
-            )
+            text = text_of(message)
+            self._session.context.journal.log(known or "info", "controller", text, logger)
+            if known in _KEEPING:
+                self._session.context.keeper.ask(f"{known}: {text}")
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("log", error)
 
@@ -271,7 +300,8 @@ class MCPBridge:
         Args:
             condition: In the language of docs/conditions.md.
             action: `pause` pauses the simulation at that very step, which needs a Supervisor;
-                `log` only records the hit.
+                `keep` keeps the seconds around the hit at full rate (see `keep`), as `pause` does
+                too; `log` only records the hit.
             after_hits: The action is taken from this hit of a run on.
 
         Returns:
@@ -361,9 +391,15 @@ class MCPBridge:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
+        if error is not None:
+            self._keep_before_end(error)
         self.close("crashed" if error is not None else None)
 
     # -- inside --------------------------------------------------------------------------------
+
+    def _keep_before_end(self, error: BaseException) -> None:
+        if not self._closed:
+            self.keep(f"the controller ended by {describe(error)}")
 
     def _leave_to_parent(self) -> None:
         """In a forked child: leave the session to the parent; what is published here is dropped."""
@@ -373,7 +409,16 @@ class MCPBridge:
     def _close_at_exit(self) -> None:
         """The interpreter keeps the exception that ends it; at a prompt it keeps others too."""
         error = None if hasattr(sys, "ps1") else getattr(sys, "last_value", None)
+        if isinstance(error, BaseException):
+            self._keep_before_end(error)
         if isinstance(error, Exception):
             self.log(f"the controller ended by {describe(error)}", "error")
             self.close("crashed")
         self.close()
+
+
+def _seconds(given: float | str) -> float:
+    seconds = float(given)
+    if not 0 <= seconds <= _MOST_KEEP_LAST_S:
+        raise ValueError(f"keep_last_s must be from 0 to {_MOST_KEEP_LAST_S:g}, got {given!r}")
+    return seconds

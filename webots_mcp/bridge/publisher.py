@@ -29,6 +29,7 @@ class Publisher:
         self._throttle = context.throttle
         self._breakpoints = context.breakpoints
         self._watch = context.watch
+        self._keeper = context.keeper
         self._runs = runs
         self._changes = Changes()
         self._run = context.clock.run
@@ -38,24 +39,34 @@ class Publisher:
         """Record the state if it is this call's turn, a breakpoint is hit or a goal is reached."""
         if self._clock.look():
             self._runs.begin()
-        hit = self._breakpoints.look(state) if self._breakpoints.concerned else ()
-        reached = self._watch.asks_states and self._watch.look(state)
-        if self._throttle.admits(bool(force or hit or reached or self._heartbeat.loop)):
+        wanted, hit, keeper, breakpoints = force, None, self._keeper, self._breakpoints
+        if breakpoints.armed or breakpoints.run is not self._clock.run:  # a call would cost more
+            hit = breakpoints.look(state)
+        if self._watch.asks_states:
+            wanted = self._watch.look(state) or wanted
+        if self._throttle.admits(wanted or hit or self._heartbeat.loop):
             self._record(state)
+        elif keeper.fills:
+            keeper.add(state)
         if hit:
-            self._breakpoints.act(hit, state)
+            breakpoints.act(hit, state)
+        if keeper.busy:
+            keeper.go_on()
 
     def publish_devices(self, extra: Mapping[Any, Any], include_time: bool) -> None:
         """Record what the devices say; they are read if it is this call's turn.
 
-        While breakpoints are armed or a run has a goal they are read in every call.
+        Where the last seconds are held, breakpoints are armed or a run has a goal, they are read
+        in every call.
         """
         if self._clock.look():
             self._runs.begin()
-        if self._breakpoints.concerned or self._watch.asks_states:
+        if self._keeper.fills or self._breakpoints.concerned or self._watch.asks_states:
             self.publish(self._read(extra, include_time), force=False)
         elif self._throttle.admits(self._heartbeat.loop is not None):
             self._record(self._read(extra, include_time))
+            if self._keeper.busy:
+                self._keeper.go_on()
 
     def _read(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
         return {**self._read_devices(include_time), **_finite(extra)}

@@ -102,6 +102,18 @@ class Recorder:
         finally:
             self._lock.release()
 
+    def record_together(self, kind: Kind, run: Run, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Write rows of one kind in one transaction, or keep them until they can be written."""
+        self.last_use_s = time.monotonic()
+        if not self._lock.acquire(this_call(), _LOCK_PATIENCE_S):
+            for values in rows:
+                self._backlog.put(Row(kind, run, values))
+            return
+        try:
+            self._writer.write_together(kind, run, rows)
+        finally:
+            self._lock.release()
+
     def fetch(self, statement: str, values: Values) -> Sequence[Any]:
         """The rows that a statement reads or changes; none while that is not possible."""
         if self.session.connection is None:

@@ -12,8 +12,8 @@ from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.recovery import Recovery
 from webots_mcp.bridge.row_counts import RowCounts
 from webots_mcp.bridge.run import Run
-from webots_mcp.bridge.session_connection import SessionConnection
-from webots_mcp.connection import roll_back
+from webots_mcp.bridge.session_connection import SessionConnection, patiently
+from webots_mcp.connection import roll_back, together
 from webots_mcp.entries import STATEMENTS, Kind, Values, bind
 
 _CATCH_UP_S: Final = 0.002  # a loop that catches up must not stall over it
@@ -53,6 +53,26 @@ class RowWriter:
         if kind == "state" and run is not None:
             run.rows += 1
         return changed
+
+    def write_together(self, kind: Kind, run: Run, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Write rows of a run in one transaction; one by one where that fails."""
+        if self._is_behind(run) and not self.catch_up(run):
+            for values in rows:
+                self._keep(Row(kind, run, values))
+            return
+        connection, registration = self._session.opened
+        bound = [bind(run.id, registration.session_id, values) for values in rows]
+        try:
+            patiently(
+                lambda: together(
+                    connection, lambda: connection.executemany(STATEMENTS[kind], bound)
+                )
+            )
+        except Exception:  # noqa: BLE001  (each tells by itself)
+            for values in rows:
+                self.write(kind, run, values)
+            return
+        self._counts.written += len(rows)
 
     def fetch(self, statement: str, values: Values) -> Sequence[Any]:
         """The rows that a statement reads or changes; none while something else comes first."""

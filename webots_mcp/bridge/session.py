@@ -18,6 +18,7 @@ from webots_mcp.bridge.goal import Watch
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.parameters import CODE, Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
@@ -52,6 +53,7 @@ class Session:
         database: Database,
         data_dir: Path,
         throttle: Throttle,
+        keep_last_s: float,
         errors: ErrorReport,
     ) -> None:
         from webots_mcp import __version__
@@ -68,6 +70,7 @@ class Session:
         parameters = Parameters(clock, recorder, start_values, self._set_parameter)
         self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters)
         pause = Pause(simulation, journal, heartbeat, self.runs.look_after_step)
+        keeper = Keeper(clock, recorder, journal, throttle, keep_last_s)
         self.context = Context(
             simulation=simulation,
             clock=clock,
@@ -80,8 +83,9 @@ class Session:
             queue=CommandQueue(recorder),
             pause=pause,
             parameters=parameters,
-            breakpoints=Breakpoints(simulation, clock, recorder, journal, pause),
+            breakpoints=Breakpoints(simulation, clock, recorder, journal, pause, keeper),
             watch=Watch(clock, simulation.basic_time_step_s / 2),
+            keeper=keeper,
         )
         self.control = Control(self.context)
         self.publisher = Publisher(self.context, self.runs)
@@ -116,6 +120,8 @@ class Session:
         if simulation.over:
             return None
         self._take_wanted_parameters()
+        if self.context.keeper.busy:
+            self.context.keeper.go_on()
         command = self.control.serve()
         self.context.heartbeat.poll()
         if simulation.over:
@@ -143,6 +149,7 @@ class Session:
         """Write what waits and end; for the reason given, or as far as it is known."""
         if self._maintainer is not None:
             self._maintainer.stop()
+        self.context.keeper.close()
         reason = reason or self._end_reason
         self.context.recorder.close(reason, self.context.clock.sim_time_s)
 

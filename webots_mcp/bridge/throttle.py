@@ -26,8 +26,8 @@ class Throttle:
         """Let the next call pass, whatever its number."""
         self._wanted = True
 
-    def admits(self, force: bool) -> bool:
-        """Count a call; True if it is to be recorded."""
+    def admits(self, force: object) -> bool:
+        """Count a call; True if it is to be recorded, as whatever is true for `force` demands."""
         self.calls += 1
         if self.calls % self.interval and not (force or self._wanted):
             self.skipped += 1

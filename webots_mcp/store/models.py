@@ -346,7 +346,7 @@ class Breakpoint(SQLModel, table=True):
     robot_id: int = _to("robot")
     session_id: int | None = _to("session", nullable=True)
     condition: str = _text("see docs/conditions.md", nullable=False)
-    action: str = _text("pause or log", nullable=False)
+    action: str = _text("pause, log or keep", nullable=False)
     after_hits: int = _column(
         Integer,
         "the action is taken from this hit of a run on",
@@ -360,6 +360,40 @@ class Breakpoint(SQLModel, table=True):
     created_wall_time_s: float = _number(nullable=False)
     created_by: str | None = _text("mcp, cli or controller: its code, for session_id only")
     error: str | None = _text("why the condition failed")
+
+
+class KeptStretch(SQLModel, table=True):
+    """Seconds of a run that are kept at full rate: each call of `publish` is a row."""
+
+    __tablename__: ClassVar[Any] = "kept_stretch"
+    __table_args__ = (
+        Index(None, "run_id", "start_sim_time_s"),
+        Index(None, "uuid", unique=True),
+        _KEEP_IDS,
+    )
+    id: int | None = _id()
+    run_id: int = _to("run")
+    uuid: str = _text(_UUID, nullable=False)
+    start_sim_time_s: float = _number(nullable=False)
+    end_sim_time_s: float = _number("ahead of the newest row while it goes on", nullable=False)
+    wall_time_s: float = _number("when it was asked for", nullable=False)
+    reason: str = _text("why it is kept", nullable=False)
+
+
+class KeptState(SQLModel, table=True):
+    """What a call of `publish` holds that only a kept stretch has; the others are in `state`."""
+
+    __tablename__: ClassVar[Any] = "kept_state"
+    __table_args__ = (UniqueConstraint("run_id", "sim_time_s", "call"), _KEEP_IDS)
+    id: int | None = _id()
+    run_id: int = _to("run")
+    call: int | None = _column(
+        Integer, "its number in the session; null where retention moved it here from state"
+    )
+    sim_time_s: float = _number(nullable=False)
+    wall_time_s: float = _number(nullable=False)
+    data: str = _text("JSON object", nullable=False)
+    odd: str | None = _text("as in state")
 
 
 class Image(SQLModel, table=True):

@@ -10,6 +10,7 @@ from tests.benchmarks.rover import Rover
 from tests.benchmarks.states import make_states
 from tests.benchmarks.table import Line, Target, duration
 from tests.benchmarks.ways import BridgeWay, JsonFiles, RawSqlite, Way
+from webots_mcp.contract import KEEP_LAST_S
 
 _BLOCKS = 30
 _WRITES = 200  # calls in a block
@@ -74,10 +75,19 @@ def _publishing(way: Way, robot: Rover, calls: int) -> Callable[[], list[float]]
     return run_block
 
 
-@benchmark("throttled", "publish(), a call that is not recorded")
+@benchmark("throttled", "publish(), a call that is not recorded, and held nowhere")
 def measure_throttled(bench: Bench) -> Iterable[Line]:
+    yield _cost_of_dropped(bench, keep_last_s=0, target=Target(2.0))
+
+
+@benchmark("held", "publish(), a call that is not recorded, with the ring buffer")
+def measure_held(bench: Bench) -> Iterable[Line]:
+    yield _cost_of_dropped(bench, keep_last_s=KEEP_LAST_S, target=Target(15.0))
+
+
+def _cost_of_dropped(bench: Bench, keep_last_s: float, target: Target) -> Line:
     robot, state = Rover(), make_states(1)[0]
-    way = BridgeWay(robot, bench.folder, every=1_000_000_000)
+    way = BridgeWay(robot, bench.folder, every=1_000_000_000, keep_last_s=keep_last_s)
 
     def call(_: int) -> None:
         robot.step(8)
@@ -88,9 +98,7 @@ def measure_throttled(bench: Bench) -> Iterable[Line]:
     taken = _take_turns(bench, pair)
     way.close()
     cost_us = 1e6 * (taken["call"].p50 - taken["none"].p50)
-    yield Line(
-        "p50", duration(taken["call"].p50), "minus the empty call", cost_us, "us", Target(2.0)
-    )
+    return Line("p50", duration(taken["call"].p50), "minus the empty call", cost_us, "us", target)
 
 
 @benchmark("poll", "get_command() with nothing to do, calls in a row")

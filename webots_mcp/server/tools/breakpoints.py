@@ -54,7 +54,7 @@ async def webots_breakpoint(
     ctx: Context[Any],
     action: Annotated[
         BreakpointAction,
-        Field(description="log only records the hit."),
+        Field(description="keep records the seconds around at full rate, log only the hit."),
     ] = "pause",
     after_hits: Annotated[
         int, Field(ge=1, le=1_000_000, description="Act from this hit of a run on.")

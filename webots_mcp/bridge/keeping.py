@@ -1,0 +1,200 @@
+"""Keeping the seconds around a moment at full rate: a ring buffer before it, each call after it.
+
+What the throttle drops goes into the ring. `keep` writes the ring to the table `kept_state`, in
+order and some rows with each call of the loop; for some seconds more each throttled call follows.
+Together with the recorded rows that is every call of a kept stretch, of which the table
+`kept_stretch` tells begin, end and reason.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from typing import Final
+
+from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.ring import Ring, RingRow
+from webots_mcp.bridge.run import Run
+from webots_mcp.bridge.text import cut, storable
+from webots_mcp.bridge.throttle import Throttle
+from webots_mcp.contract import KEEP_AFTER_S, new_uuid
+
+MOST_KEPT_S: Final = 600.0  # of one run; a condition that flickers would keep all of it
+_MOST_REASONS: Final = 10  # of one stretch that are told
+_MOST_REASON_CHARACTERS: Final = 200
+_ROWS_AT_ONCE: Final = 100  # about a millisecond
+_CHARACTERS_AT_ONCE: Final = 200_000
+
+
+class Stretch:
+    """A kept stretch of a run; `end_s` lies ahead while it goes on."""
+
+    def __init__(self, run: Run, start_s: float) -> None:
+        self.uuid = new_uuid()
+        self.run = run
+        self.start_s = self.end_s = start_s
+        self.wall_time_s = time.time()
+        self.reasons: list[str] = []
+
+    def add_reason(self, reason: str) -> None:
+        """Note why it is kept, once."""
+        text = storable(cut(reason, _MOST_REASON_CHARACTERS))
+        if text not in self.reasons and len(self.reasons) < _MOST_REASONS:
+            self.reasons.append(text)
+
+
+class Keeper:
+    """Holds the last seconds, and keeps them where it is asked to.
+
+    Args:
+        last_s: Seconds of simulation time before a moment that are kept; 0 keeps nothing.
+
+    Attributes:
+        fills: Each throttled call has to be added.
+        busy: `go_on` has to be called with each round of the loop.
+    """
+
+    def __init__(
+        self, clock: Clock, recorder: Recorder, journal: Journal, throttle: Throttle, last_s: float
+    ) -> None:
+        self._clock = clock
+        self._recorder = recorder
+        self._journal = journal
+        self._throttle = throttle
+        self._last_s = last_s
+        self._ring = Ring(last_s)
+        self._run = clock.run
+        self._ring.begin(clock.sim_time_s)
+        self._kept_s = 0.0
+        self._stretch: Stretch | None = None
+        self._going_on = False
+        self._asked: deque[str] = deque(maxlen=_MOST_REASONS)
+        self._unwritten: deque[tuple[Run, RingRow]] = deque()
+        self.enabled = last_s > 0
+        self.fills = self.enabled and throttle.interval > 1
+        self.busy = False
+
+    # -- the loop ------------------------------------------------------------------------------
+
+    def add(self, state: object) -> None:
+        """Take in a call of `publish` that is not recorded."""
+        clock = self._clock
+        if clock.run is not self._run:
+            self._begin_run()
+        encoded = encode(state)
+        if not encoded.text.startswith("{"):
+            return  # a call that is recorded says so
+        times = (clock.sim_time_s, time.time())
+        row = RingRow(self._throttle.calls, *times, encoded.text, encoded.odd_text)
+        if self._stretch is not None and row.sim_time_s > self._stretch.end_s:
+            self._end_stretch(self._stretch.end_s)
+        if self._going_on:
+            self._unwritten.append((clock.run, row))
+        else:
+            self._ring.add(row)
+
+    def go_on(self) -> None:
+        """Keep what was asked for, write some rows, and end the stretch when it is over."""
+        if self._clock.run is not self._run:
+            self._begin_run()
+        while self._asked:
+            self.keep(self._asked.popleft())
+        self._write_some()
+        if self._stretch is not None and self._clock.sim_time_s >= self._stretch.end_s:
+            self._end_stretch(self._stretch.end_s)
+        self.busy = bool(self._going_on or self._unwritten or self._asked)
+
+    # -- keeping -------------------------------------------------------------------------------
+
+    def ask(self, reason: str) -> None:
+        """Keep with the next round of the loop; any thread may ask."""
+        if self.enabled:
+            self._asked.append(reason)
+            self.busy = True
+
+    def keep(self, reason: str) -> bool:
+        """Keep the last seconds and those to come; whether that is possible."""
+        if not self.enabled or not self._may_keep():
+            return False
+        now_s = self._clock.sim_time_s
+        rows = self._ring.take()
+        before_s = min(now_s - self._last_s, rows[0].sim_time_s if rows else now_s)
+        start_s, stretch = max(self._ring.starts_s, before_s), self._stretch
+        if stretch is None or start_s > stretch.end_s:
+            stretch = self._stretch = Stretch(self._run, start_s)
+        self._kept_s += now_s + KEEP_AFTER_S - max(start_s, stretch.end_s)
+        stretch.end_s = now_s + KEEP_AFTER_S
+        stretch.add_reason(reason)
+        self._unwritten.extend((self._run, row) for row in rows)
+        self._going_on = self.busy = True
+        self._record(stretch)
+        return True
+
+    def write_all(self) -> None:
+        """Write what is kept now: the loop is about to stand still, or to end."""
+        while self._unwritten:
+            self._write_some()
+
+    def close(self) -> None:
+        """The session ends, and with it what was to be kept of the seconds to come."""
+        while self._asked:
+            self.keep(self._asked.popleft())
+        self.write_all()
+        self._end_stretch(self._clock.sim_time_s)
+
+    # -- inside --------------------------------------------------------------------------------
+
+    def _may_keep(self) -> bool:
+        if self._clock.run is not self._run:
+            self._begin_run()
+        if self._kept_s < MOST_KEPT_S:
+            return True
+        if self._kept_s < float("inf"):
+            self._kept_s = float("inf")
+            text = f"{MOST_KEPT_S:g} s of this run are kept at full rate: no more will be"
+            self._journal.log("warning", "bridge", text)
+        return False
+
+    def _begin_run(self) -> None:
+        """Time went back: what the ring holds is of a run that is over."""
+        self._end_stretch(self._clock.ended_sim_time_s)
+        self._run, self._stretch, self._kept_s = self._clock.run, None, 0.0
+        self._ring.begin(self._run.started_sim_time_s)
+
+    def _end_stretch(self, at_s: float) -> None:
+        """It stays known: one that follows before its ring could have begun goes on with it."""
+        stretch = self._stretch
+        if not self._going_on or stretch is None:
+            return
+        self._going_on = False
+        self._ring.begin(at_s)
+        if at_s < stretch.end_s:
+            stretch.end_s = at_s
+            self._record(stretch)
+
+    def _record(self, stretch: Stretch) -> None:
+        values = {
+            "uuid": stretch.uuid,
+            "start": stretch.start_s,
+            "end": stretch.end_s,
+            "wall_time": stretch.wall_time_s,
+            "reason": "; ".join(stretch.reasons),
+        }
+        self._recorder.record("kept stretch", stretch.run, values)
+
+    def _write_some(self) -> None:
+        """Rows of one run, in one transaction. They are forgotten after it: twice does no harm."""
+        rows = list[RingRow]()
+        room = _CHARACTERS_AT_ONCE
+        for run, row in self._unwritten:
+            if run is not self._unwritten[0][0] or room <= 0 or len(rows) == _ROWS_AT_ONCE:
+                break
+            rows.append(row)
+            room -= len(row.text)
+        if rows:
+            self._recorder.record_together("kept state", self._unwritten[0][0], rows)
+        for _ in rows:
+            self._unwritten.popleft()

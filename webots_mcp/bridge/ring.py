@@ -1,0 +1,81 @@
+"""The ring buffer: the last seconds of calls that were not recorded, in bounded memory."""
+
+from __future__ import annotations
+
+import sys
+from collections import deque
+from typing import Final, NamedTuple
+
+MAX_RING_BYTES: Final = 8_000_000
+_ROW_BYTES: Final = 400  # of a row beside its texts: a tuple, three numbers, its place
+
+
+class RingRow(NamedTuple):
+    """A call of `publish`, as it would have been recorded.
+
+    Attributes:
+        call: Its number in the session.
+        odd: As in the column of that name.
+    """
+
+    call: int
+    sim_time_s: float
+    wall_time_s: float
+    text: str
+    odd: str | None
+
+    @property
+    def size_bytes(self) -> int:
+        """About the memory that it takes."""
+        return _ROW_BYTES + sys.getsizeof(self.text) + (sys.getsizeof(self.odd) if self.odd else 0)
+
+
+class Ring:
+    """Rows of one run, oldest first; the oldest go where they are too old or too many.
+
+    Args:
+        last_s: So many seconds of simulation time are held.
+        most_bytes: And so many bytes at most: a row that is larger by itself is not held.
+
+    Attributes:
+        size_bytes: What the rows take.
+        starts_s: The simulation time from which on no row is missing.
+    """
+
+    def __init__(self, last_s: float, most_bytes: int = MAX_RING_BYTES) -> None:
+        self._last_s = last_s
+        self._most_bytes = most_bytes
+        self._rows: deque[tuple[int, RingRow]] = deque()
+        self.size_bytes = 0
+        self.starts_s = 0.0
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, row: RingRow) -> None:
+        """Hold the newest row."""
+        size_bytes = row.size_bytes
+        self._rows.append((size_bytes, row))
+        self.size_bytes += size_bytes
+        oldest_s = row.sim_time_s - self._last_s
+        while self._rows and (
+            self.size_bytes > self._most_bytes or self._rows[0][1].sim_time_s < oldest_s
+        ):
+            self._forget_oldest()
+
+    def take(self) -> list[RingRow]:
+        """All rows; none is left."""
+        rows = [row for _, row in self._rows]
+        self._rows.clear()
+        self.size_bytes = 0
+        return rows
+
+    def begin(self, starts_s: float) -> None:
+        """Begin empty at that simulation time."""
+        self._rows.clear()
+        self.size_bytes, self.starts_s = 0, starts_s
+
+    def _forget_oldest(self) -> None:
+        size_bytes, row = self._rows.popleft()
+        self.size_bytes -= size_bytes
+        self.starts_s = self._rows[0][1].sim_time_s if self._rows else row.sim_time_s

@@ -137,7 +137,7 @@ STATEMENTS: Final[dict[Kind, str]] = {
     ),
     "kept state": (
         "INSERT INTO kept_state (run_id, call, sim_time_s, wall_time_s, data, odd) "
-        "VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (run_id, sim_time_s, call) DO NOTHING"
+        "VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT (run_id, call) DO NOTHING"
     ),
 }
 ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction

@@ -420,8 +420,9 @@ CREATE TABLE kept_state (
 	data TEXT NOT NULL /* JSON object */, 
 	odd TEXT /* as in state */, 
 	CONSTRAINT fk_kept_state_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE, 
-	CONSTRAINT uq_kept_state_run_id UNIQUE (run_id, sim_time_s, call)
+	CONSTRAINT uq_kept_state_run_id UNIQUE (run_id, call)
 );
+CREATE INDEX ix_kept_state_run_id_sim_time_s ON kept_state (run_id, sim_time_s);
 CREATE VIEW robot_parameter AS
 /* The values that parameters had in each run, each from a time on; true and false as text. */
 SELECT r.name AS robot, v.run_id, v.name,

@@ -433,9 +433,10 @@ def create_kept_state() -> None:
             ["run_id"], ["run.id"], name=op.f("fk_kept_state_run_id"), ondelete="CASCADE"
         ),
         sa.PrimaryKeyConstraint("id"),
-        sa.UniqueConstraint("run_id", "sim_time_s", "call", name=op.f("uq_kept_state_run_id")),
+        sa.UniqueConstraint("run_id", "call", name=op.f("uq_kept_state_run_id")),
         sqlite_autoincrement=True,
     )
+    op.create_index(op.f("ix_kept_state_run_id_sim_time_s"), "kept_state", ["run_id", "sim_time_s"])
 
 
 def downgrade() -> None:

@@ -384,7 +384,11 @@ class KeptState(SQLModel, table=True):
     """What a call of `publish` holds that only a kept stretch has; the others are in `state`."""
 
     __tablename__: ClassVar[Any] = "kept_state"
-    __table_args__ = (UniqueConstraint("run_id", "sim_time_s", "call"), _KEEP_IDS)
+    __table_args__ = (
+        Index(None, "run_id", "sim_time_s"),
+        UniqueConstraint("run_id", "call"),
+        _KEEP_IDS,
+    )
     id: int | None = _id()
     run_id: int = _to("run")
     call: int | None = _column(

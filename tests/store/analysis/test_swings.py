@@ -53,6 +53,31 @@ def test_more_time_never_finds_less(course: str) -> None:
         assert len(swings_of(times[part], values[part])) == 1, (start_s, end_s)
 
 
+def zigzag(rng: np.random.Generator, times: Array) -> Array:
+    """Straight pieces of 2 to 8 s, as the heading of a robot that turns."""
+    places = np.cumsum(rng.uniform(2, 8, 60))
+    slopes = rng.choice([0.0, 0.8, -0.8, 0.3], 60)
+    course = np.concatenate(([0.0], np.cumsum(np.diff(places) * slopes[1:])))
+    return np.interp(times, places, course)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_swing_is_found_over_turns_that_follow_each_other_as_fast_as_its_periods(
+    seed: int,
+) -> None:
+    rng = np.random.default_rng(seed)
+    times = np.arange(0, 120, 0.08)
+    course = zigzag(rng, times) + rng.normal(0, 0.01, len(times))
+    inside = (times >= START_S) & (times < START_S + 6 * 4.0)
+    swing = np.where(inside, HEIGHT * np.sin(2 * np.pi * (times - START_S) / 4.0), 0)
+    assert swings_of(times, course) == []
+    (found,) = swings_of(times, course + swing)
+    assert found.period_s == pytest.approx(4.0, rel=0.05)
+    assert found.amplitude == pytest.approx(HEIGHT, rel=0.1)
+    assert found.start_s == pytest.approx(START_S, abs=5.0)
+    assert found.end_s == pytest.approx(START_S + 24.0, abs=5.0)
+
+
 def test_a_swing_goes_on_across_a_gap() -> None:
     times = np.arange(0, 120, 0.032)
     values = 0.1 * times + HEIGHT * np.sin(np.pi * times)

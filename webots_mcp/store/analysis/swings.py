@@ -2,8 +2,9 @@
 
 The search is local: each stretch without recording gaps is looked at by itself, and in it each
 period has a band of its own, in which a swing shows as crossings of zero that come
-regularly and reach equally far. What happens elsewhere in the stretch changes nothing, so that
-asking for more time never finds less.
+regularly and reach equally far. Where the course bends by more than noise makes it, swings are
+looked for beside its bends (`swings_on_bends`). What happens elsewhere in the stretch changes
+nothing, so that asking for more time never finds less.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from typing import Final
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.noise import local_noise, noise_of
 from webots_mcp.store.analysis.rhythm import gap_borders
+from webots_mcp.store.analysis.sines import TRIED_PERIODS, fit_sines, parabolas
+from webots_mcp.store.analysis.swings_on_bends import likely_swings, swings_on_bends
 
 LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again
 SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
@@ -31,13 +34,10 @@ MOST_UNEVEN: Final = 1.8  # times as far as those before it may a half swing rea
 MOST_IRREGULAR: Final = 0.25  # coefficient of variation of the half periods
 MOST_VARIED: Final = 0.4  # and of how far the half swings reach
 LEAST_EXPLAINED: Final = (0.85, 0.70)  # of the variance by a sine, for 6 half swings and for 10
-STRAIGHTENED_EXPLAINED: Final = 0.9  # where a course of slopes was taken out before
 PERIODS_FITTED: Final = 2.5  # at once: over more, a swing may change a little
 PIECES_TRIED: Final = 16  # with each period; the whole with the best of them
 LEAST_TRIED: Final = 0.5  # explained of these pieces; less is not looked at further
 NOISE_BENDS: Final = 10.0  # deviations of the noise, over the root of the rows; it makes hardly 7
-# Times the period of the crossings:
-TRIED_PERIODS: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)
 NOISE_AMPLITUDES: Final = 3.0  # a swing is at least so many deviations of the noise high ...
 MEAN_AMPLITUDES: Final = 12.0  # ... or so many of their means over half the swing
 WALK_CHANCE: Final = 1e-5  # that a random walk swings so far; it is asked thousands of times
@@ -81,10 +81,10 @@ def find_swings(
     """Swings of one signal, in order; angles have to be unwrapped.
 
     A swing counts when at least so many half swings follow each other, alike in length and reach,
-    when a sine explains most of their variance about a parabola, and when it rises above the noise
-    of its own stretch. Period and amplitude are those of the best sine. Each stretch between
-    recording gaps is looked at by itself; a swing that reaches a gap and is the same after it is
-    one swing.
+    when a sine explains most of their variance about a parabola or about straight pieces, and when
+    it rises above the noise of its own stretch. Period and amplitude are those of the best sine.
+    Each stretch between recording gaps is looked at by itself; a swing that reaches a gap and is
+    the same after it is one swing.
     """
     moving = np.diff(times, prepend=-np.inf) > 0
     times, values = times[moving], values[moving]
@@ -117,9 +117,7 @@ def _together(before: Swing, after: Swing) -> Swing:
     """Two that overlap; where their periods are unlike, the one that was seen longer is told."""
     if _ratio(before.period_s, after.period_s) > ALIKE[0]:
         return max(before, after, key=lambda each: each.half_swings * each.explained)
-    whole = _as_one(before, after)
-    count = round(2 * (after.end_s - before.start_s) / whole.period_s)
-    return replace(whole, half_swings=count)
+    return _counted(_as_one(before, after))
 
 
 def _goes_on(before: Swing, after: Swing, times: Array) -> bool:
@@ -130,8 +128,7 @@ def _goes_on(before: Swing, after: Swing, times: Array) -> bool:
     recorded_s = after.start_s - before.end_s - gap_s
     if recorded_s > 2 * JOINED_PERIODS * before.period_s:
         return False
-    periods = _ratio(before.period_s, after.period_s)
-    return periods <= ALIKE[0] and _ratio(before.amplitude, after.amplitude) <= ALIKE[1]
+    return _is_alike(before, after)
 
 
 def _ratio(one: float, other: float) -> float:
@@ -167,14 +164,45 @@ def _in_stretch(
         step = max(1, int(rows / ROWS_PER_PERIOD))
         moments, means = _means(times, step), _means(values, step)
         of_means = noise[: len(means) * step : step] / step**0.5
-        for band in _bands(moments, means, round(rows / step), of_means):
-            if max(band.max(), -band.min()) <= rounding:
-                continue
+        slow = _moving_mean(means, round(rows / step))
+        band = _moving_mean(means, round(rows / step) // FINEST_SHARE) - slow
+        if max(band.max(), -band.min()) > rounding:
             for crossings in _regular(moments, band, rows * interval_s, least_half_swings):
                 if not any(_is_same(crossings, each) for each in found):
                     found += _fitted(times, values, crossings, interval_s)
+        if _bends(slow, round(rows / step), of_means):
+            for swing in _on_bends(moments, means, rows / step, least_half_swings, found):
+                if _stands_out(times, values, swing, interval_s):
+                    found.append(swing)
         rows *= SCALE_RATIO
-    return _best([each for each in found if each.period_s <= longest_period_s])
+    return _connected(_best([each for each in found if each.period_s <= longest_period_s]))
+
+
+def _connected(swings: list[Swing]) -> list[Swing]:
+    """Two that are alike and follow each other closely as one."""
+    connected: list[Swing] = []
+    for swing in swings:
+        before = connected[-1] if connected else None
+        if before and _follows(before, swing) and _is_alike(before, swing):
+            connected[-1] = _counted(_as_one(before, swing))
+        else:
+            connected.append(swing)
+    return connected
+
+
+def _follows(before: Swing, after: Swing) -> bool:
+    return after.start_s - before.end_s < JOINED_PERIODS * before.period_s
+
+
+def _is_alike(before: Swing, after: Swing) -> bool:
+    periods = _ratio(before.period_s, after.period_s)
+    return periods <= ALIKE[0] and _ratio(before.amplitude, after.amplitude) <= ALIKE[1]
+
+
+def _counted(swing: Swing) -> Swing:
+    """With as many half swings as its time holds."""
+    count = round(2 * (swing.end_s - swing.start_s) / swing.period_s)
+    return replace(swing, half_swings=count)
 
 
 def _is_same(crossings: _Crossings, swing: Swing) -> bool:
@@ -194,12 +222,33 @@ def _means(values: Array, step: int) -> Array:
     return np.add.reduceat(values[:whole], np.arange(0, whole, step)) / step if step > 1 else values
 
 
-def _bands(times: Array, values: Array, rows: int, noise: Array) -> Iterator[Array]:
-    """What swings with about that period: as it is, and without a course of slopes that bends."""
-    slow = _moving_mean(values, rows)
-    yield _moving_mean(values, rows // FINEST_SHARE) - slow
-    if _bends(slow, rows, noise) and (course := _straightened(times, values, rows)) is not None:
-        yield _moving_mean(course, rows // FINEST_SHARE) - _moving_mean(course, rows)
+def _on_bends(
+    moments: Array, means: Array, period: float, least: int, found: list[Swing]
+) -> Iterator[Swing]:
+    """Swings on a course that bends, where they were not found without."""
+    interval_s = float(moments[-1] - moments[0]) / (len(moments) - 1)
+    for start, end, rows in likely_swings(means, period):
+        ends_s = float(moments[start]), float(moments[end - 1])
+        if not any(_covers(each, *ends_s, rows * interval_s) for each in found):
+            for bent in swings_on_bends(means, start, end, rows, least):
+                yield Swing(
+                    float(moments[bent.start]),
+                    float(moments[bent.end - 1]),
+                    bent.half_swings,
+                    bent.period * interval_s,
+                    bent.amplitude,
+                    bent.explained,
+                )
+
+
+def _covers(swing: Swing, start_s: float, end_s: float, period_s: float) -> bool:
+    """Whether what seems to swing there is that swing, with what surrounds it."""
+    near_s = JOINED_PERIODS * period_s
+    return (
+        swing.start_s - near_s <= start_s
+        and end_s <= swing.end_s + near_s
+        and _ratio(swing.period_s, period_s) < SCALE_RATIO
+    )
 
 
 def _bends(slow: Array, rows: int, noise: Array) -> bool:
@@ -226,23 +275,6 @@ def _moving_mean(values: Array, rows: int) -> Array:
         values = sums[window:] - sums[:-window]
         values /= window
     return values
-
-
-def _straightened(times: Array, values: Array, rows: int) -> Array | None:
-    """Values without a course of slopes that change now and then, as of a robot that turns.
-
-    The slope at each moment is the median over one period: a swing about it has the median 0, and
-    a change of slope stays a sharp bend. None where the stretch is too short.
-    """
-    step = max(1, rows // ROWS_PER_PERIOD)
-    half = rows // step // 2
-    means, moments = _means(values, step), _means(times, step)
-    if len(means) < 2 * half + 3:
-        return None
-    steps = np.pad(np.diff(means), half, mode="edge")
-    windows = np.lib.stride_tricks.sliding_window_view(steps, 2 * half + 1)
-    slopes = np.partition(windows, half, axis=1)[:, half]
-    return values - np.interp(times, moments, np.concatenate(([0.0], np.cumsum(slopes))))
 
 
 def _regular(times: Array, band: Array, period_s: float, least: int) -> Iterator[_Crossings]:
@@ -305,25 +337,24 @@ def _fitted(
     resolution = _resolution(values[rows])  # first: rounded courses have most candidates by far
     if farthest <= resolution:
         return
-    least = _least_amplitude(noise_of(values[rows]), period_s, interval_s, count)
-    if farthest < least:
+    if farthest < _least_amplitude(noise_of(values[rows]), period_s, interval_s, count):
         return
-    around, inner = _surroundings(rows, len(values))
-    course = values[around]
-    best = _best_sine(times[rows], values[rows], period_s, interval_s)
-    if best[0] < _least_explained(count):
-        bare = _straightened(times[around], course, round(2 * period_s / interval_s))
-        if bare is None:
-            return
-        course = bare
-        best = _best_sine(times[rows], course[inner], period_s, interval_s)
-        if best[0] < STRAIGHTENED_EXPLAINED:
-            return
-    explained, period_s, amplitude = best
-    if _is_as_of_walk(amplitude, count, _walked(course, period_s / interval_s)):
-        return
-    if amplitude >= least and amplitude > resolution:
-        yield Swing(start_s, end_s, count, period_s, amplitude, explained)
+    explained, period_s, amplitude = _best_sine(times[rows], values[rows], period_s, interval_s)
+    swing = Swing(start_s, end_s, count, period_s, amplitude, explained)
+    if explained >= _least_explained(count) and _stands_out(times, values, swing, interval_s):
+        yield swing
+
+
+def _stands_out(times: Array, values: Array, swing: Swing, interval_s: float) -> bool:
+    """Whether neither noise, nor rounding, nor a random walk makes such a swing."""
+    start, end = np.searchsorted(times, [swing.start_s, swing.end_s])
+    rows = slice(max(0, int(start) - 1), min(len(times), int(end) + 1))
+    count = swing.half_swings
+    least = _least_amplitude(noise_of(values[rows]), swing.period_s, interval_s, count)
+    if swing.amplitude < least or swing.amplitude <= _resolution(values[rows]):
+        return False
+    walked = _walked(values[_surroundings(rows, len(values))], swing.period_s / interval_s)
+    return not _is_as_of_walk(swing.amplitude, count, walked)
 
 
 def _least_amplitude(noise: float, period_s: float, interval_s: float, half_swings: int) -> float:
@@ -353,11 +384,10 @@ def _least_explained(half_swings: int) -> float:
     return float(np.interp(half_swings, (6, 10), LEAST_EXPLAINED))
 
 
-def _surroundings(rows: slice, count: int) -> tuple[slice, slice]:
-    """The rows with thrice as many before and after them, and where among those they are."""
+def _surroundings(rows: slice, count: int) -> slice:
+    """The rows with thrice as many before and after them."""
     length = 3 * (rows.stop - rows.start)
-    around = slice(max(0, rows.start - length), min(count, rows.stop + length))
-    return around, slice(rows.start - around.start, rows.stop - around.start)
+    return slice(max(0, rows.start - length), min(count, rows.stop + length))
 
 
 def _walked(course: Array, rows: float) -> float:
@@ -409,75 +439,15 @@ def _best_sine(
     shape = pieces, rows
     moments: Array = np.reshape(times[: pieces * rows], shape)
     parts: Array = np.reshape(values[: pieces * rows], shape)
+    basis = parabolas(moments)
     periods = period_s * np.array(TRIED_PERIODS)
     some = slice(None, None, -(-pieces // PIECES_TRIED))
-    tried = _explained(_fit(moments[some], parts[some], periods))
+    tried = fit_sines(moments[some], parts[some], periods, basis[some]).explained
     best = int(np.argmax(tried))
     if tried[best] < LEAST_TRIED:
         return float(tried[best]), period_s, 0.0
-    fit = _fit(moments, parts, periods[best : best + 1])
-    return float(_explained(fit)[0]), float(periods[best]), float(np.median(fit.amplitudes))
-
-
-def _explained(fit: _Fit) -> Array:
-    """The share of the squares that a sine of each period explains."""
-    course = float(fit.of_course.sum())
-    left: Array = np.sum(fit.of_sines, axis=0)
-    return np.asarray(1 - left / course if course > 0 else 0 * left, np.float64)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """Per piece, what a parabola leaves of the squares; what it leaves with a sine of each period.
-
-    Attributes:
-        of_sines: One row per piece, one column per period; `amplitudes` alike.
-    """
-
-    of_course: Array
-    of_sines: Array
-    amplitudes: Array
-
-
-def _fit(times: Array, values: Array, periods: Array) -> _Fit:
-    """Sines are fitted to what a parabola leaves of the values and of the sines themselves.
-
-    Args:
-        times: One row per piece.
-        values: Alike.
-        periods: That are tried.
-    """
-    moments = times - times.mean(axis=1, keepdims=True)
-    angles: Array = 2 * np.pi * moments[:, None, :] / periods[:, None]
-    waves = np.concatenate((np.sin(angles), np.cos(angles), values[:, None, :]), axis=1)
-    basis = _parabolas(moments)
-    rest: Array = waves - (waves @ np.swapaxes(basis, 1, 2)) @ basis
-    sines, cosines, left = np.split(rest, [len(periods), 2 * len(periods)], axis=1)
-    ss, cc, sc = (_products(*pair) for pair in ((sines,) * 2, (cosines,) * 2, (sines, cosines)))
-    sy, cy, of_course = (_products(each, left) for each in (sines, cosines, left))
-    determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
-    of_sine, of_cosine = (sy * cc - cy * sc) / determinant, (cy * ss - sy * sc) / determinant
-    amplitudes: Array = np.hypot(of_sine, of_cosine)
-    return _Fit(of_course, of_course - of_sine * sy - of_cosine * cy, amplitudes)
-
-
-def _parabolas(moments: Array) -> Array:
-    """Per piece three courses of length 1 at right angles: level, straight and bent."""
-    straight = _of_length_one(moments)
-    bent = straight**2
-    bent -= bent.mean(axis=1, keepdims=True)
-    bent -= np.einsum("ij,ij->i", bent, straight)[:, None] * straight
-    level = np.full_like(moments, moments.shape[1] ** -0.5)
-    return np.stack((level, straight, _of_length_one(bent)), axis=1)
-
-
-def _of_length_one(courses: Array) -> Array:
-    return courses / np.sqrt(np.einsum("ij,ij->i", courses, courses))[:, None]
-
-
-def _products(one: Array, other: Array) -> Array:
-    """Sums along the rows, of as many courses or of many and one."""
-    return np.einsum("ijk,ijk->ij" if one.shape == other.shape else "ijk,ilk->ij", one, other)
+    fit = fit_sines(moments, parts, periods[best : best + 1], basis)
+    return float(fit.explained[0]), float(periods[best]), float(np.median(fit.amplitudes))
 
 
 def _best(found: list[Swing]) -> list[Swing]:

@@ -109,7 +109,7 @@ def test_json_is_one_object_for_other_programs(say: Say, command: str) -> None:
         ("trends --start 3 --last 3", "two ways"),
         ("events --kind explosion", "unknown kind"),
         ("events --above 3", "need signals"),
-        ("compare 1", "2 to 10"),
+        ("compare 1 1", "1 to 10"),
         ("runs -n 300", "from 1 to 200"),
         ("plot -o a.gif", ".png or .svg"),
         ("plot -o /no/such/folder/a.png", "cannot be written"),

@@ -332,7 +332,7 @@ async def test_the_schema_is_told_before_anything_was_recorded(tmp_path: Path) -
         ("webots_find_events", {"kinds": ["threshold"]}, "above or below"),
         ("webots_find_events", {"kinds": ["explosion"]}, "must be one of 'run', 'gap'"),
         ("webots_get_timeline", {"cursor": "xyz"}, "no cursor"),
-        ("webots_compare_runs", {"run_ids": [1]}, "2 to 10"),
+        ("webots_compare_runs", {"run_ids": [1, 1]}, "1 to 10"),
         ("webots_compare_runs", {"run_ids": [1, 99]}, "no run 99"),
         ("webots_plot", {"signals": ["nope"]}, "no signal 'nope'"),
         ("webots_query_sql", {"sql": "DELETE FROM state"}, "only one reading statement"),

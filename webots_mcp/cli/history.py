@@ -227,12 +227,12 @@ def plot(arguments: argparse.Namespace) -> None:
 @question(
     "compare", DATA_DIR, DATABASE, ROBOT, JSON,
     argument("run_ids", type=int, nargs="*", metavar="RUN",
-             help="two or more runs; none: before and after the last edit of the controller"),
+             help="one or more runs; none: before and after the last edit of the controller"),
     argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
     count("-n", "the N that differ most", default=15),
 )  # fmt: skip
 def compare(arguments: argparse.Namespace) -> None:
-    """Compare runs: duration, distance, time per mode, events, and the signals that differ most."""
+    """What runs came to: distance, time per mode, events, and the signals that differ most."""
     from webots_mcp.store.questions.compare import compare_code, compare_runs
 
     wanted: dict[str, Any] = {"names": arguments.signal or ["*"], "limit": arguments.limit}
@@ -346,22 +346,34 @@ def _print_comparison(found: Comparison) -> None:
         [
             group.name,
             ", ".join(str(run.run_id) for run in group.runs),
-            group.duration_s,
+            group.total_duration_s,
             {name: ", ".join(map(str, each)) for name, each in group.parameters.items()} or None,
         ]
         for group in found.groups
     ]
-    print_table(("", "runs", "duration_s", "parameters"), groups)
+    print_table(("", "runs", "total_duration_s", "parameters"), groups)
     names: Sequence[str] = [group.name for group in found.groups]
     print(f"\nThe first {found.compared_s:.3f} s of each run:")
     verdicts = [f"{name} differs" for name in names[1:]]
     print_table(
         ["", *names, *verdicts],
         [
-            [each.name, *map(_spelled_spread, each.spread), *map(_verdict, each.different[1:])]
+            [
+                each.name,
+                *map(_spelled_spread, each.spread),
+                *map(_verdict, each.different[1:], each.runs_wanted[1:]),
+            ]
             for each in found.measures
         ],
     )
+    if found.differences:
+        _print_differences(found, verdicts)
+    unknown = [f"not known: {figures}: {why}" for figures, why in found.not_known.items()]
+    print_notes([*found.notes, *unknown])
+
+
+def _print_differences(found: Comparison, verdicts: Sequence[str]) -> None:
+    names = [group.name for group in found.groups]
     print("\nSignals, what differs most first:")
     columns = [f"mean {name}" for name in names] + [f"effect {name}" for name in names[1:]]
     columns += [f"deviation {name}" for name in names[1:]]
@@ -381,7 +393,6 @@ def _print_comparison(found: Comparison) -> None:
             for each in found.differences
         ],
     )
-    print_notes(found.notes)
 
 
 def _spelled_spread(spread: Spread | None) -> str | None:
@@ -392,5 +403,7 @@ def _spelled_spread(spread: Spread | None) -> str | None:
     return f"{spread.median:.4g}{several}"
 
 
-def _verdict(different: bool | None) -> str:
+def _verdict(different: bool | None, runs_wanted: int | None = None) -> str:
+    if runs_wanted is not None:
+        return f"not known yet: {runs_wanted} runs of each would tell"
     return {True: "yes", False: "no", None: "not known"}[different]

@@ -237,7 +237,11 @@ class ComparisonAnswer(NotedAnswer):
     measures: Table | None = Field(
         default=None,
         description="Each run as a whole: median over the runs of each group, and their range. "
-        "different: of each group but the first.",
+        "different: of each group but the first; null where it cannot be told, then runs_wanted: "
+        "so many runs of each would tell, if they went on like these.",
+    )
+    not_known: dict[str, str] | None = Field(
+        default=None, description="Figures that are null, or not of everything: why; what to do."
     )
     differences: Table | None = Field(
         default=None,

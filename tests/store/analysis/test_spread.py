@@ -8,7 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from webots_mcp.store.analysis.spread import Spread, chance_of, spread_of, verdicts_on
+from webots_mcp.store.analysis.spread import (
+    Spread,
+    Verdict,
+    chance_of,
+    chance_of_counts,
+    spread_of,
+    verdicts_on,
+)
 
 FIGURES = st.lists(st.floats(-1e6, 1e6), min_size=2, max_size=6)
 
@@ -33,23 +40,63 @@ def test_the_chance_is_a_share_and_the_same_both_ways(one: list[float], other: l
     assert chance == pytest.approx(chance_of(other, one))
 
 
+def told(groups: list[list[float]], tests: int = 1) -> list[bool | None]:
+    return [each.different for each in verdicts_on(groups, tests)]
+
+
 def test_of_one_run_each_nothing_can_be_told() -> None:
     assert chance_of([1.0], [2.0]) is None
-    assert verdicts_on([[1.0], [2.0]], tests=1) == [False, None]
+    assert told([[1.0], [2.0]]) == [False, None]
 
 
 def test_runs_that_agree_to_the_last_digit_differ_by_any_change() -> None:
-    assert verdicts_on([[1.0, 1.0], [1.0001, 1.0001]], tests=100) == [False, True]
-    assert verdicts_on([[1.0, 1.0], [1.0, 1.0]], tests=100) == [False, False]
+    assert told([[1.0, 1.0], [1.0001, 1.0001]], tests=100) == [False, True]
+    assert told([[1.0, 1.0], [1.0, 1.0]], tests=100) == [False, False]
+
+
+def test_groups_that_more_runs_would_tell_apart_are_not_called_equal() -> None:
+    near, far = [1.0, 1.2, 0.9], [1.7, 1.9, 1.6]
+    unsure = verdicts_on([near, far], tests=10)[1]
+    assert unsure.different is None and unsure.runs_wanted is not None
+    repeated = (unsure.runs_wanted + 2) // 3
+    assert told([near * repeated, far * repeated], tests=10) == [False, True]
+    assert verdicts_on([near, [1.0, 1.2, 0.95]], tests=10) == [Verdict(False), Verdict(False)]
+
+
+@pytest.mark.parametrize(
+    ("first", "other", "chance"),  # 2 * 0.5**6, and of 8 that split 1:7 2 * 9 / 256
+    [([2, 2, 2], [0, 0, 0], 0.03125), ([1, 0, 0], [2, 3, 2], 0.0703125)],
+)
+def test_the_chance_of_counts_is_that_of_the_exact_test(
+    first: list[float], other: list[float], chance: float
+) -> None:
+    assert chance_of_counts(first, other) == pytest.approx(chance)
+    assert chance_of_counts(other, first) == pytest.approx(chance)
+
+
+def test_counts_of_groups_of_unequal_size_are_expected_by_their_runs() -> None:
+    assert chance_of_counts([2, 2, 2, 2], [1]) == pytest.approx(
+        2 * sum(math.comb(9, n) * 0.2**n * 0.8 ** (9 - n) for n in (0, 1))
+    )
+    assert chance_of_counts([2000] * 3, [4000] * 3) == pytest.approx(0, abs=1e-12)
 
 
 def test_a_few_counts_that_happen_to_agree_are_not_certain() -> None:
     counts = [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]]
-    assert verdicts_on(counts, tests=1, least_variance=0.5) == [False, False]
+    assert verdicts_on(counts, 1, chance_of_counts)[1].different is None
+
+
+def test_counts_that_spread_more_than_chance_need_more_than_chance() -> None:
+    assert verdicts_on([[0, 30, 2, 40], [9, 0, 60, 80]], 1, chance_of_counts)[1].different is False
+
+
+@given(st.lists(st.integers(0, 30), min_size=2, max_size=6))
+def test_like_counts_are_never_called_different(counts: list[float]) -> None:
+    assert verdicts_on([counts, counts[::-1]], 1, chance_of_counts) == [Verdict(False)] * 2
 
 
 def test_a_figure_that_one_run_lacks_is_not_told_of_its_group() -> None:
     assert spread_of([1.0, None]) is None
     assert spread_of([]) is None
     assert spread_of([3.0, 1.0, 2.0]) == Spread(2.0, 1.0, 3.0)
-    assert verdicts_on([[1.0, None], [9.0, 9.1]], tests=1) == [None, None]
+    assert verdicts_on([[1.0, None], [9.0, 9.1]], tests=1) == [Verdict(None), Verdict(None)]

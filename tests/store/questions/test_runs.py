@@ -273,11 +273,11 @@ def test_runs_of_two_robots_can_be_compared(empty: sqlite3.Connection) -> None:
     assert comparison.only_in == {}
 
 
-@pytest.mark.parametrize("run_ids", [[], [1], [1, 1], list(range(1, 12))])
+@pytest.mark.parametrize("run_ids", [[], [1, 1], list(range(1, 12))])
 def test_a_comparison_without_sense_is_refused(
     rover: sqlite3.Connection, run_ids: list[Any]
 ) -> None:
-    with pytest.raises(InvalidInputError, match="2 to 10 different runs"):
+    with pytest.raises(InvalidInputError, match="1 to 10 different runs"):
         compare_runs(rover, run_ids)
 
 

@@ -61,10 +61,10 @@ RUN_COLUMNS: Final = (
     "world", "note",
 )  # fmt: skip
 GROUP_COLUMNS: Final = (
-    "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by", "duration_s",
-    "real_time_factor",
+    "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by",
+    "total_duration_s", "real_time_factor",
 )  # fmt: skip
-MEASURE_COLUMNS: Final = ("name", "median", "range", "different")
+MEASURE_COLUMNS: Final = ("name", "median", "range", "different", "runs_wanted")
 DIFFERENCE_COLUMNS: Final = (
     "signal", "unit", "mean", "mean_range", "deviation", "effect", "deviation_ratio", "different",
     "min", "max",
@@ -121,12 +121,12 @@ def webots_compare_runs(
     limit: ShownLimit = None,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
-    """Did my edit help? Runs beside each other; the first group is the reference.
+    """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
 
     Without run_ids: the runs before and after the last edit of the controller's file. Over the
     same stretch of each run: distance, mean speed, share of time per mode, events per minute,
     and the signals that differ most. `different` is true only beyond the spread of like runs,
-    so it takes several runs of each; null: it cannot be told.
+    so it takes several runs of each; null: it cannot be told yet.
     """
     with recording.view(robot, run_ids[0] if run_ids else None) as view:
         return answer_about(
@@ -228,8 +228,10 @@ def _compared(
         found = compare_code(view.connection, robot=view.robot.name, names=wanted, limit=most)
     differing = [each for each in found.differences if _differs(each)]
     groups, measures = _groups(found), _measures(found)
-    told = "".join(str(table.rows) for table in (groups, measures) if table)
-    room = (BUDGET if limit is None else LARGE_BUDGET) - len(told)
+    told = [str(table.rows) for table in (groups, measures) if table]
+    room = (
+        (BUDGET if limit is None else LARGE_BUDGET) - len("".join(told)) - len(str(found.not_known))
+    )
     rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
     rows = fitting(rows, room)
     only_in = list(found.only_in.items())
@@ -237,6 +239,7 @@ def _compared(
         "groups": groups,
         "compared_s": seconds(found.compared_s),
         "measures": measures,
+        "not_known": found.not_known or None,
         "differences": without_empty(DIFFERENCE_COLUMNS, rows),
         "total": found.total,
         "only_in": {name: list(groups) for name, groups in only_in[:_MOST_ONLY_IN]} or None,
@@ -258,6 +261,7 @@ def _measures(found: Comparison) -> Table | None:
             _medians(each.spread),
             _ranges(each.spread),
             _told(each.different),
+            _told(each.runs_wanted),
         ]
         for each in found.measures
     ]
@@ -293,8 +297,8 @@ def _group_row(group: Group, *, told_robot: bool) -> list[Any]:
         _values_of({n: v[0] if len(v) == 1 else v for n, v in group.parameters.items()}),
         ", ".join(hashes) or None,
         ", ".join(dict.fromkeys(run.end_reason or _GOING_ON for run in group.runs)),
-        seconds(group.duration_s),
-        figure(pace(group.duration_s, driven_s)),
+        seconds(group.total_duration_s),
+        figure(pace(group.total_duration_s, driven_s)),
     ]
 
 
@@ -320,12 +324,14 @@ def _against_first(figures: Sequence[Any]) -> Any:
     return others[0] if len(others) == 1 else others
 
 
-def _told(different: Sequence[bool | None]) -> Any:
-    """The verdict on each group but the first; None where there is none on any."""
-    return _against_first(different) if any(each is not None for each in different[1:]) else None
+def _told(verdicts: Sequence[Any]) -> Any:
+    """What is said of each group but the first; None where nothing is said of any."""
+    return _against_first(verdicts) if any(each is not None for each in verdicts[1:]) else None
 
 
 def _hint(found: Comparison, told: int, differing: int, only_in: int) -> str | None:
+    if len(found.groups) == 1:
+        return "what its signals did: webots_get_trends; what happened: webots_find_events"
     more = told < differing or differing == len(found.differences) < found.total
     hints = [f"the {told} that differ most of {found.total}: limit or signals for others"] * more
     hints += ["no numeric signal differs"] * (differing == 0)

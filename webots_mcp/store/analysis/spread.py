@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Final, NamedTuple, TypeAlias
 
 MOST_CHANCE: Final = 0.002  # that any of the figures compared at once differs among like runs
+MOST_REPEATED: Final = 10  # runs of each group: who asks for more of them has no answer
 
 
 class Spread(NamedTuple):
@@ -26,27 +27,36 @@ def spread_of(figures: Sequence[float | None]) -> Spread | None:
     return Spread(statistics.median(known), min(known), max(known))
 
 
-def chance_of(
-    first: Sequence[float], other: Sequence[float], least_variance: float = 0.0
-) -> float | None:
+class Verdict(NamedTuple):
+    """Whether a group differs from the first by more than like runs do.
+
+    Attributes:
+        different: None where that cannot be told; False where even 10 runs of each that went on
+            like these would not show a difference.
+        runs_wanted: So many runs of each would show it, if they went on like these; None where
+            they need not, or would not.
+    """
+
+    different: bool | None
+    runs_wanted: int | None = None
+
+
+Chance: TypeAlias = Callable[[Sequence[float], Sequence[float]], "float | None"]
+
+
+def chance_of(first: Sequence[float], other: Sequence[float]) -> float | None:
     """How often two groups of like runs would lie as far apart as these: Student's t test.
 
     Two-sided, with the pooled variance (Student, The probable error of a mean, Biometrika 6,
     1908). 0 where like runs agree to the last digit and the groups do not. None for one run each:
     then nothing tells how much like runs differ.
-
-    Args:
-        first: A figure of each run of the first group.
-        other: Of each run of the other group.
-        least_variance: That of counted events is at least their mean, however alike a few counts
-            may happen to be.
     """
     freedom = len(first) + len(other) - 2
     if freedom < 1 or not first or not other:
         return None
     apart = abs(statistics.fmean(other) - statistics.fmean(first))
     squares = sum(statistics.pvariance(group) * len(group) for group in (first, other))
-    variance = max(squares / freedom, least_variance) * (1 / len(first) + 1 / len(other))
+    variance = squares / freedom * (1 / len(first) + 1 / len(other))
     if math.isclose(apart, 0, abs_tol=1e-9 * max(map(abs, (*first, *other)))):
         return 1.0
     return chance_beyond(apart, variance, freedom)
@@ -63,9 +73,36 @@ def chance_beyond(apart: float, variance: float, freedom: int) -> float:
     return _student_tail(apart / math.sqrt(variance), freedom) if variance > 0 else float(not apart)
 
 
+def chance_of_counts(first: Sequence[float], other: Sequence[float]) -> float | None:
+    """The same of counted events in stretches of one length.
+
+    Neither chance alone makes such counts (the conditional test of two Poisson means, J.
+    Przyborowski, H. Wilenski, Biometrika 31, 1940: of all events each falls on a group as often as
+    the group has runs), nor the spread of like runs, which may be larger than that of chance.
+    """
+    chance = chance_of(first, other)
+    if chance is None:
+        return None
+    share = len(first) / (len(first) + len(other))
+    return max(chance, _chance_of_split(round(sum(first)), round(sum(other)), share))
+
+
+def _chance_of_split(first: int, other: int, share: float) -> float:
+    """How often so many events fall as unevenly on two groups: twice the lesser binomial tail."""
+    events = first + other
+    fewer, part = (first, share) if first <= events * share else (other, 1 - share)
+    ways = math.lgamma(events + 1) - math.lgamma(first + 1) - math.lgamma(other + 1)
+    chance = math.exp(ways + first * math.log(share) + other * math.log(1 - share))
+    tail = 0.0
+    for count in range(fewer, -1, -1):  # each of fewer events is less likely than the one before
+        tail += chance
+        chance *= count / (events - count + 1) * (1 - part) / part
+    return min(1.0, 2 * tail)
+
+
 def verdicts_on(
-    groups: Sequence[Sequence[float | None]], tests: int, least_variance: float = 0.0
-) -> list[bool | None]:
+    groups: Sequence[Sequence[float | None]], tests: int, chance: Chance = chance_of
+) -> list[Verdict]:
     """Of each group whether it differs from the first by more than like runs do.
 
     False for the first; None where that cannot be told, or a figure of any run is missing.
@@ -73,14 +110,44 @@ def verdicts_on(
     Args:
         groups: A figure of each run of each group.
         tests: How many such questions are asked at once: the more, the surer each has to be.
-        least_variance: See `chance_of`.
+        chance: How often like runs lie as far apart.
     """
     known = [[each for each in group if each is not None] for group in groups]
     if any(len(a) < len(b) for a, b in zip(known, groups, strict=True)):
-        return [None] * len(groups)
-    chances = [chance_of(known[0], other, least_variance) for other in known[1:]]
-    limit = MOST_CHANCE / tests
-    return [False, *(None if chance is None else chance < limit for chance in chances)]
+        return [Verdict(None)] * len(groups)
+    limit = MOST_CHANCE / max(tests, 1)
+    others = (_verdict(known[0], other, limit, chance) for other in known[1:])
+    return [Verdict(False), *others]
+
+
+def _verdict(
+    first: Sequence[float], other: Sequence[float], limit: float, chance: Chance
+) -> Verdict:
+    found = chance(first, other)
+    if found is None or found < limit:
+        return Verdict(None if found is None else True)
+    wanted = _runs_wanted(first, other, limit, chance)
+    return Verdict(None if wanted else False, wanted)
+
+
+def _runs_wanted(
+    first: Sequence[float], other: Sequence[float], limit: float, chance: Chance
+) -> int | None:
+    """The fewest runs of each that would show a difference, if they went on like these."""
+
+    def shows(runs: int) -> bool:
+        found = chance(_so_many(first, runs), _so_many(other, runs))
+        return found is not None and found < limit
+
+    if not shows(MOST_REPEATED):
+        return None
+    fewest = min(len(first), len(other)) + 1
+    return next((runs for runs in range(fewest, MOST_REPEATED) if shows(runs)), MOST_REPEATED)
+
+
+def _so_many(figures: Sequence[float], runs: int) -> list[float]:
+    """Figures of at least so many runs, of which the further ones are as the first were."""
+    return [figures[index % len(figures)] for index in range(max(runs, len(figures)))]
 
 
 def _student_tail(t: float, freedom: int) -> float:

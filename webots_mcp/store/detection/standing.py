@@ -16,7 +16,7 @@ from webots_mcp.store.analysis.track import Track, tracks_of
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.evidence import Evidence, Flags, turned_rad, usual, weigh
 from webots_mcp.store.detection.habits import MovedIn
-from webots_mcp.store.detection.kind import NotSearchableError
+from webots_mcp.store.detection.kind import NO_POSITION, NotSearchableError
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.registry import Signal
 
@@ -65,9 +65,7 @@ def find_standings(search: Search) -> Standings:
     """Find them once for all kinds that tell of them."""
     position = search.motion.position
     if position is None:
-        raise NotSearchableError(
-            "no position is known: publish pose: [x, y], position: {x, y} or gps in metres"
-        )
+        raise NotSearchableError(NO_POSITION)
     columns = search.view.places(search.motion.evidence, search.options.stuck_s)
     tracks = _tracks(search, position, columns)
     found = _standings(search, tracks, columns)

@@ -1,4 +1,4 @@
-"""`compare_runs`: is this run better than the last one, and in what?"""
+"""`compare_runs`: what a run came to, and whether it is better than the last one, and in what."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.differences import Difference, difference_of, only_in, size_of
-from webots_mcp.store.questions.outcomes import Measure, RunPart, measures_of, sampling_notes
+from webots_mcp.store.questions.outcomes import Measure, RunPart, outcomes_of, sampling_notes
 from webots_mcp.store.questions.runs import RunInfo, run_infos
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import whole_run
@@ -30,7 +30,7 @@ from webots_mcp.store.signals.registry import Signal
 
 COMPARE_DEADLINE_S: Final = 5.0
 MOST_COMPARED: Final = 10
-
+_AS_LONG: Final = 1.01  # times the compared stretch: the ends of like runs differ by a few rows
 
 _CODE_OF_RUNS: Final = (
     "SELECT r.id, s.controller_sha256 FROM run r JOIN session s ON s.id = r.session_id "
@@ -44,13 +44,13 @@ class Group:
     """Runs that are looked at as one: a single run, or all with the same code.
 
     Attributes:
-        duration_s: Simulated seconds of all its runs, as long as they are.
+        total_duration_s: Simulated seconds of all its runs together, as long as they are.
         parameters: Those in which the compared runs differ, with the values that its runs had.
     """
 
     name: str
     runs: tuple[RunInfo, ...]
-    duration_s: float
+    total_duration_s: float
     parameters: dict[str, tuple[Value | str, ...]]
 
 
@@ -62,6 +62,8 @@ class Comparison:
         compared_s: All figures are about the first so many simulated seconds of each run, as many
             as the shortest has.
         measures: What the runs came to as a whole.
+        not_known: Figures that are not known, or not wholly: of which runs, why, and what would
+            make them known.
         differences: What differs most comes first; at most `limit` of `total`.
         only_in: Signals that not every group has, with the groups that have them.
         notes: What is not complete.
@@ -70,6 +72,7 @@ class Comparison:
     groups: tuple[Group, ...]
     compared_s: float
     measures: tuple[Measure, ...]
+    not_known: dict[str, str]
     differences: tuple[Difference, ...]
     total: int
     only_in: dict[str, tuple[str, ...]]
@@ -86,25 +89,25 @@ def compare_runs(
     options: EventOptions | None = None,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Comparison:
-    """Compare two or more runs, aligned at their start; the first one is the reference.
+    """Compare runs, aligned at their start; the first one is the reference.
+
+    Of a single run it tells what that came to.
 
     Args:
         connection: Any.
-        run_ids: 2 to 10 different runs.
+        run_ids: 1 to 10 different runs.
         names: Signals, with `*`.
         limit: At most so many differences.
         options: What counts as an event, and what the position and the mode are.
         deadline_s: After it, the answer is made from what was read, and the notes say so.
 
     Raises:
-        InvalidInputError: Fewer than 2 or more than 10 runs, or one twice.
+        InvalidInputError: No run, more than 10, or one twice.
         UnknownRunError, UnknownSignalError: As they say.
         NothingRecordedError: A run has no state row.
     """
-    if not 2 <= len(run_ids) <= MOST_COMPARED or len(set(run_ids)) < len(run_ids):
-        raise InvalidInputError(
-            f"give 2 to {MOST_COMPARED} different runs to compare, not {list(run_ids)}"
-        )
+    if not 1 <= len(run_ids) <= MOST_COMPARED or len(set(run_ids)) < len(run_ids):
+        raise InvalidInputError(f"give 1 to {MOST_COMPARED} different runs, not {list(run_ids)}")
     groups = {f"run {run_id}": [run_id] for run_id in run_ids}
     return _compare(connection, groups, names, limit, options or EventOptions(), deadline_s)
 
@@ -159,10 +162,12 @@ def _compare(
         for name, run_ids in groups.items()
     }
     every = [part for found in parts.values() for part in found]
-    compared_s = min(part.segment.end_s - part.segment.start_s for part in every)
+    durations_s = {part.segment.run_id: part.segment.end_s - part.segment.start_s for part in every}
+    compared_s = min(durations_s.values())
     parts = {name: [each.cut(compared_s) for each in found] for name, found in parts.items()}
     known = {name: signal for part in reversed(every) for name, signal in part.known.items()}
-    numbers = [signal for signal in resolve_signals(known, names) if signal.is_number]
+    is_alone = len(every) == 1
+    numbers = [each for each in resolve_signals(known, names) if each.is_number and not is_alone]
     deadline = Deadline(deadline_s)
     summaries = [
         [_summarise(connection, part, numbers, deadline) for part in found]
@@ -171,15 +176,16 @@ def _compare(
     differences = [difference_of(signal, summaries, 2 * len(numbers)) for signal in numbers]
     shared = sorted((each for each in differences if all(each.count)), key=size_of, reverse=True)
     told = _groups(connection, groups)
-    measures = measures_of(connection, list(parts.values()), options, deadline)
+    outcomes = outcomes_of(connection, list(parts.values()), options, deadline)
     cut = [part for found in parts.values() for part in found]
-    notes = _notes(told) + sampling_notes(connection, cut)
+    notes = _notes(told) + _cut_notes(durations_s, compared_s) + sampling_notes(connection, cut)
     if deadline.passed:
         notes.append(f"the time of {deadline_s:g} s was over: not all rows were looked at")
     return Comparison(
         groups=told,
         compared_s=compared_s,
-        measures=tuple(measures),
+        measures=outcomes.measures,
+        not_known=outcomes.not_known,
         differences=tuple(shared[:limit]),
         total=len(shared),
         only_in=only_in(differences, list(groups)),
@@ -190,9 +196,10 @@ def _compare(
 def _notes(groups: Sequence[Group]) -> list[str]:
     runs = [run for group in groups for run in group.runs]
     notes: list[str] = []
-    if len(runs) == len(groups):
+    if 1 < len(runs) == len(groups):
         notes.append(
             "one run each: whether they differ by more than like runs do is not known; repeat them"
+            + _of_like_code(runs)
         )
     robots = list(dict.fromkeys(run.robot for run in runs))
     if len(robots) > 1:
@@ -204,6 +211,33 @@ def _notes(groups: Sequence[Group]) -> list[str]:
             "not known (null)"
         )
     return notes
+
+
+def _of_like_code(runs: Sequence[RunInfo]) -> str:
+    """Which of the runs are repeats of each other, and how they are compared as such."""
+    by_code: dict[str | None, list[str]] = {}
+    for run in runs:
+        by_code.setdefault(run.controller_sha256, []).append(str(run.run_id))
+    alike = [" and ".join(ids) for code, ids in by_code.items() if code and len(ids) > 1]
+    if len(by_code) < 2 or not alike:
+        return ""
+    which = "; ".join(alike)
+    return (
+        f". Runs {which} had the same controller file: without run_ids, the runs before and after "
+        "the last edit are compared as two groups"
+    )
+
+
+def _cut_notes(durations_s: dict[int, float], compared_s: float) -> list[str]:
+    """That longer runs are compared in a part only."""
+    longer = [run_id for run_id, each_s in durations_s.items() if each_s > _AS_LONG * compared_s]
+    if not longer:
+        return []
+    which = ", ".join(f"{run_id} ({durations_s[run_id]:.4g} s)" for run_id in longer)
+    return [
+        f"what came after the first {compared_s:.4g} s of run {which} is in none of these figures: "
+        "webots_find_events(run_id) tells it"
+    ]
 
 
 def _part(connection: sqlite3.Connection, run_id: int, options: EventOptions) -> RunPart:

@@ -73,7 +73,7 @@ def difference_of(
         count=[sum(each.present for each in group) for group in runs],
         deviation_ratio=[_ratio(each, deviation[0]) for each in deviation],
         effect=[_effect(turn, mean, deviation, index) for index in range(len(groups))],
-        different=[_either(*pair) for pair in verdicts],
+        different=[_either(a.different, b.different) for a, b in verdicts],
     )
 
 

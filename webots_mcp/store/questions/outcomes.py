@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import sqlite3
-import statistics
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 from webots_mcp.store.analysis.motion import Motion, path_length, position_noise
-from webots_mcp.store.analysis.spread import Spread, spread_of, verdicts_on
-from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.analysis.spread import (
+    Spread,
+    Verdict,
+    chance_of_counts,
+    spread_of,
+    verdicts_on,
+)
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.kind import NO_POSITION
 from webots_mcp.store.detection.registry import asked_kinds
-from webots_mcp.store.questions.events import collect
+from webots_mcp.store.questions.events import Collected, collect
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.reading.changes import change_points, longest_values
 from webots_mcp.store.reading.deadline import Deadline
@@ -25,6 +31,11 @@ from webots_mcp.store.signals.registry import Signal
 NOISE_ROWS: Final = 2000  # of a long run, that tell the noise of its position
 SAMPLE_S: Final = 0.5  # between the positions from which a long run's distance is summed
 _SHARE: Final = "share of "
+_RATE: Final = " per min"
+NO_MODE: Final = (
+    "no mode is known: publish one as a text, such as mode; webots_get_trends tells the time in "
+    "each value of any text"
+)
 
 
 @dataclass(frozen=True)
@@ -51,20 +62,37 @@ class Measure:
         name: distance_m, mean_speed_m_s, `share of MODE` (of the time), `KIND per min` (events).
         spread: Over the runs of the group; None where it is not known of all of them.
         different: Whether the group differs from the first by more than like runs do; None where
-            that cannot be told, because both groups are one run each or a figure is missing.
+            that cannot be told, because both groups are one run each, a figure is missing, or
+            more runs are wanted.
+        runs_wanted: So many runs of each group would show a difference, if they went on like
+            these; None where nothing shows that they would.
     """
 
     name: str
     spread: list[Spread | None]
     different: list[bool | None]
+    runs_wanted: list[int | None]
 
 
-def measures_of(
+@dataclass(frozen=True)
+class Outcomes:
+    """What the runs came to.
+
+    Attributes:
+        not_known: Figures that are not known, or not wholly: of which runs, why, and what would
+            make them known.
+    """
+
+    measures: tuple[Measure, ...]
+    not_known: dict[str, str]
+
+
+def outcomes_of(
     connection: sqlite3.Connection,
     groups: Sequence[Sequence[RunPart]],
     options: EventOptions,
     deadline: Deadline,
-) -> list[Measure]:
+) -> Outcomes:
     """What the runs came to: the way, the modes and the events of the compared stretch."""
     found = [[_outcome(connection, part, options, deadline) for part in group] for group in groups]
     runs = [run for group in found for run in group]
@@ -72,72 +100,107 @@ def measures_of(
     kinds: list[str] = list(dict.fromkeys(kind for run in runs for kind in run.events))
     tests = len(names) + len(kinds)
     measures = [
-        _measure(name, [[run.figure(name) for run in group] for group in found], tests)
+        _measure(name, figures, verdicts_on(figures, tests))
         for name in names
+        for figures in [[[run.figure(name) for run in group] for group in found]]
     ]
-    return measures + [
-        _measure(
-            f"{kind} per min",
-            [[run.per_min(kind) for run in group] for group in found],
-            tests,
-            _chance_variance([run.per_min(kind) for run in runs], runs[0].duration_s),
-        )
-        for kind in kinds
-    ]
+    measures += [_counted(kind, found, tests) for kind in kinds]
+    return Outcomes(tuple(measures), _not_known(runs))
 
 
 def _measure(
-    name: str,
-    groups: Sequence[Sequence[float | None]],
-    tests: int,
-    least_variance: float = 0.0,
+    name: str, groups: Sequence[Sequence[float | None]], verdicts: Sequence[Verdict]
 ) -> Measure:
-    spread = [spread_of(each) for each in groups]
-    return Measure(name, spread, verdicts_on(groups, tests, least_variance))
+    different, wanted = zip(*verdicts, strict=True)
+    return Measure(name, [spread_of(each) for each in groups], list(different), list(wanted))
 
 
-def _chance_variance(rates: Sequence[float | None], duration_s: float) -> float:
-    """Of events per minute that come by chance: the variance of a Poisson count is its mean."""
-    known = [rate for rate in rates if rate is not None]
-    return statistics.fmean(known) * 60 / duration_s if known and duration_s > 0 else 0.0
+def _counted(kind: str, groups: Sequence[Sequence[_Outcome]], tests: int) -> Measure:
+    """Events per minute; whether they differ is asked of their counts."""
+    counts = [[run.events_of(kind) for run in group] for group in groups]
+    per_min = [
+        [
+            None if (count := run.events_of(kind)) is None else 60 * count / run.duration_s
+            for run in each
+        ]
+        for each in groups
+    ]
+    return _measure(f"{kind}{_RATE}", per_min, verdicts_on(counts, tests, chance_of_counts))
+
+
+def _not_known(runs: Sequence[_Outcome]) -> dict[str, str]:
+    """Why figures are not known; those that share a reason under one key."""
+    runs_by_reason: dict[tuple[str, str], list[str]] = {}
+    for run in runs:
+        for name, why in run.not_known.items():
+            runs_by_reason.setdefault((name, why), []).append(str(run.run_id))
+    sharing: dict[str, list[str]] = {}
+    for (name, why), run_ids in runs_by_reason.items():
+        where = "" if len(run_ids) == len(runs) else f"run {', '.join(run_ids)}: "
+        sharing.setdefault(where + why, []).append(name)
+    return {", ".join(names): why for why, names in sharing.items()}
 
 
 class _Outcome(NamedTuple):
     """What one run came to in the compared stretch.
 
     Attributes:
-        events: How many of each kind; `complete` if all rows are there and were looked at.
+        has_mode: Its mode is known: one in which it never was took no time.
+        events: How many of each kind.
+        not_known: What is not known of it, or not wholly, with why.
+        unlooked: Kinds that were not looked for at all.
+        complete: All rows are there and were looked at.
     """
 
+    run_id: int
     duration_s: float
     figures: dict[str, float | None]
+    has_mode: bool
     events: Counter[str]
+    not_known: dict[str, str]
+    unlooked: frozenset[str]
     complete: bool
 
     def figure(self, name: str) -> float | None:
-        """A mode in which it never was took no time."""
-        return self.figures.get(name, 0.0 if name.startswith(_SHARE) else None)
+        """The way, or the share of the time that a mode took."""
+        none = 0.0 if name.startswith(_SHARE) and self.has_mode else None
+        return self.figures.get(name, none)
 
-    def per_min(self, kind: str) -> float | None:
-        """Events of a kind per minute, where they are known."""
-        return 60 * self.events[kind] / self.duration_s if self.complete else None
+    def events_of(self, kind: str) -> int | None:
+        """How many events of a kind, where that is known."""
+        return self.events[kind] if self.complete and kind not in self.unlooked else None
 
 
 def _outcome(
     connection: sqlite3.Connection, part: RunPart, options: EventOptions, deadline: Deadline
 ) -> _Outcome:
-    duration_s = part.segment.end_s - part.segment.start_s
-    purged = run_info(connection, part.segment.run_id).purged_rows > 0
+    run_id, duration_s = part.segment.run_id, part.segment.end_s - part.segment.start_s
+    purged = run_info(connection, run_id).purged_rows > 0
     figures: dict[str, float | None] = {}
-    if part.motion.position is not None:
+    not_known: dict[str, str] = {}
+    if part.motion.position is None:
+        not_known["distance_m, mean_speed_m_s"] = NO_POSITION
+    else:
         distance_m = None if purged else _distance(connection, part, deadline)
         speed = None if distance_m is None else distance_m / duration_s
         figures |= {"distance_m": distance_m, "mean_speed_m_s": speed}
-    for mode, seconds in _mode_times(connection, part, deadline).items():
-        figures[f"{_SHARE}{mode}"] = seconds / duration_s
+    modes = _mode_times(connection, part, deadline)
+    figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
+    if not modes:
+        not_known["share of each mode"] = NO_MODE
     found = _events(connection, part, options, deadline)
-    events: Counter[str] = Counter(event.kind for event in found)
-    return _Outcome(duration_s, figures, events, not purged and not deadline.passed)
+    verdicts = found.ledger.verdicts(found.kinds, found.events)
+    not_known |= {f"{kind}{_RATE}": why for kind, why in verdicts.not_searched.items()}
+    return _Outcome(
+        run_id,
+        duration_s,
+        figures,
+        bool(modes),
+        Counter(event.kind for event in found.events),
+        not_known,
+        frozenset(kind for kind in verdicts.not_searched if verdicts.unlooked(kind)),
+        not purged and not deadline.passed,
+    )
 
 
 def _distance(connection: sqlite3.Connection, part: RunPart, deadline: Deadline) -> float | None:
@@ -181,7 +244,7 @@ def _mode_times(
 
 def _events(
     connection: sqlite3.Connection, part: RunPart, options: EventOptions, deadline: Deadline
-) -> list[Event]:
+) -> Collected:
     kinds = tuple(kind.name for kind in asked_kinds(options) if kind.counted)
     whole = TimeRange(part.robot_id, "", (part.segment,), "simulation")
-    return collect(connection, whole, replace(options, kinds=kinds), deadline.left_s).events
+    return collect(connection, whole, replace(options, kinds=kinds), deadline.left_s)

@@ -1,0 +1,128 @@
+"""What a run came to, and what of it is not known: that is never 0, and no equal."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import Recorder
+from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
+from webots_mcp.store.questions.outcomes import Measure
+
+State = Callable[[float], dict[str, Any]]
+DURATION_S = 40
+
+
+def record(connection: sqlite3.Connection, code: str, state: State, end_s: float = DURATION_S):
+    recorder = Recorder(connection)
+    known = connection.execute("SELECT id FROM robot WHERE name = 'r'").fetchone()
+    robot_id = known[0] if known else recorder.robot("r")
+    connection.execute("BEGIN")
+    recorder.run(recorder.session(robot_id, code * 64), robot_id)
+    for step in range(round(end_s * 10)):
+        recorder.publish(step * 0.1, state(step * 0.1))
+    recorder.end_run("finished")
+    connection.execute("COMMIT")
+
+
+def driving(time_s: float) -> dict[str, Any]:
+    return {"pose": [0.3 * time_s, 0.0], "cmd_speed": 0.3, "mode": "drive"}
+
+
+def stuck_twice(time_s: float) -> dict[str, Any]:
+    stood_s = sum(min(max(time_s - start_s, 0.0), 6.0) for start_s in (10.0, 28.0))
+    return driving(time_s) | {"pose": [0.3 * (time_s - stood_s), 0.0]}
+
+
+def without_position(time_s: float) -> dict[str, Any]:
+    return {"cmd_speed": 0.3, "mode": "drive", "battery": 12 - 0.01 * time_s}
+
+
+def without_mode(time_s: float) -> dict[str, Any]:
+    return {"pose": [0.3 * time_s, 0.0], "modus": "fahren"}
+
+
+def measure(comparison: Comparison, name: str) -> Measure:
+    return next(each for each in comparison.measures if each.name == name)
+
+
+def medians(found: Measure) -> list[float | None]:
+    return [each and each.median for each in found.spread]
+
+
+def test_what_was_not_looked_for_in_a_run_is_not_known_of_it(empty: sqlite3.Connection) -> None:
+    record(empty, "a", stuck_twice)
+    record(empty, "b", without_position)
+    found = compare_runs(empty, [1, 2])
+    stuck = measure(found, "stuck per min")
+    assert medians(stuck) == [pytest.approx(3.0, abs=0.02), None]
+    (why,) = (why for names, why in found.not_known.items() if "stuck per min" in names)
+    assert why.startswith("run 2: no position is known")
+
+
+def test_what_no_run_has_is_told_as_not_known(empty: sqlite3.Connection) -> None:
+    record(empty, "a", without_position)
+    record(empty, "b", without_position)
+    found = compare_runs(empty, [1, 2])
+    assert "distance_m" not in {each.name for each in found.measures}
+    (names,) = (names for names, why in found.not_known.items() if "no position is known" in why)
+    assert names.split(", ") == ["distance_m", "mean_speed_m_s", "still per min", "stuck per min"]
+
+
+def test_a_run_without_a_mode_was_in_no_mode_for_no_known_time(empty: sqlite3.Connection) -> None:
+    record(empty, "a", driving)
+    record(empty, "a", without_mode)
+    record(empty, "a", lambda time_s: driving(time_s) | {"mode": "turn"})
+    found = compare_runs(empty, [1, 2, 3])
+    assert medians(measure(found, "share of drive")) == [1.0, None, 0.0]
+    assert found.not_known["share of each mode"].startswith("run 2: no mode is known")
+
+
+@pytest.mark.parametrize("runs", [2, 5])
+def test_a_rare_event_that_is_gone_asks_for_more_runs(empty: sqlite3.Connection, runs: int) -> None:
+    for code, state in (("a", stuck_twice), ("b", driving)):
+        for _ in range(runs):
+            record(empty, code, state)
+    stuck = measure(compare_code(empty), "stuck per min")
+    assert medians(stuck) == [pytest.approx(3.0, abs=0.02), 0.0]
+    assert (stuck.different, stuck.runs_wanted) == ([False, None], [None, 6])
+
+
+def test_a_rare_event_that_is_gone_from_many_runs_is_a_difference(
+    empty: sqlite3.Connection,
+) -> None:
+    for code, state in (("a", stuck_twice), ("b", driving)):
+        for _ in range(7):
+            record(empty, code, state)
+    stuck = measure(compare_code(empty), "stuck per min")
+    assert (stuck.different, stuck.runs_wanted) == ([False, True], [None, None])
+
+
+def test_of_one_run_it_is_told_how_fast_and_in_which_modes_it_went(
+    empty: sqlite3.Connection,
+) -> None:
+    record(empty, "a", lambda time_s: driving(time_s) | {"mode": "drive" if time_s < 30 else "x"})
+    found = compare_runs(empty, [1])
+    assert medians(measure(found, "mean_speed_m_s")) == [pytest.approx(0.3, abs=0.001)]
+    assert medians(measure(found, "distance_m")) == [pytest.approx(0.3 * DURATION_S, abs=0.05)]
+    assert medians(measure(found, "share of drive")) == [pytest.approx(0.75, abs=0.01)]
+    assert (found.differences, found.notes) == ((), ())
+
+
+def test_what_is_behind_the_compared_stretch_is_said_to_be_left_out(
+    empty: sqlite3.Connection,
+) -> None:
+    record(empty, "a", driving)
+    record(empty, "b", driving, end_s=20.0)
+    (note,) = (note for note in compare_runs(empty, [1, 2]).notes if "came after" in note)
+    assert "the first 19.9 s of run 1 (39.9 s)" in note
+
+
+def test_repeats_among_single_runs_are_named(empty: sqlite3.Connection) -> None:
+    for code in "aab":
+        record(empty, code, driving)
+    (note,) = (note for note in compare_runs(empty, [1, 2, 3]).notes if "one run each" in note)
+    assert "Runs 1 and 2 had the same controller file: without run_ids" in note

@@ -132,6 +132,12 @@ def _place_first(branch: str) -> tuple[bool, str]:
     return branch.rpartition(".")[2] not in _BRANCHES, branch
 
 
+def listed(names: Collection[str], most: int = 10) -> str:
+    """The first of several names, and how many more there are."""
+    more = len(names) - most
+    return ", ".join(list(names)[:most]) + (f" and {more} more" if more > 0 else "")
+
+
 def nearest_first(name: str, known: Iterable[str]) -> list[str]:
     """The known names, those most like the given one first; equally like ones keep their order.
 

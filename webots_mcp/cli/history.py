@@ -186,7 +186,8 @@ def events(arguments: argparse.Namespace) -> None:
 
 def _verdicts(verdicts: Verdicts) -> list[str]:
     """What became of the kinds that are not in the table, or not all."""
-    absent = [f"{kind} ({near})" if near else kind for kind, near in verdicts.absent.items()]
+    near = [f"{kind} ({what})" for kind, what in verdicts.came_near.items()]
+    absent = [*verdicts.far, *near]
     unsearched = [f"not looked for: {kinds}: {why}" for kinds, why in verdicts.gaps.items()]
     return [f"looked for and absent: {', '.join(absent)}"] * bool(absent) + unsearched
 

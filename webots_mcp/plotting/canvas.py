@@ -9,7 +9,7 @@ import io
 import textwrap
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
@@ -34,7 +34,6 @@ _PANEL_PX: Final = 110
 _TITLE_AND_LEGEND_PX: Final = 150
 _BUCKET_PX: Final = 3  # in fewer pixels the band of extremes would hide behind the line
 _LONGEST_NAME: Final = 24
-_SHOWN_NAMES: Final = 10
 _LETTER_PX: Final = 8  # of a bold title
 
 # A user's matplotlibrc must not change the pictures; what is recorded is text, never TeX.
@@ -177,10 +176,3 @@ def short(name: str) -> str:
     line = " ".join(name.split())
     line = line if len(line) <= _LONGEST_NAME else f"…{line[1 - _LONGEST_NAME :]}"
     return f" {line}" if line.startswith("_") else line  # matplotlib hides labels in "_"
-
-
-def listed(names: Sequence[str]) -> str:
-    """The first names of several, and how many more there are."""
-    unlike = list(dict.fromkeys(names))
-    more = len(unlike) - _SHOWN_NAMES
-    return ", ".join(unlike[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from webots_mcp.plotting.canvas import listed
+from webots_mcp.naming import listed
 from webots_mcp.plotting.palette import MOST_VALUES, OTHER_VALUES
 from webots_mcp.store.analysis.rhythm import Gap
 from webots_mcp.store.questions.series import ChangeColumns, RunHistory
@@ -67,7 +67,7 @@ def merged_notes(lanes: Sequence[Lane]) -> list[str]:
     """Which values of which signal cannot be told apart in the picture."""
     return [
         f"{lane.name} has {len(lane.merged)} more values than colours, drawn as {OTHER_VALUES}: "
-        f"{listed(lane.merged)}"
+        f"{listed(dict.fromkeys(lane.merged))}"
         for lane in lanes
         if lane.merged
     ]

@@ -9,7 +9,8 @@ from functools import partial
 from typing import Final
 
 from webots_mcp.errors import NothingRecordedError
-from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Sheet, draw, listed, media_type
+from webots_mcp.naming import listed
+from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Sheet, draw, media_type
 from webots_mcp.plotting.curves import Curve, curve_of
 from webots_mcp.plotting.event_lanes import event_lanes
 from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
@@ -185,7 +186,7 @@ def _counted(odd: dict[str, int]) -> str:
 def _left_out(names: Sequence[str], sheet: Sheet) -> str:
     lanes = min(MOST_LANES, sheet.most_rows)
     why = f"most that a picture of this size holds: panels {sheet.most_panels}, rows {lanes}"
-    return f"left out: {listed(names)} ({why}); ask for them alone"
+    return f"left out: {listed(dict.fromkeys(names))} ({why}); ask for them alone"
 
 
 def _nothing(parts: Sequence[Part]) -> str:

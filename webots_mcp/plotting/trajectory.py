@@ -8,7 +8,8 @@ from functools import partial
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.plotting.canvas import Picture, Sheet, draw, listed, media_type
+from webots_mcp.naming import listed
+from webots_mcp.plotting.canvas import Picture, Sheet, draw, media_type
 from webots_mcp.plotting.event_lanes import stuck_mark
 from webots_mcp.plotting.intervals import Lane, lane_of, merged_notes
 from webots_mcp.plotting.parts import (

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeVar
 
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
+from webots_mcp.naming import listed
 from webots_mcp.server.results import Answer, Table
 from webots_mcp.server.shortening import (
     DETAIL_BUDGET,
@@ -124,6 +125,4 @@ def notes_of(notes: Sequence[str]) -> list[str] | None:
 
 def some(names: Sequence[str], most: int = 10) -> str:
     """The first names, and how many more there are."""
-    more = len(names) - most
-    shown_names = ", ".join(cut_text(name, LONGEST_NAME) for name in names[:most])
-    return shown_names + (f" and {more} more" if more > 0 else "")
+    return listed([cut_text(name, LONGEST_NAME) for name in names], most)

@@ -133,8 +133,9 @@ class KindVerdicts(BaseModel):
     found: dict[str, int] | None = Field(
         default=None, description="How many there are in the range, shown or not."
     )
-    absent: dict[str, str] | None = Field(
-        default=None, description="Looked for, and there is none; what came nearest, if known."
+    absent: str | None = Field(default=None, description="Looked for, and there is none.")
+    came_near: dict[str, str] | None = Field(
+        default=None, description="Absent as well; what came nearest."
     )
     not_searched: dict[str, str] | None = Field(
         default=None,

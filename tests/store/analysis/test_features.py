@@ -121,6 +121,13 @@ def test_flat_since_is_the_begin_of_the_rest() -> None:
     assert flat_since(hundred, np.full(100, 2.0)) == 0.0
 
 
+def test_a_small_step_between_two_rests_ends_the_first() -> None:
+    course = np.minimum(hundred, 60.0) + 0.1 * (hundred >= 80)
+    assert flat_since(hundred, course) == 80.0
+    flickering = np.minimum(hundred, 60.0) + 0.1 * (hundred % 7 == 0)
+    assert flat_since(hundred, flickering) == 60.0
+
+
 @given(few)
 def test_what_rises_or_falls_never_goes_back(course: Array) -> None:
     steps = [after - before for before, after in pairwise(course.tolist())]

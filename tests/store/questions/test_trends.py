@@ -234,3 +234,18 @@ def test_what_grows_ever_faster_has_no_slope(empty: sqlite3.Connection) -> None:
 def test_the_ends_of_what_rises_are_told_apart(empty: sqlite3.Connection) -> None:
     record(empty, rows=601, interval_s=0.1, stamp=lambda time_s: 1.7e9 + time_s)
     assert one(empty, "stamp").says == "rises from 1700000000 to 1700000060 (1/s)"
+
+
+@pytest.mark.parametrize("step", [0.15, 5.0])
+def test_what_stepped_from_one_rest_to_another_is_flat_since_the_step(
+    empty: sqlite3.Connection, tier: str, step: float
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for row in range(1200):
+        time_s = row / 10
+        recorder.publish(time_s, {"x": min(time_s, 40.0) + step * (time_s >= 70.3)})
+    roll(empty, 100_000)
+    (x,) = trends(empty, resolve_range(empty)).runs[0].numbers
+    assert x.flat_since_s == 70.3

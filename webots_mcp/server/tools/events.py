@@ -139,7 +139,8 @@ def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
     """What became of each kind, as it is shown."""
     return KindVerdicts(
         found=verdicts.found or None,
-        absent=verdicts.absent or None,
+        absent=", ".join(verdicts.far) or None,
+        came_near=verdicts.came_near or None,
         not_searched=verdicts.gaps or None,
     )
 

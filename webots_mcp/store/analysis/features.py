@@ -15,6 +15,8 @@ TIME_BINS: Final = 8
 SPIKE_SCORE: Final = 8.0  # 3.5 is the usual; here thousands of values are looked at at once
 MOST_SPIKES_SHARE: Final = 0.05  # of the values: more of them are how the signal is
 FLAT_BAND: Final = 0.005  # of the range: what moves less is at rest
+LEAST_RESTING: Final = 3  # rows
+STEP_SHARE: Final = 0.5  # of all that it moves, between two rests
 
 
 @dataclass(frozen=True)
@@ -76,12 +78,26 @@ def _stands_alone(values: Array, row: int, limit: float) -> bool:
 def flat_since(times: Array, values: Array) -> float | None:
     """Since when the value has stayed within 0.5 % of its range; None if not for 10 % of the time.
 
-    A signal that never changed is flat since its first value.
+    A step within that band from one rest to another is no rest: it is flat since the step. A
+    signal that never changed is flat since its first value.
     """
     span = float(np.ptp(values))
     away = np.flatnonzero(np.abs(values - values[-1]) > FLAT_BAND * span)
-    since_s = float(times[away[-1] + 1 if len(away) else 0])
+    row = int(away[-1]) + 1 if len(away) else 0
+    since_s = float(times[row + _last_step(values[row:])])
     return since_s if span == 0 or times[-1] - since_s >= 0.1 * (times[-1] - times[0]) else None
+
+
+def _last_step(rest: Array) -> int:
+    """The row in which it goes over to another rest, which has no value of the one before; or 0."""
+    if len(rest) < 2 * LEAST_RESTING or np.ptp(rest) == 0:
+        return 0
+    row = int(np.abs(np.diff(rest)).argmax()) + 1
+    before, after = rest[:row], rest[row:]
+    apart = max(after.min() - before.max(), before.min() - after.max())
+    if min(len(before), len(after)) < LEAST_RESTING or apart < STEP_SHARE * np.ptp(rest):
+        return 0
+    return row + _last_step(after)
 
 
 def time_effect(times: Array, values: Array, mean: float, squares: float) -> float:

@@ -96,6 +96,9 @@ class Detection:
         except NotSearchableError as error:
             search.not_searched(kind.name, str(error))
             return []
+        if not found and search.length_s < kind.least_s(self.options) and kind.lasts:
+            search.not_searched(kind.name, _too_short(kind, search))
+            return []
         search.ledger.searched.add(kind.name)
         if not kind.stored:
             search.not_searched(kind.name, *search.view.taken_notes())
@@ -113,6 +116,11 @@ class Detection:
         began_before = looked_at.start_s > search.began_s and not has_begin
         goes_on = looked_at.end_s <= search.ended_s and not has_end
         return began_before or goes_on
+
+
+def _too_short(kind: EventKind, search: Search) -> str:
+    run = f"run {search.segment.run_id} is only {search.length_s:.3g} s long"
+    return f"{run}; this kind lasts at least {kind.least_s(search.options):g} s"
 
 
 def _around(search: Search, segment: Segment, reach_s: float) -> Segment:

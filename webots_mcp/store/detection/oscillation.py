@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from typing import Final
 
+from webots_mcp.naming import listed
 from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.analysis.swings import Swing, find_swings, joined_swings
 from webots_mcp.store.detection.event import Event, EventOptions
@@ -14,6 +15,7 @@ from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.rows import Numbers
 from webots_mcp.store.signals.registry import Signal
 
+_MOST_NAMED: Final = 5
 # What a robot swings with; sensors swing by nature while it drives.
 _SWINGING: Final = re.compile(
     r"(^|[._])(heading|yaw|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"
@@ -25,12 +27,11 @@ _SWINGING: Final = re.compile(
 def oscillation_events(search: Search) -> Iterator[Event]:
     """Of heading, wheels, speed, position and the like, and of what is asked for."""
     signals = _swinging(search)
-    left = len(search.required_numbers()) - len(signals)
-    if left:
+    if left := [each.name for each in search.required_numbers() if each not in signals]:
         search.not_searched(
             "oscillation",
-            f"not in {left} of {len(search.numbers)} signals, whose names are not of what a robot "
-            "swings with: name them in signals",
+            f"not in {len(left)} of {len(search.numbers)} signals, whose names are not of what a "
+            f"robot swings with: name them in signals ({listed(left, _MOST_NAMED)})",
         )
     found: dict[str, list[Swing]] = {}
     for numbers in search.view.stretches(signals, 1.0):

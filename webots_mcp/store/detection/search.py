@@ -73,6 +73,11 @@ class Search:
         """The run's newest row."""
         return self.bounds[1] if self.bounds else self.segment.end_s
 
+    @property
+    def length_s(self) -> float:
+        """From the run's first row to its newest one."""
+        return self.ended_s - self.began_s
+
     @cached_property
     def recorded(self) -> Segment | None:
         """The part of the segment that was recorded; None where nothing was."""

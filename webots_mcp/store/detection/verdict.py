@@ -16,10 +16,12 @@ class Verdicts:
 
     Attributes:
         found: How many there are.
-        absent: Kinds that were looked for and of which there is none, each with what came nearest,
-            or with an empty text.
+        absent: Kinds that were looked for, be it in a part, and of which there is none, each with
+            what came nearest, or with an empty text.
         not_searched: Kinds that were not looked for, or not everywhere, with why, and with what to
             ask to have them looked for. One that is also found or absent is so in the rest.
+
+    Shown are the properties, which name each kind that was not found once.
     """
 
     found: dict[str, int] = field(default_factory=dict[str, int])
@@ -27,12 +29,30 @@ class Verdicts:
     not_searched: dict[str, str] = field(default_factory=dict[str, str])
 
     @property
+    def far(self) -> list[str]:
+        """Kinds that are absent everywhere, and to which nothing came near."""
+        return [kind for kind in self._nowhere if not self.absent[kind]]
+
+    @property
+    def came_near(self) -> dict[str, str]:
+        """Kinds that are absent everywhere, with what came nearest."""
+        return {kind: self.absent[kind] for kind in self._nowhere if self.absent[kind]}
+
+    @property
     def gaps(self) -> dict[str, str]:
         """What was not searched, with the kinds that share a reason under one key."""
         sharing: dict[str, list[str]] = {}
         for kind, why in self.not_searched.items():
-            sharing.setdefault(why, []).append(kind)
+            sharing.setdefault(why + self._in_the_rest(kind), []).append(kind)
         return {", ".join(kinds): why for why, kinds in sharing.items()}
+
+    @property
+    def _nowhere(self) -> list[str]:
+        return [kind for kind in self.absent if kind not in self.not_searched]
+
+    def _in_the_rest(self, kind: str) -> str:
+        near = self.absent.get(kind)
+        return "" if near is None else f"; none in the rest{near and f' ({near})'}"
 
     def unlooked(self, kind: str) -> str | None:
         """Why a kind was not looked for anywhere; None if it was, at least in a part."""

@@ -91,6 +91,7 @@ def judge(
     spikes: list[Spike] | None,
     inner_variance: float = 0.0,
     resolution_s: float | None = None,
+    known: tuple[Array, Array] | None = None,
 ) -> Trend:
     """Put together what the summary tells and what the course of the numbers tells.
 
@@ -103,6 +104,7 @@ def judge(
         inner_variance: That of the values within the buckets. Where more of it lies there than
             between them, a course of their means is not that of the values (it may be an alias).
         resolution_s: The length of the buckets; None where the numbers are the values.
+        known: Times and values that are known beside the means of buckets: their ends and extremes.
     """
     of_rows = spikes is not None
     turn = signal.turn if of_rows else summary.turn_of(signal.turn)
@@ -114,7 +116,7 @@ def judge(
     line = None if leaps else _of_all(fit_line(times, course, inner.mean or 0.0), slow)
     swings = () if fast else _swings(times, course, resolution_s)
     monotonic = None if fast else _monotonic(course)
-    rest_s = None if fast else flat_since(times, course)
+    rest_s = None if fast else flat_since(*((times, course) if known is None or turn else known))
     mean = _mean(signal, summary, inner, numbers)
     summary = _unwrapped(summary, inner) if course is not numbers else summary
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.features import find_spikes
-from webots_mcp.store.analysis.summary import summarise_numbers
+from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.questions.trend import Trend, judge
 from webots_mcp.store.reading.changes import change_points, longest_values
@@ -177,7 +177,25 @@ def _trend_of_pieces(signal: Signal, pieces: Pieces) -> Trend | None:
             inner.append(part.deviation_in(turn) or 0.0)
     variance = statistics.fmean(deviation**2 for deviation in inner)
     course = np.array(middles), np.array(means)
-    return judge(signal, summary, *course, None, variance, pieces.piece_s)
+    known = _known_values([part for _, part in pieces.of(signal.name)])
+    return judge(signal, summary, *course, None, variance, pieces.piece_s, known)
+
+
+def _known_values(parts: Sequence[Summary]) -> tuple[Array, Array]:
+    """Times and values of the ends and extremes of each part, in order."""
+    points = {
+        (time_s, value)
+        for part in parts
+        for time_s, value in (
+            (part.first_sim_time_s, part.first),
+            (part.min_sim_time_s, part.min),
+            (part.max_sim_time_s, part.max),
+            (part.last_sim_time_s, part.last),
+        )
+        if time_s is not None and value is not None
+    }
+    times, values = np.array(sorted(points), np.float64).T
+    return times, values
 
 
 def _state_trends(

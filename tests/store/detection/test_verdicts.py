@@ -1,0 +1,41 @@
+"""What is said of kinds of events that were not found: each once, and never a plain nothing."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+
+from tests.recordings.rover import Recorder
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.verdict import Verdicts
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.reading.ranges import resolve_range
+
+
+def ask(connection: sqlite3.Connection, rows: int, *kinds: str) -> Verdicts:
+    """What is said of a robot that drives on, with a row every 0.1 s."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    for row in range(rows):
+        time_s = row / 10
+        state = {"pose": [0.2 * time_s, 0.0], "heading": 0.0, "temp_c": math.sin(time_s)}
+        recorder.publish(time_s, state)
+    return find_events(connection, resolve_range(connection), EventOptions(kinds=kinds)).verdicts
+
+
+def test_what_no_run_so_short_can_hold_was_not_searched(empty: sqlite3.Connection) -> None:
+    told = ask(empty, 21, "stuck", "still", "flat", "silent")
+    run = "run 1 is only 2 s long; this kind lasts at least"
+    assert told.gaps == {"still, stuck": f"{run} 3 s", "flat": f"{run} 20 s"}
+    assert told.far == ["silent"]
+
+
+def test_what_was_searched_in_some_signals_is_named_once_with_the_others(
+    empty: sqlite3.Connection,
+) -> None:
+    told = ask(empty, 400, "oscillation", "gap")
+    (why,) = told.gaps.values()
+    assert why.startswith("not in 1 of 4 signals")
+    assert "(temp_c)" in why and why.endswith("; none in the rest")
+    assert (told.far, told.came_near) == (["gap"], {})

@@ -122,9 +122,9 @@ def test_flat_since_is_the_begin_of_the_rest() -> None:
 
 
 def test_a_small_step_between_two_rests_ends_the_first() -> None:
-    course = np.minimum(hundred, 60.0) + 0.1 * (hundred >= 80)
+    course = np.where(hundred >= 80, 60.1, np.minimum(hundred, 60.0))
     assert flat_since(hundred, course) == 80.0
-    flickering = np.minimum(hundred, 60.0) + 0.1 * (hundred % 7 == 0)
+    flickering = np.where(hundred % 7 == 0, 60.1, np.minimum(hundred, 60.0))
     assert flat_since(hundred, flickering) == 60.0
 
 

@@ -194,8 +194,8 @@ def _known_values(parts: Sequence[Summary]) -> tuple[Array, Array]:
         )
         if time_s is not None and value is not None
     }
-    times, values = np.array(sorted(points), np.float64).T
-    return times, values
+    course: Array = np.array(sorted(points), np.float64)
+    return course[:, 0], course[:, 1]
 
 
 def _state_trends(

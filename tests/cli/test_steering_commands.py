@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import signal
 import subprocess
 import sys
@@ -75,8 +76,13 @@ def test_send_pause_step_and_resume(
         (["run", "--for", "1", "--set", "kp"], "names no value"),
         (["run", "--for", "1", "--set", "kp=1"], "declares no parameters"),
         (["run", "--until", "stepz > 1000"], "steps"),
-        (["run", "--for", "900", "--pace", "real_time", "--timeout", "0.5"], "'webots-mcp tail'"),
+        (
+            ["run", "--for", "900", "--pace", "real_time", "--timeout", "0.5"],
+            "webots-mcp wait 1",
+        ),
         (["step", "many"], "whole number"),
+        (["breakpoint", "steps <"], "column"),
+        (["breakpoint", "steps < 3", "--remove", "1"], "not both"),
     ],
 )
 def test_what_makes_no_sense_is_refused(
@@ -91,6 +97,59 @@ def test_what_makes_no_sense_is_refused(
     wait_for(lambda: recording.states() != [])
     assert main([name, "--database", str(file), *rest]) == 2
     assert told in capsys.readouterr().err
+
+
+def test_a_run_that_takes_longer_is_waited_for_with_the_line_that_it_names(
+    file: Path, driver: Driver, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording = Recording(file)
+    wait_for(lambda: recording.states() != [])
+    far = ("--for", "3", "--pace", "real_time", "--timeout", "0.3")
+    assert main(["run", "--database", str(file), *far]) == 2
+    program, *line = shlex.split(capsys.readouterr().err.strip().splitlines()[-1])
+    assert program == "webots-mcp"
+    assert main([*line, "--timeout", "0.1"]) == 2
+    assert "'webots-mcp" not in capsys.readouterr().out
+    assert main(line) == 0
+    assert "time over" in capsys.readouterr().out
+    assert main([*line[:1], "999", *line[2:]]) == 2
+    assert "no command 999" in capsys.readouterr().err
+
+
+def test_breakpoints_are_set_listed_hit_and_removed(
+    file: Path, driver: Driver, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recording, where = Recording(file), ("--database", str(file))
+    wait_for(lambda: recording.states() != [])
+    assert main(["breakpoint", *where]) == 0
+    assert capsys.readouterr().out == "no breakpoints\n"
+    assert main(["breakpoint", *where, "steps > 3", "--action", "log", "--after-hits", "1"]) == 0
+    assert capsys.readouterr().out == "breakpoint 1: steps > 3 (log), armed\n"
+    wait_for(lambda: recording.rows("SELECT hits FROM breakpoint") == [1])
+    assert main(["breakpoint", *where, "--json"]) == 0
+    (listed,) = json.loads(capsys.readouterr().out)
+    assert (listed["condition"], listed["hits"], listed["set_by"]) == ("steps > 3", 1, "cli")
+    assert main(["breakpoint", *where]) == 0
+    assert "steps > 3" in capsys.readouterr().out
+    assert main(["breakpoint", *where, "--remove", "1"]) == 0
+    assert capsys.readouterr().out == "breakpoint 1: removed\n"
+    assert main(["breakpoint", *where, "--remove", "1"]) == 2
+    assert "no breakpoint 1; it has none" in capsys.readouterr().err
+
+
+def test_a_breakpoint_of_a_robot_that_is_gone_is_stored_and_says_so(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    gone = Driver(file)
+    gone.start()
+    recording = Recording(file)
+    wait_for(lambda: recording.states() != [])
+    gone.stop()
+    assert main(["breakpoint", "--database", str(file), "stepz > 3"]) == 0
+    said = capsys.readouterr().out
+    assert "breakpoint 1: stepz > 3 (pause), not armed yet" in said
+    assert "stepz is missing as long as it is not published; there is steps" in said
+    assert "reads them when it starts" in said
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -15,7 +15,17 @@ import sys
 from collections.abc import Sequence
 from typing import Final
 
-from webots_mcp.cli import contents, data, history, looking, serving, steering, trials, tuning
+from webots_mcp.cli import (
+    breakpoints,
+    contents,
+    data,
+    history,
+    looking,
+    serving,
+    steering,
+    trials,
+    tuning,
+)
 from webots_mcp.cli.command import COMMANDS
 from webots_mcp.cli.ending import ended_by, ending_by_signals
 from webots_mcp.cli.wording import as_typed, speak_of
@@ -24,7 +34,7 @@ from webots_mcp.errors import WebotsMCPError
 __all__ = ["COMMANDS", "main"]
 
 # Each registered its commands at import.
-FAMILIES: Final = (serving, looking, history, contents, data, trials, tuning, steering)
+FAMILIES: Final = (serving, looking, history, contents, data, trials, tuning, steering, breakpoints)
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _DESCRIPTION: Final = (

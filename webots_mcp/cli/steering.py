@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import shlex
 import sys
-from typing import TYPE_CHECKING, Any, Final
+from collections.abc import Generator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, JSON, ROBOT, argument, command, settings_of
 from webots_mcp.cli.tables import print_table, text_of
@@ -19,8 +22,8 @@ if TYPE_CHECKING:
 
 _WHERE: Final = (DATA_DIR, DATABASE, ROBOT, JSON)
 _UNDER_WAY: Final = (
-    "the controller is still at it and goes on: do not send it again; 'webots-mcp tail' shows what "
-    "it does, --timeout waits longer"
+    "the controller is still at it and goes on: do not send it again, but go on waiting with\n\n"
+    "    {}\n"
 )
 TIMEOUT: Final = argument(
     "--timeout", type=float, default=600.0, metavar="S", help="wait so many wall seconds (600)"
@@ -56,7 +59,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     from webots_mcp.server.running import require_possible
 
-    recording, until, for_s = _writable(arguments), arguments.until, arguments.for_s
+    recording, until, for_s = writable(arguments), arguments.until, arguments.for_s
     require_possible(recording, arguments.robot, until, for_s, reset=arguments.reset)
     wanted: dict[str, Any] = {
         "until": until,
@@ -67,9 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
         "then": arguments.then,
     }
     params = {name: value for name, value in wanted.items() if value is not None}
-    answer: Any = anyio.run(_ask, recording, arguments, "run", params)
-    _require_done(answer)
-    _print(answer, arguments) if arguments.json else _print_run(answer)
+    _conclude(anyio.run(_ask, recording, arguments, "run", params), arguments)
 
 
 @command(
@@ -85,9 +86,8 @@ def send(arguments: argparse.Namespace) -> None:
     import anyio
 
     params = settings_of(arguments.settings)
-    answer = anyio.run(_ask, _writable(arguments), arguments, arguments.action, params)
-    _require_done(answer)
-    _print(answer, arguments)
+    answer = anyio.run(_ask, writable(arguments), arguments, arguments.action, params)
+    _conclude(answer, arguments)
 
 
 @command("pause", *_WHERE, TIMEOUT)
@@ -114,38 +114,83 @@ def step(arguments: argparse.Namespace) -> None:
     send(arguments)
 
 
+@command(
+    "wait", DATA_DIR, DATABASE, JSON, TIMEOUT,
+    argument("command_id", type=int, metavar="COMMAND", help="its number, as 'run' and 'send' say"),
+)  # fmt: skip
+def wait(arguments: argparse.Namespace) -> None:
+    """Go on waiting for a command that was still under way when --timeout was over.
+
+    Ctrl-C ends the waiting, not the command.
+    """
+    import anyio
+
+    _conclude(anyio.run(_wait, writable(arguments), arguments), arguments)
+
+
 async def _ask(
     recording: Recording, arguments: argparse.Namespace, action: str, params: dict[str, Any]
 ) -> CommandAnswer:
     from webots_mcp.server.dispatch import Dispatcher
 
-    try:
-        dispatcher = Dispatcher(recording, _show_progress)
+    with _line_of_progress():
+        dispatcher = Dispatcher(recording, show_progress)
         return await dispatcher.ask(arguments.robot, action, arguments.timeout, params)
+
+
+async def _wait(recording: Recording, arguments: argparse.Namespace) -> CommandAnswer:
+    from webots_mcp.server.dispatch import Dispatcher
+
+    with _line_of_progress():
+        dispatcher = Dispatcher(recording, show_progress)
+        return await dispatcher.wait(arguments.command_id, arguments.timeout)
+
+
+@contextmanager
+def _line_of_progress() -> Generator[None]:
+    try:
+        yield
     finally:
         if sys.stderr.isatty():
             print("\r\x1b[K", end="", file=sys.stderr, flush=True)
 
 
-async def _show_progress(progress: float, total: float | None, text: str) -> None:
+async def show_progress(progress: float, total: float | None, text: str) -> None:
     """On a terminal one line that changes; in a pipe nothing, as for all commands."""
     if sys.stderr.isatty():
         print(f"\r{text}", end="\x1b[K", file=sys.stderr, flush=True)
 
 
-def _writable(arguments: argparse.Namespace) -> Recording:
+def writable(arguments: argparse.Namespace) -> Recording:
+    """The recording that the commands for a controller go through."""
     from webots_mcp.contract import resolve_database
     from webots_mcp.store.recording import Recording
 
     return Recording(*resolve_database(arguments.database, arguments.data_dir))
 
 
-def _require_done(answer: CommandAnswer) -> None:
+def _conclude(answer: CommandAnswer | RunAnswer, arguments: argparse.Namespace) -> None:
+    _require_done(answer, arguments)
+    if answer.action == "run" and not arguments.json:
+        _print_run(cast("RunAnswer", answer))
+    else:
+        _print(answer, arguments)
+
+
+def _require_done(answer: CommandAnswer, arguments: argparse.Namespace) -> None:
     if answer.outcome == "done":
         return
-    hint = _UNDER_WAY if answer.outcome == "claimed" else answer.hint  # which names tools
+    under_way = answer.outcome == "claimed"
+    hint = _UNDER_WAY.format(_waiting(answer, arguments)) if under_way else answer.hint
     why = "; ".join(filter(None, (answer.error, hint))) or "no answer in time"
     raise CommandRefusedError(f"{answer.action} is not done ({answer.outcome}): {why}")
+
+
+def _waiting(answer: CommandAnswer, arguments: argparse.Namespace) -> str:
+    """The command line that goes on waiting."""
+    where = [("--data-dir", arguments.data_dir), ("--database", arguments.database)]
+    given = [text for option, value in where if value for text in (option, value)]
+    return shlex.join(["webots-mcp", "wait", str(answer.command_id), *given])
 
 
 def _print(answer: CommandAnswer, arguments: argparse.Namespace) -> None:

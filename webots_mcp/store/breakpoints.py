@@ -84,8 +84,7 @@ def set_breakpoint(
             return int(like[0])
         if connection.execute(_COUNT, (robot_id,)).fetchone()[0] >= MAX_BREAKPOINTS:
             raise InvalidInputError(
-                f"this robot has {MAX_BREAKPOINTS} breakpoints: remove one with "
-                "webots_remove_breakpoint"
+                f"this robot has {MAX_BREAKPOINTS} breakpoints: remove one first"
             )
         values = (robot_id, *asked, time.time(), created_by)
         return int(connection.execute(_SET, values).fetchall()[0][0])

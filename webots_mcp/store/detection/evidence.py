@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.motion import Motion
 from webots_mcp.store.analysis.noise import Array, noise_of
+from webots_mcp.store.analysis.summary import aligned_numbers
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.habits import MovedIn
 from webots_mcp.store.reading.rows import Columns
@@ -169,13 +170,7 @@ def _radians(columns: Columns, angle: Signal) -> Array:
 
 def numbers(columns: Columns, signal: Signal) -> Array:
     """One number per row, NaN where it has none."""
-    return np.array(
-        [
-            float(each) if isinstance(each, (int, float)) else np.nan
-            for each in columns.values[signal.name]
-        ],
-        np.float64,
-    )
+    return aligned_numbers(columns.values[signal.name])
 
 
 def _mostly(flags: Flags) -> bool:

@@ -6,19 +6,18 @@ holds throughout or not at all; only the buckets in between are read.
 
 from __future__ import annotations
 
-import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from itertools import compress, count, islice, pairwise
+from operator import ne
 from typing import Final, Literal, Protocol
 
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.summary import Summary, usable_numbers
 from webots_mcp.store.detection.event import Threshold
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import Pieces
-from webots_mcp.store.reading.rows import read_columns
+from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.signals.registry import Signal
 
@@ -55,8 +54,8 @@ class Condition(Protocol):
         """Whether it takes more than one row."""
         ...
 
-    def of_row(self, value: Value) -> Value:
-        """None if it does not hold; else what holds, as a key."""
+    def of_rows(self, values: Sequence[Value]) -> Sequence[Value]:
+        """Per row None if it does not hold; else what holds, as a key."""
         ...
 
     def of_bucket(self, summary: Summary) -> Verdict:
@@ -71,10 +70,13 @@ class Beyond:
     threshold: Threshold
     lasting: bool = False
 
-    def of_row(self, value: Value) -> Value:
+    def of_rows(self, values: Sequence[Value]) -> Sequence[Value]:
         """True or None."""
-        held = value is not None and not isinstance(value, str) and self.threshold.holds(value)
-        return True if held else None
+        holds = self.threshold.holds
+        return [
+            True if value is not None and not isinstance(value, str) and holds(value) else None
+            for value in values
+        ]
 
     def of_bucket(self, summary: Summary) -> Verdict:
         """From the extremes."""
@@ -91,9 +93,9 @@ class Silent:
 
     lasting = False
 
-    def of_row(self, value: Value) -> Value:
+    def of_rows(self, values: Sequence[Value]) -> Sequence[Value]:
         """True or None."""
-        return True if value is None else None
+        return [True if value is None else None for value in values]
 
     def of_bucket(self, summary: Summary) -> Verdict:
         """From the counts."""
@@ -107,9 +109,9 @@ class Flat:
 
     lasting = True
 
-    def of_row(self, value: Value) -> Value:
-        """The number."""
-        return value
+    def of_rows(self, values: Sequence[Value]) -> Sequence[Value]:
+        """The numbers."""
+        return values
 
     def of_bucket(self, summary: Summary) -> Verdict:
         """From the extremes; where it changed, its ends may still be flat."""
@@ -121,27 +123,25 @@ def spans_in_rows(
     times: Sequence[float], values: Sequence[Value], condition: Condition
 ) -> Iterator[Span]:
     """The spans in rows that were read."""
-    start = 0
-    for key, group in groupby(values, condition.of_row):
-        end = start + len(list(group))
-        ends = (start == 0, end == len(values))
+    keys = condition.of_rows(values)
+    changes = compress(count(1), map(ne, keys, islice(keys, 1, None)))
+    for start, end in pairwise([0, *changes, len(keys)] if keys else ()):
+        ends = (start == 0, end == len(keys))
         alone = end - start == 1 and not any(ends)  # else the row before or after may be the same
-        if key is not None and not (condition.lasting and alone):
+        if keys[start] is not None and not (condition.lasting and alone):
             _, held = usable_numbers(times[start:end], values[start:end])
             low, high = min(held, default=None), max(held, default=None)
-            yield Span(times[start], times[end - 1], key, low, high, *ends)
-        start = end
+            yield Span(times[start], times[end - 1], keys[start], low, high, *ends)
 
 
 def spans_in_pieces(
-    connection: sqlite3.Connection,
     segment: Segment,
     signal: Signal,
     pieces: Pieces,
     condition: Condition,
-    deadline: Deadline,
+    read: Callable[[Segment], Columns],
 ) -> Iterator[list[Span]]:
-    """The spans in a long segment, bucket by bucket; one in between is read until the deadline.
+    """The spans in a long segment, bucket by bucket; the rows of one in between are read.
 
     Flat buckets are looked for whole; of the others only those next to one are read.
     """
@@ -149,11 +149,10 @@ def spans_in_pieces(
     verdicts = [condition.of_bucket(summary) for _, summary in buckets]
     for index, (bucket, summary) in enumerate(buckets):
         near_whole = "all" in verdicts[max(0, index - 1) : index + 2]
-        part = _bucket_of(segment, bucket)
         if verdicts[index] == "all":
-            yield [_whole(part, summary, condition)]
+            yield [_whole(_bucket_of(segment, bucket), summary, condition)]
         elif verdicts[index] == "some" and (near_whole or not isinstance(condition, Flat)):
-            columns = read_columns(connection, part, [signal], deadline)
+            columns = read(_bucket_of(segment, bucket))
             yield list(spans_in_rows(columns.times, columns.values[signal.name], condition))
         else:
             yield []
@@ -164,7 +163,7 @@ def _whole(part: Segment, summary: Summary, condition: Condition) -> Span:
     first_s, last_s = summary.first_sim_time_s, summary.last_sim_time_s
     start_s = part.start_s if first_s is None else first_s
     end_s = part.end_s if last_s is None else last_s
-    key = condition.of_row(summary.last)
+    (key,) = condition.of_rows([summary.last])
     return Span(start_s, end_s, key, summary.min, summary.max, from_first=True, to_last=True)
 
 

@@ -5,18 +5,18 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.reading.rows import RAW_ROWS, Columns, cleaned
+from webots_mcp.store.reading.rows import RAW_ROWS, Columns, cleaned, extracted, values_at
 from webots_mcp.store.signals.registry import Signal
 
 MOST_SAMPLES: Final = 60_000  # about 12 us each
 
 _TICKS: Final = (
     "WITH RECURSIVE tick(t) AS (SELECT ? UNION ALL SELECT t + ? FROM tick WHERE t < ?) "
-    "SELECT s.id, s.sim_time_s, s.wall_time_s{extracts} FROM tick "
+    "SELECT s.id, s.sim_time_s, s.wall_time_s, {extract} FROM tick "
     "JOIN state s ON s.id = (SELECT id FROM state WHERE run_id = ? AND sim_time_s >= t "
     "AND sim_time_s < ? ORDER BY sim_time_s, id LIMIT 1)"
 )
@@ -42,24 +42,25 @@ def read_sampled(
         every_s: Simulated seconds.
         deadline: After it no further rows are read.
     """
-    query = _TICKS.format(extracts=", json_extract(s.data, ?)" * len(signals))
+    paths = tuple(dict.fromkeys(signal.path for signal in signals))
+    extract, asked = extracted("s.data", paths)
+    query = _TICKS.format(extract=extract)
     ticks = (segment.start_s, every_s, segment.end_s - every_s)
-    paths = tuple(signal.path for signal in signals)
-    rows: list[tuple[object, ...]] = []
+    rows: list[tuple[Any, ...]] = []
     columns = Columns(segment.run_id)
     try:
         with deadline.interrupting(connection):
-            parameters = (*ticks, *paths, segment.run_id, segment.end_s)
+            parameters = (*ticks, *asked, segment.run_id, segment.end_s)
             rows.extend(connection.execute(query, parameters))
     except sqlite3.OperationalError:
         if not deadline.passed:
             raise
         columns.cut = True
     distinct = list({row[0]: row for row in rows}.values())  # a gap gives one row several times
-    read = list(zip(*distinct, strict=True)) or [()] * (3 + len(signals))
-    columns.ids, columns.times, columns.walls = (list(column) for column in read[:3])
-    for signal, column in zip(signals, read[3:], strict=True):
-        columns.values[signal.name] = cleaned(signal, list(column))
+    *heads, texts = list(zip(*distinct, strict=True)) or [()] * 4
+    columns.ids, columns.times, columns.walls = (list(column) for column in heads)
+    by_path = values_at(paths, texts)
+    columns.values = {signal.name: cleaned(signal, by_path[signal.path]) for signal in signals}
     return columns
 
 

@@ -51,7 +51,10 @@ _WIDTHS: Final = (  # also at its border with the bucket before
     f"{_OF_SIGNAL} AND first IS NOT NULL"
 )
 _FIRST_ROW: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
-_RESTS: Final = f"SELECT EXISTS (SELECT 1 {_OF_SIGNAL} AND min = max AND present = rows)"
+_RESTING: Final = (
+    "SELECT DISTINCT signal_id FROM all_rollup WHERE run_id = ? AND bucket >= ? AND bucket < ? "
+    "AND min = max AND present = rows"
+)
 
 
 @dataclass(frozen=True)
@@ -200,6 +203,7 @@ class LongView:
         self.notes: list[str] = []
         self._through = through
         self._kept: dict[Segment, Numbers] = {}
+        self._read: dict[Segment, Columns] = {}
         self._connection = connection
         self._segment = segment
         self._deadline = deadline
@@ -259,19 +263,27 @@ class LongView:
                 f"not those of less than {self.shortest_rest_s:g} s before "
                 f"{self._purged_until_s:.3f} s, whose rows were purged"
             )
-        if condition.lasting and not self._rests(signal):
+        if condition.lasting and signal not in self._resting:
             return []
         if self._deadline.passed:
             self._cut()
             return []
         pieces = read_pieces(self._connection, self._segment, [signal], self._deadline)
-        found = spans_in_pieces(
-            self._connection, self._segment, signal, pieces, condition, self._deadline
-        )
-        spans = joined(found)
+        read = functools.partial(self._rows_of, signal)
+        spans = joined(spans_in_pieces(self._segment, signal, pieces, condition, read))
         if self._deadline.passed:
             self._cut()
         return spans
+
+    def _rows_of(self, signal: Signal, part: Segment) -> Columns:
+        """Read with the other signals that rest at times, which are likely to ask for the same."""
+        kept = self._read.get(part)
+        if kept is None or signal.name not in kept.values:
+            wanted = {each.name: each for each in (*self._resting, signal)}
+            kept = read_columns(self._connection, part, list(wanted.values()), self._deadline)
+            if not kept.cut:
+                self._read[part] = kept
+        return kept
 
     def courses(self, signal: Signal) -> Iterator[Course]:
         """The few buckets whose range is unusual, each with the rows just before and after it."""
@@ -346,9 +358,11 @@ class LongView:
     def _join_s(self) -> float:
         return _join_s(self._sample.times)
 
-    def _rests(self, signal: Signal) -> bool:
-        values = (self._span[0], signal.id, *self._span[1:])
-        return bool(self._connection.execute(_RESTS, values).fetchone()[0])
+    @functools.cached_property
+    def _resting(self) -> list[Signal]:
+        """Those that have the same value throughout a bucket."""
+        resting = {signal_id for (signal_id,) in self._connection.execute(_RESTING, self._span)}
+        return [signal for signal in self._signals if signal.id in resting]
 
     def _add_newest(self, found: Columns, signals: Sequence[Signal], every_s: float) -> None:
         """The rows after the last sample: who is stuck may be so up to the newest one."""

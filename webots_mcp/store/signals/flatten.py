@@ -39,14 +39,11 @@ def parse(text: str) -> dict[str, Any]:
     return cast("dict[str, Any]", state) if isinstance(state, dict) else {}
 
 
-def reduce_text(text: object) -> dict[str, Value]:
-    """The reductions of an array given as JSON text; empty where it is no long array."""
-    if not isinstance(text, str) or not text.startswith("["):
+def reductions(array: object) -> dict[str, Value]:
+    """The reductions of a long array; empty of what is none."""
+    if not isinstance(array, list) or len(cast("list[Any]", array)) <= LONGEST_SPREAD_ARRAY:
         return {}
-    array = json.loads(text)
-    if len(array) <= LONGEST_SPREAD_ARRAY:
-        return {}
-    return dict(zip(REDUCTIONS, reduce_array(array), strict=True))
+    return dict(zip(REDUCTIONS, reduce_array(cast("list[Any]", array)), strict=True))
 
 
 def places(state: dict[str, Any]) -> dict[str, Place]:

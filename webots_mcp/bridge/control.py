@@ -56,12 +56,14 @@ class Control:
         Returns:
             The command that was handled last in this call, if any.
         """
-        now = time.monotonic()
-        if now < self._next_poll_s and not (self._under_way or self._context.pause.active):
+        now, handled = time.monotonic(), None
+        due = now >= self._next_poll_s
+        if not (due or self._under_way or self._context.pause.active):
             return None
-        self._next_poll_s = now + POLL_INTERVAL_S
         self._advance_all()
-        handled = self._serve_one()
+        if due:
+            self._next_poll_s = now + POLL_INTERVAL_S
+            handled = self._serve_one()
         return self._serve_pause() or handled
 
     def _serve_pause(self) -> Command | None:

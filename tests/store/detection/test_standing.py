@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Callable
 from typing import Any
@@ -107,3 +108,28 @@ def test_who_turns_in_place_is_not_stuck_in_degrees_either(empty: sqlite3.Connec
     (still,) = ask(empty, drives_then_turns).events
     assert still.kind == "still"
     assert "it turned in place" in still.details["not_stuck"]
+
+
+@pytest.mark.parametrize("period_s", [0.8, 2.0, 5.0])
+def test_who_goes_to_and_fro_in_a_place_is_not_stuck(
+    empty: sqlite3.Connection, tier: str, period_s: float
+) -> None:
+    def drives_then_sways(time_s: float) -> dict[str, Any]:
+        swing = math.sin(math.tau * (time_s - 30) / period_s) if time_s > 30 else 0.0
+        wheel = 5.0 * math.copysign(1.0, swing) if time_s > 30 else 5.0
+        x_m = 0.2 * min(30.0, time_s) + 0.03 * swing
+        return {"pose": [x_m, 0.0], "mode": "drive", "wheels": [wheel, wheel]}
+
+    (still,) = ask(empty, drives_then_sways).events
+    assert still.kind == "still"
+    assert "it went to and fro within 0.06 m" in still.details["not_stuck"]
+
+
+def test_who_trembles_at_a_wall_is_stuck(empty: sqlite3.Connection, tier: str) -> None:
+    def drives_then_pushes(time_s: float) -> dict[str, Any]:
+        trembling_m = 0.002 * math.sin(40 * time_s) if time_s > 30 else 0.0
+        x_m = 0.2 * min(30.0, time_s) + trembling_m
+        return {"pose": [x_m, 0.0], "mode": "drive", "wheels": [5.0, 5.0]}
+
+    (stuck,) = ask(empty, drives_then_pushes).events
+    assert stuck.kind == "stuck"

@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from webots_mcp.naming import Value
-from webots_mcp.store.analysis.motion import Motion
-from webots_mcp.store.analysis.noise import Array, noise_of
+from webots_mcp.store.analysis.arrays import Array, Indexes
+from webots_mcp.store.analysis.motion import Motion, tracks_in
+from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.summary import aligned_numbers
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.habits import MovedIn
@@ -29,6 +30,9 @@ WHEELS_TURN: Final = 0.1  # rad/s, or in whatever unit they are published
 ON_THE_SPOT: Final = 0.2  # of the fastest wheel: where the mean of all is less, none drives ahead
 TURNED_RAD: Final = 0.1  # from a second before to a second after
 HEADING_NOISE: Final = 6.0  # standard deviations
+SWAY_S: Final = 2.0
+SWAY_M: Final = 0.01  # less is how a robot trembles whose wheels turn at a wall
+SWAY_NOISE: Final = 8.0  # deviations of the smoothed position
 MOSTLY: Final = 0.5
 TOLD_SHARE: Final = 0.1  # of the rows: what holds in fewer, at the ends, shows nothing
 
@@ -56,9 +60,11 @@ def weigh(columns: Columns, motion: Motion, options: EventOptions, moved_in: Mov
     turning = turns(columns, motion.heading)
     # Wheels that turn it on the spot move it nowhere; where it looks tells whether they do.
     turning |= spot if motion.heading is None else False
-    should_move = (told | ahead | mode) & ~stop & ~turning
+    swaying, reach_m = sways(columns, motion)
+    should_move = (told | ahead | mode) & ~stop & ~turning & ~swaying
     against = [*stop_why, *rest_why, *mode_against]
     against += ["it turned in place"] if _mostly(turning) else []
+    against += [f"it went to and fro within {reach_m:.2g} m"] if _mostly(swaying) else []
     if not should_move.any() and not against:
         against = ["nothing that is published shows that it should have moved"]
     return Evidence(should_move, [*mode_why, *told_why, *ahead_why], against)
@@ -133,6 +139,31 @@ def _moves_in(mode: Value, options: EventOptions, moved_in: MovedIn) -> str | No
         return None
     where = "" if seen.run_id == moved_in.run_id else f" in run {seen.run_id}"
     return f"in mode {mode}, in which it moved at {seen.speed_m_s:.2g} m/s{where}"
+
+
+def sways(columns: Columns, motion: Motion) -> tuple[Flags, float]:
+    """Per row whether it went about within two seconds, and how far apart its places were.
+
+    Who does so within a place moves in it, and is not stuck.
+    """
+    flags = np.zeros(len(columns.times), np.bool_)
+    times = np.array(columns.times)
+    reach_m = 0.0
+    for track in tracks_in(columns, motion.position) if motion.position else []:
+        seconds = np.arange(track.times[0] + SWAY_S, track.times[-1], SWAY_S)
+        edges = np.unique(np.searchsorted(track.times, [track.times[0], *seconds]))
+        far_m = np.hypot(*(_extents(each, edges) for each in (track.x, track.y)))
+        moved = far_m > max(SWAY_M, SWAY_NOISE * track.left_m)
+        reach_m = max(reach_m, math.hypot(np.ptp(track.x), np.ptp(track.y)))
+        here = np.searchsorted(track.times[edges], times, side="right") - 1
+        within = (times >= track.times[0]) & (times <= track.times[-1])
+        flags |= within & moved[np.maximum(here, 0)]
+    return flags, reach_m
+
+
+def _extents(values: Array, edges: Indexes) -> Array:
+    """How far values reach in each of the parts that begin at the edges."""
+    return np.maximum.reduceat(values, edges) - np.minimum.reduceat(values, edges)
 
 
 def turns(columns: Columns, heading: Signal | None) -> Flags:

@@ -91,6 +91,23 @@ def test_plot_writes_a_picture(say: Say, tmp_path: Path, name: str, start: bytes
     assert file.read_bytes().startswith(start)
 
 
+@pytest.mark.parametrize(
+    "typed",
+    ["--runs 1 3 pose.0 -o {}", "-o {} --runs 1 3 pose.0", "pose.0 -o {} --runs 1 3"],
+)
+def test_a_plot_of_runs_takes_its_signal_wherever_it_stands(
+    say: Say, tmp_path: Path, typed: str
+) -> None:
+    said = say("plot", *typed.format(tmp_path / "a.png").split())
+    assert "pose.0" in said and "run 1" in said and "run 3" in said
+
+
+def test_options_may_stand_between_arguments(say: Say) -> None:
+    text = say("trends", "pose.0", "--run", "1", "battery_v")
+    assert line_with(text, "pose.0") and line_with(text, "battery_v")
+    assert say("compare", "1", "-n", "3", "3") == say("compare", "1", "3", "-n", "3")
+
+
 @pytest.mark.parametrize("command", ["runs", "trends", "events", "compare", "history mode"])
 def test_json_is_one_object_for_other_programs(say: Say, command: str) -> None:
     answer = json.loads(say(*command.split(), "--json"))

@@ -9,7 +9,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.cli import COMMANDS, main
-from webots_mcp.cli.wording import as_typed, speak_of
+from webots_mcp.cli.wording import BY_TOOL, as_typed, speak_of
 
 
 @pytest.fixture
@@ -39,6 +39,7 @@ def data_dir(tmp_path: Path) -> Iterator[Path]:
         ("plot -o p.png --robot rover --width 5000", "--width 5000 must be from 400 to 2000"),
         ("plot -o p.png --robot rover --height 5", "--height 5 must be from 300 to 2000"),
         ("trends lost_s --robot rover", "'lost_s'"),
+        ("compare --robot rover", "give two or more RUN ('webots-mcp runs' has them)"),
     ],
 )
 def test_an_error_names_what_was_typed(
@@ -46,6 +47,20 @@ def test_an_error_names_what_was_typed(
 ) -> None:
     assert main([*typed.split(), "--data-dir", str(data_dir)]) == 2
     assert answered in capsys.readouterr().err
+
+
+def test_a_hint_names_commands_instead_of_tools() -> None:
+    (send,) = (command for command in COMMANDS if command.name == "send")
+    speak_of(send.arguments)
+    hint = "wait for it with webots_wait_for_command (command_id 7), or ask with a longer timeout_s"
+    assert as_typed(hint) == "wait for it with 'webots-mcp wait 7', or ask with a longer --timeout"
+    assert as_typed("webots_list_commands has it") == "'webots-mcp status' has it"
+
+
+def test_each_command_that_stands_for_a_tool_exists() -> None:
+    assert {command.partition(" ")[0] for command in BY_TOOL.values()} <= {
+        command.name for command in COMMANDS
+    }
 
 
 def test_a_quoted_name_is_somebodys_data() -> None:

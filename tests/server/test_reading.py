@@ -17,6 +17,7 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.server.sensing import unnamed_devices
 from webots_mcp.server.shortening import compact_json
 from webots_mcp.store.migrate import upgrade
 
@@ -162,7 +163,14 @@ async def test_odd_values_are_recognisable(connect: Connect, recorded: Recorded)
     assert answer["sensors"]["lidar"]["inf"] == 40
     assert answer["replaced"]["front"] == "nan"
     assert "x" not in answer["sensors"]
-    assert answer["not_published_by_device_name"] == "eye (Camera)"
+    assert answer["devices_not_named_in_state"] == "eye (Camera)"
+
+
+def test_a_device_is_named_in_the_state_however_its_words_are_arranged() -> None:
+    names = ("ds0", "ds7", "front left sonar", "leftEncoder", "range_finder", "gps")
+    devices: dict[str, str] = dict.fromkeys(names, "DistanceSensor")
+    state = {"ds": [1, 2], "sonar": {"front_left": 1.0}, "encoder": {"left": 3}, "seen": {"gps": 1}}
+    assert list(unnamed_devices(state, devices)) == ["ds7", "range_finder"]
 
 
 async def test_a_state_without_sensors_says_where_to_look(

@@ -13,7 +13,7 @@ import inspect
 import os
 import sys
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 from webots_mcp.cli import (
     breakpoints,
@@ -97,7 +97,9 @@ def _parser() -> argparse.ArgumentParser:
 
     parser = argparse.ArgumentParser("webots-mcp", description=_DESCRIPTION, epilog=_EPILOG)
     parser.add_argument("--version", action="version", version=f"webots-mcp {__version__}")
-    subparsers = parser.add_subparsers(metavar="COMMAND", required=True)
+    subparsers = parser.add_subparsers(
+        metavar="COMMAND", required=True, parser_class=_AnyOrderParser
+    )
     for name, run, arguments in sorted(COMMANDS):
         text = run.__doc__ or ""
         subparser = subparsers.add_parser(
@@ -110,6 +112,22 @@ def _parser() -> argparse.ArgumentParser:
         for flags, options in arguments:
             subparser.add_argument(*flags, **options)
     return parser
+
+
+class _AnyOrderParser(argparse.ArgumentParser):
+    """Takes options between arguments too: `send aim --robot rover angle=1`."""
+
+    _options_first = False
+
+    def parse_known_args(self, *args: Any, **options: Any) -> Any:
+        """Read the options, then the arguments, which `argparse` by itself takes in one piece."""
+        if self._options_first:
+            return super().parse_known_args(*args, **options)
+        self._options_first = True
+        try:
+            return self.parse_known_intermixed_args(*args, **options)
+        finally:
+            self._options_first = False
 
 
 class _Paragraphs(argparse.HelpFormatter):

@@ -63,6 +63,13 @@ TIMES: Final[tuple[Argument, ...]] = (
     argument("--until", metavar="TIME", help="up to, not including, this wall time"),
 )
 RANGE: Final = (ROBOT, RUN, *TIMES)
+
+
+def _id_or_signal(text: str) -> int | str:
+    """The id of a run; what is none is a signal that was typed behind the runs."""
+    return int(text) if text.isascii() and text.isdecimal() else text
+
+
 SIGNALS: Final = argument("signals", nargs="*", metavar="SIGNAL", help="names, with '*' (all)")
 
 
@@ -196,7 +203,7 @@ def _verdicts(verdicts: Verdicts) -> list[str]:
     "plot", DATA_DIR, DATABASE, *RANGE, SIGNALS,
     argument("-o", "--output", required=True, metavar="FILE", help="a .png or .svg file"),
     argument("--trajectory", action="store_true", help="the way of the robot, seen from above"),
-    argument("--runs", type=int, nargs="+", default=[], dest="run_ids", metavar="ID",
+    argument("--runs", type=_id_or_signal, nargs="+", default=[], dest="run_ids", metavar="ID",
              help="several runs, laid over each other"),
     count("--width", "pixels", default=900, dest="width_px", metavar="PX"),
     count("--height", "pixels", default=500, dest="height_px", metavar="PX"),
@@ -206,13 +213,15 @@ def plot(arguments: argparse.Namespace) -> None:
     from webots_mcp import plotting
 
     file = Path(arguments.output)
+    run_ids = [each for each in arguments.run_ids if isinstance(each, int)]
+    behind_runs = [each for each in arguments.run_ids if isinstance(each, str)]
     with reading(arguments) as connection:
         picture = plotting.plot(
             connection,
             "trajectory" if arguments.trajectory else "signals",
-            arguments.signals,
+            [*arguments.signals, *behind_runs],
             scope=scope_of(arguments),
-            run_ids=arguments.run_ids,
+            run_ids=run_ids,
             width_px=arguments.width_px,
             height_px=arguments.height_px,
             image_format=plotting.image_format_of(file),

@@ -98,6 +98,7 @@ def _facts(view: View) -> dict[str, Any]:
         "rows_dropped": session.rows_dropped if session else 0,
         "last_error": session.last_error if session else None,
         "controller": session.controller if session else None,
+        "actions": session.actions if session else {},
     }
 
 

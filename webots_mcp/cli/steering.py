@@ -26,7 +26,12 @@ _UNDER_WAY: Final = (
     "    {}\n"
 )
 TIMEOUT: Final = argument(
-    "--timeout", type=float, default=600.0, metavar="S", help="wait so many wall seconds (600)"
+    "--timeout",
+    type=float,
+    default=600.0,
+    dest="timeout_s",
+    metavar="S",
+    help="wait so many wall seconds (600)",
 )
 
 
@@ -42,7 +47,8 @@ TIMEOUT: Final = argument(
     argument(
         "--set",
         dest="settings",
-        action="append",
+        action="extend",
+        nargs="+",
         default=[],
         metavar="NAME=VALUE",
         help="set this parameter first; may be given several times",
@@ -135,7 +141,7 @@ async def _ask(
 
     with _line_of_progress():
         dispatcher = Dispatcher(recording, show_progress)
-        return await dispatcher.ask(arguments.robot, action, arguments.timeout, params)
+        return await dispatcher.ask(arguments.robot, action, arguments.timeout_s, params)
 
 
 async def _wait(recording: Recording, arguments: argparse.Namespace) -> CommandAnswer:
@@ -143,7 +149,7 @@ async def _wait(recording: Recording, arguments: argparse.Namespace) -> CommandA
 
     with _line_of_progress():
         dispatcher = Dispatcher(recording, show_progress)
-        return await dispatcher.wait(arguments.command_id, arguments.timeout)
+        return await dispatcher.wait(arguments.command_id, arguments.timeout_s)
 
 
 @contextmanager

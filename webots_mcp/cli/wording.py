@@ -1,7 +1,8 @@
 """Texts about a recording in the words of the command line: `last_s=-3` is `--last -3` there.
 
 The questions call their arguments as the MCP tools do. The `dest` of an option is that name, so the
-options of the command that runs say what a person has typed.
+options of the command that runs say what a person has typed. Hints that name a tool name the
+command that answers the same.
 """
 
 from __future__ import annotations
@@ -16,6 +17,31 @@ if TYPE_CHECKING:
 
 _UNQUOTED: Final = r"(?<![\w'\".-])"  # a quoted name is somebody's data
 _NOT_ON: Final = r"(?![\w'\"])"
+BY_TOOL: Final = {  # by tool
+    "compare_runs": "compare",
+    "find_events": "events",
+    "get_full_state": "tail",
+    "get_logs": "logs",
+    "get_parameters": "parameters",
+    "get_robot_state": "tail",
+    "get_timeline": "events",
+    "get_trends": "trends",
+    "list_commands": "status",
+    "list_robots": "status",
+    "list_runs": "runs",
+    "list_signals": "signals",
+    "monitor": "tail",
+    "plot": "plot",
+    "query_history": "history",
+    "query_sql": "sql",
+    "run": "run",
+    "send_command": "send",
+    "set_parameters": "parameters",
+    "simulation_control": "send",
+    "wait_for_command": "wait",
+    "world_reset": "send reset",
+}
+_TOOL: Final = re.compile(r"webots_(\w+)(?:,? \(?command_id( \d+)\)?)?")
 _running: ContextVar[tuple[Argument, ...]] = ContextVar("running", default=())
 
 
@@ -30,6 +56,7 @@ def as_typed(text: str) -> str:
     A name that is a common word (`since`) is meant only where a value follows it, or where it is
     joined to another one ("since and until").
     """
+    text = _TOOL.sub(_command_for, text)
     typed = {each.name: each.typed for each in _running.get()}
     for each in _running.get():
         text = re.sub(rf"{_UNQUOTED}{each.name}=\.\.\.", f"{each.typed} {each.value_name}", text)
@@ -41,3 +68,9 @@ def as_typed(text: str) -> str:
         return text
     joined = rf"{_UNQUOTED}({words}) (and|or) ({words}){_NOT_ON}"
     return re.sub(joined, lambda found: f"{typed[found[1]]} {found[2]} {typed[found[3]]}", text)
+
+
+def _command_for(found: re.Match[str]) -> str:
+    """The command that answers what a tool does; the tool itself where there is none."""
+    command = BY_TOOL.get(found[1])
+    return f"'webots-mcp {command}{found[2] or ''}'" if command else found[0]

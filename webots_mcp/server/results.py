@@ -60,8 +60,8 @@ class SensorsAnswer(Answer):
     replaced: dict[str, str] | None = Field(
         default=None, description="Values that JSON cannot hold: path to nan, inf, ..."
     )
-    not_published_by_device_name: str | None = Field(
-        default=None, description="Sensor devices, with their class."
+    devices_not_named_in_state: str | None = Field(
+        default=None, description="Sensors that it names nowhere, or otherwise than Webots does."
     )
     shortened: str | None = None
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterator
 from typing import Any, Final, cast
 
 # Webots device classes that sense nothing.
@@ -14,6 +16,9 @@ _WORDS: Final = (
     "bumper", "distance", "range", "radar", "sonar", "light", "altimeter", "camera", "odometry",
     "battery", "force", "contact", "scan",
 )  # fmt: skip
+_MOST_ITEMS: Final = 64  # of an array, each of which may be a device
+_HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+_WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
 
 def sensor_part(state: dict[str, Any], devices: dict[str, str]) -> dict[str, Any]:
@@ -27,18 +32,34 @@ def sensor_devices(devices: dict[str, str]) -> dict[str, str]:
     return {name: kind for name, kind in devices.items() if kind not in _NO_SENSORS}
 
 
-def unnamed_devices(sensors: dict[str, Any], devices: dict[str, str]) -> dict[str, str]:
-    """The sensor devices whose name appears nowhere among the published values."""
-    published = set(_keys(sensors))
-    return {name: kind for name, kind in sensor_devices(devices).items() if name not in published}
+def unnamed_devices(state: dict[str, Any], devices: dict[str, str]) -> dict[str, str]:
+    """The sensor devices whose name is in no name of the published values.
+
+    The words of a name may stand anywhere: `front left`, `left_front` and `ds0` are in
+    `front: {left: 1}` and `ds: [1]`.
+    """
+    published = [_words(path) for path in _paths(state)]
+    return {
+        name: kind
+        for name, kind in sensor_devices(devices).items()
+        if not any(_words(name) <= words for words in published)
+    }
 
 
 def _sounds_like_a_sensor(key: str) -> bool:
     return any(word in key.lower() for word in _WORDS)
 
 
-def _keys(value: Any) -> list[str]:
-    if not isinstance(value, dict):
-        return []
-    members = cast("dict[str, Any]", value)
-    return [*members, *(key for inner in members.values() for key in _keys(inner))]
+def _paths(value: Any, path: str = "") -> Iterator[str]:
+    """The name of each member, however deep, and of the first items of arrays."""
+    yield path
+    if isinstance(value, dict):
+        for key, member in cast("dict[str, Any]", value).items():
+            yield from _paths(member, f"{path}.{key}")
+    elif isinstance(value, list):
+        for index, item in enumerate(cast("list[Any]", value)[:_MOST_ITEMS]):
+            yield from _paths(item, f"{path}.{index}")
+
+
+def _words(name: str) -> set[str]:
+    return set(_WORD.findall(_HUMP.sub(" ", name).lower()))

@@ -76,13 +76,13 @@ def webots_get_sensors(
         state = view.state.value()
         sensors = sensor_part(state, view.robot.devices)
         short = shorten(sensors)
-        unnamed = unnamed_devices(sensors, view.robot.devices)
+        unnamed = unnamed_devices(state, view.robot.devices)
         missing = [f"{name} ({kind})" for name, kind in unnamed.items()]
         return SensorsAnswer(
             **view.header(),
             sensors=short.value,
             replaced=_replaced_in(view.state, sensors),
-            not_published_by_device_name=some(missing, _SHOWN_DEVICES) or None,
+            devices_not_named_in_state=some(missing, _SHOWN_DEVICES) or None,
             shortened=short.rule,
             hint=None if sensors else _no_sensors(state),
         )

@@ -142,7 +142,8 @@ def compare_code(
         blocks[-1][1].append(run_id)
     if len(blocks) < 2:
         raise NothingRecordedError(
-            "every recorded run had the same controller file: there is no edit to compare across"
+            "every recorded run had the same controller file: there is no edit to compare across; "
+            "give two or more run_ids (webots_list_runs has them)"
         )
     (_, after), (_, before) = blocks
     groups = {"before": before[:MOST_COMPARED][::-1], "after": after[:MOST_COMPARED][::-1]}

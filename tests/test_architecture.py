@@ -71,3 +71,21 @@ def test_each_part_imports_only_what_stands_below_it(part: str) -> None:
 
 def test_the_public_surface_is_exactly_this() -> None:
     assert webots_mcp.__all__ == ["BridgeStats", "MCPBridge", "MemoryDatabase", "__version__"]
+
+
+@pytest.mark.parametrize(
+    ("room", "above"),
+    [
+        ("analysis", ("signals", "reading", "detection", "questions")),
+        ("signals", ("detection", "questions")),
+        ("reading", ("detection", "questions")),
+        ("detection", ("questions",)),
+    ],
+)
+def test_a_room_of_the_store_knows_nothing_of_those_above_it(
+    room: str, above: tuple[str, ...]
+) -> None:
+    for file in (PACKAGE / "store" / room).glob("*.py"):
+        known = {name for name in imports(file) if name.startswith("webots_mcp.store.")}
+        beside = [name for name in known if name.split(".")[2] in above]
+        assert not beside, f"{file.name} imports {beside}"

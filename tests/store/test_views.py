@@ -16,8 +16,8 @@ from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
 from webots_mcp.connection import connect
 from webots_mcp.naming import USUAL_POSITIONS, flatten
-from webots_mcp.store.analysis.motion import find_motion, in_metres
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.motion import find_motion, in_metres
 from webots_mcp.store.migrate import downgrade, upgrade
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.signals.catalogue import catalogue

@@ -9,8 +9,8 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
-from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds

@@ -23,8 +23,8 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.path import read_path
 from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
-from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal

@@ -9,8 +9,8 @@ from typing import Any, Final
 
 from webots_mcp.server.bounds import newest_runs
 from webots_mcp.server.budget import figure, seconds
-from webots_mcp.store.analysis.motion import find_motion, path_length, places_of
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.motion import find_motion, path_length, places_of
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
 from webots_mcp.store.reading.rows import Columns, read_columns

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import Array, Indexes
-from webots_mcp.store.analysis.motion import Motion, tracks_in
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.summary import aligned_numbers
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.habits import MovedIn
+from webots_mcp.store.detection.motion import Motion, tracks_in
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.registry import Signal
 

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 
 from webots_mcp.naming import Value
-from webots_mcp.store.analysis.motion import Motion, tracks_in
 from webots_mcp.store.analysis.track import Track, path_length_m
+from webots_mcp.store.detection.motion import Motion, tracks_in
 from webots_mcp.store.reading.changes import Point, change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds

@@ -7,9 +7,9 @@ from typing import Final
 
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
-from webots_mcp.store.analysis.motion import in_metres
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.motion import in_metres
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.rows import Numbers
 from webots_mcp.store.signals.registry import Signal

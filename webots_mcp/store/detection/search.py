@@ -9,9 +9,9 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.naming import flatten
-from webots_mcp.store.analysis.motion import Motion, find_motion
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.motion import Motion, find_motion
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds

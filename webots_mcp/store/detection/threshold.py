@@ -50,7 +50,7 @@ def _beyond(search: Search, signal: Signal, threshold: Threshold) -> Iterator[Ev
     limit = {"above": threshold.above, "below": threshold.below}
     given = {name: value for name, value in limit.items() if value is not None}
     longest_s = None
-    for span in search.view.spans(signal, Beyond(threshold)):
+    for span in search.view.spans(signal, Beyond(threshold.holds)):
         if span.end_s - span.start_s >= threshold.for_s:
             details = {**given, "min": span.low, "max": span.high}
             yield search.event("threshold", span.start_s, span.end_s, signal.name, **details)

@@ -10,9 +10,9 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
-from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.differences import Difference, difference_of, only_in, size_of
 from webots_mcp.store.questions.outcomes import Measure, RunPart, outcomes_of, sampling_notes

@@ -13,11 +13,11 @@ from typing import Any, Final
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import Value, flatten
 from webots_mcp.settlement import gone_sessions
-from webots_mcp.store.analysis.motion import find_motion
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.grouping import grouped
 from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.detection.registry import asked_kinds, kind_named
 from webots_mcp.store.detection.verdict import Ledger, Verdicts
 from webots_mcp.store.questions.places import Place, placed, read_place

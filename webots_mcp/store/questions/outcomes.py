@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
-from webots_mcp.store.analysis.motion import Motion, path_length, position_noise
 from webots_mcp.store.analysis.spread import (
     Spread,
     Verdict,
@@ -18,6 +17,7 @@ from webots_mcp.store.analysis.spread import (
 )
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.kind import NO_POSITION
+from webots_mcp.store.detection.motion import Motion, path_length, position_noise
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Collected, collect
 from webots_mcp.store.questions.runs import run_info

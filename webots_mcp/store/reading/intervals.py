@@ -14,7 +14,6 @@ from typing import Final, Literal, Protocol
 
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.summary import Summary, usable_numbers
-from webots_mcp.store.detection.event import Threshold
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import Pieces
 from webots_mcp.store.reading.rows import Columns
@@ -65,16 +64,15 @@ class Condition(Protocol):
 
 @dataclass(frozen=True)
 class Beyond:
-    """Above or below a threshold."""
+    """Above or below a limit, as `holds` tells of a number."""
 
-    threshold: Threshold
+    holds: Callable[[float], bool]
     lasting: bool = False
 
     def of_rows(self, values: Sequence[Value]) -> Sequence[Value]:
         """True or None."""
-        holds = self.threshold.holds
         return [
-            True if value is not None and not isinstance(value, str) and holds(value) else None
+            True if value is not None and not isinstance(value, str) and self.holds(value) else None
             for value in values
         ]
 
@@ -82,7 +80,7 @@ class Beyond:
         """From the extremes."""
         if summary.min is None or summary.max is None:
             return "none"
-        ends = {self.threshold.holds(summary.min), self.threshold.holds(summary.max)}
+        ends = {self.holds(summary.min), self.holds(summary.max)}
         if ends == {False}:
             return "none"
         return "all" if ends == {True} and summary.present == summary.rows else "some"

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 from tests.benchmarks.measuring import Samples, time_calls
@@ -18,12 +19,15 @@ from tests.benchmarks.table import Line, Target, duration
 from tests.recordings.long import CYCLE_S
 from webots_mcp.connection import connect
 from webots_mcp.plotting import plot
+from webots_mcp.server.tools.monitor import look_back
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.logs import LogFilter, count_lines, newest_lines
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.series import query_history
+from webots_mcp.store.questions.timeline import timeline
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.recording import Recording
 from webots_mcp.store.signals.catalogue import list_signals
 from webots_mcp.store.window import Window
 
@@ -33,9 +37,15 @@ _TURNS: Final = 5
 _ENOUGH_S: Final = 0.5  # a contender that took that long is not asked again
 _MINUTE_S: Final = 60.0
 _TEN_MINUTES_S: Final = 600.0
+_HOUR_S: Final = 3600.0
 _POINTS: Final = 50
 _OVERVIEW: Final = "pose.0"
 _TEN: Final = ("pose", "ds.0", "ds.1", "ds.2", "battery_v", "imu.roll", "imu.pitch", "accel.0")
+_THIRTY: Final = (
+    "pose", "wheels", "ds", "imu", "accel", "gyro", "encoders", "errors", "battery_v",
+    "commanded_m_s",
+)  # fmt: skip
+_LAG: Final = "lag() over the mode alone"
 _WHOLE: Final = Window(-math.inf, math.inf)
 _NUMBERS: Final = "SELECT name, path FROM signal WHERE kind IN ('num', 'angle') AND reduce IS NULL"
 _CHANGES: Final = (
@@ -74,7 +84,7 @@ def measure_history(bench: Bench) -> Iterable[Line]:
         file = bench.folder / f"{rows}.db"
         record(file, rows)
         with closing(connect(file, "reader")) as db:
-            for question in _questions(db, rows):
+            for question in (*_questions(db, rows), *_looks_back(db, file)):
                 bench.say(f"{rows:,} rows, {question.what}")
                 taken = _take_turns(db, question)
                 minutes += [taken["ours"]] if question.what.startswith("last minute") else []
@@ -123,17 +133,21 @@ def _questions(db: sqlite3.Connection, rows: int) -> Iterator[Question]:
         lambda: trends(db, whole),
         scan(list(numbers.values()), length_s),
     )
+    thirty_paths = [numbers[name] for signal in _THIRTY for name in _of_signal(numbers, signal)]
     yield Question(
-        "trends of all signals, 10 minutes",
-        lambda: trends(db, ten),
-        scan(list(numbers.values()), _TEN_MINUTES_S),
+        "trends of 30 signals, 10 minutes",
+        lambda: trends(db, ten, _THIRTY),
+        scan(thirty_paths, _TEN_MINUTES_S),
+        at_most_s=0.4,
     )
     yield Question(
         "find_events of all kinds, whole run",
         lambda: find_events(db, whole),
         _CHANGES,
-        "lag() over the mode alone",
+        _LAG,
+        at_most_s=1.0,
     )
+    yield Question("timeline", lambda: timeline(db, whole), _CHANGES, _LAG, at_most_s=0.050)
     asked = LogFilter(1, _WHOLE, text="SLIP")
     yield Question(
         f"log search, {int(length_s):,} lines",
@@ -148,7 +162,29 @@ def _questions(db: sqlite3.Connection, rows: int) -> Iterator[Question]:
             lambda: plot(db, "signals", [_OVERVIEW]),
             f"SELECT sim_time_s, json_extract(data, '{path}') FROM state WHERE run_id = 1",
             "every point read, none drawn",
+            at_most_s=1.2,
         )
+        yield Question(
+            "plot, way of the robot",
+            lambda: plot(db, "trajectory"),
+            f"SELECT sim_time_s, json_extract(data, '{path}') FROM state WHERE run_id = 1",
+            "one coordinate read, none drawn",
+            at_most_s=1.2,
+        )
+
+
+def _looks_back(db: sqlite3.Connection, file: Path) -> Iterator[Question]:
+    """What the monitor answers at once, of as much as there is."""
+    yield Question(
+        "monitor, an hour back",
+        lambda: look_back(Recording(file, file.parent), None, _HOUR_S),
+        _scan(["$.pose[0]"], _HOUR_S, length_s=end_s(_rows_in(db))),
+        at_most_s=1.0,
+    )
+
+
+def _rows_in(db: sqlite3.Connection) -> int:
+    return db.execute("SELECT rows FROM run").fetchone()[0]
 
 
 def _of_signal(numbers: Mapping[str, str], signal: str) -> list[str]:

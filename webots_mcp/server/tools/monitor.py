@@ -60,7 +60,7 @@ async def webots_monitor(
         )
     duration_s = duration_s or USUAL_DURATION_S
     if lookback_s is not None:
-        return await to_thread.run_sync(_look_back, recording, robot, lookback_s)
+        return await to_thread.run_sync(look_back, recording, robot, lookback_s)
     name, started_s = await to_thread.run_sync(_start, recording, robot)
     for second in range(1, math.ceil(duration_s) + 1):
         await anyio.sleep(min(_REPORT_INTERVAL_S, duration_s - second + 1))
@@ -86,7 +86,8 @@ def _watched(recording: Recording, robot: str, started_s: float) -> MonitorAnswe
         return _report(view, started_s, view.now_s - started_s)
 
 
-def _look_back(recording: Recording, robot: str | None, lookback_s: float) -> MonitorAnswer:
+def look_back(recording: Recording, robot: str | None, lookback_s: float) -> MonitorAnswer:
+    """The report of so many wall seconds before the newest row."""
     with recording.view(robot) as view:
         run = view.require_run()
         newest_s = view.state.wall_time_s if view.state else run.last_wall_time_s

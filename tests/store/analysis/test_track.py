@@ -93,3 +93,11 @@ def test_in_bends_the_way_is_longer_than_the_straight_lines_between_its_rows(
 def test_noise_across_the_way_adds_nothing_to_it(noise_m: float) -> None:
     track, length_m = noisy_track([(120.0, 0.25, 0.0)], 0.008, noise_m)
     assert path_length_m(track) == pytest.approx(length_m, rel=0.008)
+
+
+def test_narrow_bends_of_a_slow_robot_are_no_turns_on_the_spot() -> None:
+    """At 30 mm of noise a leg between two places that differ is a second long: 1.5 rad of turn."""
+    bends = [(4.0, 0.16, 1.5), (3.0, 0.16, 0.0), (4.0, 0.16, -1.5), (2.0, 0.16, 0.5)] * 9
+    tracks = [noisy_track(bends, 0.5, 0.03, seed) for seed in range(8)]
+    ratios = [path_length_m(track) / length_m for track, length_m in tracks]
+    assert float(np.median(ratios)) == pytest.approx(1.0, abs=0.05)

@@ -187,6 +187,25 @@ def test_a_tenth_more_speed_is_found(empty: sqlite3.Connection, seed: int) -> No
     assert difference(comparison, "pose.0").different == [False, True]
 
 
+def test_what_is_one_fact_or_the_same_in_all_runs_makes_no_other_figure_less_certain(
+    empty: sqlite3.Connection,
+) -> None:
+    """Distance and mean speed are one fact; modes and events are as many and as long each time."""
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    groups = {"a": (0.1747, 0.1755, 0.1798, 0.1774), "b": (0.1958, 0.1877, 0.191, 0.1908)}
+    empty.execute("BEGIN")
+    for code, speeds in groups.items():
+        for speed in speeds:
+            recorder.run(recorder.session(robot_id, code * 64), robot_id)
+            for step in range(200):
+                driven_s = 0.2 * (min(step, 100) + max(0, step - 130))
+                mode = "scan" if 100 <= step < 130 else "explore"
+                recorder.publish(0.2 * step, {"pose": [speed * driven_s, 0.0], "mode": mode})
+    empty.execute("COMMIT")
+    assert {"distance_m", "mean_speed_m_s"} <= claimed(compare_code(empty))
+
+
 def test_a_swing_that_was_cut_comes_first(empty: sqlite3.Connection) -> None:
     recorder = Recorder(empty)
     robot_id = recorder.robot("r")

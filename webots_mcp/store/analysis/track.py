@@ -12,7 +12,7 @@ from webots_mcp.store.analysis.rhythm import rhythm_of
 
 LEG_NOISE: Final = 7.0  # a leg is longer than so many deviations of the smoothed position
 FINEST_LEG_M: Final = 0.02  # smoothing that makes legs so short is enough
-SHARPEST_ARC_RAD: Final = 1.6  # from leg to leg; who turns farther turned on the spot
+SHARPEST_ARC_RAD: Final = 2.7  # from leg to leg; who turns farther went back
 LONGEST_SMOOTHING_S: Final = 1.2  # a turn of 1.5 rad/s is cut by 0.7 % then, by 5 % in 2 s
 _PARABOLA_GAIN: Final = 2.25  # the variance that a parabola over n rows leaves is 2.25 / n of it
 
@@ -111,9 +111,9 @@ def path_length_m(track: Track) -> float:
     legs_m = np.sqrt(along**2 + across**2 - 2 * (1 - alike) * track.left_m**2)
     if len(legs_m) < 2:
         return float(legs_m.sum())
-    turns = np.angle(np.exp(1j * np.diff(np.arctan2(across, along))))
+    turns = np.pad(np.angle(np.exp(1j * np.diff(np.arctan2(across, along)))), 1)
     turns[np.abs(turns) > SHARPEST_ARC_RAD] = 0.0
-    arcs = np.concatenate((turns[:1], (turns[:-1] + turns[1:]) / 2, turns[-1:]))
+    arcs = (turns[:-1] + turns[1:]) / 2
     return float(np.sum(legs_m / np.sinc(arcs / (2 * np.pi))))
 
 

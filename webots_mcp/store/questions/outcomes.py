@@ -36,6 +36,7 @@ NO_MODE: Final = (
     "no mode is known: publish one as a text, such as mode; webots_get_trends tells the time in "
     "each value of any text"
 )
+_SPEED: Final = "mean_speed_m_s"
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def outcomes_of(
     runs = [run for group in found for run in group]
     names = dict.fromkeys(name for run in runs for name in run.figures)
     kinds: list[str] = list(dict.fromkeys(kind for run in runs for kind in run.events))
-    tests = len(names) + len(kinds)
+    tests = _facts(runs, list(names), kinds)
     measures = [
         _measure(name, figures, verdicts_on(figures, tests))
         for name in names
@@ -106,6 +107,20 @@ def outcomes_of(
     ]
     measures += [_counted(kind, found, tests) for kind in kinds]
     return Outcomes(tuple(measures), _not_known(runs))
+
+
+def _facts(runs: Sequence[_Outcome], names: Sequence[str], kinds: Sequence[str]) -> int:
+    """How many figures can differ by chance, each on its own.
+
+    Not those that are the same in all runs, which cannot (R. E. Tarone, A modified Bonferroni
+    method for discrete data, Biometrics 46, 1990); the distance and the mean speed over the same
+    time are one fact, and the last share of the time follows from the others.
+    """
+    vary = [name for name in names if len({run.figure(name) for run in runs}) > 1]
+    shares = sum(name.startswith(_SHARE) for name in vary)
+    counted = sum(len({run.events_of(kind) for run in runs}) > 1 for kind in kinds)
+    alike = (_SPEED in vary) + (shares > 0)
+    return max(1, len(vary) - alike + counted)
 
 
 def _measure(
@@ -183,7 +198,7 @@ def _outcome(
     else:
         distance_m = None if purged else _distance(connection, part, deadline)
         speed = None if distance_m is None else distance_m / duration_s
-        figures |= {"distance_m": distance_m, "mean_speed_m_s": speed}
+        figures |= {"distance_m": distance_m, _SPEED: speed}
     modes = _mode_times(connection, part, deadline)
     figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
     if not modes:

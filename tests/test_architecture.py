@@ -44,7 +44,7 @@ ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["store"] = STDLIB | {"store"}
 ALLOWED["trials"] = STDLIB | {"store", "trials"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
-ALLOWED["server"] = STDLIB | {"store", "plotting", "server", "__version__"}
+ALLOWED["server"] = STDLIB | {"store", "plotting", "trials", "server", "__version__"}
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
 ALLOWED["pytest_plugin"] = {"contract", "standin", "testing", "MCPBridge", "MemoryDatabase"}
 

@@ -374,9 +374,17 @@ CREATE TABLE trial_set (
 	created_wall_time_s FLOAT NOT NULL, 
 	host TEXT /* of the process at work */, 
 	pid INTEGER, 
-	process TEXT /* which process of that pid; null where the system does not tell */
+	process TEXT /* which process of that pid; null where the system does not tell */, 
+	robot_id INTEGER /* in whose simulation the trials run; null: each in one of its own */, 
+	session_id INTEGER /* of the controller that was tried */, 
+	former_values TEXT /* JSON object: its parameters before, until they are set back */, 
+	stop_reason TEXT /* why it does not go on although trials wait */, 
+	CONSTRAINT fk_trial_set_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE SET NULL, 
+	CONSTRAINT fk_trial_set_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
 );
 CREATE UNIQUE INDEX ix_trial_set_uuid ON trial_set (uuid);
+CREATE INDEX ix_trial_set_robot_id ON trial_set (robot_id);
+CREATE INDEX ix_trial_set_session_id ON trial_set (session_id);
 CREATE TABLE trial (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	trial_set_id INTEGER NOT NULL, 

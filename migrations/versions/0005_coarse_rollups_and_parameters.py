@@ -340,10 +340,33 @@ def create_trial_set() -> None:
         sa.Column("host", sa.Text(), comment="of the process at work"),
         sa.Column("pid", sa.Integer()),
         sa.Column("process", sa.Text(), comment=PROCESS),
+        sa.Column(
+            "robot_id",
+            sa.Integer(),
+            comment="in whose simulation the trials run; null: each in one of its own",
+        ),
+        sa.Column("session_id", sa.Integer(), comment="of the controller that was tried"),
+        sa.Column(
+            "former_values",
+            sa.Text(),
+            comment="JSON object: its parameters before, until they are set back",
+        ),
+        sa.Column("stop_reason", sa.Text(), comment="why it does not go on although trials wait"),
+        sa.ForeignKeyConstraint(
+            ["robot_id"], ["robot.id"], name=op.f("fk_trial_set_robot_id"), ondelete="SET NULL"
+        ),
+        sa.ForeignKeyConstraint(
+            ["session_id"],
+            ["session.id"],
+            name=op.f("fk_trial_set_session_id"),
+            ondelete="SET NULL",
+        ),
         sa.PrimaryKeyConstraint("id"),
         sqlite_autoincrement=True,
     )
     op.create_index(op.f("ix_trial_set_uuid"), "trial_set", ["uuid"], unique=True)
+    op.create_index(op.f("ix_trial_set_robot_id"), "trial_set", ["robot_id"])
+    op.create_index(op.f("ix_trial_set_session_id"), "trial_set", ["session_id"])
 
 
 def create_trial() -> None:

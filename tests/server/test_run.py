@@ -11,7 +11,7 @@ import anyio
 import pytest
 from mcp import Client
 
-from tests.recordings.rows import Recorded
+from tests.recordings.rows import Recorded, insert
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
 from tests.server.story import rows_of
 from webots_mcp.errors import CommandRefusedError
@@ -181,6 +181,28 @@ def test_a_change_in_the_newest_row_is_not_the_one_that_is_waited_for(recorded: 
     require_possible(recording, None, "changed(mode)", None, reset=False)
     with pytest.raises(CommandRefusedError, match=r"since 2\.000 s"):
         require_possible(recording, None, "mode == 'turn'", None, reset=False)
+
+
+async def test_a_run_that_ended_before_its_row_was_written_is_told_of_all_the_same(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, {"x": 1})
+    result = {"ended": "time over", "from_s": 0.0, "sim_time_s": 1.0, "advanced_s": 1.0}
+    times = ("created", "expires", "claimed", "finished")
+    number = insert(
+        recorded.connection,
+        "command",
+        {
+            "robot_id": robot.id, "action": "run", "params": '{"for_s": 1.0}', "status": "done",
+            "session_id": robot.session_id, "result": json.dumps(result),
+            **{f"{name}_wall_time_s": robot.now for name in times},
+        },
+    )  # fmt: skip
+    async with connect() as client:
+        answer = await ask(client, "webots_wait_for_command", command_id=number)
+    assert answer["ran"]["run_id"] == robot.run_id
+    assert answer["state"] == {"x": 1}
 
 
 async def test_two_at_once_are_refused(connect: Connect, driver: Driver) -> None:

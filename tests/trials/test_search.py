@@ -23,10 +23,10 @@ PARAMETERS = "SELECT parameters FROM trial ORDER BY number"
 
 
 def a_plan(search: Search = "tpe", **more: Any) -> Plan:
-    """Of some world: no simulator is started."""
+    """Of no world: no simulator is started."""
     ranges: dict[str, Any] = {"kp": Range(0.0, 10.0), "gait": Range(choices=["trot", "walk"])}
     given: dict[str, Any] = {"ranges": ranges, "sets": 40, "seed": 7} | more
-    return Plan(__file__, "last(x)", for_s=1.0, search=search, **given)
+    return Plan(score="last(x)", for_s=1.0, search=search, **given)
 
 
 def tried(plan: Plan, score: Callable[[dict[str, Any]], float]) -> list[Trial]:

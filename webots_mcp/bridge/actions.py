@@ -193,12 +193,12 @@ def reset_state(context: Context, command: Command) -> Progress:
 def set_parameters(context: Context, command: Command) -> Progress:
     """Set parameters, all or none: `when` "now", or "reset" for the next reset of the world."""
     params, clock, parameters = command.params, context.clock, context.parameters
-    values, when, by = params.get("values"), params.get("when", "now"), params.get("by", "command")
+    values, when = params.get("values"), params.get("when", "now")
     if not isinstance(values, dict) or not values or when not in ("now", "reset"):
         raise InvalidInputError(
             'give values, such as {"kp": 3.0}, and when: "now" or "reset" (from the next on)'
         )
-    setter = Setter(by if by in SETTERS else "command", command.id)
+    setter = _setter(command)
     given = cast("dict[str, object]", values)
     if when == "reset":
         waiting = parameters.set_from_reset(given, setter)
@@ -251,8 +251,14 @@ def _run_until(context: Context, command: Command, goal: Goal) -> Progress:
 def _set_before_run(context: Context, command: Command, goal: Goal) -> None:
     """Set the parameters of a goal, all or none."""
     if goal.parameters:
-        parameters, setter = context.parameters, Setter("command", command.id)
+        parameters, setter = context.parameters, _setter(command)
         (parameters.set_from_reset if goal.reset else parameters.set_now)(goal.parameters, setter)
+
+
+def _setter(command: Command) -> Setter:
+    """As whom a command sets parameters: a trial's says so."""
+    by = command.params.get("by")
+    return Setter(by if by in SETTERS else "command", command.id)
 
 
 def _finish_of(context: Context, command: Command, then: Then) -> Callable[[], None]:

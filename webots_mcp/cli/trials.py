@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.analysis.ranking import Ranking
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.trials import Result, Trial
-    from webots_mcp.trials.plan import Plan
+    from webots_mcp.trials.plan import WorldPlan
 
 
 _WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
@@ -73,7 +73,7 @@ def trials(arguments: argparse.Namespace) -> None:
     _show(recording, set_id, plan, as_json=arguments.json)
 
 
-def _set_of(recording: Recording, plan: Plan, arguments: argparse.Namespace) -> int:
+def _set_of(recording: Recording, plan: WorldPlan, arguments: argparse.Namespace) -> int:
     """The set that was begun with this plan, or a new one."""
     from webots_mcp.store.trials import create_trial_set, find_trial_set
 
@@ -86,7 +86,7 @@ def _set_of(recording: Recording, plan: Plan, arguments: argparse.Namespace) -> 
 class _Progress:
     """A line on stderr for each trial that is over."""
 
-    def __init__(self, recording: Recording, set_id: int, plan: Plan) -> None:
+    def __init__(self, recording: Recording, set_id: int, plan: WorldPlan) -> None:
         from webots_mcp.store.trials import trials_of
 
         with recording.reader() as connection:
@@ -105,7 +105,7 @@ class _Progress:
         print(said, file=sys.stderr, flush=True)
 
 
-def _show(recording: Recording, set_id: int, plan: Plan, *, as_json: bool) -> None:
+def _show(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:
     from webots_mcp.store.trials import ranking_of, trials_of
 
     with recording.reader() as connection:

@@ -8,7 +8,7 @@ from pathlib import Path
 from sqlite3 import Connection
 from typing import Final
 
-from anyio import to_thread
+from anyio import CancelScope, to_thread
 from mcp.server import MCPServer
 
 from webots_mcp import __version__
@@ -35,8 +35,10 @@ from webots_mcp.server.tools import (
     state,
     timeline,
     trends,
+    trials,
     world,
 )
+from webots_mcp.server.trial_worker import TrialWorkers
 from webots_mcp.settlement import settle_gone
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention import Asked, Upkeep
@@ -56,7 +58,7 @@ _PAUSE_S: Final = 0.002  # between two short writes, for the robots to write the
 # In the order in which clients list them.
 _MODULES: Final = (
     world, state, pictures, logs, monitor, signals, history, trends, events, timeline, runs, plot,
-    sql, control, run, breakpoints, commands, parameters,
+    sql, control, run, trials, breakpoints, commands, parameters,
 )  # fmt: skip
 
 
@@ -86,17 +88,17 @@ def create_server(
         tools=[
             tool for module in _MODULES for tool in tools_of(module, recording, read_only=read_only)
         ],
-        lifespan=_maintaining(None if read_only else database, Upkeep(data_dir), asked),
+        lifespan=_lifespan(recording, Upkeep(data_dir), asked),
     )
     add_resources(mcp, recording)
     add_prompts(mcp)
     return mcp
 
 
-def _maintaining(
-    database: Database | None, retain: Upkeep, asked: Asked
-) -> Callable[[MCPServer], AbstractAsyncContextManager[None]]:
-    """Keep the log short, what ended and the rollups current, the file small, if it may write."""
+def _lifespan(
+    recording: Recording, retain: Upkeep, asked: Asked
+) -> Callable[[MCPServer], AbstractAsyncContextManager[TrialWorkers]]:
+    """While a server runs, trials may, and the database is maintained if it may be written."""
     unasked = dict(asked)
 
     def work(connection: Connection) -> None:
@@ -108,15 +110,17 @@ def _maintaining(
         retain(connection)
 
     @asynccontextmanager
-    async def lifespan(_: MCPServer) -> AsyncGenerator[None]:
-        if not isinstance(database, Path):
-            yield
-            return
-        maintainer = Maintainer(database, "server", work=work)
-        maintainer.start()
+    async def lifespan(_: MCPServer) -> AsyncGenerator[TrialWorkers]:
+        workers, maintainer = TrialWorkers(recording), None
+        if isinstance(recording.database, Path) and not recording.read_only:
+            maintainer = Maintainer(recording.database, "server", work=work)
+            maintainer.start()
         try:
-            yield
+            yield workers
         finally:
-            await to_thread.run_sync(maintainer.stop, abandon_on_cancel=True)
+            with CancelScope(shield=True):
+                await to_thread.run_sync(workers.stop)
+            if maintainer is not None:
+                await to_thread.run_sync(maintainer.stop, abandon_on_cancel=True)
 
     return lifespan

@@ -188,6 +188,28 @@ class MonitorAnswer(NotedAnswer):
     )
 
 
+class TrialsAnswer(NotedAnswer):
+    """How far a trial set is, and its parameters ranked."""
+
+    trial_set: int | None = None
+    state: str | None = Field(default=None, description="under way, done, stopped and why, ...")
+    trials: int | None = None
+    over: int | None = None
+    failed: int | None = None
+    score: str | None = None
+    ranked: Table | None = Field(
+        default=None,
+        description="The best first; score is the median, range least and greatest of repeats.",
+    )
+    noise: float | None = Field(
+        default=None, description="Standard deviation of the scores of like trials."
+    )
+    best_is_better: bool | None = Field(
+        default=None, description="Than the next, beyond the noise; null: it cannot be told."
+    )
+    verdict: str | None = None
+
+
 class RunAnswer(CommandAnswer):
     """What came of a `run` command."""
 

@@ -52,6 +52,7 @@ _OF_SESSION: Final = (
     "SELECT id, started_sim_time_s, last_sim_time_s, started_wall_time_s FROM run "
     "WHERE session_id = ? ORDER BY id DESC LIMIT 1"
 )
+_BEGUN_BY: Final = "SELECT max(id) FROM run WHERE session_id = ? AND started_wall_time_s <= ?"
 _LAST_ROWS: Final = (
     "SELECT sim_time_s, data FROM state WHERE run_id = ? AND sim_time_s <= ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
@@ -85,7 +86,7 @@ def require_possible(
 
 def _require_known(view: View, condition: Condition) -> None:
     """A signal that was never seen is most likely misspelt; before the first row any may come."""
-    known = _known_names(view)
+    known = known_names(view)
     if known and (unknown := [name for name in condition.signals if name not in known]):
         raise UnknownSignalError(
             "; ".join(condition.describe_unknown(known))
@@ -94,7 +95,8 @@ def _require_known(view: View, condition: Condition) -> None:
         )
 
 
-def _known_names(view: View) -> set[str]:
+def known_names(view: View) -> set[str]:
+    """The signals that a robot published in its newest runs; empty before the first row."""
     runs = view.connection.execute(_NEWEST_RUNS, (view.robot.id, _RUNS_SEARCHED)).fetchall()
     found = (whole_run(view.connection, run_id) for (run_id,) in runs)
     segments = tuple(segment for segment in found if segment is not None)
@@ -162,7 +164,8 @@ class Way(NamedTuple):
 def way_of(connection: sqlite3.Connection, command: Command) -> Way:
     """How far it came, as the bridge says; while it does not, as far as its heartbeat shows."""
     if result := _result_of(command):
-        return Way(result["run_id"], result["from_s"], result["sim_time_s"], result.get("factor"))
+        run_id = result.get("run_id") or _run_of(connection, command)
+        return Way(run_id, result["from_s"], result["sim_time_s"], result.get("factor"))
     if command.session_id is None:
         return Way(None, 0.0, 0.0, None)
     row = connection.execute(_OF_SESSION, (command.session_id,)).fetchone()
@@ -170,6 +173,12 @@ def way_of(connection: sqlite3.Connection, command: Command) -> Way:
     if row is None or session is None:
         return Way(None, 0.0, 0.0, None)
     return _seen_way(command, row, session.sim_time_s or 0.0)
+
+
+def _run_of(connection: sqlite3.Connection, command: Command) -> int | None:
+    """The run in which it ended; its bridge did not know the id while the row waited."""
+    times = (command.session_id, command.finished_wall_time_s)
+    return connection.execute(_BEGUN_BY, times).fetchone()[0]
 
 
 def _seen_way(command: Command, run: tuple[int, float, float, float], beat_s: float) -> Way:

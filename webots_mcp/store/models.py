@@ -35,11 +35,11 @@ def _id() -> Any:
     return Field(default=None, sa_column=Column("id", Integer, primary_key=True))
 
 
-def _to(table: str, *, nullable: bool = False) -> Any:
+def _to(table: str, comment: str | None = None, *, nullable: bool = False) -> Any:
     """A reference to another table's id; what cannot be without it goes with it."""
     on_delete = "SET NULL" if nullable else "CASCADE"
     key = ForeignKey(f"{table}.id", ondelete=on_delete)
-    return Field(default=None, sa_column=Column(Integer, key, nullable=nullable))
+    return Field(default=None, sa_column=Column(Integer, key, nullable=nullable, comment=comment))
 
 
 def _key(table: str | None, comment: str | None = None) -> Any:
@@ -457,7 +457,12 @@ class TrialSet(SQLModel, table=True):
     """Runs with chosen parameters, each scored, of which the best is looked for."""
 
     __tablename__: ClassVar[Any] = "trial_set"
-    __table_args__ = (Index(None, "uuid", unique=True), _KEEP_IDS)
+    __table_args__ = (
+        Index(None, "uuid", unique=True),
+        Index(None, "robot_id"),
+        Index(None, "session_id"),
+        _KEEP_IDS,
+    )
     id: int | None = _id()
     uuid: str = _text(_UUID, nullable=False)
     plan: str = _text("JSON object", nullable=False)
@@ -465,6 +470,12 @@ class TrialSet(SQLModel, table=True):
     host: str | None = _text("of the process at work")
     pid: int | None = _column(Integer)
     process: str | None = _text("which process of that pid; null where the system does not tell")
+    robot_id: int | None = _to(
+        "robot", "in whose simulation the trials run; null: each in one of its own", nullable=True
+    )
+    session_id: int | None = _to("session", "of the controller that was tried", nullable=True)
+    former_values: str | None = _text("JSON object: its parameters before, until they are set back")
+    stop_reason: str | None = _text("why it does not go on although trials wait")
 
 
 class Trial(SQLModel, table=True):

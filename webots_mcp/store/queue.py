@@ -163,6 +163,12 @@ class CommandQueue:
         return _while_busy(lambda: self._connection.execute(_CANCEL, values)).rowcount == 1
 
 
+def find_command(connection: sqlite3.Connection, idempotency_key: str) -> Command | None:
+    """The command that was sent with that key; None where none was."""
+    row = connection.execute(_BY_KEY, (idempotency_key,)).fetchone()
+    return Command(*row) if row else None
+
+
 def fetch_command(connection: sqlite3.Connection, command_id: int) -> Command:
     """The command of that id.
 

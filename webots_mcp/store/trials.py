@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from webots_mcp.connection import transaction
@@ -17,15 +17,17 @@ from webots_mcp.store.analysis.ranking import Best, Outcome, Ranking, rank
 from webots_mcp.store.rows import columns_of
 
 _NEW_SET: Final = (
-    "INSERT INTO trial_set (uuid, plan, created_wall_time_s) VALUES (?, ?, ?) RETURNING id"
+    "INSERT INTO trial_set (uuid, plan, created_wall_time_s, robot_id) VALUES (?, ?, ?, ?) "
+    "RETURNING id"
 )
 _NEW_TRIAL: Final = (
     "INSERT INTO trial (trial_set_id, uuid, number, parameters, status) "
     "VALUES (?, ?, ?, ?, 'waiting')"
 )
-_NEWEST: Final = "SELECT id FROM trial_set WHERE plan = ? ORDER BY id DESC LIMIT 1"
-_SET: Final = "SELECT 1 FROM trial_set WHERE id = ?"
-_WORKER: Final = "SELECT host, pid, process FROM trial_set WHERE id = ?"
+_NEWEST: Final = "SELECT max(id) FROM trial_set WHERE plan = coalesce(?, plan)"
+_OF_ROBOT: Final = "SELECT id FROM trial_set WHERE robot_id = ? ORDER BY id DESC"
+_STOP: Final = "UPDATE trial_set SET stop_reason = ? WHERE id = ?"
+_BORROW: Final = "UPDATE trial_set SET session_id = ?, former_values = ? WHERE id = ?"
 _WORK: Final = "UPDATE trial_set SET host = ?, pid = ?, process = ? WHERE id = ?"
 _BEGIN: Final = (
     "UPDATE trial SET status = 'running', started_wall_time_s = ?, pid = ?, process = ? "
@@ -41,6 +43,30 @@ _FINISH: Final = (
     "pid = NULL, process = NULL WHERE id = :id"
 )
 _LABEL: Final = "UPDATE run SET label = coalesce(label, ?) WHERE id = ?"
+
+
+@dataclass(frozen=True)
+class TrialSet:
+    """Runs with chosen parameters. Columns as in `store.models`; two are JSON text."""
+
+    id: int
+    uuid: str
+    plan: str
+    created_wall_time_s: float
+    host: str | None
+    pid: int | None
+    process: str | None
+    robot_id: int | None
+    session_id: int | None
+    former_values: str | None
+    stop_reason: str | None
+
+    @property
+    def is_at_work(self) -> bool:
+        """Whether a process works on it; one on another host counts as alive."""
+        if self.pid is None:
+            return False
+        return self.host != host_name() or process_alive(self.pid, self.process, time.time())
 
 
 @dataclass(frozen=True)
@@ -99,16 +125,40 @@ class Result:
         return "failed" if self.score is None else "done"
 
 
+_SET: Final = f"SELECT {columns_of(TrialSet)} FROM trial_set WHERE id = ?"
+_NEXT: Final = (
+    f"SELECT {columns_of(Trial)} FROM trial WHERE trial_set_id = ? AND status IN ('running', "
+    "'waiting') ORDER BY status = 'waiting', number LIMIT 1"
+)
+_PROGRESS: Final = (
+    "SELECT count(finished_wall_time_s), count(*), (SELECT score FROM trial WHERE trial_set_id = "
+    "t.trial_set_id ORDER BY finished_wall_time_s DESC LIMIT 1) FROM trial t WHERE trial_set_id = ?"
+)
 _TRIALS: Final = f"SELECT {columns_of(Trial)} FROM trial WHERE trial_set_id = ? ORDER BY number"
 
 
 def create_trial_set(
-    connection: sqlite3.Connection, plan: str, parameters: list[dict[str, Any]]
+    connection: sqlite3.Connection,
+    plan: str,
+    parameters: list[dict[str, Any]],
+    robot_id: int | None = None,
 ) -> int:
-    """Enter a set and its trials, in the order in which they are to be run; returns its id."""
+    """Enter a set and its trials, in the order in which they are to be run; returns its id.
+
+    Args:
+        connection: In the role "writer".
+        plan: JSON text.
+        parameters: Of each trial.
+        robot_id: In whose simulation they run; None where each has one of its own.
+
+    Raises:
+        CommandRefusedError: Another set of that robot is not over.
+    """
     with transaction(connection):
-        row = connection.execute(_NEW_SET, (new_uuid(), plan, time.time())).fetchone()
-        set_id = int(row[0])
+        if robot_id is not None:
+            _require_free(connection, robot_id)
+        values = (new_uuid(), plan, time.time(), robot_id)
+        set_id = int(connection.execute(_NEW_SET, values).fetchone()[0])
         for number, values in enumerate(parameters, 1):
             _enter(connection, set_id, number, values)
     return set_id
@@ -128,10 +178,59 @@ def _enter(
     connection.execute(_NEW_TRIAL, (set_id, new_uuid(), number, text))
 
 
-def find_trial_set(connection: sqlite3.Connection, plan: str) -> int | None:
-    """The newest set with exactly this plan."""
-    row = connection.execute(_NEWEST, (plan,)).fetchone()
-    return int(row[0]) if row else None
+def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
+    """In one simulation one set at a time."""
+    for (set_id,) in connection.execute(_OF_ROBOT, (robot_id,)).fetchall():
+        found = fetch_trial_set(connection, set_id)
+        if found.is_at_work:
+            raise CommandRefusedError(
+                f"trial set {set_id} of this robot is under way: wait for it with "
+                f"webots_run_trials(trial_set={set_id}), or end it with cancel=true"
+            )
+        is_left = found.stop_reason is None and next_trial(connection, set_id) is not None
+        if is_left or found.former_values is not None:
+            raise CommandRefusedError(
+                f"trial set {set_id} of this robot was left by a server that ended: "
+                f"webots_run_trials(trial_set={set_id}) goes on with it, cancel=true ends it"
+            )
+
+
+def find_trial_set(connection: sqlite3.Connection, plan: str | None = None) -> int | None:
+    """The newest set with exactly this plan; without one the newest of all."""
+    return connection.execute(_NEWEST, (plan,)).fetchone()[0]
+
+
+def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSet:
+    """The set of that id.
+
+    Raises:
+        InvalidInputError: There is none.
+    """
+    row = connection.execute(_SET, (set_id,)).fetchone()
+    if row is None:
+        newest = find_trial_set(connection)
+        there = "none was begun" if newest is None else f"the newest is {newest}"
+        raise InvalidInputError(f"there is no trial set {set_id}: {there}")
+    return TrialSet(*row)
+
+
+def next_trial(connection: sqlite3.Connection, set_id: int) -> Trial | None:
+    """The trial that is to be run next, or was begun; None where all are over."""
+    row = connection.execute(_NEXT, (set_id,)).fetchone()
+    return Trial(*row) if row else None
+
+
+def stop_trial_set(connection: sqlite3.Connection, set_id: int, reason: str | None) -> None:
+    """Say why a set does not go on after its current trial; None has it go on."""
+    connection.execute(_STOP, (reason, set_id))
+
+
+def borrow_parameters(
+    connection: sqlite3.Connection, set_id: int, session_id: int, former: dict[str, Any] | None
+) -> None:
+    """Note what the parameters of a controller were before; None once they are so again."""
+    text = None if former is None else json.dumps(former, ensure_ascii=False)
+    connection.execute(_BORROW, (session_id, text, set_id))
 
 
 def trials_of(connection: sqlite3.Connection, set_id: int) -> list[Trial]:
@@ -140,8 +239,7 @@ def trials_of(connection: sqlite3.Connection, set_id: int) -> list[Trial]:
     Raises:
         InvalidInputError: There is no such set.
     """
-    if connection.execute(_SET, (set_id,)).fetchone() is None:
-        raise InvalidInputError(f"there is no trial set {set_id}")
+    fetch_trial_set(connection, set_id)
     return [Trial(*row) for row in connection.execute(_TRIALS, (set_id,)).fetchall()]
 
 
@@ -152,10 +250,11 @@ def take_up(connection: sqlite3.Connection, set_id: int) -> None:
         CommandRefusedError: Another one does.
     """
     with transaction(connection):
-        host, pid, process = connection.execute(_WORKER, (set_id,)).fetchone()
-        if pid is not None and (host != host_name() or process_alive(pid, process, time.time())):
+        found = fetch_trial_set(connection, set_id)
+        if found.is_at_work:
             raise CommandRefusedError(
-                f"process {pid} on {host} works on trial set {set_id}: wait for it, or end it"
+                f"process {found.pid} on {found.host} works on trial set {set_id}: wait for it, "
+                "or end it"
             )
         own = os.getpid()
         connection.execute(_WORK, (host_name(), own, process_identity(own), set_id))
@@ -166,9 +265,12 @@ def lay_down(connection: sqlite3.Connection, set_id: int) -> None:
     connection.execute(_WORK, (None, None, None, set_id))
 
 
-def begin_trial(connection: sqlite3.Connection, trial: Trial, pid: int) -> None:
-    """A simulator runs for it."""
-    connection.execute(_BEGIN, (time.time(), pid, process_identity(pid), trial.id))
+def begin_trial(connection: sqlite3.Connection, trial: Trial, pid: int | None = None) -> Trial:
+    """It runs: in a simulator of that pid, or in that of a live controller."""
+    process = None if pid is None else process_identity(pid)
+    now_s = time.time()
+    connection.execute(_BEGIN, (now_s, pid, process, trial.id))
+    return replace(trial, status="running", started_wall_time_s=now_s, pid=pid, process=process)
 
 
 def put_back(connection: sqlite3.Connection, trial: Trial) -> None:
@@ -191,6 +293,12 @@ def finish_trial(connection: sqlite3.Connection, trial: Trial, result: Result) -
             },
         )
         connection.execute(_LABEL, (label, result.run_id))
+
+
+def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, float, str]:
+    """How many trials of a set are over, of how many, and a word."""
+    over, of, last = connection.execute(_PROGRESS, (set_id,)).fetchone()
+    return over, of, f"{over} of {of} trials" + ("" if last is None else f", the last: {last:g}")
 
 
 def ranking_of(trials: list[Trial], best: Best) -> Ranking:

@@ -24,12 +24,11 @@ _GRID: Final = "grid"
 _REQUIRED: Final = ("world", "score")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Plan:
-    """A plan.
+    """What is tried, wherever it runs.
 
     Attributes:
-        world: The world file, with its full path.
         score: See docs/trials.md.
         parameters: The sets that are tried; empty where they are searched for.
         best: Which scores are the best.
@@ -46,7 +45,6 @@ class Plan:
         seed: Of the sampler: the same one says the same of the same trials.
     """
 
-    world: str
     score: str
     parameters: list[dict[str, Any]] = field(default_factory=list[dict[str, Any]])
     best: Best = "highest"
@@ -62,8 +60,6 @@ class Plan:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not Path(self.world).is_file():
-            raise InvalidInputError(f"world: there is no file {self.world}")
         parse_score(self.score)
         for condition in (self.until, self.prune):
             if condition is not None:
@@ -80,6 +76,7 @@ class Plan:
                 raise InvalidInputError(f"{name}={value} must be a number of seconds above 0")
         if self.search or self.ranges or self.sets or self.seed:
             self._require_searchable()
+        _require_tables(self.parameters)
         if not 1 <= self.repeats * (self.sets or len(self.parameters)) <= MOST_TRIALS:
             raise InvalidInputError(f"there must be 1 to {MOST_TRIALS} trials")
 
@@ -120,7 +117,23 @@ class Plan:
         return (self.sets or len(self.parameters)) * self.repeats + (self.repeats == 1)
 
 
-def read_plan(file: Path, search: Search | None = None) -> Plan:
+@dataclass(frozen=True, kw_only=True)
+class WorldPlan(Plan):
+    """A plan of which each trial runs in a simulator of its own.
+
+    Attributes:
+        world: The world file, with its full path.
+    """
+
+    world: str
+
+    def __post_init__(self) -> None:
+        if not Path(self.world).is_file():
+            raise InvalidInputError(f"world: there is no file {self.world}")
+        super().__post_init__()
+
+
+def read_plan(file: Path, search: Search | None = None) -> WorldPlan:
     """Read a plan, for a search or without one.
 
     Raises:
@@ -138,27 +151,38 @@ def read_plan(file: Path, search: Search | None = None) -> Plan:
         raise InvalidInputError(f"{file}: {error}") from error
 
 
-def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> Plan:
+def stored_plan(text: str) -> Plan:
+    """What the text of a plan says whose trials run in a robot's simulation."""
+    return Plan(**json.loads(text))
+
+
+def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> WorldPlan:
     require_kinds(found, _KINDS)
     if len(given := [_WRITTEN[name] for name in _WRITTEN if name in found]) != 1:
         raise InvalidInputError(_HOW_MANY + (f", not {' and '.join(given)}" if given else ""))
     if _GRID in found:
-        found = found | {"parameters": _combinations(found[_GRID])}
+        found = found | {"parameters": combinations(found[_GRID])}
     found = {name: value for name, value in found.items() if name != _GRID}
     for name in _REQUIRED:
         if name not in found:
             raise InvalidInputError(f"{name} is missing")
-    _require_tables(cast("list[Any]", found.get("parameters", [])))
     if "ranges" in found:
         found["ranges"] = read_ranges(found["ranges"])
     found["world"] = str((folder / found["world"]).resolve())
-    return Plan(**found, search=search)
+    return WorldPlan(**found, search=search)
 
 
-def _combinations(grid: dict[str, Any]) -> list[dict[str, Any]]:
+def combinations(grid: dict[str, Any]) -> list[dict[str, Any]]:
+    """Every combination of the values of a grid.
+
+    Raises:
+        InvalidInputError: One has no list of values, or there are too many.
+    """
     for name, values in grid.items():
         if not isinstance(values, list) or not values:
             raise InvalidInputError(f"[grid] {name} must be an array of values, such as [1.0, 2.0]")
+    if math.prod(len(values) for values in grid.values()) > MOST_TRIALS:
+        raise InvalidInputError(f"the grid has more than {MOST_TRIALS} combinations")
     return [dict(zip(grid, each, strict=True)) for each in itertools.product(*grid.values())]
 
 

@@ -46,7 +46,7 @@ from webots_mcp.store.trials import (
     take_up,
     trials_of,
 )
-from webots_mcp.trials.plan import Plan
+from webots_mcp.trials.plan import Plan, WorldPlan
 from webots_mcp.trials.simulators import Simulator, end_left_over
 from webots_mcp.trials.watching import End, Watch
 
@@ -77,7 +77,7 @@ class Workshop:
     """
 
     recording: Recording
-    plan: Plan
+    plan: WorldPlan
     command: Command
     stopping: threading.Event
     search: Search | None = None

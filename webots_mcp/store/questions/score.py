@@ -79,7 +79,7 @@ def score_run(
     score = parse_score(text)
     run, segment = run_info(connection, run_id), whole_run(connection, run_id)
     subject = Subject(fetch_run(connection, run_id).robot_id, run.robot, run_id)
-    _require_kinds(connection, score, run_id)
+    require_kinds(connection, score, run_id)
     if run.purged_rows:
         why = f"{run.purged_rows} rows of run {run_id} were purged: what is left is not the run"
         return RunScore(run_id, score.text, None, why, run.duration_s, 0)
@@ -87,9 +87,11 @@ def score_run(
         why = f"run {run_id} has no state row: its controller published nothing"
         return RunScore(run_id, score.text, None, why, run.duration_s, 0)
     score.require_known(catalogue(connection, subject))
-    duration_s = run.duration_s
+    noticed_s = fetch_run(connection, run_id).started_sim_time_s
+    began_s = 0.0 if run.start_reason == "reset" else noticed_s  # a reset shows a step later
+    duration_s = run.duration_s + noticed_s - began_s
     if end_s is not None and end_s < segment.end_s:
-        duration_s = end_s - fetch_run(connection, run_id).started_sim_time_s
+        duration_s = end_s - began_s
         segment = segment.through(end_s)
     return _scored(connection, score, subject, segment, duration_s, Deadline(deadline_s))
 
@@ -131,8 +133,12 @@ class _Rows:
             yield sim_time_s, parse(data)
 
 
-def _require_kinds(connection: sqlite3.Connection, score: Score, run_id: int) -> None:
-    """Before anything is run: a misspelt kind never happens, and its count would be 0."""
+def require_kinds(connection: sqlite3.Connection, score: Score, run_id: int) -> None:
+    """Refuse kinds of events that there are not, as in that run: their count would be 0.
+
+    Raises:
+        InvalidInputError: With the kinds that there are.
+    """
     stored = [kind for (kind,) in connection.execute(_STORED_KINDS, (run_id,)).fetchall()]
     known = [*kind_names(), *stored, *_BRIDGE_KINDS]
     for kind, column in score.kinds.items():

@@ -1,0 +1,126 @@
+"""Tools that try parameters in the running simulation, and rank them by a score."""
+
+from __future__ import annotations
+
+import time
+from typing import Annotated, Any, Final
+
+import anyio
+from anyio import to_thread
+from mcp.server.mcpserver import Context
+from pydantic import Field, WithJsonSchema
+
+from webots_mcp.contract import MAX_RUN_S
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.server import trial_sets
+from webots_mcp.server.declaring import READS, RESTARTS, tool
+from webots_mcp.server.history_results import TrialsAnswer
+from webots_mcp.server.parameters import Id, RobotName, TimeoutS
+from webots_mcp.server.trial_worker import TrialWorkers
+from webots_mcp.store.analysis.ranking import Best
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.trials import fetch_trial_set, progress_of
+
+_WAIT_S: Final = 60.0
+_TRIAL_S: Final = 300.0
+_LOOK_EVERY_S: Final = 0.05
+_REPORT_EVERY_S: Final = 1.0
+
+_Value = float | int | bool | str
+# What a value may be is the parameter's to say, and would take as much room as all else.
+Tried = Annotated[
+    list[dict[str, _Value]] | dict[str, list[_Value]] | None,
+    WithJsonSchema({"anyOf": [{"type": "array"}, {"type": "object"}]}),
+]
+SetId = Annotated[Id | None, Field(description="From an earlier answer.")]
+
+
+@tool("Run trials", RESTARTS)
+async def webots_run_trials(
+    recording: Recording,
+    ctx: Context[Any],
+    parameters: Annotated[
+        Tried, Field(description='Sets to try, [{"kp": 1.0}], or a grid, {"kp": [1.0, 2.0]}.')
+    ] = None,
+    score: Annotated[
+        str | None,
+        Field(
+            max_length=500,
+            description="Over a run: max(x) - 2 * count(stuck); min, mean, first, last, "
+            "time(condition), duration.",
+        ),
+    ] = None,
+    best: Annotated[Best, Field(description="Which score.")] = "highest",
+    for_s: Annotated[
+        float | None, Field(gt=0, le=MAX_RUN_S, description="Simulated seconds of a trial.")
+    ] = None,
+    until: Annotated[
+        str | None, Field(max_length=500, description="It ends when this condition holds.")
+    ] = None,
+    repeats: Annotated[int, Field(ge=1, le=1000, description="Of each set.")] = 1,
+    trial_timeout_s: Annotated[
+        float, Field(gt=0, description="Wall seconds; a trial that takes longer fails.")
+    ] = _TRIAL_S,
+    trial_set: SetId = None,
+    cancel: Annotated[bool, Field(description="Stop that set after its current trial.")] = False,
+    robot: RobotName = None,
+    timeout_s: TimeoutS = _WAIT_S,
+) -> TrialsAnswer:
+    """Which parameters are best? Each trial resets the world, sets them, runs fast, is scored.
+
+    Answers when all are over or the wait is, and then goes on in the server: trial_set alone waits
+    on, or goes on with what stopped. At the end the parameters are set back.
+    """
+    given = parameters is not None or score is not None
+    if (trial_set is None) != given:
+        raise InvalidInputError("give parameters and score for a new set, or trial_set, not both")
+    workers: TrialWorkers = ctx.request_context.lifespan_context
+    if trial_set is None:
+        if parameters is None or score is None:
+            raise InvalidInputError("give both: parameters to try, and a score to rank them by")
+        if cancel:
+            raise InvalidInputError("cancel needs trial_set: which one is to stop?")
+        asked = {"score": score, "best": best, "for_s": for_s, "until": until, "repeats": repeats}
+        asked |= {"timeout_s": trial_timeout_s}
+        number = await to_thread.run_sync(
+            lambda: trial_sets.begin_set(recording, parameters, robot, **asked)
+        )
+        await to_thread.run_sync(workers.begin, number)
+    else:
+        number = trial_set
+        await to_thread.run_sync(lambda: _take_up(recording, workers, number, cancel=cancel))
+    await _wait(recording, ctx, number, timeout_s)
+    return TrialsAnswer(**await to_thread.run_sync(trial_sets.told_of_set, recording, number))
+
+
+@tool("Get trials", READS)
+def webots_get_trials(recording: Recording, trial_set: SetId = None) -> TrialsAnswer:
+    """How far trials are, also those from a shell, and the parameters ranked by median score.
+
+    best_is_better: beyond the noise, by which repeats of the same differ.
+    """
+    return TrialsAnswer(**trial_sets.told_of_set(recording, trial_set))
+
+
+def _take_up(recording: Recording, workers: TrialWorkers, set_id: int, *, cancel: bool) -> None:
+    """Go on with a set, or end it, unless somebody is at it already."""
+    trial_sets.require_ours(recording, set_id)
+    with recording.reader() as connection:
+        at_work = fetch_trial_set(connection, set_id).is_at_work
+    if cancel:
+        trial_sets.cancel(recording, set_id)
+    elif not at_work:
+        trial_sets.go_on(recording, set_id)
+    if not at_work:
+        workers.begin(set_id)
+
+
+async def _wait(recording: Recording, ctx: Context[Any], set_id: int, timeout_s: float) -> None:
+    """Until nobody works on the set any more, or the time is over."""
+    until_s, report_s = time.monotonic() + timeout_s, time.monotonic() + _REPORT_EVERY_S
+    with recording.reader() as connection:
+        while fetch_trial_set(connection, set_id).is_at_work and time.monotonic() < until_s:
+            if time.monotonic() >= report_s:
+                report_s += _REPORT_EVERY_S
+                await ctx.report_progress(*progress_of(connection, set_id))
+            await anyio.sleep(_LOOK_EVERY_S)

@@ -1,0 +1,246 @@
+"""Trial sets in a robot's simulation: what is refused, and what an answer says of one."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from webots_mcp.conditions.score import parse_score
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.parameter import require_known
+from webots_mcp.server.budget import (
+    condensed,
+    figure,
+    figures,
+    fitting,
+    header_of_only,
+    notes_of,
+    shown,
+)
+from webots_mcp.server.running import ACTION, known_names, require_possible
+from webots_mcp.server.shortening import cut_text
+from webots_mcp.server.target import find_target
+from webots_mcp.server.tuning import settable
+from webots_mcp.store.analysis.ranking import Best, Ranked, Ranking
+from webots_mcp.store.questions.score import require_kinds
+from webots_mcp.store.recording import Recording, look
+from webots_mcp.store.robots import robot_name
+from webots_mcp.store.trials import (
+    Trial,
+    TrialSet,
+    create_trial_set,
+    fetch_trial_set,
+    find_trial_set,
+    ranking_of,
+    stop_trial_set,
+    trials_of,
+)
+from webots_mcp.trials.plan import Plan, combinations
+
+CANCELLED: Final = "it was cancelled"
+_TABLE_BUDGET: Final = 5_400
+_LONGEST_WHY: Final = 120
+_FIGURES: Final = ("score", "range", "scored", "failed", "why", "runs")
+_MOST_NAMED_RUNS: Final = 5
+
+
+# -- before anything is begun -----------------------------------------------------------------
+
+
+def begin_set(
+    recording: Recording,
+    parameters: Sequence[Mapping[str, Any]] | Mapping[str, Sequence[Any]],
+    robot: str | None,
+    **asked: Any,
+) -> int:
+    """Enter a set of trials, once it is sure that they can be run; returns its id.
+
+    Args:
+        recording: Of the robot.
+        parameters: Sets of values, or a grid of which every combination is tried.
+        robot: Whose controller; None for the only live one.
+        asked: The other fields of a `Plan`.
+
+    Raises:
+        InvalidInputError: The controller does not declare a parameter or not with such a value,
+            a signal of the score or of `until` was never recorded, or the plan makes no sense.
+        CommandRefusedError: Nobody alive could run them, or another set of the robot is not over.
+    """
+    sets = combinations(dict(parameters)) if isinstance(parameters, Mapping) else parameters
+    require_possible(recording, robot, asked.get("until"), asked.get("for_s"), reset=True)
+    checked = _checked(recording, robot, sets)
+    with recording.reader() as connection:
+        view = find_target(connection, robot, ACTION)
+        plan = Plan(parameters=checked, robot=view.robot.name, **asked)
+        score = parse_score(plan.score)
+        require_kinds(connection, score, view.require_run().id)
+        if known := known_names(view):
+            score.require_known(known)
+    with recording.writer() as connection:
+        return create_trial_set(connection, plan.text, plan.trials, view.robot.id)
+
+
+def _checked(
+    recording: Recording, robot: str | None, sets: Sequence[Mapping[str, Any]]
+) -> list[dict[str, Any]]:
+    """The values as the parameters hold them."""
+    declared = settable(recording, robot)
+    require_known(list({name: None for values in sets for name in values}), list(declared))
+    return [
+        {name: declared[name].declaration.checked(value) for name, value in values.items()}
+        for values in sets
+    ]
+
+
+def require_ours(recording: Recording, set_id: int) -> None:
+    """Refuse a set whose trials run in simulators of their own.
+
+    Raises:
+        InvalidInputError: It is one, or there is no such set.
+    """
+    with recording.reader() as connection:
+        if fetch_trial_set(connection, set_id).robot_id is None:
+            raise InvalidInputError(
+                f"trial set {set_id} was begun from a shell: the command 'webots-mcp trials PLAN' "
+                f"goes on with it; webots_get_trials(trial_set={set_id}) tells of it"
+            )
+
+
+def go_on(recording: Recording, set_id: int) -> None:
+    """Have a set that stopped go on."""
+    _stop(recording, set_id, None)
+
+
+def cancel(recording: Recording, set_id: int) -> None:
+    """Have a set stop after its current trial."""
+    _stop(recording, set_id, CANCELLED)
+
+
+def _stop(recording: Recording, set_id: int, reason: str | None) -> None:
+    with recording.writer() as connection:
+        stop_trial_set(connection, set_id, reason)
+
+
+# -- what came of it --------------------------------------------------------------------------
+
+
+def told_of_set(recording: Recording, set_id: int | None) -> dict[str, Any]:
+    """What an answer says of a set, by default of the newest.
+
+    Raises:
+        InvalidInputError: There is no such set.
+        NothingRecordedError: There is no database.
+    """
+    with recording.reader() as connection:
+        number = find_trial_set(connection) if set_id is None else set_id
+        if number is None:
+            return {**header_of_only(connection), "hint": "no trials were begun: webots_run_trials"}
+        found = fetch_trial_set(connection, number)
+        return {**_header(connection, found), **_told(connection, found)}
+
+
+def _header(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
+    if found.robot_id is None:
+        return header_of_only(connection)
+    return look(connection, robot_name(connection, found.robot_id)).header()
+
+
+def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
+    trials, plan = trials_of(connection, found.id), json.loads(found.plan)
+    best: Best = plan.get("best", "highest")
+    over = sum(each.is_over for each in trials)
+    state, hint = _state(found, len(trials) - over)
+    ranking = ranking_of(trials, best)
+    rows = fitting(_rows(ranking, trials), _TABLE_BUDGET)
+    left_out = len(ranking.sets) - len(rows)
+    return {
+        "trial_set": found.id,
+        "state": state,
+        "trials": len(trials),
+        "over": over,
+        "failed": sum(each.status == "failed" for each in trials) or None,
+        "score": f"{cut_text(str(plan.get('score')), 500)} ({best} is best)",
+        "ranked": condensed((*_names(ranking), *_FIGURES), rows),
+        "noise": figure(ranking.noise.deviation) if ranking.noise.freedom else None,
+        "best_is_better": ranking.better,
+        "verdict": ranking.verdict if over else None,
+        "notes": notes_of([*_left_out(left_out), *_gone(connection, trials)]),
+        "hint": hint,
+    }
+
+
+def _state(found: TrialSet, left: int) -> tuple[str, str | None]:
+    """Whether it goes on, and what to do next."""
+    again = f"webots_run_trials(trial_set={found.id})"
+    if found.is_at_work:
+        if found.stop_reason:
+            return f"stopping: {found.stop_reason}", None
+        return "under way", f"{again} waits for it, with cancel=true it stops"
+    if found.former_values is not None:
+        return "left by a server that ended", f"{again} goes on and sets the parameters back"
+    if not left:
+        return "done", None
+    if found.robot_id is None:
+        return "left", "the same command, 'webots-mcp trials PLAN', goes on with it"
+    if found.stop_reason:
+        return f"stopped: {found.stop_reason}", f"{again} goes on with the {left} that are left"
+    return "left by a server that ended", f"{again} goes on with the {left} that are left"
+
+
+def _names(ranking: Ranking) -> list[str]:
+    """The parameters as columns beside those of the figures."""
+    names = dict.fromkeys(name for each in ranking.sets for name in each.parameters)
+    return [f"parameter {name}" if name in _FIGURES else name for name in names]
+
+
+def _rows(ranking: Ranking, trials: Sequence[Trial]) -> list[list[Any]]:
+    names = list(dict.fromkeys(name for each in ranking.sets for name in each.parameters))
+    runs: dict[str, list[int]] = {}
+    for each in trials:
+        if each.is_over and each.run_id is not None:
+            runs.setdefault(_as_key(each.values), []).append(each.run_id)
+    return [_row(each, names, runs.get(_as_key(each.parameters), [])) for each in ranking.sets]
+
+
+def _as_key(values: Mapping[str, Any]) -> str:
+    return json.dumps(values, sort_keys=True)
+
+
+def _row(ranked: Ranked, names: Sequence[str], runs: Sequence[int]) -> list[Any]:
+    spread, why = ranked.score, next(iter(ranked.failures), None)
+    several = spread is not None and len(ranked.scores) > 1
+    return [
+        *(shown(ranked.parameters.get(name)) for name in names),
+        figure(spread.median) if spread else None,
+        figures([spread.low, spread.high]) if spread and several else None,
+        len(ranked.scores),
+        len(ranked.failures) or None,
+        why and cut_text(why, _LONGEST_WHY),
+        list(runs[:_MOST_NAMED_RUNS]),
+    ]
+
+
+def _left_out(count: int) -> list[str]:
+    more = f"{count} sets that rank lower are not shown: webots_query_sql has all in table trial"
+    return [more] if count > 0 else []
+
+
+def _gone(connection: sqlite3.Connection, trials: Sequence[Trial]) -> list[str]:
+    """Scores stay where rows do not."""
+    asked = json.dumps([each.run_id for each in trials if each.run_id is not None])
+    purged = {number for (number,) in connection.execute(_PURGED, (asked,)).fetchall()}
+    deleted = [each.number for each in trials if each.score is not None and each.run_id is None]
+    gone = sorted({each.number for each in trials if each.run_id in purged} | {*deleted})
+    if not gone:
+        return []
+    listed = ", ".join(map(str, gone[:_MOST_NAMED_RUNS])) + (
+        f" and {len(gone) - _MOST_NAMED_RUNS} more" if len(gone) > _MOST_NAMED_RUNS else ""
+    )
+    return [f"rows of trial {listed} were purged since: the scores stay"]
+
+
+_PURGED: Final = (
+    "SELECT id FROM run WHERE purged_rows > 0 AND id IN (SELECT value FROM json_each(?))"
+)

@@ -1,0 +1,351 @@
+"""Runs the trials of a set one after another in a robot's simulation, in a thread of the server.
+
+Whatever happened is in the database before the next step is taken, so that another server can go on
+where this one was killed: the command of a trial has a key by which it is found again, and is never
+sent twice.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sqlite3
+import threading
+import time
+from collections.abc import Mapping
+from typing import Any, Final
+
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+from webots_mcp.server.running import ACTION
+from webots_mcp.server.target import find_target
+from webots_mcp.store.parameters import described
+from webots_mcp.store.questions.score import score_run
+from webots_mcp.store.queue import Command, CommandQueue, fetch_command, find_command
+from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.robots import robot_name
+from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.trials import (
+    Result,
+    Trial,
+    TrialSet,
+    begin_trial,
+    borrow_parameters,
+    fetch_trial_set,
+    finish_trial,
+    lay_down,
+    next_trial,
+    put_back,
+    stop_trial_set,
+    take_up,
+    trials_of,
+)
+from webots_mcp.trials.plan import Plan, stored_plan
+
+_LOOK_EVERY_S: Final = 0.02
+_SETTLE_EVERY_S: Final = 1.0
+_PATIENCE_S: Final = 5.0  # with a command that takes a round of the loop
+_END_PATIENCE_S: Final = 2.0  # the same where the server ends
+_SET_PARAMETERS: Final = "set_parameters"
+_ENDS: Final = {"condition held": "until", "time over": "for_s"}
+_RUN_OF: Final = (
+    "SELECT min(id) FROM run WHERE session_id = ? AND started_wall_time_s >= "
+    "(SELECT claimed_wall_time_s FROM command WHERE id = ?)"
+)
+_HANGS: Final = (
+    "the loop of robot {!r} does not come to bridge.get_command() any more: see what it waits for, "
+    "or start its controller again"
+)
+
+_log = logging.getLogger(__name__)
+
+
+class _ServerEndsError(Exception):
+    """The server ends; the set waits for another one."""
+
+
+class TrialWorker(threading.Thread):
+    """Works on a set until it is over or something speaks against going on.
+
+    Args:
+        recording: Of the robot.
+        set_id: The set.
+
+    Raises:
+        CommandRefusedError: Another process works on it.
+    """
+
+    def __init__(self, recording: Recording, set_id: int) -> None:
+        super().__init__(name=f"trial set {set_id}", daemon=True)
+        self._recording = recording
+        self._set_id = set_id
+        self._stopping = threading.Event()
+        with recording.writer() as connection:
+            take_up(connection, set_id)
+            self._set = fetch_trial_set(connection, set_id)
+            self._robot = robot_name(connection, self._set.robot_id or 0)
+        self._plan: Plan = stored_plan(self._set.plan)
+
+    def stop(self) -> None:
+        """The server ends: leave the set as it is."""
+        self._stopping.set()
+        self.join(2 * _END_PATIENCE_S + 1)
+
+    def run(self) -> None:
+        """Run what is left of the set."""
+        try:
+            while (trial := self._next()) is not None:
+                self._try(trial)
+        except _ServerEndsError:
+            pass
+        except WebotsMCPError as error:
+            self._say_why(str(error))
+        except Exception as error:  # noqa: BLE001  (no thread ends without a word)
+            _log.exception("trial set %d failed", self._set_id)
+            self._say_why(f"a defect of webots-mcp ({type(error).__name__}: {error})")
+        finally:
+            self._leave()
+
+    # -- one trial -----------------------------------------------------------------------------
+
+    def _next(self) -> Trial | None:
+        """What a killed server has begun comes first; a set that stops begins no other."""
+        if self._stopping.is_set():
+            raise _ServerEndsError
+        with self._recording.reader() as connection:
+            trial = next_trial(connection, self._set_id)
+            stops = fetch_trial_set(connection, self._set_id).stop_reason is not None
+        return None if trial and trial.status == "waiting" and stops else trial
+
+    def _try(self, trial: Trial) -> None:
+        try:
+            command = self._watched(self._sent(trial), self._plan.timeout_s)
+            result = self._result(trial, command)
+        except BaseException:
+            with self._recording.writer() as connection:
+                put_back(connection, trial)
+            raise
+        with self._recording.writer() as connection:
+            finish_trial(connection, trial, result)
+        if not command.is_final:
+            raise CommandRefusedError(_HANGS.format(self._robot))
+
+    def _sent(self, trial: Trial) -> Command:
+        """The command that runs a trial; one that was sent already is not sent again."""
+        with self._recording.writer() as connection:
+            known = find_command(connection, _key(trial))
+            if known is not None:
+                return known
+            view = self._borrow(connection)
+            begun = begin_trial(connection, trial) if trial.status == "waiting" else trial
+            return CommandQueue(connection).enqueue(
+                view.robot.id,
+                ACTION,
+                self._asked(trial),
+                requested_by="mcp",
+                idempotency_key=_key(begun),
+            )
+
+    def _asked(self, trial: Trial) -> dict[str, Any]:
+        asked = {
+            "until": self._plan.until,
+            "for_s": self._plan.for_s,
+            "reset": True,
+            "pace": "fast",
+            "parameters": trial.values,
+            "by": "trial",
+            "then": "pause",
+        }
+        return {name: value for name, value in asked.items() if value is not None}
+
+    def _borrow(self, connection: sqlite3.Connection) -> View:
+        """The robot; what its parameters are is noted first, of each controller once."""
+        view = find_target(connection, self._robot, ACTION)
+        noted = fetch_trial_set(connection, self._set_id)
+        assert view.session is not None  # it is live
+        if noted.former_values is None or noted.session_id != view.session.id:
+            tried = {name for values in self._plan.parameters for name in values}
+            known = {each["name"]: each for each in described(connection, view.require_run())}
+            former = {name: _value(known[name]) for name in known if name in tried}
+            borrow_parameters(connection, self._set_id, view.session.id, former)
+        return view
+
+    def _watched(self, command: Command, timeout_s: float) -> Command:
+        """Wait until it is settled; a run that takes longer is ended."""
+        command = self._settled(command.id, timeout_s)
+        if not command.is_final:
+            self._take_back(command)
+            command = self._settled(command.id, _PATIENCE_S)
+        return command
+
+    def _settled(self, command_id: int, timeout_s: float, *, hurried: bool = False) -> Command:
+        """The command, once its fate is settled or the time is over."""
+        until_s, settle_s = time.monotonic() + timeout_s, time.monotonic() + _SETTLE_EVERY_S
+        with self._recording.reader() as connection:
+            while not (command := fetch_command(connection, command_id)).is_final:
+                now_s = time.monotonic()
+                if now_s >= until_s:
+                    break
+                if now_s >= settle_s:
+                    settle_s = now_s + _SETTLE_EVERY_S
+                    self._recording.settle()
+                if hurried:
+                    time.sleep(_LOOK_EVERY_S)
+                elif self._stopping.wait(_LOOK_EVERY_S):
+                    self._take_back(command)
+                    self._settled(command_id, _END_PATIENCE_S, hurried=True)
+                    raise _ServerEndsError
+        return command
+
+    def _take_back(self, command: Command) -> None:
+        """It does not run, or ends now."""
+        with self._recording.writer() as connection:
+            queue = CommandQueue(connection)
+            if not queue.cancel(command.id, "its trial was ended"):
+                params = {"command_id": command.id}
+                queue.enqueue(command.robot_id, "cancel_run", params, requested_by="mcp")
+
+    # -- what came of it -----------------------------------------------------------------------
+
+    def _result(self, trial: Trial, command: Command) -> Result:
+        """What became of a trial.
+
+        Raises:
+            CommandRefusedError: Somebody else decides what the simulation does.
+            InvalidInputError: No trial of the set can succeed.
+        """
+        if command.status in ("expired", "cancelled"):
+            raise CommandRefusedError(f"trial {trial.number} was not run: {command.error}")
+        with self._recording.reader() as connection:
+            run_id = connection.execute(_RUN_OF, (command.session_id, command.id)).fetchone()[0]
+            if command.status != "done":
+                why = self._too_long if command.status == "claimed" else command.error
+                return Result(run_id, None, f"{_reached(connection, run_id)}: {why}")
+            told: Mapping[str, Any] = command.decoded_result() or {}
+            if told.get("ended") in _ENDS:
+                return self._scored(connection, run_id, told)
+            return Result(run_id, None, self._why_not(connection, trial, run_id, told))
+
+    def _why_not(
+        self,
+        connection: sqlite3.Connection,
+        trial: Trial,
+        run_id: int | None,
+        told: Mapping[str, Any],
+    ) -> str:
+        """Why a run ended without having reached its end."""
+        why = str(told.get("why") or told.get("ended"))
+        if told.get("ended") == "interrupted":
+            if "cancelled" not in why:
+                raise CommandRefusedError(f"trial {trial.number} was interrupted: {why}")
+            why = self._too_long
+        return f"{_reached(connection, run_id)}: {why}"
+
+    @property
+    def _too_long(self) -> str:
+        return f"it took longer than {self._plan.timeout_s:g} s of wall time"
+
+    def _scored(
+        self, connection: sqlite3.Connection, run_id: int, told: Mapping[str, Any]
+    ) -> Result:
+        end_s = told["sim_time_s"]
+        ended = (_ENDS[told["ended"]], end_s)
+        try:
+            scored = score_run(connection, run_id, self._plan.score, end_s=end_s)
+        except InvalidInputError as error:
+            if not any(each.score is not None for each in trials_of(connection, self._set_id)):
+                raise
+            return Result(run_id, None, str(error), *ended)
+        return Result(run_id, scored.value, scored.why, *ended)
+
+    # -- at the end ----------------------------------------------------------------------------
+
+    def _say_why(self, reason: str) -> None:
+        """Why the set does not go on; what was said first counts."""
+        with self._recording.writer() as connection:
+            if fetch_trial_set(connection, self._set_id).stop_reason is None:
+                stop_trial_set(connection, self._set_id, reason)
+
+    def _leave(self) -> None:
+        """Set the parameters back, and let others work on the set."""
+        try:
+            self._give_back()
+        except WebotsMCPError as error:
+            _log.warning("trial set %d: the parameters were not set back: %s", self._set_id, error)
+        finally:
+            with self._recording.writer() as connection:
+                lay_down(connection, self._set_id)
+
+    def _give_back(self) -> None:
+        """A controller that has ended has no values any more."""
+        with self._recording.writer() as connection:
+            noted = fetch_trial_set(connection, self._set_id)
+            if noted.former_values is None:
+                return
+            assert noted.robot_id is not None and noted.session_id is not None
+            command = self._ask_back(connection, noted)
+        patience_s = _END_PATIENCE_S if self._stopping.is_set() else _PATIENCE_S
+        if command is not None:
+            command = self._settled(command.id, patience_s, hurried=True)
+        if command is None or command.status == "done":
+            with self._recording.writer() as connection:
+                borrow_parameters(connection, self._set_id, noted.session_id, None)
+        else:
+            self._say_why(f"its parameters were not set back: {command.error or command.status}")
+
+    def _ask_back(self, connection: sqlite3.Connection, noted: TrialSet) -> Command | None:
+        """The command that sets the parameters back; None where there is nobody to ask."""
+        assert noted.robot_id is not None and noted.former_values is not None
+        try:
+            view = find_target(connection, self._robot, _SET_PARAMETERS)
+        except CommandRefusedError:
+            return None
+        if view.session is None or view.session.id != noted.session_id:
+            return None
+        params = {"values": json.loads(noted.former_values), "when": "now", "by": "trial"}
+        return CommandQueue(connection).enqueue(
+            noted.robot_id, _SET_PARAMETERS, params, requested_by="mcp"
+        )
+
+
+class TrialWorkers:
+    """Those of a server.
+
+    Args:
+        recording: Of the robots.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self._recording = recording
+        self._workers: list[TrialWorker] = []
+
+    def begin(self, set_id: int) -> None:
+        """Work on a set.
+
+        Raises:
+            CommandRefusedError: Another process does.
+        """
+        worker = TrialWorker(self._recording, set_id)
+        self._workers = [each for each in self._workers if each.is_alive()] + [worker]
+        worker.start()
+
+    def stop(self) -> None:
+        """The server ends."""
+        for worker in self._workers:
+            worker.stop()
+
+
+def _key(trial: Trial) -> str:
+    """Of the command of a trial that was begun at that time."""
+    return f"trial {trial.uuid} {trial.started_wall_time_s}"
+
+
+def _value(parameter: Mapping[str, Any]) -> Any:
+    """Its value; before the first was recorded, what the code declares."""
+    return parameter["default"] if parameter["value"] is None else parameter["value"]
+
+
+def _reached(connection: sqlite3.Connection, run_id: int | None) -> str:
+    if run_id is None:
+        return "its run did not begin"
+    run = fetch_run(connection, run_id)
+    return f"never reached its end, but {run.last_sim_time_s:.3f} s"

@@ -30,18 +30,30 @@ class Memory(Protocol):
         ...
 
 
-class Changed:
+class _Holding:
+    """Whether something holds, as of the state that was taken in last."""
+
+    _error: ConditionFailedError | None = None
+    _holds = False
+
+    def holds(self, state: State) -> bool:
+        """It could be asked of that state; else the error says why not."""
+        if self._error is not None:
+            raise self._error
+        return self._holds
+
+
+class Changed(_Holding):
     """Whether a value is another than the last one that was there."""
 
     def __init__(self, read: Read) -> None:
         self._read = read
-        self._error: ConditionFailedError | None = None
         self.forget()
 
     def forget(self) -> None:
         """What comes first is no change."""
         self._last: Value = None
-        self._changed = False
+        self._holds = False
 
     def update(self, state: State, sim_time_s: float) -> None:
         """A missing value is no change, and neither is its return as it was."""
@@ -51,15 +63,9 @@ class Changed:
         except ConditionFailedError as error:
             self._error = error
             return
-        self._changed = value is not None and self._last is not None and value != self._last
+        self._holds = value is not None and self._last is not None and value != self._last
         if value is not None:
             self._last = value
-
-    def holds(self, state: State) -> bool:
-        """As of the state that was taken in last."""
-        if self._error is not None:
-            raise self._error
-        return self._changed
 
 
 class Rate:
@@ -140,19 +146,18 @@ class Displacement:
         return math.hypot(self._here[0] - was_x, self._here[1] - was_y)
 
 
-class Lasting:
+class Lasting(_Holding):
     """Whether a condition held in every state of at least so many seconds."""
 
     def __init__(self, condition: Callable[[State], bool], seconds: float) -> None:
         self._condition = condition
         self._seconds = seconds
-        self._error: ConditionFailedError | None = None
         self.forget()
 
     def forget(self) -> None:
         """It holds since no time at all."""
         self._since_s: float | None = None
-        self._long_enough = False
+        self._holds = False
 
     def update(self, state: State, sim_time_s: float) -> None:
         """Between two states in both of which it holds it counts as unbroken."""
@@ -164,14 +169,8 @@ class Lasting:
             return
         if not holds:
             self._since_s = None
-            self._long_enough = False
+            self._holds = False
             return
         if self._since_s is None:
             self._since_s = sim_time_s
-        self._long_enough = sim_time_s - self._since_s >= self._seconds - SAME_TIME_S
-
-    def holds(self, state: State) -> bool:
-        """As of the state that was taken in last."""
-        if self._error is not None:
-            raise self._error
-        return self._long_enough
+        self._holds = sim_time_s - self._since_s >= self._seconds - SAME_TIME_S

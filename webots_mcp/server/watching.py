@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 import sqlite3
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any
 
 from webots_mcp.server.bounds import newest_runs
 from webots_mcp.server.budget import figure, seconds
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion, path_length, places_of
+from webots_mcp.store.reading.coverage import row_before
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.recording import View
 from webots_mcp.store.signals.catalogue import known_signals
 from webots_mcp.store.signals.registry import Signal
-
-_ROW_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 
 
 @dataclass(frozen=True)
@@ -40,17 +39,16 @@ def window_from(view: View, wall_start_s: float) -> Window:
     found = find_range(view.connection, Scope(since=wall_start_s), view.subject)
     found = newest_runs(found if found.segments else replace(found, notes=()))
     around = [
-        replace(segment, start_s=_row_before(view.connection, segment))
+        replace(segment, start_s=_from_row_before(view.connection, segment))
         for segment in found.segments or [_standing(view, wall_start_s)]
     ]
     around[-1] = replace(around[-1], end_s=math.inf)
     return Window(found, replace(found, segments=tuple(around)))
 
 
-def _row_before(connection: sqlite3.Connection, segment: Segment) -> float:
-    values = (segment.run_id, segment.start_s)
-    before_s = connection.execute(_ROW_BEFORE, values).fetchone()[0]
-    return segment.start_s if before_s is None else float(before_s)
+def _from_row_before(connection: sqlite3.Connection, segment: Segment) -> float:
+    before_s = row_before(connection, segment.run_id, segment.start_s)
+    return segment.start_s if before_s is None else before_s
 
 
 def _standing(view: View, wall_start_s: float) -> Segment:

@@ -61,7 +61,7 @@ def test_a_summary_of_arrays_is_that_of_lists(course: Array, missing: int, angle
     times = times_of(course)
     padding = [math.nan] * missing
     rows = len(course) + missing
-    found = summarise_numbers(times, course, rows=rows, angle=angle)
+    found = summarise_numbers(times, course, rows=rows, turn=math.tau if angle else None)
     plain = summarise([*times.tolist(), *padding], [*course.tolist(), *padding], angle=angle)
     for field, one, other in zip(Summary._fields, found, plain, strict=True):
         assert one == (other if other is None else pytest.approx(other, abs=1e-9)), field

@@ -105,3 +105,27 @@ def test_a_bearing_to_the_nearest_of_several_things_does_not_turn(
     assert (bearing.summary.min, bearing.summary.max) == (
         pytest.approx(-1.8, abs=0.02), pytest.approx(2.4, abs=0.02),
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "turn"), [("bearing_rad", math.tau), ("bearing_deg", 360.0)])
+def test_where_turns_are_not_counted_neither_extremes_nor_deviation_count_them(
+    empty: sqlite3.Connection, tier: str, name: str, turn: float
+) -> None:
+    places = [0.45, -0.45, 0.1]
+    bearing = trend_of(empty, f"lidar.{name}", lambda t: turn * places[int(10 * t) % 7 % 3])
+    assert (bearing.turned, bearing.fast) == (None, True)
+    assert (bearing.summary.min, bearing.summary.max) == pytest.approx((-0.45 * turn, 0.45 * turn))
+    assert bearing.deviation is not None
+    assert 0.1 * turn < bearing.deviation < 0.4 * turn
+
+
+@pytest.mark.parametrize("name", ["heading", "heading_deg"])
+def test_the_deviation_of_a_course_is_that_of_its_values_in_a_long_range_too(
+    empty: sqlite3.Connection, tier: str, name: str
+) -> None:
+    half = 180.0 if name == "heading_deg" else math.pi
+    heading = trend_of(
+        empty, name, lambda t: math.remainder(0.99 * half + 0.03 * half * math.sin(t / 5), 2 * half)
+    )
+    assert heading.deviation == pytest.approx(0.03 * half / 2**0.5, rel=0.12)
+    assert heading.summary.min is not None and heading.summary.min > 0.9 * half

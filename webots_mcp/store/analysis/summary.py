@@ -152,7 +152,7 @@ def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = 
 
 
 def summarise_numbers(
-    times: Array, numbers: Array, *, rows: int | None = None, angle: bool = False
+    times: Array, numbers: Array, *, rows: int | None = None, turn: float | None = None
 ) -> Summary:
     """The same of usable numbers in arrays, as `usable_arrays` gives them: faster where many.
 
@@ -160,11 +160,12 @@ def summarise_numbers(
         times: Of the numbers.
         numbers: In order.
         rows: Of which so many held one; None for as many.
-        angle: They are angles in radians.
+        turn: A whole turn of what is an angle, in its unit.
     """
     count = len(numbers)
     if not count:
         return Summary(rows or 0)
+    angles = numbers * (math.tau / turn) if turn else None
     low, high = int(numbers.argmin()), int(numbers.argmax())
     total = float(numbers.sum())
     deviations = numbers - total / count
@@ -178,8 +179,8 @@ def summarise_numbers(
         *_at(times, numbers, high),
         total,
         inner(deviations, deviations),
-        float(np.sin(numbers).sum()) if angle else None,
-        float(np.cos(numbers).sum()) if angle else None,
+        None if angles is None else float(np.sin(angles).sum()),
+        None if angles is None else float(np.cos(angles).sum()),
     )
 
 

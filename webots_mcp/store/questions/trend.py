@@ -45,7 +45,7 @@ class Trend:
         mean: Of an angle the circular mean. What is less than a few millionths of the range is
             rounded away: it comes from adding.
         deviation: Standard deviation; of an angle that of the unwrapped angle, or the circular one
-            where turns cannot be counted.
+            where turns cannot be counted, beside extremes as they were recorded.
         turned: How far an angle turned, positive as it grows, turns counted; else None.
         leaps: An angle that changed by more than a quarter turn from row to row, as the bearing to
             the nearest of several things does: its turns cannot be counted.
@@ -109,7 +109,7 @@ def judge(
     of_rows = spikes is not None
     turn = signal.turn if of_rows else summary.turn_of(signal.turn)
     leaps = turn is not None and of_rows and leaps_in(numbers, turn)
-    course = np.unwrap(numbers, period=turn) if turn and not leaps else numbers
+    course = _unwrapped(numbers, summary, turn) if turn and not leaps else numbers
     inner = summary if of_rows and course is numbers else summarise_numbers(times, course)
     slow = _slow_share(inner, inner_variance, turn)
     fast = slow < SLOW_SHARE or leaps
@@ -118,7 +118,11 @@ def judge(
     monotonic = None if fast else _monotonic(course)
     rest_s = None if fast else flat_since(*((times, course) if known is None or turn else known))
     mean = _mean(signal, summary, inner, numbers)
-    summary = _unwrapped(summary, inner) if course is not numbers else summary
+    counted = course is not numbers and not fast
+    deviation = summary.deviation_in(signal.turn)
+    if counted:
+        deviation = _deviation(inner, inner_variance)
+    summary = _with_extremes_of(inner, summary) if counted else summary
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
     trend = Trend(
         name=signal.name,
@@ -126,7 +130,7 @@ def judge(
         unit=signal.unit,
         summary=summary,
         mean=_rounded(mean, inner),
-        deviation=_deviation(signal, summary, inner, leaps=leaps),
+        deviation=deviation,
         turned=_turned(summary, numbers, turn) if turn and not fast else None,
         leaps=leaps,
         slope_per_s=line.slope_per_s if line else None,
@@ -175,7 +179,13 @@ def _swings(times: Array, course: Array, resolution_s: float | None) -> tuple[Sw
     )
 
 
-def _unwrapped(summary: Summary, course: Summary) -> Summary:
+def _unwrapped(angles: Array, summary: Summary, turn: float) -> Array:
+    """With turns counted, beginning where the first value is."""
+    course: Array = np.unwrap(angles, period=turn)
+    return course + turn * round(((summary.first or 0.0) - float(course[0])) / turn)
+
+
+def _with_extremes_of(course: Summary, summary: Summary) -> Summary:
     """With the extremes of the course in which turns are counted."""
     return summary._replace(
         min=course.min,
@@ -198,10 +208,10 @@ def _mean(signal: Signal, summary: Summary, course: Summary, numbers: Array) -> 
     )
 
 
-def _deviation(signal: Signal, summary: Summary, course: Summary, *, leaps: bool) -> float | None:
-    if leaps and signal.kind == "angle":
-        return summary.circular_deviation
-    return course.deviation if signal.turn else summary.deviation
+def _deviation(means: Summary, inner_variance: float) -> float | None:
+    """Of the means of buckets and of the values within them; of values the usual one."""
+    between = means.deviation
+    return None if between is None else math.hypot(between, math.sqrt(inner_variance))
 
 
 def _turned(summary: Summary, numbers: Array, turn: float) -> float:

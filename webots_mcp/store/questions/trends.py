@@ -155,9 +155,7 @@ def _trend_of_rows(signal: Signal, columns: Columns) -> Trend | None:
     times, numbers = columns.numbers(signal.name)
     if not len(numbers):
         return None
-    summary = summarise_numbers(
-        times, numbers, rows=len(columns.times), angle=signal.kind == "angle"
-    )
+    summary = summarise_numbers(times, numbers, rows=len(columns.times), turn=signal.turn)
     return judge(signal, summary, times, numbers, find_spikes(times, numbers))
 
 

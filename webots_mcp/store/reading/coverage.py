@@ -20,6 +20,12 @@ _LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND si
 _FIRST_FROM: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s >= ?"
 
 
+def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
+    """The time of a run's newest row before a time; None where there is none."""
+    before_s: float | None = connection.execute(_LAST_BEFORE, (run_id, sim_time_s)).fetchone()[0]
+    return before_s
+
+
 def coverage_notes(
     connection: sqlite3.Connection,
     run_id: int,
@@ -58,7 +64,7 @@ def _gap_notes(
     """That the range lies between two rows."""
     if connection.execute(_ROW_IN, (run_id, start_s, end_s)).fetchone():
         return
-    before_s = connection.execute(_LAST_BEFORE, (run_id, start_s)).fetchone()[0]
+    before_s = row_before(connection, run_id, start_s)
     after_s = connection.execute(_FIRST_FROM, (run_id, end_s)).fetchone()[0]
     if before_s is not None and after_s is not None:
         yield f"no row: nothing was recorded between {before_s:g} and {after_s:g} s of run {run_id}"

@@ -99,10 +99,13 @@ def test_it_pauses_at_the_very_step_at_which_the_condition_holds(
     assert notes == [sent]
 
 
-def test_it_pauses_at_the_step_that_reaches_the_time(rounds: Rounds, recording: Recording) -> None:
+@pytest.mark.parametrize("steps", [100, 99.5, 99.1])
+def test_it_pauses_at_the_step_that_reaches_the_time(
+    rounds: Rounds, recording: Recording, steps: float
+) -> None:
     rounds.drive(3)
     paused = let_go_when_paused(rounds)
-    sent = recording.send("run", for_s=100 * STEP_S)
+    sent = recording.send("run", for_s=steps * STEP_S)
     rounds.drive(150)
     _, result, error = recording.fate(sent)
     assert error is None

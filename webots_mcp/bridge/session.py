@@ -84,7 +84,7 @@ class Session:
             pause=pause,
             parameters=parameters,
             breakpoints=Breakpoints(simulation, clock, recorder, journal, pause, keeper),
-            watch=Watch(clock, simulation.basic_time_step_s / 2),
+            watch=Watch(clock, simulation.basic_time_step_s / 100),
             keeper=keeper,
         )
         self.control = Control(self.context)

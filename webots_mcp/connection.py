@@ -344,7 +344,7 @@ def _file_uri(file: Database, create: bool) -> str:
     assert not isinstance(file, MemoryDatabase)
     if create:
         _make(file)
-    elif not _exists(file):
+    elif not is_there(file):
         raise NoDatabaseError(
             f"no database at {file}: no controller with an MCPBridge has recorded there yet"
         )
@@ -366,7 +366,12 @@ def _make(file: Path) -> None:
         raise DatabaseError(f"{file} cannot be opened for writing: {error}") from error
 
 
-def _exists(file: Path) -> bool:
+def is_there(file: Path) -> bool:
+    """Whether the file exists.
+
+    Raises:
+        DatabaseError: Its folder cannot be looked into.
+    """
     try:
         return file.exists()
     except OSError as error:

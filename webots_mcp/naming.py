@@ -35,6 +35,7 @@ USUAL_POSITIONS: Final = (
     *((f"{branch}_{unit}.0", f"{branch}_{unit}.1") for branch in _BRANCHES for unit in _LENGTHS),
     *_AXES[1:],  # at the top
 )
+NO_POSITION: Final = "no position is known: publish pose: [x, y], position: {x, y} or gps in metres"
 _LONGEST_COMPARED: Final = 100  # characters of a name
 
 

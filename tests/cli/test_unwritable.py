@@ -178,12 +178,22 @@ def test_an_older_schema_asks_for_a_copy(tmp_path: Path) -> None:
     assert "Traceback" not in ended.stderr
 
 
-def test_a_folder_that_cannot_be_looked_into_is_said_to_be_one(recorded: Recorded) -> None:
+def test_it_is_not_migrated_and_the_reason_is_said(artifact: Path) -> None:
+    ended = run("-m", "webots_mcp", "migrate", "--database", str(artifact))
+    assert ended.returncode == 2
+    assert "cannot be written from here" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize("command", ["status", "migrate"])
+def test_a_folder_that_cannot_be_looked_into_is_said_to_be_one(
+    recorded: Recorded, command: str
+) -> None:
     assert isinstance(recorded.database, Path)
     folder = recorded.database.parent
     folder.chmod(0)
     try:
-        ended = run("-m", "webots_mcp", "status", "--database", str(recorded.database))
+        ended = run("-m", "webots_mcp", command, "--database", str(recorded.database))
     finally:
         folder.chmod(0o700)
     assert ended.returncode == 2

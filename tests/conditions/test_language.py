@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from webots_mcp.conditions import parse_condition
@@ -45,6 +47,8 @@ def test_a_condition_names_the_signals_that_it_reads(text: str, signals: list[st
         ("front_m < 0.1)", 14, "unmatched"),
         ("a < 1 && b < 1", 7, "`and`"),
         ("a < 'x", 5, "not closed"),
+        ("a == 'it''s'", 10, "no escapes"),
+        ("a == 'x' \"y\"", 10, "between two texts"),
         ("a < 1\nb < 2", 6, "one line"),
         ("a < 1 for 1 for 2", 13, "parentheses"),
         ("a < 1 for b", 11, "number of seconds"),
@@ -115,6 +119,21 @@ def test_a_refusal_names_the_column_and_what_would_do(text: str, column: int, wh
 def test_what_is_empty_long_or_deep_is_refused(text: str) -> None:
     with pytest.raises(InvalidConditionError):
         parse_condition(text)
+
+
+@pytest.mark.parametrize("value", [5, None, b"a < 1", ["a < 1"]])
+def test_what_is_no_text_is_refused(value: Any) -> None:
+    with pytest.raises(InvalidConditionError, match="is a text such as"):
+        parse_condition(value)
+
+
+def test_a_displacement_says_that_no_position_is_published() -> None:
+    condition = parse_condition("displacement(3) < 0.05 or bumper")
+
+    (told,) = condition.describe_unknown(["bumper", "place.x_now", "place.y_now"])
+    assert told.startswith("displacement has no value: no position is known")
+    assert condition.describe_unknown(["bumper", "pose.x", "pose.y"]) == []
+    assert condition.describe_unknown([]) != []
 
 
 def test_unknown_signals_are_told_with_the_nearest_ones() -> None:

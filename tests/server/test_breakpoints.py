@@ -70,6 +70,15 @@ async def test_it_says_what_is_not_there_and_refuses_what_is_no_condition(
         assert f"there are {known}" in wrong
 
 
+async def test_one_that_would_go_off_at_once_says_so(connect: Connect, driver: Driver) -> None:
+    async with connect() as client:
+        await newest_state(client)
+        answer = await ask(client, "webots_breakpoint", condition="mode > 1", action="log")
+        (note,) = answer["notes"]
+        assert note.startswith("it goes off with the first state that is like the last ones")
+        assert "> the number 1?" in note
+
+
 async def test_without_a_controller_it_is_stored_and_says_so(
     connect: Connect, recorded: Recorded
 ) -> None:

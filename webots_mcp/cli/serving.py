@@ -121,14 +121,15 @@ def migrate(arguments: argparse.Namespace) -> None:
     """Bring a database to the schema of this version; its data is kept."""
     from alembic.util import CommandError
 
+    from webots_mcp.connection import is_there
     from webots_mcp.contract import MemoryDatabase, resolve_database
-    from webots_mcp.store.migrate import upgrade
+    from webots_mcp.store.recording import Recording
 
-    database, _ = resolve_database(arguments.database, arguments.data_dir)
-    if isinstance(database, MemoryDatabase) or not database.exists():
+    database, data_dir = resolve_database(arguments.database, arguments.data_dir)
+    if isinstance(database, MemoryDatabase) or not is_there(database):
         raise InvalidInputError(f"no database at {database}: give --data-dir or --database")
     try:
-        before, after = upgrade(database, arguments.revision)
+        before, after = Recording(database, data_dir).migrate(arguments.revision)
     except CommandError as error:
         raise InvalidInputError(f"--revision {arguments.revision}: {error}") from error
     print(f"{database}: schema {before}, now {after}" if before != after else f"schema {after}")

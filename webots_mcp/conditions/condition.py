@@ -11,7 +11,7 @@ from webots_mcp.conditions.compiling import Compiler
 from webots_mcp.conditions.memory import SAME_TIME_S
 from webots_mcp.conditions.reading import Plain, State
 from webots_mcp.conditions.scanning import Scanned, refusal, scan
-from webots_mcp.naming import Value, flatten, nearest_first
+from webots_mcp.naming import NO_POSITION, Value, find_position, flatten, nearest_first
 
 _MOST_OFFERED: Final = 3
 
@@ -48,11 +48,19 @@ class Condition:
         return Evaluator(Compiler(self._scanned, self._tree, plain), plain)
 
     def describe_unknown(self, known: Collection[str]) -> list[str]:
-        """A sentence for each of its signals that is not among the known ones."""
+        """A sentence for each of its signals, and the position, not among the known ones."""
         return [
-            f"{name} is missing as long as it is not published; there is {near}"
-            for name, near in self.nearest_to_unknown(known)
+            *(
+                f"{name} is missing as long as it is not published; there is {near}"
+                for name, near in self.nearest_to_unknown(known)
+            ),
+            *self.describe_lost(known),
         ]
+
+    def describe_lost(self, known: Collection[str]) -> list[str]:
+        """That it asks where the robot is, and none of the known names is a place."""
+        lost = self.asks_position and find_position(known) is None
+        return [f"displacement has no value: {NO_POSITION}"] * lost
 
     def nearest_to_unknown(self, known: Collection[str]) -> list[tuple[str, str]]:
         """Each of its signals that is not among the known ones, and the names that are near."""

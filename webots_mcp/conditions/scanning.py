@@ -35,6 +35,7 @@ _NEVER_TOGETHER: Final = frozenset(
         ("item", "text"),
     )
 )
+_NO_ESCAPES: Final = "texts have no escapes"
 _INSTEAD: Final = {
     "=": "to compare, write ==",
     "&": "write `and`",
@@ -45,7 +46,7 @@ _INSTEAD: Final = {
     "%": "there is no remainder",
     "{": "there are no braces",
     ":": "there are no slices and lambdas",
-    "\\": "texts have no escapes",
+    "\\": _NO_ESCAPES,
     '"': "a text is not closed",
     "'": "a text is not closed",
 }
@@ -85,11 +86,10 @@ def scan(text: str, what: str = "condition") -> Scanned:
     Raises:
         InvalidConditionError: It is empty or too long, or holds a sign that is not of the language.
     """
-    text = text.strip(" ")
-    _require_length(text, what)
+    text = _stripped(text, what)
     unread = Scanned(text, text, tuple(range(len(text) + 1)), frozenset(), what)
     source, columns, durations = "", list[int](), list[int]()
-    place, before = 0, "space"
+    place, before, last = 0, "space", ""
     while place < len(text):
         found = _TOKEN.match(text, place)
         if found is None:
@@ -99,6 +99,8 @@ def scan(text: str, what: str = "condition") -> Scanned:
             kind = "item"
         if (before, kind) in _NEVER_TOGETHER:
             raise refusal(unread, place, "a space or an operator is missing before it")
+        if kind == last == "text":  # which Python would join to one
+            raise refusal(unread, place, "an operator is missing between two texts; " + _NO_ESCAPES)
         if token == "for":
             durations.append(len(source))
             token = ",  "
@@ -106,7 +108,7 @@ def scan(text: str, what: str = "condition") -> Scanned:
             token = _as_item(unread, place, token)
         source += token
         columns += (place + min(i, found.end() - place - 1) for i in range(len(token)))
-        place, before = found.end(), kind
+        place, before, last = found.end(), kind, last if kind == "space" else kind
     return Scanned(text, source, (*columns, len(text)), frozenset(durations), what)
 
 
@@ -117,13 +119,18 @@ def _as_item(unread: Scanned, place: int, token: str) -> str:
     return f"[{token[1:]}]"
 
 
-def _require_length(text: str, what: str) -> None:
-    if not text:
+def _stripped(text: object, what: str) -> str:
+    """The text without the spaces around it, if it is one of a possible length."""
+    if not isinstance(text, str):
+        raise InvalidConditionError(f"a {what} is a text such as {_SUCH_AS[what]!r}, not {text!r}")
+    stripped = text.strip(" ")
+    if not stripped:
         raise InvalidConditionError(f"the {what} is empty: give one such as {_SUCH_AS[what]!r}")
-    if len(text) > MAX_CHARACTERS:
+    if len(stripped) > MAX_CHARACTERS:
         raise InvalidConditionError(
-            f"the {what} has {len(text)} characters; at most {MAX_CHARACTERS} are possible"
+            f"the {what} has {len(stripped)} characters; at most {MAX_CHARACTERS} are possible"
         )
+    return stripped
 
 
 def _why_unknown(sign: str) -> str:

@@ -10,9 +10,10 @@ from anyio import to_thread
 
 from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.contract import BreakpointAction
-from webots_mcp.errors import CommandRefusedError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.server.dispatch import Dispatcher, Report
 from webots_mcp.server.results import BreakpointAnswer, CommandAnswer
+from webots_mcp.server.running import holds_since
 from webots_mcp.server.shortening import cut_text
 from webots_mcp.store import breakpoints as stored
 from webots_mcp.store.reading.subject import Subject
@@ -122,7 +123,12 @@ def _notes(view: View, condition: Condition) -> list[str]:
     if view.run is None:
         return condition.describe_unknown(())
     subject = Subject(view.robot.id, view.robot.name, view.run.id)
-    return condition.describe_unknown(catalogue(view.connection, subject))
+    notes = condition.describe_unknown(catalogue(view.connection, subject))
+    try:
+        holds_since(view.connection, view.run.id, condition)
+    except InvalidInputError as error:
+        notes.append(f"it goes off with the first state that is like the last ones: {error}")
+    return notes
 
 
 def _remove(recording: Recording, robot: str | None, breakpoint_id: int) -> str:

@@ -87,9 +87,9 @@ def require_possible(
 def _require_known(view: View, condition: Condition) -> None:
     """A signal that was never seen is most likely misspelt; before the first row any may come."""
     known = known_names(view)
-    if known and (unknown := [name for name in condition.signals if name not in known]):
+    if known and (unknown := condition.describe_unknown(known)):
         raise UnknownSignalError(
-            "; ".join(condition.describe_unknown(known))
+            "; ".join(unknown)
             + f": {'it was' if len(unknown) == 1 else 'they were'} never published by robot "
             f"{view.robot.name!r}, so the condition could not come true"
         )
@@ -113,7 +113,7 @@ def _require_open(view: View, condition: Condition) -> None:
     """
     if view.run is None or "changed(" in condition.text:
         return
-    since_s = _holds_since(view.connection, view.run.id, condition)
+    since_s = holds_since(view.connection, view.run.id, condition)
     if since_s is None:
         return
     raise CommandRefusedError(
@@ -123,8 +123,12 @@ def _require_open(view: View, condition: Condition) -> None:
     )
 
 
-def _holds_since(connection: sqlite3.Connection, run_id: int, condition: Condition) -> float | None:
-    """Since when a condition holds in the last rows of a run; None where it does not."""
+def holds_since(connection: sqlite3.Connection, run_id: int, condition: Condition) -> float | None:
+    """Since when a condition holds in the last rows of a run; None where it does not.
+
+    Raises:
+        InvalidInputError: It cannot be asked of values like those.
+    """
     newest = connection.execute(_LAST_ROWS, (run_id, 1e300, _MOST_REMEMBERED_ROWS)).fetchall()
     rows = [row for row in newest if row[0] >= newest[0][0] - _REMEMBERED_S]
     evaluator, since_s = condition.evaluator(), None

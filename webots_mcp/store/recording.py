@@ -179,6 +179,28 @@ class Recording:
         ):
             create_schema(connection)
 
+    def migrate(self, revision: str = "head") -> tuple[int, int]:
+        """Bring the database forward to a revision of Alembic's.
+
+        Returns:
+            The schema version before and after.
+
+        Raises:
+            DatabaseError: It cannot be written, or is not ours.
+        """
+        from sqlalchemy.exc import SQLAlchemyError
+
+        from webots_mcp.store.migrate import upgrade
+
+        with self._migrating, self._explained():
+            try:
+                return upgrade(self.database, revision)
+            except SQLAlchemyError as error:
+                raise DatabaseError(
+                    f"the database at {name_of(self.database)} could not be migrated: {error}; "
+                    "stop what uses it and run 'webots-mcp migrate'"
+                ) from error
+
     @contextmanager
     def _opened(self, role: Role) -> Generator[sqlite3.Connection]:
         with self._explained(), closing(self._open(role)) as connection:
@@ -227,18 +249,7 @@ class Recording:
                 f"the database at {name_of(self.database)} has an older schema, and what only "
                 "reads does not migrate it: run 'webots-mcp migrate'"
             )
-        from sqlalchemy.exc import SQLAlchemyError
-
-        from webots_mcp.store.migrate import upgrade
-
-        with self._migrating:
-            try:
-                upgrade(self.database)
-            except SQLAlchemyError as error:
-                raise DatabaseError(
-                    f"the database at {name_of(self.database)} could not be migrated: {error}; "
-                    "stop what uses it and run 'webots-mcp migrate'"
-                ) from error
+        self.migrate()
 
 
 def look(connection: sqlite3.Connection, robot: str | None, run_id: int | None = None) -> View:

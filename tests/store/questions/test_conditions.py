@@ -70,6 +70,15 @@ def test_several_runs_are_several_pasts(rover: sqlite3.Connection) -> None:
     assert {round(event.start_s, 1) for event in found.events} == {25.0}
 
 
+def test_without_a_position_a_displacement_is_refused_rather_than_never_short(
+    counting: Recorder,
+) -> None:
+    for step in range(50):
+        counting.publish(step / 10, {"n": step})
+    with pytest.raises(UnknownSignalError, match="displacement has no value: no position is known"):
+        ask(counting.connection, "displacement(3) < 0.05 or n > 5")
+
+
 def test_where_it_never_held_the_answer_says_how_many_rows_were_looked_at(
     rover: sqlite3.Connection,
 ) -> None:

@@ -38,8 +38,8 @@ def condition_events(search: Search) -> Iterator[Event]:
 
 def _require_known(condition: Condition, search: Search) -> None:
     unknown = condition.nearest_to_unknown(search.known)
-    if unknown:
-        said = [f"no signal {name!r} is recorded; there is {near}" for name, near in unknown]
+    said = [f"no signal {name!r} is recorded; there is {near}" for name, near in unknown]
+    if said := [*said, *condition.describe_lost(search.known)]:
         raise UnknownSignalError("; ".join(said))
 
 

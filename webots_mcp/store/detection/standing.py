@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from webots_mcp.naming import NO_POSITION
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.standstill import find_standstills
 from webots_mcp.store.analysis.track import Track, tracks_of

@@ -345,10 +345,14 @@ def _file_uri(file: Database, create: bool) -> str:
     if create:
         _make(file)
     elif not is_there(file):
-        raise NoDatabaseError(
-            f"no database at {file}: no controller with an MCPBridge has recorded there yet"
-        )
+        raise NoDatabaseError(f"no database at {file}: {_why_none_is_in(file.parent)}")
     return f"{file.absolute().as_uri()}?mode={'rwc' if create else 'rw'}"
+
+
+def _why_none_is_in(folder: Path) -> str:
+    if folder.is_dir():
+        return "no controller with an MCPBridge has recorded there yet"
+    return f"{folder} is no folder" if folder.exists() else f"there is no folder {folder}"
 
 
 def _make(file: Path) -> None:

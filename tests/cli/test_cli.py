@@ -217,6 +217,28 @@ def test_a_reader_that_has_seen_enough_ends_the_tail_quietly(
         assert (process.wait(timeout=1), process.stderr.read()) == (0, "")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="there only a line that is written tells")
+def test_the_tail_ends_with_its_reader_also_where_nothing_is_recorded(
+    rover: RecordedRobot, tmp_path: Path
+) -> None:
+    with run("tail", "--interval", "600", "--data-dir", str(tmp_path)) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.readline()
+        process.stdout.close()
+        assert (process.wait(timeout=30), process.stderr.read()) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("data_dir", "why"), [("nowhere", "there is no folder"), ("notes.txt", "is no folder")]
+)
+def test_a_data_folder_that_is_none_is_said_to_be_none(
+    data_dir: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "notes.txt").touch()
+    assert main(["status", "--data-dir", str(tmp_path / data_dir)]) == 2
+    assert why in capsys.readouterr().err
+
+
 def test_an_old_database_is_migrated_with_its_data(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

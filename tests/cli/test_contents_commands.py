@@ -102,7 +102,7 @@ def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, say:
         (["sql", "DELETE FROM run"], "only one reading statement"),
         (["sql", "WITH a AS (SELECT 1) DELETE FROM run"], "only reading is allowed"),
         (["sql", "SELECT lable FROM run"], "label"),
-        (["sql", "SELECT 1", "-n", "5000"], "must be from 1 to 1000"),
+        (["sql", "SELECT 1", "-n", "5000"], "-n 5000 must be from 1 to 1000"),
         (["label", "1"], "give a label or a note"),
         (["label", "99", "x"], "newest runs are"),
         (["label", "1", "x" * 101], "at most 100"),

@@ -72,7 +72,9 @@ def test_send_pause_step_and_resume(
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["run"], "give until"),
+        (["run"], "give --until CONDITION"),
+        (["run", "--for", "nan"], "--for is a number of simulated seconds above 0"),
+        (["run", "--for", "inf"], "up to 1000000, not inf"),
         (["run", "--for", "1", "--set", "kp"], "names no value"),
         (["run", "--for", "1", "--set", "kp=1"], "declares no parameters"),
         (["run", "--until", "stepz > 1000"], "steps"),
@@ -168,3 +170,9 @@ def test_ctrl_c_leaves_the_simulation_as_then_says(
     (result,) = recording.rows("SELECT result FROM command WHERE action = 'run'")
     assert json.loads(result)["why"] == "it was cancelled"
     assert recording.rows("SELECT hold FROM session") == ["paused"]
+
+
+def test_send_needs_an_action_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["send"])
+    assert capsys.readouterr().err.endswith("arguments are required: ACTION\n")

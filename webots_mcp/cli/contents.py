@@ -115,7 +115,7 @@ def _log_row(line: LogLine) -> list[Any]:
 @question(
     "sql", DATA_DIR, DATABASE, JSON,
     argument("sql", metavar="STATEMENT", help="one SELECT, in quotes"),
-    count("-n", "at most N rows, up to 1000", default=100),
+    count("-n", "at most N rows, up to 1000", default=100, dest="max_rows"),
 )  # fmt: skip
 def sql(arguments: argparse.Namespace) -> None:
     """Read by SQL (SQLite) what the other commands do not cover; nothing but reading is allowed.
@@ -131,7 +131,9 @@ def sql(arguments: argparse.Namespace) -> None:
 
     require_select(arguments.sql)
     with reading(arguments), as_file(open_recording(arguments).database) as file:
-        asked = Statement(str(file), arguments.sql, arguments.limit, MAX_BYTES, QUESTION_DEADLINE_S)
+        asked = Statement(
+            str(file), arguments.sql, arguments.max_rows, MAX_BYTES, QUESTION_DEADLINE_S
+        )
         ended = subprocess.run(
             LINE, input=asked.encoded(), stdout=subprocess.PIPE, cwd=FOLDER, check=False
         )

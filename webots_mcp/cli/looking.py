@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import select
+import sys
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -79,8 +81,24 @@ def tail(arguments: argparse.Namespace) -> None:
         _print_lines(follower.look(arguments.limit))
         following = not arguments.no_follow and not storage(connection)
         while following:
-            time.sleep(arguments.interval)
+            _wait(arguments.interval)
             _print_lines(_newest_states_only(follower.look()))
+
+
+def _wait(seconds: float) -> None:
+    """Wait for the next look, or end where nobody reads a pipe any more (`tail | head`).
+
+    Raises:
+        BrokenPipeError: The reader is gone; printing would tell only when there is a line.
+    """
+    try:
+        output = sys.stdout.fileno()
+        watch = select.poll()  # not on Windows
+    except (AttributeError, OSError):
+        return time.sleep(seconds)
+    watch.register(output, 0)
+    if watch.poll(seconds * 1000):
+        raise BrokenPipeError
 
 
 def _facts(view: View) -> dict[str, Any]:

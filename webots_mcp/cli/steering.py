@@ -82,7 +82,9 @@ def run(arguments: argparse.Namespace) -> None:
 @command(
     "send", *_WHERE, TIMEOUT,
     argument("action", metavar="ACTION", help="of the controller's own, or built in"),
-    argument("settings", nargs="*", metavar="NAME=VALUE", help="its parameters"),
+    argument(
+        "settings", nargs="*", default=[], metavar="NAME=VALUE", help="its parameters"
+    ),
 )  # fmt: skip
 def send(arguments: argparse.Namespace) -> None:
     """Have a controller run an action, and print its answer.

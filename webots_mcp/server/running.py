@@ -10,6 +10,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.conditions.memory import SAME_TIME_S
+from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import (
     CommandRefusedError,
     ConditionFailedError,
@@ -74,7 +75,13 @@ def require_possible(
         CommandRefusedError: No controller of the robot could run it.
     """
     if until is None and for_s is None:
-        raise InvalidInputError("give until (a condition), for_s (simulated seconds), or both")
+        raise InvalidInputError(
+            "give until=... (a condition), for_s=... (simulated seconds), or both"
+        )
+    if for_s is not None and not 0 < for_s <= MAX_RUN_S:
+        raise InvalidInputError(
+            f"for_s is a number of simulated seconds above 0, up to {MAX_RUN_S:.0f}, not {for_s}"
+        )
     condition = None if until is None else parse_condition(until)
     with recording.reader() as connection:
         view = find_target(connection, robot, ACTION)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.store.detection.event import Event, EventOptions
@@ -12,9 +12,6 @@ from webots_mcp.store.detection.event import Event, EventOptions
 if TYPE_CHECKING:
     from webots_mcp.store.detection.search import Search
     from webots_mcp.store.signals.registry import Signal
-
-
-NO_POSITION: Final = "no position is known: publish pose: [x, y], position: {x, y} or gps in metres"
 
 
 class NotSearchableError(NothingRecordedError):

@@ -16,7 +16,7 @@ from webots_mcp.store.analysis.track import Track, tracks_of
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.evidence import Evidence, Flags, turned_rad, usual, weigh
 from webots_mcp.store.detection.habits import MovedIn
-from webots_mcp.store.detection.kind import NO_POSITION, NotSearchableError
+from webots_mcp.store.detection.kind import NotSearchableError
 from webots_mcp.store.detection.motion import in_metres, position_noise, tracks_in
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.registry import Signal

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
+from webots_mcp.naming import NO_POSITION
 from webots_mcp.store.analysis.spread import (
     Spread,
     Verdict,
@@ -16,7 +17,6 @@ from webots_mcp.store.analysis.spread import (
     verdicts_on,
 )
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.kind import NO_POSITION
 from webots_mcp.store.detection.motion import Motion, path_length, position_noise
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Collected, collect

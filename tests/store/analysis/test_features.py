@@ -23,10 +23,11 @@ from webots_mcp.store.analysis.features import (
 )
 from webots_mcp.store.analysis.summary import (
     Summary,
+    aligned_numbers,
     summarise,
     summarise_numbers,
-    usable_arrays,
     usable_numbers,
+    usable_part,
 )
 
 numbers = st.lists(st.floats(-1e6, 1e6), min_size=3, max_size=50).map(np.array)
@@ -51,7 +52,7 @@ def test_arrays_hold_the_same_numbers_as_lists(held: list[Value]) -> None:
     shown = [None if isinstance(value, str) else value for value in held]
     times = [float(index) for index in range(len(held))]
     plain_times, plain = usable_numbers(times, shown)
-    moments, course = usable_arrays(times, shown)
+    moments, course = usable_part(np.array(times), aligned_numbers(shown))
     assert moments.tolist() == list(plain_times)
     assert course.tolist() == [float(number) for number in plain]
 

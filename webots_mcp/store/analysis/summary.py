@@ -154,7 +154,7 @@ def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = 
 def summarise_numbers(
     times: Array, numbers: Array, *, rows: int | None = None, turn: float | None = None
 ) -> Summary:
-    """The same of usable numbers in arrays, as `usable_arrays` gives them: faster where many.
+    """The same of usable numbers in arrays, as `usable_part` gives them: faster where many.
 
     Args:
         times: Of the numbers.
@@ -210,11 +210,6 @@ def usable_numbers(
         if type(value) in _NUMBERS and -_LARGEST <= cast("float", value) <= _LARGEST
     ]
     return [time for time, _ in pairs], [value for _, value in pairs]
-
-
-def usable_arrays(times: Sequence[float], values: Sequence[Value]) -> tuple[Array, Array]:
-    """The same as arrays."""
-    return usable_part(np.array(times, np.float64), aligned_numbers(values))
 
 
 def usable_part(times: Array, numbers: Array) -> tuple[Array, Array]:

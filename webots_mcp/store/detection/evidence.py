@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import Array, Indexes
 from webots_mcp.store.analysis.noise import noise_of
-from webots_mcp.store.analysis.summary import aligned_numbers
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.habits import MovedIn
 from webots_mcp.store.detection.motion import Motion, tracks_in
@@ -147,7 +146,7 @@ def sways(columns: Columns, motion: Motion) -> tuple[Flags, float]:
     Who does so within a place moves in it, and is not stuck.
     """
     flags = np.zeros(len(columns.times), np.bool_)
-    times = np.array(columns.times)
+    times = columns.moments
     reach_m = 0.0
     for track in tracks_in(columns, motion.position) if motion.position else []:
         seconds = np.arange(track.times[0] + SWAY_S, track.times[-1], SWAY_S)
@@ -176,7 +175,7 @@ def turns(columns: Columns, heading: Signal | None) -> Flags:
     if len(present) < 2:
         return none
     course = np.interp(np.arange(len(angles)), present, np.unwrap(angles[present]))
-    times = np.array(columns.times)
+    times = columns.moments
     later = np.minimum(np.searchsorted(times, times + 1.0), len(times) - 1)
     earlier = np.maximum(np.searchsorted(times, times - 1.0, side="right") - 1, 0)
     limit = max(TURNED_RAD, HEADING_NOISE * noise_of(course))
@@ -201,7 +200,7 @@ def _radians(columns: Columns, angle: Signal) -> Array:
 
 def numbers(columns: Columns, signal: Signal) -> Array:
     """One number per row, NaN where it has none."""
-    return aligned_numbers(columns.values[signal.name])
+    return columns.aligned(signal.name)
 
 
 def _mostly(flags: Flags) -> bool:

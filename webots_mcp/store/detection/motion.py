@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 from webots_mcp.naming import FARTHEST_M, find_mode, find_position
 from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.summary import aligned_numbers
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
@@ -168,10 +167,9 @@ def in_metres(signal: Signal, lengths: Array) -> Array:
 
 def places_of(columns: Columns, position: tuple[Signal, Signal]) -> tuple[Array, Array, Array]:
     """Time, and x and y in metres, of the rows that have a position."""
-    x, y = (in_metres(each, aligned_numbers(columns.values[each.name])) for each in position)
+    x, y = (in_metres(each, columns.aligned(each.name)) for each in position)
     there = np.maximum(np.abs(x), np.abs(y)) <= FARTHEST_M
-    times: Array = np.array(columns.times, np.float64)
-    return times[there], x[there], y[there]
+    return columns.moments[there], x[there], y[there]
 
 
 def tracks_in(

@@ -8,11 +8,12 @@ import sqlite3
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Final
 
 from webots_mcp.naming import Value, flatten
 from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.summary import aligned_numbers, usable_arrays, usable_part
+from webots_mcp.store.analysis.summary import aligned_numbers, usable_part
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.batch import is_odd, odd_names
@@ -61,10 +62,22 @@ class Columns:
     values: dict[str, list[Value]] = field(default_factory=dict[str, list[Value]])
     odd: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])
     cut: bool = False
+    _aligned: dict[str, Array] = field(default_factory=dict[str, Array], repr=False)
+
+    @cached_property
+    def moments(self) -> Array:
+        """The times, of columns to which nothing is added any more."""
+        return np.array(self.times, np.float64)
+
+    def aligned(self, name: str) -> Array:
+        """One number per row, NaN where it has none; made once, of columns that are whole."""
+        if name not in self._aligned:
+            self._aligned[name] = aligned_numbers(self.values[name])
+        return self._aligned[name]
 
     def numbers(self, name: str) -> tuple[Array, Array]:
         """Times and numbers of a numeric signal, of the rows that have a usable one."""
-        return usable_arrays(self.times, self.values[name])
+        return usable_part(self.moments, self.aligned(name))
 
 
 @dataclass(frozen=True)
@@ -85,8 +98,7 @@ class Numbers:
 
 def numbers_of(columns: Columns, signals: Sequence[Signal]) -> Numbers:
     """The numbers of some signals."""
-    values = {each.name: aligned_numbers(columns.values[each.name]) for each in signals}
-    return Numbers(np.array(columns.times, np.float64), values)
+    return Numbers(columns.moments, {each.name: columns.aligned(each.name) for each in signals})
 
 
 def exceeds(connection: sqlite3.Connection, segment: Segment) -> bool:

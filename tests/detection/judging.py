@@ -27,6 +27,7 @@ class Tally:
         clean: Runs without a false claim.
         begin_errors: How many rows the begin of each found incident is off, of a swing how many
             periods; and so for its end.
+        least_begin_errors: What no unbiased estimate of these begins falls below, in rows.
         period_errors: As shares of the truth; `amplitude_errors` as well.
     """
 
@@ -40,6 +41,7 @@ class Tally:
     slowest_s: float = 0.0
     begin_errors: list[float] = field(default_factory=list[float])
     end_errors: list[float] = field(default_factory=list[float])
+    least_begin_errors: list[float] = field(default_factory=list[float])
     period_errors: list[float] = field(default_factory=list[float])
     amplitude_errors: list[float] = field(default_factory=list[float])
 
@@ -79,6 +81,7 @@ class Tally:
         if claim.count == 1 and not incident.split:
             unit_s = incident.period_s or interval_s
             self.begin_errors.append(abs(claim.start_s - incident.start_s) / unit_s)
+            self.least_begin_errors.append(incident.begin_error_s / unit_s)
             self.end_errors.append(abs(claim.end_s - incident.end_s) / unit_s)
         if incident.period_s:
             told_s, told = claim.period_s or math.inf, claim.amplitude or math.inf

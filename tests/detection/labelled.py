@@ -21,6 +21,7 @@ class Incident:
     Attributes:
         name: The published signal that it is about; None where it is about the robot.
         amplitude: Half of the way from one extreme to the other.
+        begin_error_s: Standard deviation that no unbiased estimate of its begin falls below.
         optional: It lies at the limit of what counts, so that an answer may tell it or not.
         split: It is cut in two by a recording gap, so that an answer may tell it twice.
     """
@@ -31,6 +32,7 @@ class Incident:
     name: str | None = None
     period_s: float | None = None
     amplitude: float | None = None
+    begin_error_s: float = 0.0
     optional: bool = False
     split: bool = False
 
@@ -121,7 +123,9 @@ def _reversed(run: LabelledRun) -> LabelledRun:
         times=ends_s - run.times[::-1],
         columns={name: list(values)[::-1] for name, values in run.columns.items()},
         incidents=tuple(
-            replace(each, start_s=ends_s - each.end_s, end_s=ends_s - each.start_s)
+            replace(
+                each, start_s=ends_s - each.end_s, end_s=ends_s - each.start_s, begin_error_s=0.0
+            )
             if each.measure != "leap"
             else _shifted(each, ends_s + run.interval_s - 2 * each.start_s)
             for each in run.incidents

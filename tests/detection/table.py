@@ -6,20 +6,21 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final
 
-from tests.detection.goals import missed_goals
+from tests.detection.goals import MEDIAN_ERROR, missed_goals
 from tests.detection.judging import Tally, median, nine_in_ten
 from tests.detection.measuring import Key, Report
 from tests.detection.pairs import Pairs
 from tests.detection.travelling import Travelled
 
 _COLUMNS: Final = (
-    "recording", "judged", "condition", "runs", "truth", "recall", "precision", "begin", "end",
-    "period %", "amplitude %", "false/min", "said", "slowest s", "below the goal",
+    "recording", "judged", "condition", "runs", "truth", "recall", "precision", "begin", "best",
+    "end", "period %", "amplitude %", "false/min", "said", "slowest s", "below the goal",
 )  # fmt: skip
 LEGEND: Final = (
     "recording: the kind that was drawn; judged: what was looked for; truth: how often it happened",
     "precision: where it never happened, the share of runs without a false claim",
     "begin, end: error in rows, of a swing in periods: median/nine in ten",
+    "best: of a begin, the median error in rows that no unbiased estimate falls below",
     "period, amplitude: error that nine in ten do not exceed",
     "said: of what was missed, the share whose answer said that it may have missed some",
 )
@@ -66,6 +67,7 @@ def _line(key: Key, tally: Tally) -> tuple[str, ...]:
         _share(tally.recall),
         _share(tally.precision),
         _both(tally.begin_errors),
+        _best(tally),
         _both(tally.end_errors),
         _percent(tally.period_errors),
         _percent(tally.amplitude_errors),
@@ -114,6 +116,11 @@ def _share(value: float | None) -> str:
 def _both(values: Sequence[float]) -> str:
     middle, most = median(values), nine_in_ten(values)
     return "-" if middle is None or most is None else f"{middle:.1f}/{most:.1f}"
+
+
+def _best(tally: Tally) -> str:
+    least = median(tally.least_begin_errors)
+    return f"{MEDIAN_ERROR * least:.1f}" if least else "-"
 
 
 def _percent(values: Sequence[float]) -> str:

@@ -115,3 +115,10 @@ def test_an_answer_admits_what_it_says_it_did_not_search() -> None:
     answer = Answer((), {"stuck": "no position is known"}, 0.0)
     assert answer.admits("stuck") and answer.admits("standstill") and not answer.admits("swing")
     assert not Answer((), {"oscillation": "not in 3 of 4 signals"}, 0.0).admits("swing")
+
+
+def test_a_begin_that_noise_hides_is_judged_by_what_can_be_known_of_it() -> None:
+    late = [stand(10.5, 20), stand(40.5, 50)]
+    hidden = [replace(each, begin_error_s=0.8) for each in STOPS]
+    assert missed_goals(("drive", "standstill", ""), tally(judge(STOPS, late, 0.1))) == ["begin"]
+    assert missed_goals(("drive", "standstill", ""), tally(judge(hidden, late, 0.1))) == []

@@ -29,6 +29,7 @@ ROWS: Final = 60
 JSON_COLUMNS: Final = {
     ("robot", "devices"), ("session", "versions"), ("session", "actions"), ("state", "data"),
     ("state", "odd"), ("event", "data"), ("command", "params"), ("command", "result"),
+    ("trial_set", "plan"), ("trial_set", "former_values"), ("trial", "parameters"),
 }  # fmt: skip
 _BLOB: Final = b"\x00\xff\x01"
 NOT_UTF8: Final = "CAST(x'7b22ff41227d' AS TEXT)"
@@ -66,6 +67,8 @@ READING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_get_timeline", {}),
     ("webots_list_runs", {}),
     ("webots_list_breakpoints", {}),
+    ("webots_get_trials", {}),
+    ("webots_compare_runs", {"trial_set": 1}),
     ("webots_compare_runs", {"run_ids": [1, 2]}),
 )
 DRAWING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
@@ -110,9 +113,28 @@ def record(file: Path) -> None:
         if reason:
             robot.end_run(reason)
             robot.begin_run(reason)
+    _add_trials(recorded.connection, robot)
     roll(recorded.connection)
     recorded.connection.execute("INSERT INTO lease VALUES ('maintenance', 'x', 1.0)")
     recorded.close()
+
+
+def _add_trials(connection: sqlite3.Connection, robot: RecordedRobot) -> None:
+    """A set of which a killed server has left the second trial."""
+    now = time.time()
+    plan = '{"score": "max(pose.0)", "best": "highest"}'
+    number = insert(connection, "trial_set", {
+        "uuid": "s", "plan": plan, "created_wall_time_s": now, "host": "h", "pid": 1,
+        "process": "p", "robot_id": robot.id, "session_id": robot.session_id,
+        "former_values": '{"kp": 1.0}',
+    })  # fmt: skip
+    for run_id, status, score in ((1, "done", 5.0), (2, "running", None), (2, "failed", None)):
+        insert(connection, "trial", {
+            "trial_set_id": number, "uuid": status, "number": len(status), "parameters":
+            '{"kp": 2.0}', "status": status, "run_id": run_id, "score": score, "ended_by": "for_s",
+            "ended_sim_time_s": 5.0, "error": "late" if status == "failed" else None,
+            "started_wall_time_s": now, "finished_wall_time_s": now if score else None,
+        })  # fmt: skip
 
 
 def _fill(robot: RecordedRobot, folder: Path) -> None:

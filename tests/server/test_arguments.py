@@ -122,7 +122,8 @@ async def test_one_name_is_taken_for_a_list_of_one(connect: Connect, recorded: R
         for names in ("pose.x", ["pose.x"], '["pose.x"]'):
             answer = await ask(client, "webots_query_history", signals=names, **arguments)
             assert answer["raw"]["signals"] == {"pose.x": [1]}
-        assert "not [1]" in await fail(client, "webots_compare_runs", run_ids=1)
+        assert "not [1, 1]" in await fail(client, "webots_compare_runs", run_ids=[1, 1])
+        assert "run 1" in str((await ask(client, "webots_compare_runs", run_ids=1))["groups"])
         answer = await ask(client, "webots_find_events", kinds="run")
         assert answer["verdicts"]["found"] == {"run": 1}
 

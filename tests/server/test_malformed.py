@@ -15,7 +15,7 @@ pytestmark = pytest.mark.anyio
 # Of each column one in turn; `python -m tests.server.malformed` tries all there are.
 TRIED = (b"\x00\xff\x01", '{"x": ', "[1, 2]", '{"x": "\\ud800"}')
 TABLES = ("robot", "session", "run", "state", "event", "command", "log", "image", "signal",
-          "rollup", "change", "breakpoint")  # fmt: skip
+          "rollup", "change", "breakpoint", "trial_set", "trial")  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +21,10 @@ from tests.processes.conftest import Start, data_dir, filed, has_states, start  
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
 from tests.server.story import rows_of
+from webots_mcp.connection import connect as database
 from webots_mcp.server import create_server
 from webots_mcp.standin import Mode, Simulation
+from webots_mcp.store.retention.policy import KEPT
 
 __all__ = ["data_dir", "filed", "start"]
 pytestmark = pytest.mark.anyio
@@ -118,6 +121,12 @@ async def test_a_grid_is_tried_and_ranked_and_the_parameters_are_set_back(
             name: pytest.approx(answer[name], abs=5) for name in ("age_s",)
         }
         assert await value_of(client, "kp") == 7.0
+        compared = await ask(client, "webots_compare_runs", trial_set=1)
+        groups = {row["name"]: row["runs"] for row in rows_of(compared["groups"])}
+        assert groups == {
+            "kp 4.0, gait trot": best["runs"],
+            "kp 1.0, gait trot": other["runs"],
+        }
         runs = rows_of((await ask(client, "webots_list_runs", parameters={"kp": 4.0}))["runs"])
         assert [row["run_id"] for row in runs] == sorted(best["runs"], reverse=True)
         assert runs[-1]["label"] == "trial 2 of set 1: kp 4.0, gait trot"
@@ -270,6 +279,22 @@ async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(
         assert told["over"] == 0
         assert f"webots_run_trials(trial_set={first['trial_set']}) goes on" in told["hint"]
         assert await value_of(client, "kp") == 2.0
+
+
+async def test_rows_that_were_purged_leave_the_score_and_the_answer_says_so(
+    connect: Connect, tunable: TunableDriver, file: Path
+) -> None:
+    async with connect() as client:
+        answer = await trials(client, parameters={"kp": [1.0]}, repeats=2)
+        (row,) = rows_of(answer["ranked"])
+        with closing(database(file, "writer")) as connection:
+            (kept,) = connection.execute(f"SELECT count(*) FROM run WHERE {KEPT}").fetchone()
+            assert kept == 0, "a trial's label does not keep its rows for good"
+            connection.execute("UPDATE run SET purged_rows = 3 WHERE id = ?", row["runs"][:1])
+            connection.execute("DELETE FROM run WHERE id = ?", row["runs"][1:])
+        told = await ask(client, "webots_get_trials")
+        assert rows_of(told["ranked"])[0]["score"] == row["score"]
+        assert told["notes"] == ["rows of trial 1, 2 were purged since: the scores stay"]
 
 
 async def test_a_hundred_trials_are_told_in_a_short_answer(

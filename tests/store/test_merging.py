@@ -17,6 +17,15 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
 from webots_mcp.store.merging import merge
 from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.trials import (
+    Result,
+    create_trial_set,
+    fetch_trial_set,
+    find_trial_set,
+    finish_trial,
+    take_up,
+    trials_of,
+)
 
 TABLES = ("session", "run", "state", "log", "event", "image", "parameter_value", "command")
 
@@ -146,3 +155,22 @@ def test_what_goes_on_or_is_purged_is_refused(
         merge(target, tmp_path / "here", source)
 
     assert counts(target) == before
+
+
+def test_trial_sets_come_with_their_runs_once_and_without_who_worked_on_them(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    with closing(connect(source, "writer")) as connection:
+        set_id = create_trial_set(connection, '{"score": "duration"}', [{"kp": 1.0}, {"kp": 2.0}])
+        take_up(connection, set_id)
+        first, _ = trials_of(connection, set_id)
+        finish_trial(connection, first, Result(2, 4.5, None))
+        (uuid,) = connection.execute("SELECT uuid FROM run WHERE id = 2").fetchone()
+    for _ in range(2):
+        runs = merge(target, tmp_path / "here", source)
+        found = find_trial_set(target)
+        assert found is not None
+        assert fetch_trial_set(target, found).pid is None
+        done, waiting = trials_of(target, found)
+        assert (done.run_id, done.score, done.values) == (runs[uuid], 4.5, {"kp": 1.0})
+        assert (waiting.status, waiting.run_id) == ("waiting", None)

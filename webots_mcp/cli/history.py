@@ -238,16 +238,22 @@ def plot(arguments: argparse.Namespace) -> None:
     "compare", DATA_DIR, DATABASE, ROBOT, JSON,
     argument("run_ids", type=int, nargs="*", metavar="RUN",
              help="one or more runs; none: before and after the last edit of the controller"),
+    argument("--trials", type=int, dest="trial_set", metavar="SET",
+             help="the runs of a trial set, by their parameters"),
     argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
     count("-n", "the N that differ most", default=15),
 )  # fmt: skip
 def compare(arguments: argparse.Namespace) -> None:
     """What runs came to: distance, time per mode, events, and the signals that differ most."""
-    from webots_mcp.store.questions.compare import compare_code, compare_runs
+    from webots_mcp.store.questions.compare import compare_code, compare_runs, compare_trials
 
     wanted: dict[str, Any] = {"names": arguments.signal or ["*"], "limit": arguments.limit}
+    if arguments.run_ids and arguments.trial_set is not None:
+        raise InvalidInputError("name runs or give --trials, not both")
     with reading(arguments) as connection:
-        if arguments.run_ids:
+        if arguments.trial_set is not None:
+            found = compare_trials(connection, arguments.trial_set, **wanted)
+        elif arguments.run_ids:
             found = compare_runs(connection, arguments.run_ids, **wanted)
         else:
             found = compare_code(connection, robot=arguments.robot, **wanted)

@@ -44,6 +44,7 @@ RobotName = Annotated[
     Field(description="Where several are live."),
 ]
 RunId = Annotated[Id | None, Field(description="Instead of its current run.")]
+TrialSetId = Annotated[Id | None, Field(description="Of webots_get_trials.")]
 LastS = Annotated[
     _Duration | None,
     Field(description="The last seconds of simulation time."),

@@ -23,13 +23,14 @@ from webots_mcp.server.running import ACTION, known_names, require_possible
 from webots_mcp.server.shortening import cut_text
 from webots_mcp.server.target import find_target
 from webots_mcp.server.tuning import settable
-from webots_mcp.store.analysis.ranking import Best, Ranked, Ranking
+from webots_mcp.store.analysis.ranking import Ranked, Ranking
 from webots_mcp.store.questions.score import require_kinds
 from webots_mcp.store.recording import Recording, look
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.trials import (
     Trial,
     TrialSet,
+    best_of,
     create_trial_set,
     fetch_trial_set,
     find_trial_set,
@@ -149,7 +150,7 @@ def _header(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
 
 def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
     trials, plan = trials_of(connection, found.id), json.loads(found.plan)
-    best: Best = plan.get("best", "highest")
+    best = best_of(plan)
     over = sum(each.is_over for each in trials)
     state, hint = _state(found, len(trials) - over)
     ranking = ranking_of(trials, best)

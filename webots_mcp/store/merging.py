@@ -32,13 +32,17 @@ _BUSY: Final = (
 _SET_BY: Final = (
     "SELECT id, command_id FROM main.parameter_value WHERE run_id = ? AND command_id IS NOT NULL"
 )
+_TRIALS: Final = (
+    "SELECT t.id, t.uuid, n.id FROM source.trial t LEFT JOIN source.run r ON r.id = t.run_id "
+    "LEFT JOIN main.run n ON n.uuid = r.uuid WHERE t.trial_set_id = ? ORDER BY t.id"
+)
 _RUNS: Final = (
     "SELECT n.uuid, n.id FROM source.run r JOIN main.run n ON n.uuid = r.uuid ORDER BY r.id"
 )
 
 
 def merge(connection: sqlite3.Connection, data_dir: Path, source: Path) -> dict[str, int]:
-    """Take in all sessions of a recording that is over.
+    """Take in all sessions of a recording that is over, and its trial sets.
 
     Args:
         connection: In the role "writer".
@@ -60,6 +64,8 @@ def merge(connection: sqlite3.Connection, data_dir: Path, source: Path) -> dict[
                 _copy_pictures(connection, data_dir, source.parent, session_id)
                 with transaction(connection):
                     _take_in(connection, session_id, robot_id)
+        with transaction(connection):
+            _take_in_trials(connection)
         return dict(connection.execute(_RUNS).fetchall())
 
 
@@ -103,6 +109,24 @@ def _take_in(connection: sqlite3.Connection, session_id: int, robot_id: int) -> 
         renamed = [(commands.get(command_id), value_id) for value_id, command_id in set_by]
         connection.executemany("UPDATE parameter_value SET command_id = ? WHERE id = ?", renamed)
     _insert(connection, "parameter", "session_id = ?", session_id, owner | {"session_id": new})
+
+
+def _take_in_trials(connection: sqlite3.Connection) -> None:
+    """Trial sets and trials that are not there, each with its run as it is called here.
+
+    Nobody works on them here: their simulators and the parameters of their controllers are gone.
+    """
+    gone: dict[str, Any] = dict.fromkeys(
+        ("host", "pid", "process", "robot_id", "session_id", "former_values")
+    )
+    for set_id, uuid in connection.execute("SELECT id, uuid FROM source.trial_set").fetchall():
+        here = _id_of(connection, "trial_set", uuid)
+        if here is None:
+            here = _insert(connection, "trial_set", "id = ?", set_id, gone)
+        for trial_id, trial_uuid, run_id in connection.execute(_TRIALS, (set_id,)).fetchall():
+            if _id_of(connection, "trial", trial_uuid) is None:
+                own = {"trial_set_id": here, "run_id": run_id, "pid": None, "process": None}
+                _insert(connection, "trial", "id = ?", trial_id, own)
 
 
 def _robot(connection: sqlite3.Connection, robot_id: int) -> int:

@@ -26,7 +26,8 @@ _SHOWN: Final = 5
 
 _OBJECTS: Final = frozenset(
     {"robot.devices", "session.versions", "session.actions", "state.data", "state.odd",
-     "event.data", "command.params"}
+     "event.data", "command.params", "trial_set.plan", "trial_set.former_values",
+     "trial.parameters"}
 )  # fmt: skip
 _OF_TEXTS: Final = frozenset({"robot.devices", "session.actions", "state.odd"})
 _VALUES: Final = frozenset(
@@ -37,10 +38,11 @@ _VALUES: Final = frozenset(
 _REFERENCES: Final = {
     "session": (("robot_id", "robot"),),
     "run": (("session_id", "session"), ("robot_id", "robot")),
+    "trial": (("trial_set_id", "trial_set"),),
 }
 _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
                   "signal", "rollup", "coarse_rollup", "change", "watermark",
-                  "parameter", "parameter_value", "breakpoint")  # fmt: skip
+                  "parameter", "parameter_value", "breakpoint", "trial_set", "trial")  # fmt: skip
 # What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
 # be stored, a run that is not there.
 _UNSTORABLE: Final = (

@@ -6,12 +6,13 @@ import json
 import os
 import sqlite3
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
 from webots_mcp.connection import transaction
 from webots_mcp.contract import host_name, new_uuid
-from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import process_alive, process_identity
 from webots_mcp.store.analysis.ranking import Best, Outcome, Ranking, rank
 from webots_mcp.store.rows import columns_of
@@ -280,8 +281,7 @@ def put_back(connection: sqlite3.Connection, trial: Trial) -> None:
 
 def finish_trial(connection: sqlite3.Connection, trial: Trial, result: Result) -> None:
     """Enter what became of it; its run gets a label, unless it has one."""
-    values = ", ".join(f"{name} {value}" for name, value in trial.values.items())
-    label = f"trial {trial.number} of set {trial.trial_set_id}: {values}"[:100]
+    label = f"trial {trial.number} of set {trial.trial_set_id}: {spelled(trial.values)}"[:100]
     with transaction(connection):
         connection.execute(
             _FINISH,
@@ -293,6 +293,35 @@ def finish_trial(connection: sqlite3.Connection, trial: Trial, result: Result) -
             },
         )
         connection.execute(_LABEL, (label, result.run_id))
+
+
+def spelled(values: Mapping[str, Any]) -> str:
+    """Values of parameters in one line."""
+    return ", ".join(f"{name} {value}" for name, value in values.items())
+
+
+def scored_runs(connection: sqlite3.Connection, set_id: int) -> dict[str, list[int]]:
+    """The runs that have a score by their parameters in one line, the best set first.
+
+    Raises:
+        InvalidInputError: There is no such set.
+        NothingRecordedError: No run of it is there that has a score.
+    """
+    trials = trials_of(connection, set_id)
+    plan = json.loads(fetch_trial_set(connection, set_id).plan)
+    runs: dict[str, list[int]] = {}
+    for each in trials:
+        if each.score is not None and each.run_id is not None:
+            runs.setdefault(spelled(each.values), []).append(each.run_id)
+    if not runs:
+        raise NothingRecordedError(f"no run of trial set {set_id} is recorded that has a score")
+    ranked = [spelled(each.parameters) for each in ranking_of(trials, best_of(plan)).sets]
+    return {name: runs[name] for name in ranked if name in runs}
+
+
+def best_of(plan: Mapping[str, Any]) -> Best:
+    """Which scores of a stored plan are the best."""
+    return "lowest" if plan.get("best") == "lowest" else "highest"
 
 
 def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, float, str]:

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
+from webots_mcp.errors import InvalidInputError
 from webots_mcp.server.budget import (
     BUDGET,
     LARGE_BUDGET,
@@ -34,6 +35,7 @@ from webots_mcp.server.parameters import (
     RunId,
     RunIds,
     ShownLimit,
+    TrialSetId,
 )
 from webots_mcp.server.results import Table
 from webots_mcp.server.shortening import DETAIL_BUDGET, WHOLE, shorten
@@ -44,6 +46,7 @@ from webots_mcp.store.questions.compare import (
     Group,
     compare_code,
     compare_runs,
+    compare_trials,
 )
 from webots_mcp.store.questions.runs import (
     MOST_RUNS,
@@ -54,6 +57,7 @@ from webots_mcp.store.questions.runs import (
     run_info,
 )
 from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.trials import scored_runs
 
 RUN_COLUMNS: Final = (
     "run_id", "robot", "label", "parameters", "started", "began_by", "ended_by", "duration_s",
@@ -119,6 +123,7 @@ def webots_compare_runs(
     run_ids: RunIds = None,
     signals: AnyNames = None,
     limit: ShownLimit = None,
+    trial_set: TrialSetId = None,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
@@ -128,10 +133,19 @@ def webots_compare_runs(
     and the signals that differ most. `different` is true only beyond the spread of like runs,
     so it takes several runs of each; null: it cannot be told yet.
     """
-    with recording.view(robot, run_ids[0] if run_ids else None) as view:
+    if run_ids and trial_set:
+        raise InvalidInputError("give run_ids or trial_set, not both")
+    first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None
+    with recording.view(robot, first) as view:
         return answer_about(
-            view, ComparisonAnswer, lambda: _compared(view, run_ids, signals, limit)
+            view, ComparisonAnswer, lambda: _compared(view, run_ids, trial_set, signals, limit)
         )
+
+
+def _first_run(recording: Recording, set_id: int) -> int:
+    """Of its best parameters, so that the answer is about the robot that was tried."""
+    with recording.reader() as connection:
+        return next(iter(scored_runs(connection, set_id).values()))[0]
 
 
 @tool("Annotate a run", ACTS)
@@ -218,12 +232,15 @@ def _file(path: str | None) -> str | None:
 def _compared(
     view: View,
     run_ids: Sequence[int] | None,
+    set_id: int | None,
     names: Sequence[str] | None,
     limit: int | None,
 ) -> dict[str, Any]:
     wanted, most = names or ("*",), limit or DEFAULT_DIFFERENCES
     if run_ids:
         found = compare_runs(view.connection, run_ids, names=wanted, limit=most)
+    elif set_id:
+        found = compare_trials(view.connection, set_id, names=wanted, limit=most)
     else:
         found = compare_code(view.connection, robot=view.robot.name, names=wanted, limit=most)
     differing = [each for each in found.differences if _differs(each)]

@@ -15,7 +15,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.server import trial_sets
 from webots_mcp.server.declaring import READS, RESTARTS, tool
 from webots_mcp.server.history_results import TrialsAnswer
-from webots_mcp.server.parameters import Id, RobotName, TimeoutS
+from webots_mcp.server.parameters import RobotName, TimeoutS, TrialSetId
 from webots_mcp.server.trial_worker import TrialWorkers
 from webots_mcp.store.analysis.ranking import Best
 from webots_mcp.store.recording import Recording
@@ -32,7 +32,6 @@ Tried = Annotated[
     list[dict[str, _Value]] | dict[str, list[_Value]] | None,
     WithJsonSchema({"anyOf": [{"type": "array"}, {"type": "object"}]}),
 ]
-SetId = Annotated[Id | None, Field(description="From an earlier answer.")]
 
 
 @tool("Run trials", RESTARTS)
@@ -61,15 +60,15 @@ async def webots_run_trials(
     trial_timeout_s: Annotated[
         float, Field(gt=0, description="Wall seconds; a trial that takes longer fails.")
     ] = _TRIAL_S,
-    trial_set: SetId = None,
+    trial_set: TrialSetId = None,
     cancel: Annotated[bool, Field(description="Stop that set after its current trial.")] = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> TrialsAnswer:
     """Which parameters are best? Each trial resets the world, sets them, runs fast, is scored.
 
-    Answers when all are over or the wait is, and then goes on in the server: trial_set alone waits
-    on, or goes on with what stopped. At the end the parameters are set back.
+    After timeout_s they go on: trial_set alone waits on, or goes on with what stopped. At the end
+    the parameters are set back.
     """
     given = parameters is not None or score is not None
     if (trial_set is None) != given:
@@ -94,7 +93,7 @@ async def webots_run_trials(
 
 
 @tool("Get trials", READS)
-def webots_get_trials(recording: Recording, trial_set: SetId = None) -> TrialsAnswer:
+def webots_get_trials(recording: Recording, trial_set: TrialSetId = None) -> TrialsAnswer:
     """How far trials are, also those from a shell, and the parameters ranked by median score.
 
     best_is_better: beyond the noise, by which repeats of the same differ.

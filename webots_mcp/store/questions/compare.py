@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
@@ -27,9 +27,11 @@ from webots_mcp.store.rollup.buckets import COARSE_S
 from webots_mcp.store.runs import fetch_run
 from webots_mcp.store.signals.catalogue import catalogue, resolve_signals
 from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.trials import scored_runs
 
 COMPARE_DEADLINE_S: Final = 5.0
 MOST_COMPARED: Final = 10
+MOST_SETS: Final = 5  # of a trial set
 _AS_LONG: Final = 1.01  # times the compared stretch: the ends of like runs differ by a few rows
 
 _CODE_OF_RUNS: Final = (
@@ -148,6 +150,34 @@ def compare_code(
     (_, after), (_, before) = blocks
     groups = {"before": before[:MOST_COMPARED][::-1], "after": after[:MOST_COMPARED][::-1]}
     return _compare(connection, groups, names, limit, options or EventOptions(), deadline_s)
+
+
+@in_one_snapshot
+def compare_trials(
+    connection: sqlite3.Connection,
+    set_id: int,
+    *,
+    names: Sequence[str] = ("*",),
+    limit: int = 30,
+    options: EventOptions | None = None,
+    deadline_s: float = COMPARE_DEADLINE_S,
+) -> Comparison:
+    """Compare the runs of a trial set by their parameters; the best is the reference.
+
+    Its best five sets of parameters count, of each the runs that have a score, at most 10.
+
+    Raises:
+        InvalidInputError: There is no such set.
+        NothingRecordedError: It has no run with a score, or one has no state row.
+        UnknownSignalError: As it says.
+    """
+    found = scored_runs(connection, set_id)
+    groups = {name: found[name][:MOST_COMPARED] for name in list(found)[:MOST_SETS]}
+    compared = _compare(connection, groups, names, limit, options or EventOptions(), deadline_s)
+    if len(found) == len(groups):
+        return compared
+    note = f"the best {len(groups)} of {len(found)} sets of parameters"
+    return replace(compared, notes=(note, *compared.notes))
 
 
 def _compare(

@@ -13,7 +13,11 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.runs import fetch_run
 
 # A run that a person named, described or marked is not retention's to judge.
-KEPT: Final = "(keep <> 0 OR coalesce(label, '') <> '' OR coalesce(note, '') <> '')"
+# Trials are labelled by the hundred without anybody's having judged them: their scores stay.
+KEPT: Final = (
+    "(keep <> 0 OR coalesce(note, '') <> '' "
+    "OR (coalesce(label, '') <> '' AND label NOT GLOB 'trial [0-9]* of set [0-9]*: *'))"
+)
 _MARK: Final = "UPDATE run SET keep = ? WHERE id = ?"
 
 
@@ -59,7 +63,8 @@ class Retention:
     """The limits of each kind of row.
 
     They hold for the whole database, over all robots: rows go in the order in which they were
-    recorded, whatever their run. Runs with a label, a note or `keep` lose nothing and do not count.
+    recorded, whatever their run. Runs with a label (but that of
+    a trial), a note or `keep` lose nothing and do not count.
 
     Attributes:
         state: The full rows. They go only after they were rolled up.

@@ -36,7 +36,7 @@ def test_the_page_shows_what_is_said_and_answered_today() -> None:
     assert had.returncode == 0, had.stderr
     shown = (FOLDER / "README.md").read_text("utf-8")
 
-    assert len(turns_of(shown)) == 9
+    assert len(turns_of(shown)) == 10
     assert turns_of(had.stdout) == turns_of(shown)
     assert [text for text in shown.splitlines() if text.startswith("**You:**")] == [
         text for text in had.stdout.splitlines() if text.startswith("**You:**")

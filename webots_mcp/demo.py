@@ -41,6 +41,11 @@ CONVERSATION: Final[tuple[tuple[str, str, dict[str, Any]], ...]] = (
     ("Drive faster.", "webots_set_parameters", {"values": {"speed": 6.0}}),
     ("Pause.", "webots_simulation_control", {"command": "pause"}),
     ("Five steps.", "webots_simulation_control", {"command": "step", "steps": 5}),
+    (
+        "Which cruising speed gets farther in five seconds?",
+        "webots_run_trials",
+        {"parameters": {"speed": [3.0, 8.0]}, "score": "max(pose.x) - first(pose.x)", "for_s": 5},
+    ),
     ("Go on.", "webots_simulation_control", {"command": "resume"}),
     ("Show me the arena.", "webots_take_screenshot", {}),
     (

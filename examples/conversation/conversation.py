@@ -112,8 +112,19 @@ TURNS: tuple[Turn, ...] = (
         "webots_compare_runs",
         {"run_ids": ["{first_run_id}", "{run_id}"]},
         ("compared_s", "groups", "measures"),
-        "One run of each says nothing about the noise: repeat both before you believe it, or let "
-        "`webots-mcp trials` do so ([docs/trials.md](../../docs/trials.md)).",
+        "One run of each says nothing about the noise: repeat both before you believe it.",
+    ),
+    Turn(
+        "Do so, in 5 s each, and take 5 in, too.",
+        "webots_run_trials",
+        {
+            "parameters": {"speed": [3.0, 5.0, 8.0]},
+            "score": "max(pose.x) - first(pose.x) - count(stuck)",
+            "for_s": 5,
+            "repeats": 2,
+        },
+        ("trial_set", "state", "trials", "over", "failed", "ranked", "noise", "best_is_better"),
+        "The verdict: {verdict}. What can be scored: [docs/trials.md](../../docs/trials.md).",
     ),
 )
 

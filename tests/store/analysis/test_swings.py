@@ -78,6 +78,16 @@ def test_a_swing_is_found_over_turns_that_follow_each_other_as_fast_as_its_perio
     assert found.end_s == pytest.approx(START_S + 24.0, abs=5.0)
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_pieces_of_which_none_is_as_high_as_their_median_swing_without_a_warning() -> None:
+    rng = np.random.default_rng(43)
+    times = np.arange(0, 60, 0.1)
+    low, high = rng.uniform(0.05, 0.5, 2).tolist()
+    swing = np.sin(2 * np.pi * times / float(rng.uniform(2, 4.8)))
+    swing *= np.select([times <= 10, times < 30, times < 50], [0.0, low, high])
+    swings_of(times, zigzag(rng, times) + swing)
+
+
 def test_a_swing_goes_on_across_a_gap() -> None:
     times = np.arange(0, 120, 0.032)
     values = 0.1 * times + HEIGHT * np.sin(np.pi * times)

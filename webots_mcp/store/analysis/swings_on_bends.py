@@ -164,11 +164,14 @@ def _fitted(
     swings: Flags = fitted.left < (1 - LEAST_IN_PIECE) * fitted.courses
     if swings.any():
         swings &= _beats_zigzag(pieces, fitted, basis, noise)
-    if swings.any():
-        middle = float(np.median(fitted.amplitudes[swings]))
-        swings &= (fitted.amplitudes < ALIKE * middle) & (fitted.amplitudes > middle / ALIKE)
-        whole = pieces.shape[1] * middle**2 / 2
-        swings &= fitted.left < np.median(fitted.left[swings]) + ENDING * whole
+    if not swings.any():
+        return
+    middle = float(np.median(fitted.amplitudes[swings]))
+    swings &= (fitted.amplitudes < ALIKE * middle) & (fitted.amplitudes > middle / ALIKE)
+    if not swings.any():
+        return
+    whole = pieces.shape[1] * middle**2 / 2
+    swings &= fitted.left < np.median(fitted.left[swings]) + ENDING * whole
     for part in _followed(np.flatnonzero(swings), touching):
         yield part, fitted
 

@@ -19,7 +19,7 @@ from mcp import Client, MCPError, StdioServerParameters
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, data_dir, filed, has_states, start  # fixtures
 from tests.recordings.rows import Recorded
-from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
+from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
 from tests.server.story import rows_of
 from webots_mcp.connection import connect as database
 from webots_mcp.server import create_server
@@ -127,6 +127,10 @@ async def test_a_grid_is_tried_and_ranked_and_the_parameters_are_set_back(
             "kp 4.0, gait trot": best["runs"],
             "kp 1.0, gait trot": other["runs"],
         }
+        drawn = await client.call_tool("webots_plot", {"trial_set": 1})
+        assert not drawn.is_error
+        assert "trial set 1, 4 trials: last(distance) over kp" in text_of(drawn)
+        assert len(pictures_of(drawn)) == 1
         runs = rows_of((await ask(client, "webots_list_runs", parameters={"kp": 4.0}))["runs"])
         assert [row["run_id"] for row in runs] == sorted(best["runs"], reverse=True)
         assert runs[-1]["label"] == "trial 2 of set 1: kp 4.0, gait trot"

@@ -21,8 +21,9 @@ def test_sets_are_tried_scored_ranked_and_their_runs_kept(
 ) -> None:
     plan('score = "last(x)"\nfor_s = 2\nrepeats = 2\n[grid]\nspeed = [1.0, 2.0, 3.0]')
 
-    answer = json.loads(run("--jobs", "2", "--json").stdout)
+    answer = json.loads(run("--jobs", "2", "--json", "--plot", str(project / "a.png")).stdout)
 
+    assert (project / "a.png").read_bytes().startswith(b"\x89PNG")
     best, next_, crashed = answer["sets"]
     assert [each["parameters"]["speed"] for each in answer["sets"]] == [2.0, 1.0, 3.0]
     assert best["scores"] == [pytest.approx(4.0, abs=0.05)] * 2

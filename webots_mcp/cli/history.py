@@ -27,6 +27,7 @@ from webots_mcp.cli.tables import print_notes, print_table
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
+    from webots_mcp.plotting import Picture
     from webots_mcp.store.analysis.spread import Spread
     from webots_mcp.store.detection.event import EventOptions
     from webots_mcp.store.detection.verdict import Verdicts
@@ -205,11 +206,13 @@ def _verdicts(verdicts: Verdicts) -> list[str]:
     argument("--trajectory", action="store_true", help="the way of the robot, seen from above"),
     argument("--runs", type=_id_or_signal, nargs="+", default=[], dest="run_ids", metavar="ID",
              help="several runs, laid over each other"),
+    argument("--trials", type=int, dest="trial_set", metavar="SET",
+             help="the scores of a trial set, over one or two parameters (named as signals)"),
     count("--width", "pixels", default=900, dest="width_px", metavar="PX"),
     count("--height", "pixels", default=500, dest="height_px", metavar="PX"),
 )  # fmt: skip
 def plot(arguments: argparse.Namespace) -> None:
-    """Draw signals over time, or the way of the robot; without signals those that changed most."""
+    """Draw signals over time, the robot's way, or trials; without signals what changed most."""
     from webots_mcp import plotting
 
     file = Path(arguments.output)
@@ -222,10 +225,20 @@ def plot(arguments: argparse.Namespace) -> None:
             [*arguments.signals, *behind_runs],
             scope=scope_of(arguments),
             run_ids=run_ids,
+            trial_set=arguments.trial_set,
             width_px=arguments.width_px,
             height_px=arguments.height_px,
             image_format=plotting.image_format_of(file),
         )
+    write_picture(file, picture)
+
+
+def write_picture(file: Path, picture: Picture) -> None:
+    """Write a picture, and say what it shows.
+
+    Raises:
+        InvalidInputError: The file cannot be written.
+    """
     try:
         file.write_bytes(picture.data)
     except OSError as error:

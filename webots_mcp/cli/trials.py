@@ -6,6 +6,8 @@ import argparse
 import json
 import sys
 import threading
+from collections.abc import Callable
+from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -20,6 +22,7 @@ from webots_mcp.cli.command import (
     open_recording,
 )
 from webots_mcp.cli.ending import ending_by_event
+from webots_mcp.cli.history import write_picture
 from webots_mcp.cli.tables import print_notes, print_table, text_of
 
 if TYPE_CHECKING:
@@ -40,6 +43,7 @@ _WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
     argument("--search", metavar="SAMPLER",
              help="search the plan's [ranges]: tpe or random, by Optuna (pip install optuna)"),
     argument("--stand-in", action="store_true", help="on the stand-in instead of Webots"),
+    argument("--plot", metavar="FILE", help="a .png or .svg file: the scores over the parameters"),
     argument("--again", action="store_true",
              help="from the start, also where all trials of the plan are done"),
 )  # fmt: skip
@@ -60,6 +64,7 @@ def trials(arguments: argparse.Namespace) -> None:
 
     plan = read_plan(Path(arguments.plan), arguments.search)
     command_of = stand_in if arguments.stand_in else webots
+    picture = _picture_of(arguments)
     command_of(plan.world)  # before anything is written: is there such a program?
     if plan.search:
         require_optuna()
@@ -71,6 +76,26 @@ def trials(arguments: argparse.Namespace) -> None:
     with ending_by_event(workshop.stopping):
         run_trials(workshop, set_id, arguments.jobs, _Progress(recording, set_id, plan).tell)
     _show(recording, set_id, plan, as_json=arguments.json)
+    if picture is not None:
+        picture(recording, set_id)
+
+
+def _picture_of(arguments: argparse.Namespace) -> Callable[[Recording, int], None] | None:
+    """What draws the picture that is asked for; None where none is."""
+    if arguments.plot is None:
+        return None
+    from webots_mcp.plotting import Sheet, image_format_of, plot_trials
+
+    file = Path(arguments.plot)
+    sheet = Sheet(image_format=image_format_of(file))
+
+    def draw(recording: Recording, set_id: int) -> None:
+        with recording.reader() as connection:
+            picture = plot_trials(connection, set_id, sheet=sheet)
+        with redirect_stdout(sys.stderr):  # stdout may be JSON
+            write_picture(file, picture)
+
+    return draw
 
 
 def _set_of(recording: Recording, plan: WorldPlan, arguments: argparse.Namespace) -> int:

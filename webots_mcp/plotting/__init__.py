@@ -17,6 +17,7 @@ from webots_mcp.plotting.canvas import (
 from webots_mcp.plotting.question import PlotKind, plot
 from webots_mcp.plotting.signals import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
+from webots_mcp.plotting.trials import plot_trials
 
 __all__ = [
     "HEIGHT_PX",
@@ -32,4 +33,5 @@ __all__ = [
     "plot",
     "plot_signals",
     "plot_trajectory",
+    "plot_trials",
 ]

@@ -11,6 +11,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.plotting.canvas import HEIGHT_PX, WIDTH_PX, ImageFormat, Picture, Sheet
 from webots_mcp.plotting.signals import plot_signals
 from webots_mcp.plotting.trajectory import plot_trajectory
+from webots_mcp.plotting.trials import plot_trials
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 
@@ -26,13 +27,14 @@ def plot(
     *,
     scope: Scope | None = None,
     run_ids: Sequence[int] = (),
+    trial_set: int | None = None,
     bands: str | None = None,
     events: bool = True,
     width_px: int = WIDTH_PX,
     height_px: int = HEIGHT_PX,
     image_format: ImageFormat = "png",
 ) -> Picture:
-    """A picture of signals over a range of time, or of the way that the robot took.
+    """A picture of signals over a range of time, of the robot's way, or of trials.
 
     Args:
         connection: Any.
@@ -41,6 +43,8 @@ def plot(
             the position, or none to find them by name.
         scope: Robot and stretch of time; None for the whole newest run.
         run_ids: More runs than that of the scope; of several, each from its start, in one picture.
+        trial_set: The scores of that set instead, over one or two parameters, which `signals` may
+            name; of what else is asked only the form of the picture counts.
         bands: The text signal that stands behind the curves or colours the way; None for the mode,
             where there is one; "" for none (a trajectory is coloured by time then).
         events: Whether to mark events.
@@ -54,6 +58,8 @@ def plot(
         NothingRecordedError: There is nothing to draw in the range.
     """
     sheet = Sheet(width_px, height_px, image_format)
+    if trial_set is not None:
+        return plot_trials(connection, trial_set, signals, sheet=sheet)
     asked = scope or Scope()
     several = dict.fromkeys((asked.run_id, *run_ids) if asked.run_id is not None else run_ids)
     scopes = [replace(asked, run_id=run_id) for run_id in several] or [asked]

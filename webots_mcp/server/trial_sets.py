@@ -43,7 +43,7 @@ from webots_mcp.trials.plan import Plan, combinations
 CANCELLED: Final = "it was cancelled"
 _TABLE_BUDGET: Final = 5_400
 _LONGEST_WHY: Final = 120
-_FIGURES: Final = ("score", "range", "scored", "failed", "why", "runs")
+_FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
 _MOST_NAMED_RUNS: Final = 5
 
 
@@ -217,6 +217,7 @@ def _row(ranked: Ranked, names: Sequence[str], runs: Sequence[int]) -> list[Any]
         figure(spread.median) if spread else None,
         figures([spread.low, spread.high]) if spread and several else None,
         len(ranked.scores),
+        ranked.pruned or None,
         len(ranked.failures) or None,
         why and cut_text(why, _LONGEST_WHY),
         list(runs[:_MOST_NAMED_RUNS]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
 
@@ -16,13 +17,16 @@ from webots_mcp.plotting import (
     WIDTH_PX,
     Picture,
     PlotKind,
+    Sheet,
     plot,
+    plot_trials,
 )
 from webots_mcp.server.budget import notes_of
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import (
     AnyNames,
     RunIds,
+    TrialSetId,
 )
 from webots_mcp.server.shortening import compact_json
 from webots_mcp.store.reading.ranges import Scope
@@ -39,18 +43,22 @@ def webots_plot(
     ] = "signals",
     signals: AnyNames = None,
     run_ids: RunIds = None,
+    trial_set: TrialSetId = None,
     width_px: Annotated[
-        int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="A wider picture shows more detail.")
+        int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="Wider: more detail.")
     ] = WIDTH_PX,
     height_px: Annotated[
-        int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="A higher one has room for more.")
+        int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="Higher: more.")
     ] = HEIGHT_PX,
 ) -> list[str | Image]:
-    """A picture of signals over time (mean line, min-max band, modes, events), or of the way.
+    """A picture of signals over time (mean line, min-max band, modes, events), way, or trials.
 
     Without signals those that changed most; a trajectory finds the position by itself, or takes
     the two signals x and y. Several run_ids are laid over each other, each from its start.
+    trial_set: scores over one or two parameters, as signals.
     """
+    if trial_set is not None:
+        return _trials(recording, trial_set, signals or (), (width_px, height_px))
     first = scope.run_id or next(iter(run_ids or ()), None)
     with recording.view(scope.robot, first) as view:
         view.require_run()
@@ -64,6 +72,18 @@ def webots_plot(
             height_px=height_px,
         )
         return [_caption(view, picture), Image(data=picture.data, format="png")]
+
+
+def _trials(
+    recording: Recording, set_id: int, names: Sequence[str], size_px: tuple[int, int]
+) -> list[str | Image]:
+    """The scores of a trial set, which may be of a robot that is gone."""
+    with recording.reader() as connection:
+        picture = plot_trials(connection, set_id, names, sheet=Sheet(*size_px))
+    return [
+        compact_json({"shows": picture.caption, "notes": notes_of(picture.notes) or []}),
+        Image(data=picture.data, format="png"),
+    ]
 
 
 def _caption(view: View, picture: Picture) -> str:

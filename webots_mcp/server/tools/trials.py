@@ -54,12 +54,10 @@ async def webots_run_trials(
         float | None, Field(gt=0, le=MAX_RUN_S, description="Simulated seconds of a trial.")
     ] = None,
     until: Annotated[
-        str | None, Field(max_length=500, description="It ends when this condition holds.")
+        str | None, Field(max_length=500, description="Or when this condition holds.")
     ] = None,
     repeats: Annotated[int, Field(ge=1, le=1000, description="Of each set.")] = 1,
-    trial_timeout_s: Annotated[
-        float, Field(gt=0, description="Wall seconds; a trial that takes longer fails.")
-    ] = _TRIAL_S,
+    trial_timeout_s: Annotated[float, Field(gt=0, description="Wall seconds.")] = _TRIAL_S,
     trial_set: TrialSetId = None,
     cancel: Annotated[bool, Field(description="Stop that set after its current trial.")] = False,
     robot: RobotName = None,
@@ -94,10 +92,7 @@ async def webots_run_trials(
 
 @tool("Get trials", READS)
 def webots_get_trials(recording: Recording, trial_set: TrialSetId = None) -> TrialsAnswer:
-    """How far trials are, also those from a shell, and the parameters ranked by median score.
-
-    best_is_better: beyond the noise, by which repeats of the same differ.
-    """
+    """How far trials are, also those from a shell; the parameters, ranked by their scores."""
     return TrialsAnswer(**trial_sets.told_of_set(recording, trial_set))
 
 

@@ -13,6 +13,7 @@ from webots_mcp.conditions.reading import Plain, State
 from webots_mcp.conditions.scanning import Scanned, refusal, scan
 from webots_mcp.naming import NO_POSITION, Value, find_position, flatten, nearest_first
 
+POSITION: Final = "the position"  # what a displacement reads, whatever its signals are called
 _MOST_OFFERED: Final = 3
 
 
@@ -111,6 +112,14 @@ class Evaluator:
         place = self._position.read(state) if self._position is not None else None
         values = {name: read(state) for name, read in self._readers.items()}
         return values | dict(zip(names, place or (None, None), strict=True)) if names else values
+
+    def lacks(self, state: State) -> set[str]:
+        """What the condition reads and a state has no value of: signals, and `POSITION`."""
+        state = self._as_dict(state)
+        lacking = {name for name, read in self._readers.items() if read(state) is None}
+        if self._position is not None and self._position.read(state) is None:
+            lacking.add(POSITION)
+        return lacking
 
     def names_in(self, state: State) -> list[str]:
         """The names of all values of a state, null or not."""

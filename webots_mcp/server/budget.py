@@ -119,8 +119,10 @@ def condensed(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | None
 
 
 def notes_of(notes: Sequence[str]) -> list[str] | None:
-    """The notes of an answer; None without any."""
-    return [cut_text(note, _LONGEST_NOTE) for note in notes[:_MOST_NOTES]] or None
+    """The notes of an answer, of many the first and how many more; None without any."""
+    left_out = len(notes) - _MOST_NOTES
+    more = [f"and {left_out} more notes"] if left_out > 0 else []
+    return [cut_text(note, _LONGEST_NOTE) for note in notes[:_MOST_NOTES]] + more or None
 
 
 def some(names: Sequence[str], most: int = 10) -> str:

@@ -88,6 +88,44 @@ def test_where_it_never_held_the_answer_says_how_many_rows_were_looked_at(
 
 
 @pytest.mark.parametrize(
+    ("where", "named"),
+    [
+        ("blind < 3", "blind"),
+        ("displacement(1) < 0.05", "the position"),
+        ("n > 9 and blind", "bli"),
+    ],
+)
+def test_what_never_had_a_value_was_not_looked_for(
+    counting: Recorder, where: str, named: str
+) -> None:
+    for step in range(50):
+        counting.publish(step * 0.1, {"n": step % 5, "blind": None})
+    verdicts = ask(counting.connection, where).verdicts
+
+    assert verdicts.absent == {}
+    assert verdicts.not_searched["condition"].startswith(named)
+    assert "had no value in any row" in verdicts.not_searched["condition"]
+    assert ask(counting.connection, "n > 9 and missing(blind)").verdicts.absent == {
+        "condition": "it held in none of 50 rows"
+    }
+
+
+def test_of_several_runs_all_rows_are_counted_and_the_same_is_said_once(
+    rover: sqlite3.Connection,
+) -> None:
+    found = ask(rover, "target > 1e6", since=0.0, until=2e9)
+
+    assert found.verdicts.absent["condition"] == "it held in none of 2050 rows"
+    (note,) = (note for note in found.notes if "row" in note)
+    assert note.startswith("run 1, 2, 3: ")
+
+
+def test_a_misspelt_signal_is_told_from_how_many(rover: sqlite3.Connection) -> None:
+    with pytest.raises(UnknownSignalError, match=r"there is .* \(the nearest of \d+\)"):
+        ask(rover, "bmuper < 3")
+
+
+@pytest.mark.parametrize(
     ("interval", "said"),
     [(1, "nothing was missed"), (5, "one publish() call in 5 is a row"), (None, "may be fewer")],
 )

@@ -6,12 +6,14 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from webots_mcp.conditions import Condition, parse_condition
+from webots_mcp.conditions.condition import POSITION
 from webots_mcp.errors import UnknownSignalError
 from webots_mcp.naming import Value
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.kind import NO_POSITION, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.held import recorded_share, where_held
+from webots_mcp.store.reading.held import Held, recorded_share, where_held
+from webots_mcp.store.signals.catalogue import say_unknown
 
 _MOST_VALUES: Final = 8
 
@@ -29,18 +31,32 @@ def condition_events(search: Search) -> Iterator[Event]:
         then = f"ask again with start_s={held.reached_s:.3f}"
         search.not_searched("condition", f"the time was over at {held.reached_s:.3f} s: {then}")
     if search.only is None:
-        search.ledger.notes.append(recorded_share(search.connection, search.segment.run_id))
-        search.came_near("condition", 0.0, f"it held in none of {held.rows} rows")
+        share = recorded_share(search.connection, search.segment.run_id)
+        search.ledger.note_of_run(search.segment.run_id, share)
+        _require_values(condition, held)
+        search.ledger.rows += held.rows
+        search.came_near(
+            "condition", search.ledger.rows, f"it held in none of {search.ledger.rows} rows"
+        )
     for stretch in held.stretches:
         times = (stretch.start_s, stretch.end_s)
         yield search.event("condition", *times, condition.text, **_details(stretch.values))
 
 
 def _require_known(condition: Condition, search: Search) -> None:
-    unknown = condition.nearest_to_unknown(search.known)
-    said = [f"no signal {name!r} is recorded; there is {near}" for name, near in unknown]
+    unknown = [name for name in condition.signals if name not in search.known]
+    said = [say_unknown(search.known, name) for name in unknown]
     if said := [*said, *condition.describe_lost(search.known)]:
         raise UnknownSignalError("; ".join(said))
+
+
+def _require_values(condition: Condition, held: Held) -> None:
+    """Of what is never there a condition can ask only whether it is missing."""
+    if held.stretches or not held.never_there or "missing(" in condition.text:
+        return
+    names = ", ".join(sorted(held.never_there))
+    why = f": {NO_POSITION}" if POSITION in held.never_there else ""
+    raise NotSearchableError(f"{names} had no value in any row, so that it could not hold{why}")
 
 
 def _details(values: dict[str, Value]) -> dict[str, Any]:

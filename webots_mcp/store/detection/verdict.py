@@ -67,16 +67,31 @@ class Ledger:
     Attributes:
         searched: Kinds that were looked for at least in a part.
         notes: Remarks that are about no kind.
+        rows: Those in which a condition held nowhere, of all runs.
     """
 
     searched: set[str] = field(default_factory=set[str])
     notes: list[str] = field(default_factory=list[str])
+    rows: int = 0
+    _of_runs: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
     _reasons: dict[str, dict[str, None]] = field(default_factory=dict[str, dict[str, None]])
     _nearest: dict[str, tuple[float, str]] = field(default_factory=dict[str, tuple[float, str]])
 
     def not_searched(self, kind: str, *reasons: str) -> None:
         """Note why a kind was not looked for, or where it was not."""
         self._reasons.setdefault(kind, {}).update(dict.fromkeys(reasons))
+
+    def note_of_run(self, run_id: int, note: str) -> None:
+        """Remark on a run; runs of which the same is to say are told together."""
+        self._of_runs.setdefault(note, []).append(run_id)
+
+    @property
+    def all_notes(self) -> tuple[str, ...]:
+        """The remarks, each once."""
+        of_runs = [
+            f"run {', '.join(map(str, run_ids))}: {note}" for note, run_ids in self._of_runs.items()
+        ]
+        return tuple(dict.fromkeys([*self.notes, *of_runs]))
 
     def came_near(self, kind: str, share: float, what: str) -> None:
         """Note what came near to an event, as a share of what would be one; the most counts."""

@@ -235,7 +235,7 @@ def collect(
             ledger.not_searched(kind.name, "nothing was recorded in that range")
     over = _runs_over(connection, [segment.run_id for segment in time_range.segments])
     ended = [replace(e, ongoing=False) if e.ongoing and e.run_id in over else e for e in found]
-    return Collected(ended, kinds, ledger, tuple(dict.fromkeys(ledger.notes)))
+    return Collected(ended, kinds, ledger, ledger.all_notes)
 
 
 def _runs_over(connection: sqlite3.Connection, run_ids: Sequence[int]) -> set[int]:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.conditions import Condition
+from webots_mcp.conditions import Condition, Evaluator
 from webots_mcp.errors import ConditionFailedError, InvalidInputError
 from webots_mcp.naming import Value
 from webots_mcp.store.reading.deadline import Deadline
@@ -51,12 +51,14 @@ class Held:
     Attributes:
         reached_s: The simulation time of the last row that was looked at; None without any.
         cut: The deadline passed; later rows were not looked at.
+        never_there: What the condition reads and no row had a value of.
     """
 
     stretches: list[Stretch]
     rows: int = 0
     reached_s: float | None = None
     cut: bool = False
+    never_there: set[str] | None = None
 
 
 def where_held(
@@ -74,7 +76,7 @@ def where_held(
     from_s = min(known_from_s, segment.start_s - condition.remembers_s)
     bounds = (segment.run_id, from_s, segment.end_s, segment.wall_start_s, segment.wall_end_s)
     held = Held([])
-    rows = _within(connection.execute(_ROWS, bounds), deadline, held)
+    rows = _within(connection.execute(_ROWS, bounds), deadline, held, condition.evaluator())
     try:
         held.stretches += stretches_in(rows, condition, segment.start_s)
     except ConditionFailedError as error:
@@ -83,12 +85,19 @@ def where_held(
     return held
 
 
-def _within(rows: Iterable[tuple[float, str]], deadline: Deadline, held: Held) -> Iterator[Row]:
+def _within(
+    rows: Iterable[tuple[float, str]], deadline: Deadline, held: Held, reading: Evaluator
+) -> Iterator[Row]:
     for time_s, data in rows:
         if held.rows % 500 == 499 and deadline.passed:
             held.cut = True
             return
-        yield time_s, parse(data)
+        state = parse(data)
+        if held.never_there is None:
+            held.never_there = reading.lacks(state)
+        elif held.never_there:
+            held.never_there &= reading.lacks(state)
+        yield time_s, state
         held.rows += 1
         held.reached_s = time_s
 
@@ -117,6 +126,6 @@ def recorded_share(connection: sqlite3.Connection, run_id: int) -> str:
     """How many of the published states a run's rows are, in a sentence."""
     (interval,) = connection.execute(_INTERVAL, (run_id,)).fetchone()
     if interval == 1:
-        return f"run {run_id}: each publish() call is a row, so nothing was missed"
+        return "each publish() call is a row, so nothing was missed"
     share = f"one publish() call in {interval} is a row" if interval else "rows may be fewer"
-    return f"run {run_id}: {share}, so what held between two rows is not seen"
+    return f"{share}, so what held between two rows is not seen"

@@ -165,7 +165,7 @@ def resolve_signals(known: dict[str, Signal], names: Sequence[str]) -> list[Sign
     for name in names:
         meant = list(_meant(known, name))
         if not meant:
-            raise UnknownSignalError(_unknown(known, name))
+            raise UnknownSignalError(say_unknown(known, name))
         found.update((signal.name, signal) for signal in meant)
     return list(found.values())
 
@@ -202,7 +202,8 @@ def _meant(known: dict[str, Signal], name: str) -> Iterable[Signal]:
     return (known[each] for each in known if fnmatch.fnmatchcase(each, escaped))
 
 
-def _unknown(known: dict[str, Signal], name: str) -> str:
+def say_unknown(known: dict[str, Signal], name: str) -> str:
+    """That there is no such signal, and which are near."""
     if not known:
         return f"no signal {name!r}: no state row with values has been recorded yet"
     offer = ", ".join(nearest_first(name.replace("*", ""), known)[:_MOST_OFFERED])

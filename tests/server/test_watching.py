@@ -121,3 +121,15 @@ def test_a_movement_says_from_when_on_rows_were_not_read(
         answer = movement(view, whole, 0)
     assert answer is not None
     assert answer["rows_missing_from_s"] < 1499.5
+
+
+async def test_a_robot_that_ended_is_not_waited_for_and_nothing_is_absent(
+    connect: Connect, recorded: Recorded, rover: RecordedRobot
+) -> None:
+    drive(rover, [0, 0], [1, 0], [2, 0])
+    recorded.connection.execute("UPDATE session SET ended_wall_time_s = last_seen_wall_time_s")
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", duration_s=60)
+    assert (answer["rows"], answer["window_s"] < 30) == (0, True)
+    (kinds,) = (k for k, why in answer["verdicts"]["not_searched"].items() if "no row" in why)
+    assert {"gap", "silent", "flat", "jump", "still", "stuck"} <= set(kinds.split(", "))

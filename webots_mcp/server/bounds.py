@@ -32,5 +32,6 @@ def newest_runs(found: TimeRange) -> TimeRange:
     earlier = len(found.segments) - MOST_RUNS
     if earlier <= 0:
         return found
-    note = f"the range holds {earlier} earlier runs too (webots_list_runs): ask with run_id"
+    runs = "1 earlier run" if earlier == 1 else f"{earlier} earlier runs"
+    note = f"the range holds {runs} too (webots_list_runs): ask with run_id"
     return replace(found, segments=found.segments[-MOST_RUNS:], notes=(*found.notes, note))

@@ -249,3 +249,37 @@ def test_what_stepped_from_one_rest_to_another_is_flat_since_the_step(
     roll(empty, 100_000)
     (x,) = trends(empty, resolve_range(empty)).runs[0].numbers
     assert x.flat_since_s == 70.3
+
+
+def test_a_staircase_rises_and_does_not_swing(empty: sqlite3.Connection) -> None:
+    record(empty, rows=600, interval_s=0.1, turned=lambda time_s: 90.0 * (time_s // 8))
+    trend = one(empty, "turned")
+    assert (trend.shape, trend.swings) == ("rising", ())
+    assert "swing" not in trend.says and "swung" not in trend.says
+
+
+def test_a_ripple_on_a_course_is_no_headline(empty: sqlite3.Connection) -> None:
+    def ride(time_s: float) -> float:
+        return 1000 * math.sin(time_s / 20) + 20 * math.sin(time_s * 6)
+
+    record(empty, rows=600, interval_s=0.1, y=ride)
+    trend = one(empty, "y")
+    assert trend.shape == "varying"
+    assert trend.says.startswith("between ")
+    assert "also swung by 20" in trend.says
+
+
+def test_the_rate_is_that_of_the_two_ends_beside_it(empty: sqlite3.Connection) -> None:
+    def fall(time_s: float) -> float:
+        return 16800 - 20 * time_s - (900 if time_s > 57 else 0)
+
+    record(empty, rows=581, interval_s=0.1, volts=fall)
+    trend = one(empty, "volts")
+    assert trend.says.startswith("falls from 1.68e+04 to 1.474e+04 (-35.5/s)")
+
+
+def test_a_constant_that_lost_its_value_is_told_with_the_last(empty: sqlite3.Connection) -> None:
+    record(empty, rows=600, interval_s=0.1, temp=lambda time_s: 40.0 if time_s < 30 else None)
+    trend = one(empty, "temp")
+    assert trend.is_lacking
+    assert trend.says == "constant at 40; no value in 300 of 600 rows, the last value at 29.9 s"

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Annotated, Any, Final
 
 import anyio
@@ -19,15 +21,18 @@ from webots_mcp.server.parameters import MAX_WAIT_S, RobotName
 from webots_mcp.server.tools.events import fitting_events, not_shown_of, verdicts_of
 from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
 from webots_mcp.server.watching import Window, movement, window_from
-from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.questions.events import search_events
-from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.questions.trends import RunTrends, trends
 from webots_mcp.store.recording import Recording, View
 
 USUAL_DURATION_S: Final = 10.0
 _REPORT_INTERVAL_S: Final = 1.0
 _SHOWN_SIGNALS: Final = 12
 _SHOWN_EVENTS: Final = 30
+_ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "noticed"))  # without any row
 
 
 @tool("Watch the robot", READS)
@@ -61,18 +66,20 @@ async def webots_monitor(
     duration_s = duration_s or USUAL_DURATION_S
     if lookback_s is not None:
         return await to_thread.run_sync(look_back, recording, robot, lookback_s)
-    name, started_s = await to_thread.run_sync(_start, recording, robot)
-    for second in range(1, math.ceil(duration_s) + 1):
+    name, started_s, is_live = await to_thread.run_sync(_start, recording, robot)
+    for second in range(1, math.ceil(duration_s) + 1) if is_live else ():
         await anyio.sleep(min(_REPORT_INTERVAL_S, duration_s - second + 1))
         doing = await to_thread.run_sync(_doing, recording, name)
         await ctx.report_progress(min(second, duration_s), duration_s, doing)
     return await to_thread.run_sync(_watched, recording, name, started_s)
 
 
-def _start(recording: Recording, robot: str | None) -> tuple[str, float]:
+def _start(recording: Recording, robot: str | None) -> tuple[str, float, bool]:
+    """The robot, since when it is watched, and whether any controller could write meanwhile."""
     with recording.view(robot) as view:
         view.require_run()
-        return view.robot.name, time.time()
+        is_live = view.session is not None and view.session.is_alive(view.now_s)
+        return view.robot.name, time.time(), is_live
 
 
 def _doing(recording: Recording, robot: str) -> str:
@@ -104,8 +111,7 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     window = window_from(view, wall_start_s)
     recorded = bool(window.rows.segments)
     told = trends(view.connection, window.rows, limit=MOST_SIGNALS).runs if recorded else ()
-    budget = BUDGET // 2 // max(len(told), 1)
-    found = search_events(view.connection, window.around)
+    found = search_events(view.connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
     shown, events = fitting_events(in_window, _SHOWN_EVENTS, BUDGET // 2, view)
@@ -113,13 +119,28 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     return {
         "rows": rows,
         "movement": movement(view, window.rows) if recorded else None,
-        "trends": [trend_tables(run, _SHOWN_SIGNALS, budget) for run in told] or None,
+        "trends": [trend_tables(run, _SHOWN_SIGNALS, BUDGET // 2) for run in told[-1:]] or None,
         "events": events,
-        "verdicts": verdicts_of(in_window.verdicts),
+        "verdicts": verdicts_of(in_window.verdicts if recorded else _unlooked(in_window.verdicts)),
         "not_shown": not_shown_of(shown),
-        "notes": notes_of(tuple(dict.fromkeys((*window.rows.notes, *found.notes)))),
+        "notes": notes_of(
+            tuple(dict.fromkeys((*window.rows.notes, *found.notes, *_of_earlier(told))))
+        ),
         "hint": _hint(rows, bool(shown.left_out), wall_start_s, view),
     }
+
+
+def _unlooked(verdicts: Verdicts) -> Verdicts:
+    """With the kinds that were not asked for because there is no row to look at."""
+    others = [each.name for each in asked_kinds(EventOptions()) if each.name not in _ROWLESS.kinds]
+    why = dict.fromkeys(others, "no row was recorded in that time")
+    return replace(verdicts, not_searched=verdicts.not_searched | why)
+
+
+def _of_earlier(told: Sequence[RunTrends]) -> list[str]:
+    """Where the trends of all runs but the newest are."""
+    earlier = ", ".join(str(run.run_id) for run in told[:-1])
+    return [f"the trends of run {earlier}: webots_get_trends(run_id)"] if earlier else []
 
 
 def _in_window(event: Event, window: Window, wall_start_s: float) -> bool:

@@ -38,6 +38,7 @@ MOST_SIGNALS: Final = 500
 _STATES_SHARE: Final = 0.25  # of the budget
 _LONGEST_SAYING: Final = 200
 _NO_ROW: Final = "no row in that range: leave the range out, or see notes"
+EMPTY: Final = '""'  # a name without a character
 _SHOWN_VALUES: Final = 6
 _SHOWN_CONSTANTS: Final = 20
 
@@ -99,17 +100,20 @@ def trend_tables(run: RunTrends, limit: int, budget: int) -> RunTrendTables:
 
 
 def _moving(run: RunTrends) -> list[Trend]:
-    return [trend for trend in run.numbers if trend.shape != "constant"]
+    """Those that changed, or lost their value: no constant is dead."""
+    return [trend for trend in run.numbers if trend.shape != "constant" or trend.is_lacking]
 
 
 def _constants(run: RunTrends) -> list[str]:
     """What never changed, each with its value."""
     numbers = [
-        f"{trend.name} {figure(trend.summary.last):g}{f' {trend.unit}' if trend.unit else ''}"
+        f"{trend.name or EMPTY} {figure(trend.summary.last):g} {trend.unit or ''}".rstrip()
         for trend in run.numbers
-        if trend.shape == "constant"
+        if trend.shape == "constant" and not trend.is_lacking
     ]
-    states = [f"{each.name} {compact_json(each.last)}" for each in run.states if not each.changes]
+    states = [
+        f"{each.name or EMPTY} {compact_json(each.last)}" for each in run.states if not each.changes
+    ]
     return numbers + states
 
 

@@ -35,7 +35,7 @@ def condition_events(search: Search) -> Iterator[Event]:
         search.ledger.note_of_run(search.segment.run_id, share)
         _require_values(condition, held)
         search.ledger.rows += held.rows
-        search.came_near(
+        search.ledger.came_near(
             "condition", search.ledger.rows, f"it held in none of {search.ledger.rows} rows"
         )
     for stretch in held.stretches:

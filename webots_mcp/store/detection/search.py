@@ -157,7 +157,8 @@ class Search:
 
     def came_near(self, kind: str, share: float, what: str) -> None:
         """Note what came near to an event, as a share of what would be one."""
-        self.ledger.came_near(kind, share, what)
+        where = f" (run {self.segment.run_id})" if self.ledger.of_several_runs else ""
+        self.ledger.came_near(kind, share, what + where)
 
     def is_over(self, kind: str, left: Sequence[Signal]) -> bool:
         """Whether the time is over; then it is noted which signals were not searched."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
@@ -13,7 +13,7 @@ from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.detection.event import LEVELS, Event
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError, only_if_named
 from webots_mcp.store.detection.search import Search, wall_time_at
-from webots_mcp.store.reading.changes import change_points
+from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points
 from webots_mcp.store.reading.gaps import rhythm_in, with_rows_around
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rows import exceeds, read_columns
@@ -101,12 +101,16 @@ def change_events(search: Search) -> Iterator[Event]:
     before_s = math.nextafter(segment.start_s, -math.inf)
     whole = Segment(segment.run_id, before_s, just_after(newest_s))
     for name, points in change_points(search.connection, whole, states, search.deadline).items():
-        ends_s = [*(point.sim_time_s for point in points[2:]), None]
+        told = _without_measurements(points)
+        ends_s = [*(point.sim_time_s for point in told[2:]), None]
         changes = [
             (before, point, end_s)
-            for (before, point), end_s in zip(pairwise(points), ends_s, strict=False)
+            for (before, point), end_s in zip(pairwise(told), ends_s, strict=False)
             if segment.start_s <= point.sim_time_s < segment.end_s
         ]
+        if len(told) < len(points):
+            why = f"not from number to number of {name}, which measures: ask signals=['{name}']"
+            search.not_searched("change", f"{why} of webots_query_history")
         if len(changes) > MOST_CHANGES:
             until_s = changes[-MOST_CHANGES][1].sim_time_s
             why = (
@@ -118,6 +122,26 @@ def change_events(search: Search) -> Iterator[Event]:
             wall_s = wall_time_at(search.connection, segment.run_id, point.sim_time_s)
             details = {"before": before.value, "after": point.value}
             yield Event("change", *place, wall_s, name, details, ongoing=end_s is None)
+
+
+def _without_measurements(points: Sequence[Point]) -> Sequence[Point]:
+    """Without the changes from number to number of what has more numbers than any mode has.
+
+    It is a measurement that is a text now and then, such as "n/a".
+    """
+    numbers = [_is_number(point.value) for point in points]
+    values = {point.value for point, is_number in zip(points, numbers, strict=True) if is_number}
+    if len(values) <= MOST_VALUES:
+        return points
+    kept = [not (was and now) for was, now in pairwise([False, *numbers])]
+    return [point for point, keep in zip(points, kept, strict=True) if keep]
+
+
+def _is_number(value: object) -> bool:
+    try:
+        return isinstance(value, str) and math.isfinite(float(value))
+    except ValueError:
+        return False
 
 
 def log_events(search: Search) -> Iterator[Event]:

@@ -67,11 +67,13 @@ class Ledger:
     Attributes:
         searched: Kinds that were looked for at least in a part.
         notes: Remarks that are about no kind.
+        of_several_runs: What came near has to say in which run.
         rows: Those in which a condition held nowhere, of all runs.
     """
 
     searched: set[str] = field(default_factory=set[str])
     notes: list[str] = field(default_factory=list[str])
+    of_several_runs: bool = False
     rows: int = 0
     _of_runs: dict[str, list[int]] = field(default_factory=dict[str, list[int]])
     _reasons: dict[str, dict[str, None]] = field(default_factory=dict[str, dict[str, None]])

@@ -223,8 +223,8 @@ def collect(
     kinds = asked_kinds(options)
     known = known_signals(connection, time_range)
     import_module("numpy")  # once per process, before the time counts
-    ledger = Ledger(notes=list(time_range.notes))
     deadline, segments = Deadline(deadline_s), time_range.segments
+    ledger = Ledger(notes=list(time_range.notes), of_several_runs=len(segments) > 1)
     found: list[Event] = []
     for index, segment in enumerate(segments):  # each run gets its share of the time
         part = deadline.part(1 / (len(segments) - index))

@@ -26,6 +26,7 @@ STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would 
 TOLD_MISSING_SHARE: Final = 0.001
 SLOW_SHARE: Final = 0.5  # of the variance must be left in means for their course to be the values'
 SWINGING_SHARE: Final = 0.6  # of the range: what swung for less did something else as well
+WIDE_SHARE: Final = 0.3  # of the range of values: who swings by less swings about a moving place
 TOLD_BEYOND_ENDS: Final = 0.05  # of the range: extremes nearer to the ends are as good as them
 _DUST: Final = 1e-12  # of a value: what adding leaves of it
 _HALF_TURN_VARIANCE: Final = -2 * math.log(2 / math.pi)  # of angles spread over half a turn
@@ -82,6 +83,11 @@ class Trend:
     change: float
     says: str
 
+    @property
+    def is_lacking(self) -> bool:
+        """Whether so many rows have no value that it is told."""
+        return self.missing > TOLD_MISSING_SHARE * self.summary.rows
+
 
 def judge(
     signal: Signal,
@@ -114,8 +120,8 @@ def judge(
     slow = _slow_share(inner, inner_variance, turn)
     fast = slow < SLOW_SHARE or leaps
     line = None if leaps else _of_all(fit_line(times, course, inner.mean or 0.0), slow)
-    swings = () if fast else _swings(times, course, resolution_s)
     monotonic = None if fast else _monotonic(course)
+    swings = () if fast or monotonic else _swings(times, course, resolution_s)
     rest_s = None if fast else flat_since(*((times, course) if known is None or turn else known))
     mean = _mean(signal, summary, inner, numbers)
     counted = course is not numbers and not fast
@@ -243,13 +249,19 @@ def _shape(
 ) -> Shape:
     if _is_constant(summary):
         return "constant"
-    if swings and sum(each.end_s - each.start_s for each in swings) >= SWINGING_SHARE * whole_s:
+    wide = [each for each in swings if _is_wide(each, summary)]
+    if wide and sum(each.end_s - each.start_s for each in wide) >= SWINGING_SHARE * whole_s:
         return "oscillating"
     if monotonic is not None:
         return monotonic
     if line is not None and line.r2 >= STRAIGHT_R2:
         return "rising" if line.slope_per_s > 0 else "falling"
     return "resting" if rest_s is not None else "varying"
+
+
+def _is_wide(swing: Swing, summary: Summary) -> bool:
+    """Whether the swing makes the range, rather than a slow course on which it rides."""
+    return 2 * swing.amplitude >= WIDE_SHARE * ((summary.max or 0.0) - (summary.min or 0.0))
 
 
 def _is_constant(summary: Summary) -> bool:
@@ -272,6 +284,8 @@ def _remarks(trend: Trend) -> Iterator[str]:
     elif trend.fast:
         yield f"varies faster than {trend.resolution_s:g} s: ask for a shorter range"
     yield from _beyond_ends(trend)
+    if trend.swings and not any(_is_wide(each, summary) for each in trend.swings):
+        yield f"also {_swinging(trend, unit)}"
     if trend.flat_since_s is not None and trend.shape != "constant" and summary.changes != 1:
         yield f"flat at {_told(summary.last, summary)} since {trend.flat_since_s:.6g} s"
     if trend.spikes:
@@ -280,18 +294,21 @@ def _remarks(trend: Trend) -> Iterator[str]:
             f"{len(trend.spikes)} spike{'s' if len(trend.spikes) > 1 else ''}, the largest "
             f"{largest.value:.4g} at {largest.sim_time_s:.6g} s"
         )
-    if trend.missing > TOLD_MISSING_SHARE * summary.rows:
-        yield f"no value in {trend.missing} of {summary.rows} rows"
+    if trend.is_lacking:
+        yield (
+            f"no value in {trend.missing} of {summary.rows} rows, the last value at "
+            f"{summary.last_sim_time_s:.6g} s"
+        )
 
 
 def _course(trend: Trend, unit: str) -> str:
     summary = trend.summary
     if trend.shape == "constant":
         return f"constant at {summary.last or 0.0:.4g}{unit}"
-    if trend.swings:
+    if any(_is_wide(each, summary) for each in trend.swings):
         return _swinging(trend, unit)
     if trend.shape in ("rising", "falling"):
-        slope = f" ({trend.slope_per_s:.3g}{unit}/s)" if _is_straight(trend) else ""
+        slope = f" ({_mean_rate(trend):.3g}{unit}/s)" if _is_straight(trend) else ""
         if trend.turned is not None:
             return f"turns by {trend.turned:.3g}{unit}{slope}"
         verb = "rises" if trend.shape == "rising" else "falls"
@@ -304,6 +321,14 @@ def _course(trend: Trend, unit: str) -> str:
     return f"between {low} (at {summary.min_sim_time_s:.6g} s) and {high}{unit} " + (
         f"(at {summary.max_sim_time_s:.6g} s)"
     )
+
+
+def _mean_rate(trend: Trend) -> float:
+    """From the first value to the last, which stand beside it in the sentence."""
+    summary = trend.summary
+    change = (summary.last or 0.0) - (summary.first or 0.0)
+    lasts_s = (summary.last_sim_time_s or 0.0) - (summary.first_sim_time_s or 0.0)
+    return (change if trend.turned is None else trend.turned) / lasts_s
 
 
 def _is_straight(trend: Trend) -> bool:

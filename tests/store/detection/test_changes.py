@@ -1,0 +1,48 @@
+"""Changes of what a robot does are told; a measurement that is a text now and then is no mode."""
+
+from __future__ import annotations
+
+import sqlite3
+
+from tests.recordings.rover import Recorder
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.rollup.rolling import roll
+
+
+def changes(connection: sqlite3.Connection) -> Events:
+    return find_events(
+        connection, resolve_range(connection, run_id=1), EventOptions(kinds=("change",)), limit=20
+    )
+
+
+def test_a_text_now_and_then_among_numbers_hides_no_change_of_the_mode(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(300):
+        mixed = "n/a" if 100 <= step < 120 else step * 0.25
+        mode = "drive" if step < 50 else "return"
+        recorder.publish(step * 0.1, {"mode": mode, "mixed": mixed})
+    roll(empty, 100_000)
+    found = changes(empty)
+    assert [(each.name, round(each.start_s, 1)) for each in found.events] == [
+        ("mode", 5.0),
+        ("mixed", 10.0),
+        ("mixed", 12.0),
+    ]
+    assert "not from number to number of mixed" in found.verdicts.not_searched["change"]
+
+
+def test_a_mode_that_is_a_number_as_text_changes(empty: sqlite3.Connection) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(90):
+        recorder.publish(step * 0.1, {"level": str(step // 30)})
+    found = changes(empty)
+    assert [each.details["after"] for each in found.events] == ["1", "2"]
+    assert found.verdicts.not_searched == {}

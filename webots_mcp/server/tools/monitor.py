@@ -32,6 +32,7 @@ USUAL_DURATION_S: Final = 10.0
 _REPORT_INTERVAL_S: Final = 1.0
 _SHOWN_SIGNALS: Final = 12
 _SHOWN_EVENTS: Final = 30
+_TOLD_RUNS: Final = 2  # whose trends are told: that before a reset, and that after it
 _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "noticed"))  # without any row
 
 
@@ -111,6 +112,8 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     window = window_from(view, wall_start_s)
     recorded = bool(window.rows.segments)
     told = trends(view.connection, window.rows, limit=MOST_SIGNALS).runs if recorded else ()
+    newest = told[-_TOLD_RUNS:]
+    budget = BUDGET // 2 // max(len(newest), 1)
     found = search_events(view.connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
@@ -119,7 +122,7 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     return {
         "rows": rows,
         "movement": movement(view, window.rows) if recorded else None,
-        "trends": [trend_tables(run, _SHOWN_SIGNALS, BUDGET // 2) for run in told[-1:]] or None,
+        "trends": [trend_tables(run, _SHOWN_SIGNALS, budget) for run in newest] or None,
         "events": events,
         "verdicts": verdicts_of(in_window.verdicts if recorded else _unlooked(in_window.verdicts)),
         "not_shown": not_shown_of(shown),
@@ -139,7 +142,7 @@ def _unlooked(verdicts: Verdicts) -> Verdicts:
 
 def _of_earlier(told: Sequence[RunTrends]) -> list[str]:
     """Where the trends of all runs but the newest are."""
-    earlier = ", ".join(str(run.run_id) for run in told[:-1])
+    earlier = ", ".join(str(run.run_id) for run in told[:-_TOLD_RUNS])
     return [f"the trends of run {earlier}: webots_get_trends(run_id)"] if earlier else []
 
 

@@ -117,7 +117,7 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     found = search_events(view.connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)
-    shown, events = fitting_events(in_window, _SHOWN_EVENTS, BUDGET // 2, view)
+    shown, events = fitting_events(in_window, _SHOWN_EVENTS, BUDGET // 3, view)
     rows = sum(run.rows for run in told)
     return {
         "rows": rows,

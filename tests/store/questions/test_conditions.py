@@ -99,7 +99,7 @@ def test_what_never_had_a_value_was_not_looked_for(
     counting: Recorder, where: str, named: str
 ) -> None:
     for step in range(50):
-        counting.publish(step * 0.1, {"n": step % 5, "blind": None})
+        counting.publish(step * 0.1, {"n": step % 5, "blind": None, "pose": [None, None]})
     verdicts = ask(counting.connection, where).verdicts
 
     assert verdicts.absent == {}

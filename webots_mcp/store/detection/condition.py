@@ -8,9 +8,9 @@ from typing import Any, Final
 from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.conditions.condition import POSITION
 from webots_mcp.errors import UnknownSignalError
-from webots_mcp.naming import Value
+from webots_mcp.naming import NO_POSITION, Value
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.kind import NO_POSITION, EventKind, NotSearchableError
+from webots_mcp.store.detection.kind import EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.held import Held, recorded_share, where_held
 from webots_mcp.store.signals.catalogue import say_unknown

@@ -126,7 +126,8 @@ def test_a_movement_says_from_when_on_rows_were_not_read(
 async def test_a_robot_that_ended_is_not_waited_for_and_nothing_is_absent(
     connect: Connect, recorded: Recorded, rover: RecordedRobot
 ) -> None:
-    drive(rover, [0, 0], [1, 0], [2, 0])
+    for step in range(3):
+        rover.state(step * 0.5, {"pose": [step, 0]}, at=rover.now - 5 + step)
     recorded.connection.execute("UPDATE session SET ended_wall_time_s = last_seen_wall_time_s")
     async with connect() as client:
         answer = await ask(client, "webots_monitor", duration_s=60)

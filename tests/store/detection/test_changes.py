@@ -46,3 +46,17 @@ def test_a_mode_that_is_a_number_as_text_changes(empty: sqlite3.Connection) -> N
     found = changes(empty)
     assert [each.details["after"] for each in found.events] == ["1", "2"]
     assert found.verdicts.not_searched == {}
+
+
+def test_of_a_mode_that_is_a_number_the_way_to_its_changes_is_named(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("r")
+    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    for step in range(90):
+        recorder.publish(step * 0.1, {"betriebsart": step // 30})
+    assert "where='changed(NAME)'" in changes(empty).verdicts.not_searched["change"]
+    options = EventOptions(kinds=("condition",), where="changed(betriebsart)")
+    found = find_events(empty, resolve_range(empty, run_id=1), options)
+    assert [round(each.start_s, 1) for each in found.events] == [3.0, 6.0]

@@ -96,7 +96,10 @@ def change_events(search: Search) -> Iterator[Event]:
     segment, newest_s = _recorded(search), search.ended_s
     states = [signal for signal in search.signals if not signal.is_number]
     if not states:
-        raise NotSearchableError("no text or flag was published, or none of these names")
+        raise NotSearchableError(
+            "no text or flag was published, or none of these names; of a mode that is a number ask "
+            "where='changed(NAME)'"
+        )
     # From just before on: what changed exactly at the start had another value until then.
     before_s = math.nextafter(segment.start_s, -math.inf)
     whole = Segment(segment.run_id, before_s, just_after(newest_s))

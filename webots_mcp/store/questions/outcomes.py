@@ -34,7 +34,7 @@ _SHARE: Final = "share of "
 _RATE: Final = " per min"
 NO_MODE: Final = (
     "no mode is known: publish one as a text, such as mode; webots_get_trends tells the time in "
-    "each value of any text"
+    "each value of any text, webots_find_events(where='NAME == 1') when a number had a value"
 )
 _SPEED: Final = "mean_speed_m_s"
 

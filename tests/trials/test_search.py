@@ -13,6 +13,8 @@ from typing import Any, get_args
 import pytest
 
 from tests.trials.conftest import Run, command, rows, wait_for_trial
+from webots_mcp.server.trial_sets import told_of_set
+from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Trial
 from webots_mcp.trials.plan import Plan, Search
 from webots_mcp.trials.ranges import Range
@@ -133,6 +135,9 @@ def test_a_search_runs_trials_and_ends_early_what_is_pruned(
     statuses = rows(project, "SELECT DISTINCT status, ended_by, run_id > 0, error FROM trial")
     assert sorted(statuses)[0] == ("done", "for_s", 1, None)
     assert sorted(statuses)[1][:3] == ("pruned", "prune", 1)
+    told = told_of_set(Recording(project / "data" / "webots.db", project / "data"), None)
+    assert (told["state"], told["trials"], told["pruned"]) == ("done", 4, pruned["pruned"])
+    assert told["failed"] is None
     table = run("--search", "random").stdout
     assert "every other parameter set was pruned" in table
 
@@ -154,6 +159,9 @@ def test_a_search_that_was_killed_goes_on_as_if_it_had_not_been(
         wait_for_trial(project, 2)
         killed.kill()
 
+    left = told_of_set(Recording(project / "data" / "webots.db", project / "data"), None)
+    assert left["state"] == "left"
+    assert left["trials"] > left["over"]
     answer = json.loads(run("--search", "tpe", "--json").stdout)
     found = rows(project, PARAMETERS)
     run("--search", "tpe", "--again")

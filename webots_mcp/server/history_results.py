@@ -195,6 +195,7 @@ class TrialsAnswer(NotedAnswer):
     state: str | None = Field(default=None, description="under way, done, stopped and why, ...")
     trials: int | None = None
     over: int | None = None
+    pruned: int | None = Field(default=None, description="Ended early, as the plan says.")
     failed: int | None = None
     score: str | None = None
     ranked: Table | None = Field(

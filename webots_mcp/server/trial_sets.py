@@ -31,6 +31,7 @@ from webots_mcp.store.trials import (
     Trial,
     TrialSet,
     best_of,
+    count_planned,
     create_trial_set,
     fetch_trial_set,
     find_trial_set,
@@ -152,15 +153,17 @@ def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
     trials, plan = trials_of(connection, found.id), json.loads(found.plan)
     best = best_of(plan)
     over = sum(each.is_over for each in trials)
-    state, hint = _state(found, len(trials) - over)
+    planned = count_planned(plan, trials)
+    state, hint = _state(found, planned - over)
     ranking = ranking_of(trials, best)
     rows = fitting(_rows(ranking, trials), _TABLE_BUDGET)
     left_out = len(ranking.sets) - len(rows)
     return {
         "trial_set": found.id,
         "state": state,
-        "trials": len(trials),
+        "trials": planned,
         "over": over,
+        "pruned": sum(each.status == "pruned" for each in trials) or None,
         "failed": sum(each.status == "failed" for each in trials) or None,
         "score": f"{cut_text(str(plan.get('score')), 500)} ({best} is best)",
         "ranked": condensed((*_names(ranking), *_FIGURES), rows),

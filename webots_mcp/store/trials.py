@@ -6,7 +6,7 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -322,6 +322,13 @@ def scored_runs(connection: sqlite3.Connection, set_id: int) -> dict[str, list[i
 def best_of(plan: Mapping[str, Any]) -> Best:
     """Which scores of a stored plan are the best."""
     return "lowest" if plan.get("best") == "lowest" else "highest"
+
+
+def count_planned(plan: Mapping[str, Any], trials: Sequence[Trial]) -> int:
+    """How many trials a set has in the end; those of a search are entered as it goes on."""
+    sets, repeats = int(plan.get("sets") or 0), int(plan.get("repeats") or 1)
+    again = repeats == 1 and sets > 0 and any(each.score is not None for each in trials)
+    return max(len(trials), sets * repeats + again)
 
 
 def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, float, str]:

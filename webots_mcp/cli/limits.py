@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 _BACK: Final = "default"
 _KINDS: Final = {
     "state": "recorded states",
+    "kept_state": "what is kept at full rate (kept stretches)",
     "rollup": "rollups and change points",
     "log": "log lines",
     "event": "events; its age also holds for commands",
@@ -56,7 +57,7 @@ def _times(text: str) -> float:
 LIMITS: Final = (
     *(
         argument(
-            f"--keep-{kind}s",
+            "--keep-stretches" if kind == "kept_state" else f"--keep-{kind}s",
             metavar="LIMIT",
             dest=kind,
             default=_Default(kind),

@@ -24,7 +24,7 @@ _UNFIT: Final = (
     "SELECT (SELECT count(*) FROM source.session WHERE ended_wall_time_s IS NULL), "
     "(SELECT count(*) FROM source.run WHERE purged_rows > 0)"
 )
-_OF_RUN: Final = ("state", "log", "event", "parameter_value")
+_OF_RUN: Final = ("state", "kept_stretch", "kept_state", "log", "event", "parameter_value")
 _BUSY: Final = (
     "SELECT EXISTS (SELECT 1 FROM main.session s JOIN main.robot b ON b.id = s.robot_id "
     "WHERE b.name = ? AND s.ended_wall_time_s IS NULL)"

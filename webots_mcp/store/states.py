@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 import sqlite3
 from dataclasses import dataclass
 from typing import Any, Final, cast
@@ -37,18 +38,20 @@ class State:
 
 
 _COLUMNS: Final = columns_of(State)
+# Of a crash only a kept stretch has the newest state; it has a negative id.
 _NEWEST: Final = (
-    f"SELECT {_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
+    "SELECT * FROM (SELECT * FROM (SELECT {columns} FROM state WHERE run_id = :run "
+    "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1) UNION ALL "
+    "SELECT -id, {kept} FROM (SELECT {columns} FROM kept_state WHERE run_id = :run "
+    "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1)) "
+    "ORDER BY sim_time_s DESC, wall_time_s DESC LIMIT 1"
+).format(columns=_COLUMNS, kept=_COLUMNS.partition(", ")[2])
 _RECENT_TIMES: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 )
-_UP_TO: Final = (
-    f"SELECT {_COLUMNS} FROM state WHERE run_id = ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
 _BY_ID: Final = f"SELECT {_COLUMNS} FROM state WHERE id = ?"
+_KEPT_BY_ID: Final = f"SELECT -id, {_COLUMNS.partition(', ')[2]} FROM kept_state WHERE id = -?"
 _OF_RUN: Final = f"SELECT {_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s, id"
 
 PACE_ROWS: Final = 6
@@ -61,19 +64,19 @@ _SHOWN_KEY_CHARACTERS: Final = 40
 
 def newest_state(connection: sqlite3.Connection, run_id: int) -> State | None:
     """The latest row of a run."""
-    row = connection.execute(_NEWEST, (run_id,)).fetchone()
-    return State(*row) if row else None
+    return state_at(connection, run_id, math.inf)
 
 
 def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> State | None:
     """The latest row of a run up to that simulation time."""
-    row = connection.execute(_UP_TO, (run_id, sim_time_s)).fetchone()
+    row = connection.execute(_NEWEST, {"run": run_id, "until": sim_time_s}).fetchone()
     return State(*row) if row else None
 
 
 def fetch_state(connection: sqlite3.Connection, state_id: int) -> State | None:
     """The row of that id; None where it was deleted."""
-    row = connection.execute(_BY_ID, (state_id,)).fetchone()
+    query = _BY_ID if state_id > 0 else _KEPT_BY_ID
+    row = connection.execute(query, (state_id,)).fetchone()
     return State(*row) if row else None
 
 

@@ -275,6 +275,24 @@ def merge(parts: Sequence[Summary]) -> Summary:
     )
 
 
+def with_extremes(whole: Summary, beside: Summary) -> Summary:
+    """A summary whose extremes are also those of values that it does not count.
+
+    Where it has no value of its own, those are all there is.
+    """
+    if beside.min is None or beside.max is None:
+        return whole
+    if whole.min is None or whole.max is None:
+        return beside._replace(rows=max(whole.rows, beside.rows))
+    low, high = min(whole, beside, key=attrgetter("min")), max(whole, beside, key=attrgetter("max"))
+    return whole._replace(
+        min=low.min,
+        min_sim_time_s=low.min_sim_time_s,
+        max=high.max,
+        max_sim_time_s=high.max_sim_time_s,
+    )
+
+
 def _merged_without_numbers(rows: int, held: Sequence[Summary]) -> Summary:
     if not held:
         return Summary(rows)

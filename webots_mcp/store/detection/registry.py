@@ -12,6 +12,7 @@ from webots_mcp.store.detection import (
     condition,
     flat,
     jump,
+    kept,
     oscillation,
     silent,
     still,
@@ -36,6 +37,7 @@ KINDS: Final[list[EventKind]] = [
     stored.COMMAND,
     stored.LOG,
     stored.NOTICED,
+    kept.KEPT,
     stored.IMAGE,
 ]
 

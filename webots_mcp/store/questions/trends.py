@@ -10,14 +10,14 @@ from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.features import find_spikes
-from webots_mcp.store.analysis.summary import Summary, summarise_numbers
+from webots_mcp.store.analysis.summary import Summary, summarise_numbers, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.questions.trend import Trend, judge
 from webots_mcp.store.reading.changes import change_points, longest_values
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.reading.rollups import Pieces, piece_length_s, read_pieces
-from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
+from webots_mcp.store.reading.rows import Columns, exceeds, kept_columns, read_columns
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.registry import Signal
@@ -127,12 +127,14 @@ def run_trends(
     if exceeds(connection, segment):
         piece_s = piece_length_s(connection, segment, LEAST_PIECES)
         pieces = read_pieces(connection, segment, numbers, deadline, piece_s)
-        found = [_trend_of_pieces(signal, pieces) for signal in numbers]
+        kept = kept_columns(connection, segment, numbers, deadline)
+        found = [_trend_of_pieces(signal, pieces, kept) for signal in numbers]
         rows = max((pieces.whole(signal.name).rows for signal in numbers), default=0)
         resolution_s, cut_at_s = piece_s, pieces.cut_at_s
     else:
         columns = read_columns(connection, segment, numbers, deadline)
-        found = [_trend_of_rows(signal, columns) for signal in numbers]
+        kept = None if segment.full_rate else kept_columns(connection, segment, numbers, deadline)
+        found = [_trend_of_rows(signal, columns, kept) for signal in numbers]
         rows, resolution_s = len(columns.times), None
         cut_at_s = (columns.times or [segment.start_s])[-1] if columns.cut else None
     held = sorted((trend for trend in found if trend), key=lambda trend: -trend.change)
@@ -151,18 +153,27 @@ def run_trends(
     )
 
 
-def _trend_of_rows(signal: Signal, columns: Columns) -> Trend | None:
+def _with_kept(signal: Signal, summary: Summary, kept: Columns | None) -> Summary:
+    """With the extremes of what only kept stretches have."""
+    if kept is None:
+        return summary
+    return with_extremes(summary, signal.summarise(kept.times, kept.values[signal.name]))
+
+
+def _trend_of_rows(signal: Signal, columns: Columns, kept: Columns | None) -> Trend | None:
     times, numbers = columns.numbers(signal.name)
     if not len(numbers):
         return None
     summary = summarise_numbers(times, numbers, rows=len(columns.times), turn=signal.turn)
+    summary = _with_kept(signal, summary, kept)
     return judge(signal, summary, times, numbers, find_spikes(times, numbers))
 
 
-def _trend_of_pieces(signal: Signal, pieces: Pieces) -> Trend | None:
+def _trend_of_pieces(signal: Signal, pieces: Pieces, kept: Columns | None) -> Trend | None:
     summary = pieces.whole(signal.name)
     if summary.sum is None:
         return None
+    summary = _with_kept(signal, summary, kept)
     turn = summary.turn_of(signal.turn)
     middles: list[float] = []
     means: list[float] = []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sqlite3
+from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -11,12 +12,12 @@ from itertools import count, groupby, pairwise
 from typing import Final, Literal
 
 from webots_mcp.store.analysis.rhythm import Rhythm, rhythm_of
-from webots_mcp.store.analysis.summary import Summary, merge
+from webots_mcp.store.analysis.summary import Summary, merge, with_extremes
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rhythm_in
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import piece_length_s, read_pieces
-from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
+from webots_mcp.store.reading.rows import Columns, exceeds, kept_columns, read_columns
 from webots_mcp.store.signals.registry import Signal
 
 Tier = Literal["rows", "raw", "rollup"]
@@ -68,9 +69,39 @@ def tabulate(
         least_step_s: No bucket is shorter; above 0 no row is a bucket of its own.
     """
     if exceeds(connection, segment):
-        return _from_rollups(connection, segment, signals, max_points, deadline, least_step_s)
-    columns = read_columns(connection, segment, signals, deadline)
-    return _from_rows(columns, signals, max_points, least_step_s)
+        table = _from_rollups(connection, segment, signals, max_points, deadline, least_step_s)
+    else:
+        columns = read_columns(connection, segment, signals, deadline)
+        table = _from_rows(columns, signals, max_points, least_step_s)
+    if table.starts and not segment.full_rate:
+        _take_in_kept(connection, segment, signals, deadline, table)
+    return table
+
+
+def _take_in_kept(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+    table: Table,
+) -> None:
+    """Put the extremes of what only kept stretches have into its buckets.
+
+    A row that is a bucket of its own reaches up to the next one.
+    """
+    columns = kept_columns(connection, segment, signals, deadline)
+    if columns is None:
+        return
+    places = [max(0, bisect_right(table.starts, time_s + 1e-9) - 1) for time_s in columns.times]
+    start = 0
+    for place, group in groupby(places):
+        end = start + len(list(group))
+        for signal in signals:
+            values = columns.values[signal.name][start:end]
+            beside = signal.summarise(columns.times[start:end], values)
+            if cells := table.cells.get(signal.name):
+                cells[place] = with_extremes(cells[place], beside)
+        start = end
 
 
 def _from_rows(

@@ -9,7 +9,8 @@ from itertools import pairwise
 from typing import Final, NamedTuple
 
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.kept import kept_parts
+from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rollups import rows_after
 from webots_mcp.store.reading.rows import read_columns
 from webots_mcp.store.rollup.rolling import watermark
@@ -58,7 +59,31 @@ def change_points(
         for signal in signals:
             new = zip(columns.times, columns.values[signal.name], strict=True)
             _append_changes(points[signal.name], new)
+    if signals:
+        _splice_kept(connection, segment, signals, deadline, points)
     return {name: _from(found, segment.start_s) for name, found in points.items()}
+
+
+def _splice_kept(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+    points: dict[str, list[Point]],
+) -> None:
+    """In kept stretches the points are those of each call: to the very step, and none missed."""
+    for each in kept_parts(connection, segment.run_id, segment.start_s, segment.end_s):
+        end_s = min(just_after(each.end_s), segment.end_s)
+        stretch = Segment(segment.run_id, each.start_s, end_s, full_rate=True)
+        columns = read_columns(connection, stretch, signals, deadline)
+        if columns.cut:
+            return
+        for signal in signals:
+            before = [point for point in points[signal.name] if point.sim_time_s < each.start_s]
+            after = [point for point in points[signal.name] if point.sim_time_s >= end_s]
+            _append_changes(before, zip(columns.times, columns.values[signal.name], strict=True))
+            _append_changes(before, after)
+            points[signal.name] = before
 
 
 def _stored(

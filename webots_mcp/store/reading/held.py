@@ -11,12 +11,18 @@ from webots_mcp.conditions import Condition, Evaluator
 from webots_mcp.errors import ConditionFailedError, InvalidInputError
 from webots_mcp.naming import Value
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.signals.flatten import parse
 
-_ROWS: Final = (
-    "SELECT sim_time_s, data FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
-    "AND wall_time_s >= ? AND wall_time_s < ? ORDER BY sim_time_s, id"
+_IN: Final = (
+    "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
+    "AND wall_time_s >= ? AND wall_time_s < ?"
+)
+_ROWS: Final = f"SELECT sim_time_s, data FROM state {_IN} ORDER BY sim_time_s, id"
+_EVERY_ROW: Final = (  # each part comes in the order of its index
+    f"SELECT sim_time_s, wall_time_s, data FROM state {_IN} UNION ALL "
+    f"SELECT sim_time_s, wall_time_s, data FROM kept_state {_IN} ORDER BY sim_time_s, wall_time_s"
 )
 _SOME_BEFORE: Final = (  # what was there last, for `changed` and `rate`
     "SELECT min(sim_time_s) FROM (SELECT sim_time_s FROM state WHERE run_id = ? "
@@ -76,7 +82,12 @@ def where_held(
     from_s = min(known_from_s, segment.start_s - condition.remembers_s)
     bounds = (segment.run_id, from_s, segment.end_s, segment.wall_start_s, segment.wall_end_s)
     held = Held([])
-    rows = _within(connection.execute(_ROWS, bounds), deadline, held, condition.evaluator())
+    evaluator = condition.evaluator()
+    if kept_parts(connection, segment.run_id, from_s, segment.end_s):
+        every = connection.execute(_EVERY_ROW, bounds * 2)
+        rows = _within(((time_s, data) for time_s, _, data in every), deadline, held, evaluator)
+    else:
+        rows = _within(connection.execute(_ROWS, bounds), deadline, held, evaluator)
     try:
         held.stretches += stretches_in(rows, condition, segment.start_s)
     except ConditionFailedError as error:

@@ -25,6 +25,7 @@ from typing import Any, Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
 from webots_mcp.store.reading.coverage import coverage_notes, purge_notes
+from webots_mcp.store.reading.kept import is_at_full_rate, kept_notes
 from webots_mcp.store.reading.moments import moment_of, shown_time
 from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.reading.wall_time import parse_wall_time, simulation_times
@@ -37,8 +38,10 @@ _RUN_BEFORE: Final = (
     "SELECT (SELECT max(id) FROM run b WHERE b.robot_id = run.robot_id AND b.id < run.id), "
     "start_reason FROM run WHERE id = ?"
 )
-_FIRST: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
-_NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"
+_BOUND: Final = (
+    "SELECT {0}(time_s) FROM (SELECT {0}(sim_time_s) AS time_s FROM state WHERE run_id = :run "
+    "UNION ALL SELECT {0}(sim_time_s) FROM kept_state WHERE run_id = :run)"
+)
 _RUNS_IN: Final = (
     "SELECT id FROM run WHERE robot_id = ? AND started_wall_time_s < ? "
     "AND (ended_wall_time_s IS NULL OR ended_wall_time_s >= ?) "
@@ -71,6 +74,7 @@ class Segment:
         open_start: The start is that of the first row: what was stored before it (the begin of
             the run, a log line) is in the range as well.
         open_end: The same at the newest row: a last log line, the end of the run.
+        full_rate: It lies in a kept stretch: each call of `publish` is a row of it.
     """
 
     run_id: int
@@ -80,6 +84,7 @@ class Segment:
     wall_end_s: float = math.inf
     open_start: bool = False
     open_end: bool = False
+    full_rate: bool = False
 
     def until(self, end_s: float) -> Segment:
         """Its part before that time."""
@@ -224,8 +229,11 @@ def recorded_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float,
 
 def _row_bounds(connection: sqlite3.Connection, run_id: int) -> tuple[float, float] | None:
     """Simulation times of a run's first and newest row; None without any."""
-    first = connection.execute(_FIRST, (run_id,)).fetchone()[0]
-    return None if first is None else (first, connection.execute(_NEWEST, (run_id,)).fetchone()[0])
+    bounds = [
+        connection.execute(_BOUND.format(which), {"run": run_id}).fetchone()[0]
+        for which in ("min", "max")
+    ]
+    return None if bounds[0] is None else (bounds[0], bounds[1])
 
 
 def just_after(time_s: float) -> float:
@@ -238,7 +246,14 @@ def whole_run(connection: sqlite3.Connection, run_id: int) -> Segment | None:
     bounds = recorded_bounds(connection, run_id)
     if bounds is None:
         return None
-    return Segment(run_id, bounds[0], just_after(bounds[1]), open_start=True, open_end=True)
+    segment = Segment(run_id, bounds[0], just_after(bounds[1]), open_start=True, open_end=True)
+    return _rated(connection, segment)
+
+
+def _rated(connection: sqlite3.Connection, segment: Segment) -> Segment:
+    """The segment, which knows whether it is kept at full rate."""
+    kept = is_at_full_rate(connection, segment.run_id, segment.start_s, segment.end_s)
+    return replace(segment, full_rate=True) if kept else segment
 
 
 def _in_simulation_time(
@@ -263,7 +278,9 @@ def _in_simulation_time(
     segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
     notes = [*coverage_notes(connection, run_id, (start, end), bounds)]
     notes += _too_young(connection, subject, last_s, newest_s - first_s)
-    return TimeRange(subject.robot_id, subject.robot, (segment,), "simulation", tuple(notes))
+    notes += kept_notes(connection, run_id, start, end)
+    segments = (_rated(connection, segment),)
+    return TimeRange(subject.robot_id, subject.robot, segments, "simulation", tuple(notes))
 
 
 def _too_young(
@@ -299,6 +316,7 @@ def _in_wall_time(
     notes = [] if segments else [f"no row of robot {subject.robot!r} in that wall time"]
     for segment in segments:
         notes += purge_notes(connection, segment.run_id, segment.start_s)
+        notes += kept_notes(connection, segment.run_id, segment.start_s, segment.end_s)
     if len(runs) > MOST_RUNS:
         notes.append(f"only the newest {MOST_RUNS} runs in that wall time are looked at")
     return TimeRange(subject.robot_id, subject.robot, segments, "wall", tuple(notes))
@@ -314,4 +332,5 @@ def _cut(
     if found is None:
         return None
     start_s, last_s = found
-    return Segment(run_id, start_s, just_after(last_s), *walls, open_start=True, open_end=True)
+    segment = Segment(run_id, start_s, just_after(last_s), *walls, open_start=True, open_end=True)
+    return _rated(connection, segment)

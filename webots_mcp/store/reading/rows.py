@@ -15,6 +15,7 @@ from webots_mcp.naming import Value, flatten
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.summary import aligned_numbers, usable_part
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.batch import is_odd, odd_names
 from webots_mcp.store.signals.flatten import parse, reductions, shown
@@ -30,9 +31,14 @@ RAW_ROWS: Final = 30_000  # 2 to 3 us each: what a question may read without rol
 MAX_EXTRACTED: Final = 99  # with the row 100, as many arguments as a function of SQLite has
 
 _IN_SEGMENT: Final = (
-    "FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
-    "AND wall_time_s >= ? AND wall_time_s < ? AND id > ?"
+    "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? "
+    "AND wall_time_s >= ? AND wall_time_s < ? AND id > ?"  # of each table its own ids
 )
+# Of a kept stretch; each part comes in the order of its index, and the rows that only it has with
+# negative ids.
+_STATES: Final = (("id", "state"),)
+_EVERY_STATE: Final = (*_STATES, ("-id", "kept_state"))
+KEPT_STATES: Final = (("-id", "kept_state"),)
 _FEWER_THAN: Final = (
     "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? "
     "AND sim_time_s < ? LIMIT ?)"
@@ -106,6 +112,8 @@ def exceeds(connection: sqlite3.Connection, segment: Segment) -> bool:
 
     Looks at no more index entries than that.
     """
+    if segment.full_rate:
+        return False
     bounds = (segment.run_id, segment.start_s, segment.end_s, RAW_ROWS + 1)
     if connection.execute(_FEWER_THAN, bounds).fetchone()[0] > RAW_ROWS:
         return True
@@ -121,6 +129,7 @@ def read_columns(
     after_id: int = 0,
     limit: int = -1,
     exact: bool = False,
+    tables: Sequence[tuple[str, str]] | None = None,
 ) -> Columns:
     """Read the rows of a segment, in order, until the deadline.
 
@@ -132,15 +141,20 @@ def read_columns(
         after_id: Only rows with greater ids: those after the watermark, or after a page.
         limit: At most so many rows; -1 for all.
         exact: Integers beyond 2^63 as they are, of which floats are made elsewhere.
+        tables: `KEPT_STATES` for the rows that only kept stretches have; None for all rows of a
+            segment at full rate, else for those that the throttle let through.
     """
     columns = Columns(segment.run_id, values={signal.name: [] for signal in signals})
     decode = exact or len(signals) > MAX_EXTRACTED or any(signal.decoded for signal in signals)
     read = _read_decoded if decode else _read_extracted
     bounds = (segment.run_id, segment.start_s, segment.end_s)
-    parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id, limit)
+    parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id)
+    if tables is None:
+        tables = _EVERY_STATE if segment.full_rate and after_id == 0 else _STATES
+    asked = _Rows(tables, parameters, limit)
     try:
         with deadline.interrupting(connection):
-            read(connection, signals, parameters, columns, deadline)
+            read(connection, signals, asked, columns, deadline)
     except sqlite3.OperationalError:
         if not deadline.passed:
             raise
@@ -150,18 +164,50 @@ def read_columns(
     return columns
 
 
+def kept_columns(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+) -> Columns | None:
+    """What only kept stretches have of a segment, up to 30,000 rows; None where that is nothing."""
+    if not kept_parts(connection, segment.run_id, segment.start_s, segment.end_s):
+        return None
+    return read_columns(connection, segment, signals, deadline, limit=RAW_ROWS, tables=KEPT_STATES)
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Which rows are read, from which tables: each with what its id is called there."""
+
+    tables: Sequence[tuple[str, str]]
+    bounds: tuple[object, ...]
+    limit: int
+
+    def query(self, what: str, paths: Sequence[str] = ()) -> tuple[str, list[object]]:
+        """A query for columns after the id, in order, and its values."""
+        parts = [
+            f"SELECT {key} AS row_id, {what} FROM {table} {_IN_SEGMENT}"
+            for key, table in self.tables
+        ]
+        tie = "wall_time_s" if len(parts) > 1 else "row_id"
+        values = [value for _ in parts for value in (*paths, *self.bounds)]
+        query = f"{' UNION ALL '.join(parts)} ORDER BY sim_time_s, {tie} LIMIT ?"
+        return query, [*values, self.limit]
+
+
 def _read_extracted(
     connection: sqlite3.Connection,
     signals: Sequence[Signal],
-    parameters: tuple[object, ...],
+    asked: _Rows,
     columns: Columns,
     deadline: Deadline,
 ) -> None:
     """Each path is extracted once, all of a row in one call."""
     paths = tuple(dict.fromkeys(signal.path for signal in signals))
-    extract, asked = extracted("data", paths)
-    query = f"SELECT id, sim_time_s, wall_time_s, odd, {extract} {_IN_SEGMENT}"
-    for chunk in _chunks(connection, query, (*asked, *parameters), columns, deadline):
+    extract, asked_paths = extracted("data", paths)
+    query, values = asked.query(f"sim_time_s, wall_time_s, odd, {extract}", asked_paths)
+    for chunk in _chunks(connection, query, values, columns, deadline):
         read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
         _extend(columns, read[:3])
         by_path = values_at(paths, read[4])
@@ -208,12 +254,12 @@ def _decoded(text: str) -> list[Any]:
 def _read_decoded(
     connection: sqlite3.Connection,
     signals: Sequence[Signal],
-    parameters: tuple[object, ...],
+    asked: _Rows,
     columns: Columns,
     deadline: Deadline,
 ) -> None:
-    query = f"SELECT id, sim_time_s, wall_time_s, odd, data {_IN_SEGMENT}"
-    for chunk in _chunks(connection, query, parameters, columns, deadline):
+    query, values = asked.query("sim_time_s, wall_time_s, odd, data")
+    for chunk in _chunks(connection, query, values, columns, deadline):
         read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
         states = [flatten(parse(data)) for data in read[4]]
         _extend(columns, read[:3])
@@ -226,11 +272,11 @@ def _read_decoded(
 def _chunks(
     connection: sqlite3.Connection,
     query: str,
-    parameters: tuple[object, ...],
+    values: Sequence[object],
     columns: Columns,
     deadline: Deadline,
 ) -> Iterator[list[Any]]:
-    cursor = connection.execute(f"{query} ORDER BY sim_time_s, id LIMIT ?", parameters)
+    cursor = connection.execute(query, values)
     while chunk := cursor.fetchmany(_CHUNK_ROWS):
         yield chunk
         if deadline.passed and len(chunk) == _CHUNK_ROWS:

@@ -16,14 +16,14 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.connection import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import process_alive
-from webots_mcp.store.retention.notation import NO_LIMIT, limit_text
+from webots_mcp.store.retention.notation import NO_LIMIT, limit_text, option_of
 from webots_mcp.store.retention.policy import DEFAULT, Limit, Retention
 
 Asked = Mapping[str, "Limit | float | None"]
 """Limits by the names that they have in `Retention`; None is back to the default."""
 
 SERVE: Final = "serve"
-KINDS: Final = ("state", "rollup", "log", "event", "image")
+KINDS: Final = ("state", "kept_state", "rollup", "log", "event", "image")
 _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
 _READ: Final = (
@@ -127,7 +127,7 @@ def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
         setting = settings.get(name)
         if setting is None or value is None or _text(setting.value) == _text(value):
             continue
-        option = f"--keep-{_KIND_OF[name]}s"
+        option = option_of(_KIND_OF[name])
         found.append(
             f"{option} {_text(value)} is not in force: the database keeps {_said(setting)}; "
             f"'webots-mcp keep {option} ...' changes it"

@@ -16,6 +16,11 @@ NO_LIMIT: Final = "all"  # is kept
 _ROWS: Final = {"row": 1, "rows": 1}
 
 
+def option_of(kind: str) -> str:
+    """The option of the command line that limits a kind of row."""
+    return "--keep-stretches" if kind == "kept_state" else f"--keep-{kind}s"
+
+
 def parse_limit(text: str, default: Limit) -> Limit:
     """A limit from its parts, separated by commas; what is not named has no limit.
 

@@ -68,6 +68,8 @@ class Retention:
 
     Attributes:
         state: The full rows. They go only after they were rolled up.
+        kept_state: Rows of kept stretches: those that the throttle dropped, and those that went
+            from `state`. A stretch that loses a row is none any more.
         rollup: Rollups and change points; of whole finished runs, after the last of their states.
         log: Log lines.
         event: Events; its age also holds for finished commands.
@@ -80,6 +82,7 @@ class Retention:
 
     state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)
     rollup: Limit = Limit()
+    kept_state: Limit = Limit(size_bytes=100_000_000)
     log: Limit = Limit(size_bytes=100_000_000)
     event: Limit = Limit(size_bytes=100_000_000)
     image: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50)

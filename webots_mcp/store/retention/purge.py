@@ -22,7 +22,7 @@ from webots_mcp.store.images import inside
 from webots_mcp.store.retention.planning import OLD_COMMANDS, ROLLED, Plan, plan
 from webots_mcp.store.retention.planning import Step as Going
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
-from webots_mcp.store.retention.usage import TABLES
+from webots_mcp.store.retention.usage import TABLES, first_id
 from webots_mcp.store.rollup.rolling import roll, watermark
 
 BATCH_ROWS: Final = 500
@@ -36,7 +36,6 @@ _IN_TIME: Final = (
     "SELECT id, run_id FROM {table} NOT INDEXED WHERE id > :after AND id <= :bound "
     "AND run_id IN (SELECT value FROM json_each(:runs)) ORDER BY id LIMIT :limit"
 )
-_FIRST: Final = "SELECT id FROM {table} WHERE run_id = ? ORDER BY sim_time_s, id LIMIT 1"
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
 _IN_RUN: Final = "SELECT run_id, signal_id, {third} FROM {table} WHERE run_id = ? LIMIT ?"
 _OLD_COMMANDS: Final = f"SELECT id {OLD_COMMANDS} ORDER BY id LIMIT :limit"
@@ -59,16 +58,30 @@ _COUNT_PURGED: Final = (
     "UPDATE run SET purged_rows = purged_rows + "
     "(SELECT count(*) FROM going WHERE run_id = run.id) WHERE id IN (SELECT run_id FROM going)"
 )
+# What goes from the states and lies in a kept stretch stays with it, under a limit of its own.
+_MOVE_KEPT: Final = (
+    "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, odd) "
+    "SELECT s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd FROM state s "
+    "JOIN going g ON g.id = s.id WHERE EXISTS (SELECT 1 FROM kept_stretch k "
+    "WHERE k.run_id = s.run_id AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) "
+    "ORDER BY s.id"
+)
+_END_KEEPING: Final = (
+    "DELETE FROM kept_stretch WHERE EXISTS (SELECT 1 FROM kept_state s JOIN going g ON g.id = s.id "
+    "WHERE s.run_id = kept_stretch.run_id "
+    "AND s.sim_time_s BETWEEN kept_stretch.start_sim_time_s AND kept_stretch.end_sim_time_s)"
+)
+_BEFORE_DELETION: Final = {"state": (_COUNT_PURGED, _MOVE_KEPT), "kept_state": (_END_KEEPING,)}
 _DELETE_GOING: Final = "DELETE FROM {table} WHERE id IN (SELECT id FROM going)"
 _STEPS: Final = {
     table: Step(
         f"purge_{table}",
         ("step",),
         _NOT_GOING.format(table=table, kept=KEPT),
-        *((_COUNT_PURGED,) if table == "state" else ()),
+        *_BEFORE_DELETION.get(table, ()),
         _DELETE_GOING.format(table=table),
     )
-    for table in ("state", "log", "event")
+    for table in ("state", "kept_state", "log", "event")
 }
 _SESSION: Final = "SELECT session_id FROM run WHERE id = ?"
 _FORGET_SESSION: Final = (
@@ -216,8 +229,7 @@ class _Purge:
         """Keys in the order in which the rows were recorded, so that whole pages become free."""
         left: dict[int, int] = {step.owner_id: step.rows for step in steps}
         bounds = {step.owner_id: step.bound for step in steps}
-        firsts = [self._first(_FIRST.format(table=table), run_id) for run_id in left]
-        after = min((first for first in firsts if first is not None), default=0) - 1
+        after = first_id(self._connection, table, list(left)) - 1
         last = self._first(_LAST.format(table=table))  # what comes later was not planned
         while left:
             values = {

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 from webots_mcp.store.retention.pages import INDEX_BYTES, disk_shares
 from webots_mcp.store.retention.policy import KEPT
 
-TABLES: Final = ("state", "log", "event", "image")
+TABLES: Final = ("state", "kept_state", "log", "event", "image")
 
 _RUNS: Final = (
     f"SELECT id, robot_id, rows, started_wall_time_s, last_wall_time_s, {KEPT}, "
@@ -147,11 +147,20 @@ def oldest(connection: sqlite3.Connection, held: Sequence[Holding], rows: int) -
     table = held[0].table
     values = {
         "runs": _as_json(held),
-        "first": min(nth_id(connection, holding, 1) for holding in held),
+        "first": first_id(connection, table, [holding.run.id for holding in held]),
         "rows": rows,
     }
     found = connection.execute(_OLDEST.format(table=table), values).fetchall()
     return {run_id: Oldest(count, bound) for run_id, count, bound in found}
+
+
+def first_id(connection: sqlite3.Connection, table: str, run_ids: Sequence[int]) -> int:
+    """An id that no row of these runs is below; what kept stretches took over came later."""
+    if table == "kept_state":
+        return 0
+    query = _NTH_ID.format(table=table)
+    found = (connection.execute(query, (run_id, 1)).fetchone() for run_id in run_ids)
+    return min((row[0] for row in found if row is not None), default=0)
 
 
 def nth_newest_id(connection: sqlite3.Connection, held: Sequence[Holding], number: int) -> float:

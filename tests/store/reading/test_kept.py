@@ -1,0 +1,202 @@
+"""Answers about a kept stretch use each call, and means and counts around it are not skewed."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+
+import pytest
+
+from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.connection import connect
+from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.questions.events import EventOptions, find_events
+from webots_mcp.store.questions.series import query_history
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.pages import query_rows
+from webots_mcp.store.reading.ranges import TimeRange, resolve_range
+from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.states import newest_state
+
+STEP_MS = 16
+CALLS = 2000
+SPIKE = 1003  # between two rows that the throttle lets through
+HIT = 1009  # in one of them
+LAST = CALLS + 7  # published after the last such row
+
+
+def value(number: int) -> float:
+    """It grows faster in the stretch, so that equal weights of rows would show."""
+    return 900.0 if number == SPIKE else 10.0 if 720 < number < 1130 else 1.0
+
+
+@pytest.fixture(scope="module")
+def recorded() -> Iterator[MemoryDatabase]:
+    """Robot `throttled` with a kept stretch and one at its end; robot `every` has all rows."""
+    database = MemoryDatabase()
+    for name, interval in (("throttled", 10), ("every", 1)):
+        robot = InProcessSupervisor(name)
+        bridge = MCPBridge(robot, throttle_interval=interval, database=database)
+        bridge.breakpoint(f"n == {HIT}", "keep")
+        for number in range(CALLS + 8):
+            robot.step(STEP_MS)
+            mode = "bump" if number == SPIKE + 1 else "drive"
+            bridge.publish({"n": number, "v": value(number), "mode": mode})
+        bridge.log("the gear is gone", "error")
+        bridge.close()
+    yield database
+    database.close()
+
+
+@pytest.fixture(params=[False, True], ids=["rows", "rolled up"])
+def connection(
+    recorded: MemoryDatabase, request: pytest.FixtureRequest
+) -> Iterator[sqlite3.Connection]:
+    with closing(connect(recorded, "writer")) as connection:
+        if request.param:
+            while not roll(connection).done:
+                pass
+        yield connection
+
+
+def stretch(connection: sqlite3.Connection, number: int = 0) -> tuple[float, float]:
+    sql = (
+        "SELECT k.start_sim_time_s, k.end_sim_time_s FROM kept_stretch k JOIN run u "
+        "ON u.id = k.run_id JOIN robot r ON r.id = u.robot_id WHERE r.name = 'throttled' "
+        "ORDER BY k.id LIMIT 1 OFFSET ?"
+    )
+    return connection.execute(sql, (number,)).fetchone()
+
+
+def ranges(
+    connection: sqlite3.Connection, start_s: float | None = None, end_s: float | None = None
+) -> list[TimeRange]:
+    """Of the throttled robot, and the same of the one with all rows."""
+    return [
+        resolve_range(connection, robot=robot, start_s=start_s, end_s=end_s)
+        for robot in ("throttled", "every")
+    ]
+
+
+def inside(connection: sqlite3.Connection) -> list[TimeRange]:
+    start_s, end_s = stretch(connection)
+    return ranges(connection, start_s, math.nextafter(end_s, math.inf))
+
+
+def test_a_range_inside_a_stretch_is_answered_as_if_each_call_were_recorded(
+    connection: sqlite3.Connection,
+) -> None:
+    kept, every = (
+        query_history(connection, each, ["*"], max_points=20).runs[0] for each in inside(connection)
+    )
+    assert kept.rows == every.rows
+    assert kept.rows is not None and kept.rows > 400
+    assert (kept.numbers, kept.sim_time_s, kept.step_s) == (
+        every.numbers, every.sim_time_s, every.step_s,
+    )  # fmt: skip
+    ((kept_mode,), (every_mode,)) = kept.changes, every.changes
+    assert kept_mode.points[1:] == every_mode.points[1:]  # the first lies before the range
+    assert kept_mode.time_by_value_s == every_mode.time_by_value_s
+    assert kept.interval_s == pytest.approx(STEP_MS / 1000)
+    assert kept.gaps == ()
+    found = [trends(connection, each, ["*"]).runs[0] for each in inside(connection)]
+    assert found[0].numbers == found[1].numbers
+    assert found[0].rows == found[1].rows
+
+
+def test_its_rows_come_page_by_page_each_once(connection: sqlite3.Connection) -> None:
+    found: list[float | None] = []
+    cursor: int | None = 0
+    while cursor is not None:
+        page = query_rows(connection, inside(connection)[0], ["n"], limit=100, after_id=cursor)
+        found += [None if n is None else float(n) for n in page.values["n"]]  # type: ignore[arg-type]
+        cursor = page.cursor
+    assert found == sorted(set(found), key=lambda n: n or 0)
+    assert len(found) == len(query_rows(connection, inside(connection)[1], ["n"], limit=1000).ids)
+
+
+def test_an_answer_says_what_is_kept_and_why(connection: sqlite3.Connection) -> None:
+    (note,) = [note for note in ranges(connection)[0].notes if "full rate" in note]
+    assert f"n == {HIT}" in note
+    assert "the gear is gone" in note
+    assert ranges(connection)[1].notes == ()
+
+
+def test_means_and_counts_of_a_longer_range_are_not_those_of_the_stretch(
+    connection: sqlite3.Connection,
+) -> None:
+    kept, every = (
+        query_history(connection, each, ["v"], max_points=1).runs[0].numbers[0].whole
+        for each in ranges(connection)
+    )
+    truth = sum(value(n) for n in range(CALLS) if n != SPIKE) / (CALLS - 1)
+    assert kept.present == pytest.approx(every.present / 10, abs=2)
+    assert kept.mean == pytest.approx(truth, rel=0.02)
+    assert (kept.max, kept.min) == (every.max, every.min)
+    assert kept.max_sim_time_s == every.max_sim_time_s
+
+
+def test_the_extreme_between_two_rows_is_in_its_bucket_and_in_the_trend(
+    connection: sqlite3.Connection,
+) -> None:
+    whole = ranges(connection)[0]
+    (run,) = query_history(connection, whole, ["v"], max_points=40).runs
+    (signal,) = run.numbers
+    (place,) = [i for i, most in enumerate(signal.max) if most == 900.0]
+    assert run.step_s is not None
+    spike_s = signal.max_sim_time_s[place]
+    assert spike_s == pytest.approx((SPIKE + 1) * STEP_MS / 1000, abs=0.02)
+    assert spike_s is not None
+    assert run.sim_time_s[place] <= spike_s < run.sim_time_s[place] + run.step_s
+    (trend,) = trends(connection, whole, ["v"]).runs[0].numbers
+    assert trend.summary.max == 900.0
+
+
+def test_a_change_between_two_rows_is_told_to_the_step(connection: sqlite3.Connection) -> None:
+    for asked in (ranges(connection), inside(connection)):
+        kept, every = (
+            query_history(connection, each, ["mode"]).runs[0].changes[0].points for each in asked
+        )
+        assert kept[1:] == every[1:]
+        assert [point.value for point in kept] == ["drive", "bump", "drive"]
+
+
+@pytest.mark.parametrize("where", ["v > 100", "changed(mode)", "v > 5 for 3"])
+def test_where_a_condition_held_is_found_between_rows(
+    connection: sqlite3.Connection, where: str
+) -> None:
+    options = EventOptions(kinds=("condition",), where=where)
+    kept, every = (
+        find_events(connection, each, options, limit=10).events for each in inside(connection)
+    )
+    assert [(each.start_s, each.end_s) for each in kept] == [
+        (each.start_s, each.end_s) for each in every
+    ]
+    assert len(kept) > 0
+
+
+def test_the_newest_state_and_the_end_of_a_crashed_run_are_those_of_its_last_call(
+    connection: sqlite3.Connection,
+) -> None:
+    whole = ranges(connection)[0]
+    (segment,) = whole.segments
+    state = newest_state(connection, segment.run_id)
+    assert state is not None
+    assert state.value()["n"] == LAST
+    assert segment.end_s > state.sim_time_s
+    last = stretch(connection, 1)
+    page = query_rows(
+        connection, resolve_range(connection, robot="throttled", start_s=last[0]), ["n"], limit=1000
+    )
+    assert page.values["n"][-1] == LAST
+    assert page.values["n"] == list(range(LAST + 1 - len(page.ids), LAST + 1))
+
+
+def test_stretches_are_events_with_their_reason(connection: sqlite3.Connection) -> None:
+    options = EventOptions(kinds=("kept",))
+    first, last = find_events(connection, ranges(connection)[0], options, limit=10).events
+    assert (first.start_s, first.end_s) == stretch(connection)
+    assert "gear is gone" in last.details["reason"]
+    assert not last.ongoing

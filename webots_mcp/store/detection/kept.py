@@ -1,0 +1,27 @@
+"""Kept stretches: where each call of `publish` was recorded, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.search import Search
+from webots_mcp.store.reading.kept import kept_stretches
+
+
+def kept_events(search: Search) -> Iterator[Event]:
+    """The stretches that the segment touches; one that is not over reaches up to the newest row."""
+    segment = search.segment
+    span = (segment.holds_from_s, segment.holds_to_s)
+    for each in kept_stretches(search.connection, segment.run_id, *span):
+        ongoing = each.end_s > search.ended_s
+        end_s = max(each.start_s, min(each.end_s, search.ended_s))
+        place = (segment.run_id, each.start_s, end_s, each.wall_time_s)
+        yield Event("kept", *place, None, {"reason": each.reason}, ongoing=ongoing)
+
+
+KEPT: Final = EventKind(
+    "kept", "at full rate", kept_events, stored=True, routine=True, counted=False
+)

@@ -12,6 +12,7 @@ import pytest
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.export.rows import Source
 from webots_mcp.store.questions.events import EventOptions, find_events
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
@@ -200,3 +201,13 @@ def test_stretches_are_events_with_their_reason(connection: sqlite3.Connection) 
     assert (first.start_s, first.end_s) == stretch(connection)
     assert "gear is gone" in last.details["reason"]
     assert not last.ongoing
+
+
+def test_an_export_has_each_call_once_and_in_order(
+    connection: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("webots_mcp.store.export.rows.CHUNK_ROWS", 7)
+    kept, every = (Source.of(connection, each.segments, 1, None) for each in inside(connection))
+    numbers = [row.values["n"] for row in kept.rows()]
+    assert numbers == [row.values["n"] for row in every.rows()]
+    assert len(numbers) == kept.total

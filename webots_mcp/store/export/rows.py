@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Any, Final, Literal, NamedTuple, cast
 
 from webots_mcp.naming import LONGEST_SPREAD_ARRAY
+from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.states import put_back
@@ -22,15 +23,27 @@ RESERVED: Final = frozenset((*HEAD, "odd"))
 CHUNK_ROWS: Final = 2000  # read in one short transaction each: no checkpoint waits for an export
 
 _IN_SEGMENT: Final = (
-    "FROM state WHERE run_id = :run_id AND sim_time_s >= :start_s AND sim_time_s < :end_s "
-    "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s AND id <= :last_id"
+    "run_id = :run_id AND sim_time_s >= :start_s AND sim_time_s < :end_s "
+    "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s"
 )
 _CHUNK: Final = (
-    f"SELECT id, sim_time_s, wall_time_s, data, odd {_IN_SEGMENT} "
-    "AND (sim_time_s > :start_s OR id > :after_id) ORDER BY sim_time_s, id LIMIT :limit"
+    f"SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE {_IN_SEGMENT} "
+    "AND id <= :last_id AND (sim_time_s > :start_s OR id > :after_id) "
+    "ORDER BY sim_time_s, id LIMIT :limit"
 )
-_COUNT: Final = "SELECT count(*) FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
-_LAST_ID: Final = "SELECT coalesce(max(id), 0) FROM state"
+# Where there are kept stretches, with negative ids for what only they have. Of several calls in one
+# step wall time tells the order.
+_AFTER_WALL: Final = "(sim_time_s > :start_s OR wall_time_s > :after_wall_s)"
+_CHUNK_WITH_KEPT: Final = (
+    f"SELECT id, sim_time_s, wall_time_s, data, odd FROM state WHERE {_IN_SEGMENT} "
+    f"AND id <= :last_id AND {_AFTER_WALL} UNION ALL "
+    f"SELECT -id, sim_time_s, wall_time_s, data, odd FROM kept_state WHERE {_IN_SEGMENT} "
+    f"AND id <= :last_kept_id AND {_AFTER_WALL} ORDER BY sim_time_s, wall_time_s LIMIT :limit"
+)
+_COUNT: Final = (
+    "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
+)
+_LAST_ID: Final = "SELECT coalesce(max(id), 0) FROM {table}"
 _NOT_FINITE: Final = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 _LARGEST_INT: Final = 2**63 - 1
 _PLAIN_KINDS: Final[dict[type[object], ColumnKind]] = {
@@ -42,7 +55,8 @@ class Row(NamedTuple):
     """A state row.
 
     Attributes:
-        head: Run, id, simulation time, wall time; as `HEAD` names them.
+        head: Run, id, simulation time, wall time; as `HEAD` names them. The id of a row that only a
+            kept stretch has is below 0.
         values: By dotted name. What was not finite is so again; an array of more than 16 items
             is one value.
         odd: Path of every value that JSON could not hold, and what it was.
@@ -71,6 +85,7 @@ class Source:
     connection: sqlite3.Connection
     segments: Sequence[Segment]
     last_id: int
+    last_kept_id: int
     total: int
     passes: int
     progress: Progress | None = None
@@ -84,10 +99,13 @@ class Source:
         progress: Progress | None,
     ) -> Source:
         """The rows that these segments have now; ids are given in the order of writing."""
-        last_id = int(connection.execute(_LAST_ID).fetchone()[0])
         bounds = [(part.run_id, part.start_s, part.end_s) for part in segments]
-        total = sum(connection.execute(_COUNT, bound).fetchone()[0] for bound in bounds)
-        return cls(connection, segments, last_id, total, passes, progress)
+        last_ids, total = list[int](), 0
+        for table in ("state", "kept_state"):
+            last_ids.append(int(connection.execute(_LAST_ID.format(table=table)).fetchone()[0]))
+            count = _COUNT.format(table=table)
+            total += sum(connection.execute(count, bound).fetchone()[0] for bound in bounds)
+        return cls(connection, segments, *last_ids, total, passes, progress)
 
     def rows(self, pass_number: int = 1) -> Iterator[Row]:
         """All of them, run by run, in the order of simulation time."""
@@ -115,11 +133,15 @@ class Source:
         values: dict[str, Any] = {
             "run_id": segment.run_id, "start_s": segment.start_s, "end_s": segment.end_s,
             "wall_start_s": segment.wall_start_s, "wall_end_s": segment.wall_end_s,
-            "last_id": self.last_id, "after_id": 0, "limit": CHUNK_ROWS,
+            "last_id": self.last_id, "last_kept_id": self.last_kept_id,
+            "after_id": 0, "after_wall_s": -math.inf, "limit": CHUNK_ROWS,
         }  # fmt: skip
-        while chunk := self.connection.execute(_CHUNK, values).fetchall():
+        query = _CHUNK
+        if kept_parts(self.connection, segment.run_id, segment.start_s, segment.end_s):
+            query = _CHUNK_WITH_KEPT
+        while chunk := self.connection.execute(query, values).fetchall():
             yield chunk
-            values["after_id"], values["start_s"] = chunk[-1][:2]
+            values["after_id"], values["start_s"], values["after_wall_s"] = chunk[-1][:3]
 
 
 def _row(head: tuple[int, int, float, float], data: str, odd_text: str | None) -> Row:

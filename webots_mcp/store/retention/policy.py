@@ -68,8 +68,6 @@ class Retention:
 
     Attributes:
         state: The full rows. They go only after they were rolled up.
-        kept_state: Rows of kept stretches: those that the throttle dropped, and those that went
-            from `state`. A stretch that loses a row is none any more.
         rollup: Rollups and change points; of whole finished runs, after the last of their states.
         log: Log lines.
         event: Events; its age also holds for finished commands.
@@ -78,15 +76,17 @@ class Retention:
             that many times their age ago (and as many states as an age spares were recorded since),
             all that is left of it goes, and with the last run of that time the commands. 0 keeps
             runs for ever.
+        kept_state: Rows of kept stretches: those that the throttle dropped, and those that went
+            from `state`. A stretch that loses a row is none any more.
     """
 
     state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)
     rollup: Limit = Limit()
-    kept_state: Limit = Limit(size_bytes=100_000_000)
     log: Limit = Limit(size_bytes=100_000_000)
     event: Limit = Limit(size_bytes=100_000_000)
     image: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50)
     outlive: float = 10.0
+    kept_state: Limit = Limit(size_bytes=100_000_000)
 
     def __post_init__(self) -> None:
         if not (self.outlive == 0 or 1 <= self.outlive < math.inf):

@@ -100,12 +100,13 @@ class Source:
     ) -> Source:
         """The rows that these segments have now; ids are given in the order of writing."""
         bounds = [(part.run_id, part.start_s, part.end_s) for part in segments]
-        last_ids, total = list[int](), 0
+        last_ids, total = dict[str, int](), 0
         for table in ("state", "kept_state"):
-            last_ids.append(int(connection.execute(_LAST_ID.format(table=table)).fetchone()[0]))
+            last_ids[table] = connection.execute(_LAST_ID.format(table=table)).fetchone()[0]
             count = _COUNT.format(table=table)
             total += sum(connection.execute(count, bound).fetchone()[0] for bound in bounds)
-        return cls(connection, segments, *last_ids, total, passes, progress)
+        newest = (last_ids["state"], last_ids["kept_state"])
+        return cls(connection, segments, *newest, total, passes, progress)
 
     def rows(self, pass_number: int = 1) -> Iterator[Row]:
         """All of them, run by run, in the order of simulation time."""

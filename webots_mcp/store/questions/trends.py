@@ -22,6 +22,7 @@ from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.registry import Signal
 
+TOO_LARGE: Final = "its numbers are beyond 1e100"
 LEAST_PIECES: Final = 100  # of a long range, whose means tell its course
 
 
@@ -51,7 +52,7 @@ class RunTrends:
         resolution_s: None if every row was looked at; else the length of the rollups from which
             shape, slope and swings come (counts, extremes, mean and deviation stay exact).
         numbers: What changed most comes first; at most `limit` of `total`.
-        silent: Names that have no value in the range.
+        silent: Names that have no value in the range, or none that can be reckoned with.
         cut_at_s: The deadline passed; from there on rows are missing in the answer.
     """
 
@@ -124,6 +125,7 @@ def run_trends(
     """The trends of signals in one run."""
     numbers = [signal for signal in signals if signal.is_number]
     found: list[Trend | None]
+    columns: Columns | None = None
     if exceeds(connection, segment):
         piece_s = piece_length_s(connection, segment, LEAST_PIECES)
         pieces = read_pieces(connection, segment, numbers, deadline, piece_s)
@@ -139,6 +141,7 @@ def run_trends(
         cut_at_s = (columns.times or [segment.start_s])[-1] if columns.cut else None
     held = sorted((trend for trend in found if trend), key=lambda trend: -trend.change)
     silent = [signal.name for signal, trend in zip(numbers, found, strict=True) if trend is None]
+    too_large = [] if columns is None else [each for each in silent if _has_number(columns, each)]
     return RunTrends(
         run_id=segment.run_id,
         start_s=segment.start_s,
@@ -147,7 +150,7 @@ def run_trends(
         rows=rows,
         numbers=tuple(held[:limit]),
         states=_state_trends(connection, segment, signals, deadline),
-        silent=tuple(silent),
+        silent=tuple(f"{each} ({TOO_LARGE})" if each in too_large else each for each in silent),
         total=len(held),
         cut_at_s=cut_at_s,
     )
@@ -158,6 +161,11 @@ def _with_kept(signal: Signal, summary: Summary, kept: Columns | None) -> Summar
     if kept is None:
         return summary
     return with_extremes(summary, signal.summarise(kept.times, kept.values[signal.name]))
+
+
+def _has_number(columns: Columns, name: str) -> bool:
+    """Whether a signal without a usable value has numbers, which are too large then."""
+    return any(isinstance(value, (int, float)) for value in columns.values[name])
 
 
 def _trend_of_rows(signal: Signal, columns: Columns, kept: Columns | None) -> Trend | None:

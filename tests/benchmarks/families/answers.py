@@ -35,6 +35,7 @@ _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
     "webots_simulation_control": {"command": "resume"},
     "webots_annotate_run": {"label": "benchmark"},
     "webots_run": {"for_s": 0.5, "then": "go_on"},
+    "webots_run_trials": {"parameters": {"speed": [4.0, 6.0]}, "score": "duration", "for_s": 0.2},
     "webots_breakpoint": {"condition": "distance_m.left < 0", "action": "log"},
     "webots_remove_breakpoint": {"breakpoint_id": 1},
     "webots_set_parameters": {"values": {"speed": 6.0}},

@@ -109,8 +109,9 @@ def import_(arguments: argparse.Namespace) -> None:
 def prune(arguments: argparse.Namespace) -> None:
     """Delete what is beyond the limits, and give the space back to the disk.
 
-    Rows go in the order in which they were recorded, whatever their run. Runs with a label or a
-    note, and those marked by 'webots-mcp keep', lose nothing and do not count. A LIMIT is a size
+    Rows go in the order in which they were recorded, whatever their run. Runs with a label (but
+    that of a trial) or a note, and those marked by 'webots-mcp keep', lose nothing and do not
+    count. A LIMIT is a size
     (500MB), an age (30d), a number of rows (100000rows), several of them with commas between; all,
     which keeps everything; or default. What is given belongs to the database from then on, and
     servers keep to it; with --dry-run it is only tried. A size or a number of rows always holds; an

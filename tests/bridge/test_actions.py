@@ -182,6 +182,23 @@ def test_a_loop_that_publishes_after_its_commands_sees_one_reset(
     assert recording.rows("SELECT start_reason FROM run ORDER BY id") == ["start", "reset"]
 
 
+@pytest.mark.parametrize("asked_again", [False, True])
+def test_a_reset_at_the_first_step_begins_the_run_with_the_first_state_after_it(
+    bridge: MCPBridge, recording: Recording, drive: Callable[[int], None], asked_again: bool
+) -> None:
+    drive(1)
+    sent = recording.send("reset")
+    eager(bridge)
+    if asked_again:
+        eager(bridge)  # in the same round: no step has been made
+        bridge.publish({"mode": "before the reset"})
+    drive(2)
+    assert recording.fate(sent)[0] == "done"
+    times = "SELECT sim_time_s FROM state WHERE run_id = ? ORDER BY id"
+    assert recording.rows(times, 1) == pytest.approx([0.016] * (2 if asked_again else 1))
+    assert recording.rows(times, 2) == pytest.approx([0.016, 0.032])
+
+
 def test_reset_state_runs_the_callbacks_or_says_that_there_are_none(
     bridge: MCPBridge, recording: Recording
 ) -> None:

@@ -134,14 +134,15 @@ def _reset(context: Context, command: Command) -> Generator[None]:
     clock.await_reset()
     context.simulation.robot.simulationReset()
     deadline_s = time.monotonic() + _RESET_TIMEOUT_S
-    while clock.run is run:
-        if time.monotonic() > deadline_s:
-            clock.forget_reset()
-            raise CommandRefusedError(
-                "simulationReset() was called, but simulation time did not go back within "
-                f"{_RESET_TIMEOUT_S:.0f} s"
-            )
-        yield
+    with context.pause.awaiting_step():  # the state of the first one is of the new run
+        while clock.run is run:
+            if time.monotonic() > deadline_s:
+                clock.forget_reset()
+                raise CommandRefusedError(
+                    "simulationReset() was called, but simulation time did not go back within "
+                    f"{_RESET_TIMEOUT_S:.0f} s"
+                )
+            yield
 
 
 @_built_in

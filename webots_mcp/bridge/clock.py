@@ -26,18 +26,19 @@ class Clock:
         self.ended_sim_time_s = self.sim_time_s  # of the run before this one
         self._reset_from_s: float | None = None
 
-    def look(self, *, came_round: bool = False) -> bool:
+    def look(self, *, after_step: bool = False) -> bool:
         """Read the time; True if it went back since the last look: a new run has begun.
 
         Args:
-            came_round: The user's loop has come round, so that it has made a step.
+            after_step: A step has just ended, which is the only proof that one was made where the
+                time is the same again.
         """
         before, now = self.sim_time_s, self._simulation.time_s
         self.sim_time_s = now
         if now > before + _EPSILON_S:
             self.moved_s = time.monotonic()
             self.steps_seen += 1
-        if now >= before - _EPSILON_S and not self._is_awaited_reset(now, came_round):
+        if now >= before - _EPSILON_S and not self._is_awaited_reset(now, after_step):
             return False
         self._reset_from_s = None
         self.ended_sim_time_s = before
@@ -65,9 +66,9 @@ class Clock:
         """The reset did not come."""
         self._reset_from_s = None
 
-    def _is_awaited_reset(self, now_s: float, came_round: bool) -> bool:
+    def _is_awaited_reset(self, now_s: float, after_step: bool) -> bool:
         if self._reset_from_s is None:
             return False
         if self._reset_from_s < self._simulation.basic_time_step_s - _EPSILON_S:
             return now_s > self._reset_from_s + _EPSILON_S
-        return came_round and now_s <= self._reset_from_s + _EPSILON_S
+        return after_step and now_s <= self._reset_from_s + _EPSILON_S

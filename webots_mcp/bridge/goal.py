@@ -267,7 +267,8 @@ class Watch:
 
     def _judge_time(self, watched: _Watched) -> Reached | None:
         for_s, (since_s, _) = watched.goal.for_s, watched.since_s
-        if for_s is None or self._clock.sim_time_s - since_s < for_s - self._tolerance_s:
+        run_s = self._clock.sim_time_s - since_s
+        if for_s is None or run_s <= 0 or run_s < for_s - self._tolerance_s:
             return None
         return self._reached("time over")
 

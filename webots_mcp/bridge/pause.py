@@ -27,7 +27,7 @@ class Pause:
         simulation: What is paused.
         journal: Is told when the pause begins and ends.
         heartbeat: Tells others of it.
-        stepped: Is told of each step that user code made.
+        stepped: Is told of each guarded step when it is over.
 
     Attributes:
         active: The loop stays where it is.
@@ -48,6 +48,7 @@ class Pause:
         self._stepped = stepped
         self._mode_before = "real_time"
         self._user_code_depth = 0  # a handler may ask for commands itself
+        self._awaiting_step = False
         self._ask_before_steps: Callable[[], object] | None = None
         self.active = False
         self.cause: dict[str, object] = {}
@@ -112,6 +113,17 @@ class Pause:
         self._guard_steps()
 
     @contextmanager
+    def awaiting_step(self) -> Generator[None]:
+        """While something is to come with the end of a step: it is told before the loop goes on."""
+        self._awaiting_step = True
+        self._guard_steps()
+        try:
+            yield
+        finally:
+            self._awaiting_step = False
+            self._guard_steps()
+
+    @contextmanager
     def user_code(self) -> Generator[None]:
         """While a handler or a callback runs: its steps are made, also during the pause."""
         self._user_code_depth += 1
@@ -138,12 +150,12 @@ class Pause:
 
     def _guard_steps(self) -> None:
         """Outside of a pause the steps of user code are only told: they show that it lives."""
-        needed = self.active or self._user_code_depth > 0 or self._ask_before_steps is not None
+        told = self._awaiting_step or self._ask_before_steps is not None
+        needed = self.active or self._user_code_depth > 0 or told
         self._simulation.guard_steps(self._on_step if needed else None)
 
     def _on_step(self, step: Step) -> int:
         if step.begins and self._ask_before_steps is not None and not self.active:
-            self._stepped()  # a loop may make several steps in a round
             self._ask_before_steps()
         if self.active and step.begins:
             if self._user_code_depth:
@@ -152,8 +164,6 @@ class Pause:
                 self.serve()
         if self._simulation.over:
             return QUIT
-        if not (self.active or self._user_code_depth):
-            return step.make()
         answer = self._leave_for(step) if self.active else step.make()
         if answer == QUIT:
             self._simulation.end()

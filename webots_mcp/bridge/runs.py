@@ -29,18 +29,18 @@ class Runs:
         self._reloads = reloads
         self._parameters = parameters
 
-    def look(self, *, came_round: bool = False) -> None:
+    def look(self, *, after_step: bool = False) -> None:
         """Begin a run if simulation time went back since the last look.
 
         Args:
-            came_round: The user's loop has come round, so that it has made a step.
+            after_step: A step has just ended.
         """
-        if self._clock.look(came_round=came_round):
+        if self._clock.look(after_step=after_step):
             self.begin()
 
     def look_after_step(self) -> None:
-        """Time has passed, or gone back, outside of the loop: in a step of a handler's."""
-        self.look()
+        """A step is over: time has passed, or gone back, and the loop has not come round yet."""
+        self.look(after_step=True)
         self._heartbeat.beat_if_due()
 
     def begin(self) -> None:

@@ -116,7 +116,7 @@ class Session:
     def serve(self) -> Command | None:
         """One round of the loop: the commands that wait, and the heartbeat."""
         simulation = self.context.simulation
-        self.runs.look(came_round=True)
+        self.runs.look()
         if simulation.over:
             return None
         self._take_wanted_parameters()

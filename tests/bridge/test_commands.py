@@ -160,17 +160,20 @@ def test_an_unknown_action_is_refused_with_the_known_ones(
     eager(bridge)
     status, _, error = recording.fate(sent)
     assert status == "failed"
-    assert error is not None and "no action 'setspeed'; this robot knows set_speed, pause" in error
+    assert error is not None and "no action 'setspeed'; this robot knows set_speed, reset" in error
 
 
-def test_a_loop_without_registered_actions_gets_every_command_from_get_command(
+def test_a_loop_without_registered_actions_gets_every_command_and_none_of_them_looks_like_success(
     bridge: MCPBridge, recording: Recording
 ) -> None:
     sent = recording.send("dance", style="waltz")
     command = eager(bridge)
     assert command is not None
     assert (command["action"], command["style"]) == ("dance", "waltz")
-    assert recording.fate(sent)[:2] == ("done", {"returned_by_get_command": True})
+    status, _, error = recording.fate(sent)
+    assert status == "failed"
+    assert error is not None and "has registered none (bridge.register_command)" in error
+    assert "whether the loop did anything with it is not known" in error
 
 
 def test_an_expired_command_never_runs(bridge: MCPBridge, recording: Recording) -> None:

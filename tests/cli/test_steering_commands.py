@@ -101,21 +101,37 @@ def test_what_makes_no_sense_is_refused(
     assert told in capsys.readouterr().err
 
 
-def test_a_run_that_takes_longer_is_waited_for_with_the_line_that_it_names(
+def test_a_run_that_takes_longer_is_waited_for_or_ended_with_the_lines_that_it_names(
     file: Path, driver: Driver, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = Recording(file)
     wait_for(lambda: recording.states() != [])
     far = ("--for", "3", "--pace", "real_time", "--timeout", "0.3")
     assert main(["run", "--database", str(file), *far]) == 2
-    program, *line = shlex.split(capsys.readouterr().err.strip().splitlines()[-1])
-    assert program == "webots-mcp"
+    said = map(shlex.split, capsys.readouterr().err.splitlines())
+    (_, *line), (_, *end) = [words for words in said if words[:1] == ["webots-mcp"]]
     assert main([*line, "--timeout", "0.1"]) == 2
     assert "'webots-mcp" not in capsys.readouterr().out
     assert main(line) == 0
     assert "time over" in capsys.readouterr().out
     assert main([*line[:1], "999", *line[2:]]) == 2
     assert "no command 999" in capsys.readouterr().err
+    assert main(["run", "--database", str(file), *far]) == 2
+    assert main(end) == 0
+    assert recording.fate(2)[1]["ended"] == "interrupted"
+
+
+def test_an_action_that_nobody_registered_is_no_success(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    silent = Driver(file, registers=False)
+    silent.start()
+    recording = Recording(file)
+    wait_for(lambda: recording.states() != [])
+    assert main(["send", "--database", str(file), "resett"]) == 2
+    silent.stop()
+    said = capsys.readouterr().err
+    assert "no action 'resett'; this robot knows reset, reset_state, " in said
 
 
 def test_breakpoints_are_set_listed_hit_and_removed(

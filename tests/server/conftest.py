@@ -79,12 +79,13 @@ async def fail(client: Client, tool: str, **arguments: Any) -> str:
 class Driver(threading.Thread):
     """A controller's loop in a thread: a robot of the stand-in, recorded by a real bridge."""
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, *, registers: bool = True) -> None:
         super().__init__(name="controller", daemon=True)
         self.robot = InProcessSupervisor("rover")
         self.bridge = MCPBridge(self.robot, throttle_interval=1, database=file)
-        self.bridge.register_command("set_speed", self.set_speed)
-        self.bridge.register_command("break_down", self.break_down)
+        if registers:
+            self.bridge.register_command("set_speed", self.set_speed)
+            self.bridge.register_command("break_down", self.break_down)
         self.bridge.on_reload(self.rewind)
         self.speed = 1.0
         self._pace = threading.Event()

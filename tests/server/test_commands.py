@@ -150,6 +150,17 @@ async def test_steering_through_a_plain_robot_is_refused_with_the_supervisor_to_
     assert "'referee' is a Supervisor of this simulation: ask it (robot='referee')" in beside
 
 
+async def test_where_the_supervisors_controller_has_ended_it_is_the_one_to_start(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot("referee", ended_wall_time_s=time.time(), end_reason="crashed")
+    recorded.robot("rover", supervisor=0)
+    async with connect() as client:
+        text = await fail(client, "webots_simulation_control", command="pause")
+    assert "'referee' is a Supervisor of this simulation, but its controller has ended" in text
+    assert "set the field" not in text
+
+
 @pytest.mark.parametrize("command", ["pause", "step"])
 async def test_without_a_name_steering_goes_to_the_only_live_supervisor(
     connect: Connect, controller: Callable[..., RecordedRobot], recorded: Recorded, command: str

@@ -11,6 +11,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.text import cut, storable
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.errors import CommandRefusedError
+from webots_mcp.naming import nearest_first
 
 Handler = Callable[[dict[str, Any]], object]
 
@@ -53,16 +54,23 @@ class Handlers:
         """What the function of the command's action returns; whatever it raises is passed on.
 
         Raises:
-            CommandRefusedError: There are such functions, and none for this action.
+            CommandRefusedError: There is no function for this action.
         """
         handler = self._handlers.get(command.action)
-        if handler is not None:
-            return self._call(handler, command)
+        if handler is None:
+            raise CommandRefusedError(self._unknown(command.action))
+        return self._call(handler, command)
+
+    def _unknown(self, action: str) -> str:
+        """Nothing is known of a loop that looks at what get_command() returns by itself."""
+        known = nearest_first(action, (*self._handlers, *BUILT_IN_ACTIONS))
+        said = f"no action {action!r}; this robot knows {', '.join(known)}"
         if self._handlers:
-            known = ", ".join((*self._handlers, *BUILT_IN_ACTIONS))
-            raise CommandRefusedError(f"no action {command.action!r}; this robot knows {known}")
-        # A loop without registered actions may look at what get_command() returns by itself.
-        return {"returned_by_get_command": True}
+            return said
+        return (
+            f"{said}: its controller has registered none (bridge.register_command). "
+            "get_command() returned the command; whether the loop did anything with it is not known"
+        )
 
     def _call(self, handler: Handler, command: Command) -> object:
         outer, self.running = self.running, True

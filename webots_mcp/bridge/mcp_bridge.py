@@ -130,7 +130,8 @@ class MCPBridge:
 
         Returns:
             The command handled last in this call: `id`, `action`, `params`, and the parameters
-            as keys; None where there was none.
+            as keys; None where there was none. One whose action nobody has registered is
+            returned too, and its answer is that it failed.
         """
         try:
             command = self._session.serve()
@@ -266,7 +267,8 @@ class MCPBridge:
         It begins with what the environment variable `WEBOTS_MCP_PARAMETERS` says (a JSON object
         of names and values), else with `default`. It changes only inside `get_command()` and when
         the world is reset; each value is recorded with its time. A reset keeps the values, a
-        reload begins with the first ones again. Declaring a name again brings it up to date.
+        reload begins with the first ones again. Declaring a name again brings it up to date; a
+        log line says what is other than before.
 
         Args:
             name: Up to 100 characters, without a space or `=`; `arm.kp` is fine.

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
 from webots_mcp.bridge.clock import Clock
+from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.start_values import StartValues
 from webots_mcp.entries import Kind, Values
@@ -103,6 +104,7 @@ class Parameters:
     Args:
         clock: Tells the run and the time of each change.
         recorder: Takes the rows.
+        journal: Is told of a name that is declared anew.
         start_values: Those from the environment.
         set_later: What `Parameter.set` calls, with the name and the value.
     """
@@ -111,11 +113,13 @@ class Parameters:
         self,
         clock: Clock,
         recorder: Recorder,
+        journal: Journal,
         start_values: StartValues,
         set_later: Callable[[str, object], None],
     ) -> None:
         self._clock = clock
         self._recorder = recorder
+        self._journal = journal
         self._start_values = start_values
         self._set_later = set_later
         self._held: dict[str, _Held] = {}
@@ -233,6 +237,7 @@ class Parameters:
     def _redeclare(self, held: _Held, declaration: Declaration) -> None:
         """A value from outside outlives a new declaration that allows it."""
         is_default = held.setter is CODE and held.value == held.declaration.default
+        self._journal.log("warning", "bridge", _declared_anew(held.declaration, declaration))
         held.declaration = declaration
         self._from_reset.pop(declaration.name, None)
         self._wanted.pop(declaration.name, None)
@@ -261,6 +266,16 @@ class Parameters:
     def _record_next(self, values: Mapping[str, Value | None]) -> None:
         if values:
             self._recorder.record("parameter next", None, _next(values))
+
+
+def _declared_anew(before: Declaration, now: Declaration) -> str:
+    """That one name has two declarations, which may be meant as two parameters."""
+    pairs = zip(before._asdict().items(), now._asdict().values(), strict=True)
+    changed = [f"{name} {new!r}, not {old!r}" for (name, old), new in pairs if new != old]
+    return (
+        f"parameter {now.name!r} is declared again, with {', '.join(changed)}: what was declared "
+        "last counts, for both"
+    )
 
 
 def _described(declaration: Declaration) -> dict[str, Any]:

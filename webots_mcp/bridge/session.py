@@ -67,7 +67,7 @@ class Session:
         reloads = Reloads(errors.failed)
         given = os.environ.get(PARAMETERS_VARIABLE)
         start_values = StartValues(given, self._identity.robot_name, errors)
-        parameters = Parameters(clock, recorder, start_values, self._set_parameter)
+        parameters = Parameters(clock, recorder, journal, start_values, self._set_parameter)
         self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters)
         pause = Pause(simulation, journal, heartbeat, self.runs.look_after_step)
         keeper = Keeper(clock, recorder, journal, throttle, keep_last_s)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Final, cast
 from webots_mcp.cli.command import DATA_DIR, DATABASE, JSON, ROBOT, argument, command, settings_of
 from webots_mcp.cli.tables import print_table, text_of
 from webots_mcp.cli.tuning import parameters_of
+from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError
 
 if TYPE_CHECKING:
@@ -23,8 +24,9 @@ if TYPE_CHECKING:
 _WHERE: Final = (DATA_DIR, DATABASE, ROBOT, JSON)
 _UNDER_WAY: Final = (
     "the controller is still at it and goes on: do not send it again, but go on waiting with\n\n"
-    "    {}\n"
+    "    {}\n{}"
 )
+_END_IT: Final = "\nor end it with\n\n    {}\n"
 TIMEOUT: Final = argument(
     "--timeout",
     type=float,
@@ -189,16 +191,19 @@ def _require_done(answer: CommandAnswer, arguments: argparse.Namespace) -> None:
     if answer.outcome == "done":
         return
     under_way = answer.outcome == "claimed"
-    hint = _UNDER_WAY.format(_waiting(answer, arguments)) if under_way else answer.hint
+    hint = _under_way(answer, arguments) if under_way else answer.hint
     why = "; ".join(filter(None, (answer.error, hint))) or "no answer in time"
     raise CommandRefusedError(f"{answer.action} is not done ({answer.outcome}): {why}")
 
 
-def _waiting(answer: CommandAnswer, arguments: argparse.Namespace) -> str:
-    """The command line that goes on waiting."""
+def _under_way(answer: CommandAnswer, arguments: argparse.Namespace) -> str:
+    """The command lines that go on waiting, and that end what lets the loop come round."""
     where = [("--data-dir", arguments.data_dir), ("--database", arguments.database)]
     given = [text for option, value in where if value for text in (option, value)]
-    return shlex.join(["webots-mcp", "wait", str(answer.command_id), *given])
+    wait = shlex.join(["webots-mcp", "wait", str(answer.command_id), *given])
+    robot = ["--robot", answer.robot] if answer.robot else []
+    end = shlex.join(["webots-mcp", "pause", *robot, *given])
+    return _UNDER_WAY.format(wait, _END_IT.format(end) if answer.action in LOOPING else "")
 
 
 def _print(answer: CommandAnswer, arguments: argparse.Namespace) -> None:

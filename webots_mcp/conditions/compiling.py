@@ -93,6 +93,8 @@ class Compiler(Nodes):
             return self._flag_of(cast("ast.Call", node))
         if is_signal(node):
             return self._flag(node)
+        if isinstance(node, ast.Call) and function_of(node) not in FUNCTIONS:
+            self._refuse(node, self._unknown_function(node))
         self._refuse(node, "this is a value; a condition compares it, as in `x < 1`")
 
     def _comparison(self, node: ast.Compare) -> Holds:
@@ -193,7 +195,7 @@ class Compiler(Nodes):
 
     def _arithmetic(self, node: ast.BinOp) -> ReadNumber:
         if type(node.op) not in ARITHMETIC:
-            self._refuse(node, "there are + - * / only")
+            self._refuse_at(self._operator_column(node), "there are + - * / only")
         left, right = self._number(node.left), self._number(node.right)
         apply = ARITHMETIC[type(node.op)]
 

@@ -64,6 +64,12 @@ class Nodes:
     def _end_column(self, node: ast.expr) -> int:
         return len(self._encoded[: node.end_col_offset].decode())
 
+    def _operator_column(self, node: ast.BinOp) -> int:
+        """Behind the left operand, and the parentheses and spaces after it."""
+        start = self._end_column(node.left)
+        after = self._scanned.source[start:]
+        return start + len(after) - len(after.lstrip(" )"))
+
     def _refuse(self, node: ast.expr, why: str) -> NoReturn:
         self._refuse_at(self._column(node), why)
 

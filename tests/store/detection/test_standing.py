@@ -7,6 +7,7 @@ import sqlite3
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.recordings.rover import Recorder
@@ -18,14 +19,19 @@ from webots_mcp.store.rollup.rolling import roll
 OPTIONS = EventOptions(kinds=("still", "stuck"))
 
 
-def ask(connection: sqlite3.Connection, state: Callable[[float], dict[str, Any]]) -> Events:
-    """What is told of 60 s with a row every 0.1 s."""
+def ask(
+    connection: sqlite3.Connection,
+    state: Callable[[float], dict[str, Any]],
+    interval_s: float = 0.1,
+    seconds: float = 60.0,
+) -> Events:
+    """What is told of so many seconds with a row at each interval."""
     recorder = Recorder(connection)
     robot_id = recorder.robot("rover")
     recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
     connection.execute("BEGIN")
-    for step in range(600):
-        recorder.publish(round(step * 0.1, 6), state(step * 0.1))
+    for step in range(round(seconds / interval_s)):
+        recorder.publish(round(step * interval_s, 6), state(step * interval_s))
     connection.execute("COMMIT")
     roll(connection, 100_000)
     return find_events(connection, resolve_range(connection), OPTIONS)
@@ -132,4 +138,20 @@ def test_who_trembles_at_a_wall_is_stuck(empty: sqlite3.Connection, tier: str) -
         return {"pose": [x_m, 0.0], "mode": "drive", "wheels": [5.0, 5.0]}
 
     (stuck,) = ask(empty, drives_then_pushes).events
+    assert stuck.kind == "stuck"
+
+
+@pytest.mark.parametrize(
+    ("noise_m", "interval_s", "held_s"), [(0.002, 0.008, 40.0), (0.02, 0.5, 5.0)]
+)
+def test_noise_alone_is_no_going_to_and_fro(
+    empty: sqlite3.Connection, noise_m: float, interval_s: float, held_s: float
+) -> None:
+    noise = np.random.default_rng(1)
+
+    def drives_and_is_held(time_s: float) -> dict[str, Any]:
+        x_m = 0.2 * (min(30.0, time_s) + max(0.0, time_s - 30 - held_s))
+        return {"pose": noise.normal((x_m, 0.0), noise_m).tolist(), "mode": "drive"}
+
+    (stuck,) = ask(empty, drives_and_is_held, interval_s=interval_s, seconds=held_s + 60).events
     assert stuck.kind == "stuck"

@@ -30,8 +30,8 @@ ON_THE_SPOT: Final = 0.2  # of the fastest wheel: where the mean of all is less,
 TURNED_RAD: Final = 0.1  # from a second before to a second after
 HEADING_NOISE: Final = 6.0  # standard deviations
 SWAY_S: Final = 2.0
-SWAY_M: Final = 0.01  # less is how a robot trembles whose wheels turn at a wall
-SWAY_NOISE: Final = 8.0  # deviations of the smoothed position
+SWAY_M: Final = 0.0035  # of 1 cm to and fro; less is how a robot trembles at a wall
+SWAY_NOISE: Final = 3.5  # deviations in each coordinate: noise alone comes to 1.4 of them
 MOSTLY: Final = 0.5
 TOLD_SHARE: Final = 0.1  # of the rows: what holds in fewer, at the ends, shows nothing
 
@@ -51,15 +51,17 @@ class Evidence:
     against: list[str] = field(default_factory=list[str])
 
 
-def weigh(columns: Columns, motion: Motion, options: EventOptions, moved_in: MovedIn) -> Evidence:
-    """Weigh what the rows of one standstill tell."""
+def weigh(
+    columns: Columns, motion: Motion, options: EventOptions, moved_in: MovedIn, noise_m: float
+) -> Evidence:
+    """Weigh what the rows of one standstill tell; the noise is that of its way's positions."""
     told, told_why, stop, stop_why = _by_command(columns, motion, options)
     ahead, ahead_why, spot, rest_why = _by_wheels(columns, motion)
     mode, mode_why, mode_against = _by_mode(columns, motion, options, moved_in)
     turning = turns(columns, motion.heading)
     # Wheels that turn it on the spot move it nowhere; where it looks tells whether they do.
     turning |= spot if motion.heading is None else False
-    swaying, reach_m = sways(columns, motion)
+    swaying, reach_m = sways(columns, motion, noise_m)
     should_move = (told | ahead | mode) & ~stop & ~turning & ~swaying
     against = [*stop_why, *rest_why, *mode_against]
     against += ["it turned in place"] if _mostly(turning) else []
@@ -140,19 +142,20 @@ def _moves_in(mode: Value, options: EventOptions, moved_in: MovedIn) -> str | No
     return f"in mode {mode}, in which it moved at {seen.speed_m_s:.2g} m/s{where}"
 
 
-def sways(columns: Columns, motion: Motion) -> tuple[Flags, float]:
+def sways(columns: Columns, motion: Motion, noise_m: float) -> tuple[Flags, float]:
     """Per row whether it went about within two seconds, and how far apart its places were.
 
-    Who does so within a place moves in it, and is not stuck.
+    Who does so within a place moves in it, and is not stuck. What counts is how far its places are
+    from their mean (root mean square): of many rows some few are always far away.
     """
     flags = np.zeros(len(columns.times), np.bool_)
     times = columns.moments
     reach_m = 0.0
-    for track in tracks_in(columns, motion.position) if motion.position else []:
+    for track in tracks_in(columns, motion.position, noise_m) if motion.position else []:
         seconds = np.arange(track.times[0] + SWAY_S, track.times[-1], SWAY_S)
         edges = np.unique(np.searchsorted(track.times, [track.times[0], *seconds]))
-        far_m = np.hypot(*(_extents(each, edges) for each in (track.x, track.y)))
-        moved = far_m > max(SWAY_M, SWAY_NOISE * track.left_m)
+        away_m = np.sqrt(sum(_variances(each, edges) for each in (track.x, track.y)))
+        moved = away_m > max(SWAY_M, SWAY_NOISE * track.left_m)
         reach_m = max(reach_m, math.hypot(np.ptp(track.x), np.ptp(track.y)))
         here = np.searchsorted(track.times[edges], times, side="right") - 1
         within = (times >= track.times[0]) & (times <= track.times[-1])
@@ -160,9 +163,11 @@ def sways(columns: Columns, motion: Motion) -> tuple[Flags, float]:
     return flags, reach_m
 
 
-def _extents(values: Array, edges: Indexes) -> Array:
-    """How far values reach in each of the parts that begin at the edges."""
-    return np.maximum.reduceat(values, edges) - np.minimum.reduceat(values, edges)
+def _variances(values: Array, edges: Indexes) -> Array:
+    """The variance of the values in each of the parts that begin at the edges."""
+    counts = np.diff(edges, append=len(values))
+    off = values - np.repeat(np.add.reduceat(values, edges) / counts, counts)
+    return np.add.reduceat(off**2, edges) / counts
 
 
 def turns(columns: Columns, heading: Signal | None) -> Flags:

@@ -37,6 +37,7 @@ class Standing:
 
     Attributes:
         columns: Rows in which it stood: all, or samples.
+        noise_m: Of the positions on the way that it is part of.
         within_s: How exactly begin and end are known; 0 for to the row.
     """
 
@@ -45,6 +46,7 @@ class Standing:
     x_m: float
     y_m: float
     columns: Columns
+    noise_m: float
     within_s: float = 0.0
 
 
@@ -73,7 +75,9 @@ def find_standings(search: Search) -> Standings:
     moved_in = MovedIn(search.connection, search.segment.run_id, search.motion, search.deadline)
     events: list[Event] = []
     for standing in found:
-        evidence = weigh(standing.columns, search.motion, search.options, moved_in)
+        evidence = weigh(
+            standing.columns, search.motion, search.options, moved_in, standing.noise_m
+        )
         events += _told(search, standing, evidence)
     nearest = None if found else _nearest(search, tracks)
     return Standings(events, search.view.taken_notes(), nearest)
@@ -150,7 +154,8 @@ def _in_track(search: Search, track: Track, columns: Columns, least_s: float) ->
     for each in find_standstills(track, search.options.stuck_m, least_s):
         start_s, end_s = float(track.times[each.start]), float(track.times[each.last])
         rows = slice(bisect_left(columns.times, start_s), bisect_right(columns.times, end_s))
-        place = Standing(start_s, end_s, each.x_m, each.y_m, _rows(columns, rows))
+        standing_rows = _rows(columns, rows)
+        place = Standing(start_s, end_s, each.x_m, each.y_m, standing_rows, track.noise_m)
         yield from _at_one_height(search, place, least_s)
 
 

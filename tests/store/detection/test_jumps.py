@@ -123,3 +123,24 @@ def test_a_quick_swing_after_a_long_rest_is_a_motion_and_a_dropout_in_it_is_a_ju
 
     record(empty, steering)
     assert [(event.name, event.start_s) for event in jumps(empty)] == [("steering", 105.0)]
+
+
+def test_which_beam_is_the_shortest_neither_jumps_nor_freezes(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    nearest = random.Random(1)
+
+    def scans(time_s: float) -> dict[str, Any]:
+        beam = nearest.randint(10, 12)
+        if 50 <= time_s < 100:  # along a wall on the left
+            beam = 2
+        elif time_s == pytest.approx(150):  # something passes on the right
+            beam = 30
+        return {"lidar": [1.0 + 0.1 * nearest.random() - (item == beam) for item in range(32)]}
+
+    record(empty, scans)
+    asked = EventOptions(kinds=("jump", "flat"))
+    assert find_events(empty, resolve_range(empty), asked).events == ()
+    asked = EventOptions(kinds=("jump", "flat"), signals=("lidar.argmin",))
+    found = find_events(empty, resolve_range(empty), asked).verdicts.not_searched
+    assert all("leaps and rests by nature" in found[kind] for kind in ("jump", "flat"))

@@ -66,7 +66,7 @@ def reads(connection: sqlite3.Connection, *kinds: str) -> int:
     find_events(connection, resolve_range(connection), EventOptions(kinds=kinds))
     connection.set_trace_callback(None)
     return sum(
-        "json_extract(data" in each and "ORDER BY sim_time_s, id" in each for each in statements
+        "json_extract(data" in each and "ORDER BY sim_time_s, row_id" in each for each in statements
     )
 
 

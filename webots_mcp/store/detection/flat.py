@@ -24,11 +24,12 @@ _LIVELY: Final = (
 def flat_events(search: Search) -> Iterator[Event]:
     """Of a long segment only rests that fill a stretch of the rollups."""
     least_s = max(search.options.flat_s, search.view.shortest_rest_s)
-    for index, signal in enumerate(search.required_numbers()):
+    signals = search.required_quantities()
+    for index, signal in enumerate(signals):
         here = search.view.summary(signal)
         if here.changes >= here.present - 1:
             continue
-        if search.is_over("flat", search.numbers[index:]):
+        if search.is_over("flat", signals[index:]):
             return
         spans = search.view.spans(signal, Flat())
         flat = [span for span in spans if _length_s(span) >= least_s]

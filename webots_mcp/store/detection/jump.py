@@ -22,8 +22,12 @@ _ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to
 def jump_events(search: Search) -> Iterator[Event]:
     """Dropouts and spikes that come back, steps that stay, and leaps of the position."""
     position = search.motion.position or ()
-    numbers = search.numbers if position else search.required_numbers()
-    signals = [s for s in numbers if s.kind != "angle" and s not in position]
+    numbers = search.numbers if position else search.required_quantities()
+    signals = [
+        signal
+        for signal in numbers
+        if signal.kind != "angle" and not signal.is_index and signal not in position
+    ]
     for index, signal in enumerate(signals):
         if search.is_over("jump", signals[index:]):
             break

@@ -123,6 +123,19 @@ class Search:
             raise NotSearchableError("no number was published, or none of these names")
         return self.numbers
 
+    def required_quantities(self) -> list[Signal]:
+        """The numeric signals that are no index of an array.
+
+        Raises:
+            NotSearchableError: There are none.
+        """
+        quantities = [signal for signal in self.required_numbers() if not signal.is_index]
+        if not quantities:
+            raise NotSearchableError(
+                "which item of an array is the least leaps and rests by nature"
+            )
+        return quantities
+
     @cached_property
     def view(self) -> View:
         """The values of all signals that the kinds look at; read at the first use."""

@@ -80,6 +80,11 @@ class Signal:
         return summary._replace(sines=sines, cosines=cosines)
 
     @property
+    def is_index(self) -> bool:
+        """Whether it says which item of an array, not how much: it leaps and rests by nature."""
+        return self.reduce == "argmin"
+
+    @property
     def is_number(self) -> bool:
         """Whether it has a minimum and a mean; text and flags have change points instead."""
         return self.kind in ("num", "angle", "null")

@@ -197,6 +197,28 @@ async def test_cancel_stops_after_the_current_trial_and_sets_the_parameters_back
         assert again["state"] == "done"
 
 
+async def test_what_a_set_does_not_name_is_as_it_was_before_the_trials(
+    connect: Connect, tunable: TunableDriver
+) -> None:
+    async with connect() as client:
+        await ask(client, "webots_set_parameters", values={"kp": 7.0})
+        sets = [{"kp": 3.0, "gait": "walk"}, {"gait": "trot"}, {}]
+        answer = await trials(client, parameters=sets, repeats=2, score="max(distance) / 0.16")
+        scores = [(row["kp"], row["range"]) for row in rows_of(answer["ranked"])]
+        assert scores == [
+            (None, [pytest.approx(7.0)] * 2),
+            (None, [pytest.approx(7.0)] * 2),
+            (3.0, [pytest.approx(3.0)] * 2),
+        ]
+
+
+async def test_trials_that_change_nothing_end(connect: Connect, tunable: TunableDriver) -> None:
+    async with connect() as client:
+        answer = await trials(client, parameters=[{}], repeats=2)
+        assert (answer["state"], answer["over"]) == ("done", 2)
+        assert (await trials(client, parameters={"kp": [1.0]}))["state"] == "done"
+
+
 async def test_what_cannot_be_tried_is_refused_before_anything_is_done(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -371,7 +393,7 @@ async def test_a_set_whose_server_was_killed_is_gone_on_with_by_another(
         left = await ask(client, "webots_get_trials")
         assert left["state"] == "left by a server that ended"
         said = await fail(client, "webots_run_trials", parameters=SPEEDS, score="duration", for_s=1)
-        assert "trial set 1 of this robot was left by a server that ended" in said
+        assert "trial set 1 of this robot is not over (it was left by a server that ended)" in said
         release.touch()
         answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=90)
         assert (answer["state"], answer["over"]) == ("done", 6)

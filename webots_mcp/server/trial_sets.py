@@ -182,15 +182,14 @@ def _state(found: TrialSet, left: int) -> tuple[str, str | None]:
         if found.stop_reason:
             return f"stopping: {found.stop_reason}", None
         return "under way", f"{again} waits for it, with cancel=true it stops"
+    why = f"stopped: {found.stop_reason}" if found.stop_reason else "left by a server that ended"
     if found.former_values is not None:
-        return "left by a server that ended", f"{again} goes on and sets the parameters back"
+        return why, f"{again} goes on and sets the parameters back"
     if not left:
         return "done", None
     if found.robot_id is None:
         return "left", "the same command, 'webots-mcp trials PLAN', goes on with it"
-    if found.stop_reason:
-        return f"stopped: {found.stop_reason}", f"{again} goes on with the {left} that are left"
-    return "left by a server that ended", f"{again} goes on with the {left} that are left"
+    return why, f"{again} goes on with the {left} that are left"
 
 
 def _names(ranking: Ranking) -> list[str]:

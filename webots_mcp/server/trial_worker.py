@@ -137,21 +137,23 @@ class TrialWorker(threading.Thread):
                 return known
             view = self._borrow(connection)
             begun = begin_trial(connection, trial) if trial.status == "waiting" else trial
+            former = fetch_trial_set(connection, self._set_id).former_values or "{}"
             return CommandQueue(connection).enqueue(
                 view.robot.id,
                 ACTION,
-                self._asked(trial),
+                self._asked(json.loads(former) | trial.values),
                 requested_by="mcp",
                 idempotency_key=_key(begun),
             )
 
-    def _asked(self, trial: Trial) -> dict[str, Any]:
+    def _asked(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """What runs a trial; a reset would leave a parameter as the trial before had it."""
         asked = {
             "until": self._plan.until,
             "for_s": self._plan.for_s,
             "reset": True,
             "pace": "fast",
-            "parameters": trial.values,
+            "parameters": values,
             "by": "trial",
             "then": "pause",
         }
@@ -293,15 +295,17 @@ class TrialWorker(threading.Thread):
             self._say_why(f"its parameters were not set back: {command.error or command.status}")
 
     def _ask_back(self, connection: sqlite3.Connection, noted: TrialSet) -> Command | None:
-        """The command that sets the parameters back; None where there is nobody to ask."""
+        """The command that sets the parameters back; None where there is nothing, or nobody."""
         assert noted.robot_id is not None and noted.former_values is not None
+        if not (former := json.loads(noted.former_values)):
+            return None
         try:
             view = find_target(connection, self._robot, _SET_PARAMETERS)
         except CommandRefusedError:
             return None
         if view.session is None or view.session.id != noted.session_id:
             return None
-        params = {"values": json.loads(noted.former_values), "when": "now", "by": "trial"}
+        params = {"values": former, "when": "now", "by": "trial"}
         return CommandQueue(connection).enqueue(
             noted.robot_id, _SET_PARAMETERS, params, requested_by="mcp"
         )

@@ -30,7 +30,11 @@ _CHARACTERS_AT_ONCE: Final = 200_000
 
 
 class Stretch:
-    """A kept stretch of a run; `end_s` lies ahead while it goes on."""
+    """A kept stretch of a run; `end_s` lies ahead while it goes on.
+
+    Attributes:
+        gaps: Why not each call is in it; None where each is.
+    """
 
     def __init__(self, run: Run, start_s: float) -> None:
         self.uuid = new_uuid()
@@ -38,6 +42,12 @@ class Stretch:
         self.start_s = self.end_s = start_s
         self.wall_time_s = time.time()
         self.reasons: list[str] = []
+        self.gaps: str | None = None
+
+    @property
+    def reason(self) -> str:
+        """All reasons, and what is missing."""
+        return "; ".join([*self.reasons, *filter(None, [self.gaps])])
 
     def add_reason(self, reason: str) -> None:
         """Note why it is kept, once."""
@@ -69,6 +79,7 @@ class Keeper:
         self._run = clock.run
         self._ring.begin(clock.sim_time_s)
         self._kept_s = 0.0
+        self._left_out: tuple[float, str] | None = None  # the last one of this run
         self._stretch: Stretch | None = None
         self._going_on = False
         self._asked: deque[str] = deque(maxlen=_MOST_REASONS)
@@ -95,6 +106,17 @@ class Keeper:
             self._unwritten.append((clock.run, row))
         else:
             self._ring.add(row)
+
+    def leave_out(self, why: str) -> None:
+        """A call is neither recorded nor held; a stretch with it says why."""
+        if self._clock.run is not self._run:
+            self._begin_run()
+        now_s = self._clock.sim_time_s
+        self._left_out = now_s, why
+        stretch = self._stretch
+        if self._going_on and stretch is not None and now_s <= stretch.end_s and not stretch.gaps:
+            stretch.gaps = why
+            self._record(stretch)
 
     def go_on(self) -> None:
         """Keep what was asked for, write some rows, and end the stretch when it is over."""
@@ -128,6 +150,8 @@ class Keeper:
         self._kept_s += now_s + KEEP_AFTER_S - max(start_s, stretch.end_s)
         stretch.end_s = now_s + KEEP_AFTER_S
         stretch.add_reason(reason)
+        if self._left_out is not None and self._left_out[0] >= start_s:
+            stretch.gaps = stretch.gaps or self._left_out[1]
         self._unwritten.extend((self._run, row) for row in rows)
         self._going_on = self.busy = True
         self._record(stretch)
@@ -162,6 +186,7 @@ class Keeper:
         """Time went back: what the ring holds is of a run that is over."""
         self._end_stretch(self._clock.ended_sim_time_s)
         self._run, self._stretch, self._kept_s = self._clock.run, None, 0.0
+        self._left_out = None
         self._ring.begin(self._run.started_sim_time_s)
 
     def _end_stretch(self, at_s: float) -> None:
@@ -181,7 +206,7 @@ class Keeper:
             "start": stretch.start_s,
             "end": stretch.end_s,
             "wall_time": stretch.wall_time_s,
-            "reason": "; ".join(stretch.reasons),
+            "reason": stretch.reason,
         }
         self._recorder.record("kept stretch", stretch.run, values)
 

@@ -64,7 +64,8 @@ class MCPBridge:
         keep_last_s: Seconds of simulation time before a moment that are kept at full rate: every
             call of `publish`, also those that the throttle drops (see `keep`). They are held in
             memory, up to 8 MB, of which the oldest go first. Five seconds hold what leads to a
-            crash or a hit, and cost a throttled call some microseconds. 0 holds and keeps nothing;
+            crash or a hit, and cost a throttled call some microseconds, one of `auto_publish` up to
+            100 us on average for reading devices (see `stats().ring_interval`). 0 holds nothing;
             the environment variable `WEBOTS_MCP_KEEP_LAST_S` overrides it.
         database: A file, `":memory:"`, or a `MemoryDatabase` shared with a server; None for
             `webots.db` in the data folder.
@@ -357,6 +358,7 @@ class MCPBridge:
             values_replaced=self._session.context.journal.values_replaced,
             publish_mean_us=self._publisher.cost.mean_us,
             publish_max_us=self._publisher.cost.max_us,
+            ring_interval=self._publisher.devices.ring_interval,
             failures=self._errors.failures,
             last_error=self._errors.last_error,
         )

@@ -9,7 +9,7 @@ from typing import Any
 
 from webots_mcp.bridge.changes import Changes
 from webots_mcp.bridge.context import Context
-from webots_mcp.bridge.devices import read_devices
+from webots_mcp.bridge.device_reader import DeviceReader
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.runs import Runs
 from webots_mcp.bridge.stats import PublishCost
@@ -20,6 +20,7 @@ class Publisher:
 
     Attributes:
         cost: How long the recorded calls took.
+        devices: Reads the devices for `auto_publish`.
     """
 
     def __init__(self, context: Context, runs: Runs) -> None:
@@ -32,6 +33,7 @@ class Publisher:
         self._keeper = context.keeper
         self._runs = runs
         self._changes = Changes()
+        self.devices = DeviceReader(context.simulation, context.journal, context.recorder.errors)
         self._run = context.clock.run
         self.cost = PublishCost()
 
@@ -56,20 +58,28 @@ class Publisher:
     def publish_devices(self, extra: Mapping[Any, Any], include_time: bool) -> None:
         """Record what the devices say; they are read if it is this call's turn.
 
-        Where the last seconds are held, breakpoints are armed or a run has a goal, they are read
-        in every call.
+        Where breakpoints are armed or a run has a goal, they are read in every call; where the
+        last seconds are held, as often as its bound on the time for it allows.
         """
         if self._clock.look():
             self._runs.begin()
-        if self._keeper.fills or self._breakpoints.concerned or self._watch.asks_states:
+        keeper, throttle = self._keeper, self._throttle
+        due = keeper.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
+        if due or self._breakpoints.concerned or self._watch.asks_states:
             self.publish(self._read(extra, include_time), force=False)
-        elif self._throttle.admits(self._heartbeat.loop is not None):
+            return
+        if throttle.admits(self._heartbeat.loop is not None):
             self._record(self._read(extra, include_time))
-            if self._keeper.busy:
-                self._keeper.go_on()
+        elif keeper.fills:
+            keeper.leave_out(self.devices.why)
+        if keeper.busy:
+            keeper.go_on()
 
     def _read(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
-        return {**self._read_devices(include_time), **_finite(extra)}
+        state: dict[Any, Any] = self.devices.read()
+        if include_time:
+            state["time"] = self._clock.sim_time_s
+        return state | _finite(extra)
 
     def _record(self, state: Mapping[Any, Any]) -> None:
         started_s = time.perf_counter()
@@ -89,17 +99,6 @@ class Publisher:
             self._changes.forget()
         for name, before, after in self._changes.look(state):
             self._context.journal.event("change", {"from": before, "to": after}, name)
-
-    def _read_devices(self, include_time: bool) -> dict[str, object]:
-        """What the devices say; without what cannot be read, which is counted."""
-        try:
-            state = read_devices(self._context.simulation.robot)
-        except Exception as error:  # noqa: BLE001  (the robot comes first)
-            self._context.recorder.errors.failed("auto_publish", error)
-            state = dict[str, object]()
-        if include_time:
-            state["time"] = self._clock.sim_time_s
-        return state
 
 
 def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:

@@ -6,7 +6,11 @@ from typing import NamedTuple
 
 
 class BridgeStats(NamedTuple):
-    """What a bridge recorded so far, and what it could not."""
+    """What a bridge recorded so far, and what it could not.
+
+    Attributes:
+        ring_interval: Of `auto_publish` one call in so many is held in the ring buffer.
+    """
 
     rows_written: int
     rows_waiting: int
@@ -16,6 +20,7 @@ class BridgeStats(NamedTuple):
     values_replaced: int
     publish_mean_us: float
     publish_max_us: float
+    ring_interval: int
     failures: int
     last_error: str | None
 

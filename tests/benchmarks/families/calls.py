@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 from tests.benchmarks.measuring import Samples, alternate, ratio, time_calls
 from tests.benchmarks.registry import Bench, NotMeasurableError, benchmark
@@ -10,7 +12,9 @@ from tests.benchmarks.rover import Rover
 from tests.benchmarks.states import make_states
 from tests.benchmarks.table import Line, Target, duration
 from tests.benchmarks.ways import BridgeWay, JsonFiles, RawSqlite, Way
+from webots_mcp import MCPBridge
 from webots_mcp.contract import KEEP_LAST_S
+from webots_mcp.standin import InProcessSupervisor
 
 _BLOCKS = 30
 _WRITES = 200  # calls in a block
@@ -99,6 +103,46 @@ def _cost_of_dropped(bench: Bench, keep_last_s: float, target: Target) -> Line:
     way.close()
     cost_us = 1e6 * (taken["call"].p50 - taken["none"].p50)
     return Line("p50", duration(taken["call"].p50), "minus the empty call", cost_us, "us", target)
+
+
+@benchmark("devices", "auto_publish(), what reading devices for the ring buffer adds to a call")
+def measure_devices(bench: Bench) -> Iterable[Line]:
+    for lidars in (1, 30):
+        yield _cost_of_reading(bench, lidars)
+
+
+def _cost_of_reading(bench: Bench, lidars: int) -> Line:
+    """Processor time; of slow devices most calls read nothing, so the mean tells."""
+    pair = {
+        name: _reading(bench.place(f"{name} {lidars}"), lidars, seconds, _calls(bench, 300))
+        for name, seconds in (("ring", KEEP_LAST_S), ("none", 0.0))
+    }
+    taken = _take_turns(bench, pair)
+    ring, none = taken["ring"].mean, taken["none"].mean
+    beside = f"without ring {duration(none)}"
+    added_us = 1e6 * (ring - none)
+    return Line(f"mean, {lidars} lidars", duration(ring), beside, added_us, "us", Target(120.0))
+
+
+def _reading(
+    folder: Path, lidars: int, keep_last_s: float, calls: int
+) -> Callable[[], list[float]]:
+    robot = InProcessSupervisor("rover")
+    lidar = robot.getDevice("lidar")
+    lidar.enable(8)
+    robot.step(32)
+    robot.devices.update({f"lidar {i}": lidar for i in range(1, lidars)})
+    bridge = MCPBridge(
+        robot, data_dir=folder, throttle_interval=1_000_000_000, keep_last_s=keep_last_s
+    )
+
+    def run_block() -> list[float]:
+        started_s = time.process_time()
+        for _ in range(calls):
+            bridge.auto_publish()
+        return [(time.process_time() - started_s) / calls]
+
+    return run_block
 
 
 @benchmark("poll", "get_command() with nothing to do, calls in a row")

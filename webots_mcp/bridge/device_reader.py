@@ -1,0 +1,64 @@
+"""Reading the devices for `auto_publish`, and how often the ring buffer may ask for it."""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections import deque
+from typing import Final
+
+from webots_mcp.bridge.devices import read_devices
+from webots_mcp.bridge.error_report import ErrorReport
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.simulation import Simulation
+
+MOST_READING_US: Final = 100.0  # per call, on average, for rows that are only held
+_READINGS: Final = 9  # one of them that was interrupted does not decide
+
+
+class DeviceReader:
+    """Reads a robot's devices, and measures what that takes.
+
+    Attributes:
+        ring_interval: One call of `auto_publish` in so many may be read only to be held: as many
+            as keep the mean of all calls below 100 us.
+        why: What it is for; empty while each call is read.
+    """
+
+    def __init__(self, simulation: Simulation, journal: Journal, errors: ErrorReport) -> None:
+        self._simulation = simulation
+        self._journal = journal
+        self._errors = errors
+        self._durations_us: deque[float] = deque(maxlen=_READINGS)
+        self._told = 1
+        self.ring_interval = 1
+        self.why = ""
+
+    def read(self) -> dict[str, object]:
+        """What the devices say; without what cannot be read, which is counted."""
+        started_s = time.perf_counter()
+        try:
+            return read_devices(self._simulation.robot)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._errors.failed("auto_publish", error)
+            return {}
+        finally:
+            self._count(1e6 * (time.perf_counter() - started_s))
+
+    def _count(self, duration_us: float) -> None:
+        """The median of the last ones decides; a single slow one is no reason to tell."""
+        self._durations_us.append(duration_us)
+        usual_us = statistics.median(self._durations_us)
+        interval = max(1, math.ceil(usual_us / MOST_READING_US))
+        if interval != self.ring_interval:
+            self.ring_interval = interval
+            self.why = _why(interval, usual_us) if interval > 1 else ""
+        if self.ring_interval > self._told and len(self._durations_us) == _READINGS:
+            self._told = 2 * self.ring_interval
+            self._journal.log("info", "bridge", f"ring buffer: {self.why}")
+
+
+def _why(interval: int, usual_us: float) -> str:
+    share = f"of auto_publish() one call in {interval}"
+    return f"{share}, because reading the devices takes {usual_us:.0f} us"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
+import sys
+from contextlib import closing
 from typing import Any
 
 import pytest
@@ -99,3 +101,52 @@ def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
     roll(empty, 100_000)
     asked = resolve_range(empty, start_s=70.0, end_s=80.0)
     assert find_events(empty, asked, EventOptions(kinds=("silent",))).events == ()
+
+
+@pytest.mark.parametrize("rolled", [True, False])
+def test_what_a_short_stretch_costs_does_not_grow_with_the_run(
+    empty: sqlite3.Connection, rolled: bool
+) -> None:
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    costs = [after_so_many_rows(recorder, empty, rows, rolled) for rows in (2000, 10_000)]
+    assert costs[1] < 1.5 * costs[0]
+
+
+def after_so_many_rows(
+    recorder: Recorder, connection: sqlite3.Connection, rows: int, rolled: bool
+) -> int:
+    """What the last second of the run costs; its mode rests, and one value is never there."""
+    (first,) = connection.execute("SELECT count(*) FROM state").fetchone()
+    for step in range(first, rows):
+        state = {"pose": [step * 0.02, 0.0], "mode": "drive", "text": f"row {step}", "none": None}
+        recorder.publish(step * 0.1, state)
+    if rolled:
+        roll(connection, 100_000)
+    return calls(connection)
+
+
+def calls(connection: sqlite3.Connection) -> int:
+    """How many functions of Python and, in SQLite, rows of JSON the last second takes."""
+    counted = [0]
+
+    def count(frame: object, event: str, argument: object) -> None:
+        counted[0] += event == "call"
+
+    with closing(sqlite3.connect(":memory:")) as other:
+
+        def json_extract(*asked: object) -> Any:
+            query = f"SELECT json_extract({', '.join('?' * len(asked))})"
+            return other.execute(query, asked).fetchone()[0]
+
+        connection.create_function("json_extract", -1, json_extract)
+        asked = resolve_range(connection, last_s=1.0)
+        find_events(connection, asked)
+        before = sys.getprofile()
+        sys.setprofile(count)
+        try:
+            find_events(connection, asked)
+        finally:
+            sys.setprofile(before)
+    return counted[0]

@@ -62,7 +62,7 @@ def _without_value(search: Search, signal: Signal) -> list[Span]:
 
 def _has_begun(search: Search, signal: Signal, span: Span) -> bool:
     """What had no value before its first one was not there yet; that is no silence."""
-    if span.start_s <= search.began_s:
+    if span.start_s <= search.began_s or signal.kind == "null":
         return False
     if not span.from_first:
         return True

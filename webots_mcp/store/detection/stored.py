@@ -13,12 +13,14 @@ from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.detection.event import LEVELS, Event
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError, only_if_named
 from webots_mcp.store.detection.search import Search, wall_time_at
-from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points
+from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
 from webots_mcp.store.reading.gaps import rhythm_in, with_rows_around
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rows import exceeds, read_columns
+from webots_mcp.store.signals.registry import Signal
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
+AROUND_S: Final = 10.0  # before and after: what changes all the time there, measures
 MOST_CHANGES: Final = 500  # newest change points of one signal that become events
 
 _IN_SEGMENT: Final = (
@@ -100,12 +102,12 @@ def change_events(search: Search) -> Iterator[Event]:
             "no text or flag was published, or none of these names; of a mode that is a number ask "
             "where='changed(NAME)'"
         )
-    # From just before on: what changed exactly at the start had another value until then.
-    before_s = math.nextafter(segment.start_s, -math.inf)
-    whole = Segment(segment.run_id, before_s, just_after(newest_s))
-    for name, points in change_points(search.connection, whole, states, search.deadline).items():
+    around = Segment(segment.run_id, segment.start_s - AROUND_S, segment.end_s + AROUND_S)
+    found = change_points(search.connection, around, states, search.deadline, since=False)
+    for signal in states:
+        name, points = signal.name, found[signal.name]
         told = _without_measurements(points)
-        ends_s = [*(point.sim_time_s for point in told[2:]), None]
+        ends_s = [*(point.sim_time_s for point in told[2:]), _last_ends_s(search, signal, told)]
         changes = [
             (before, point, end_s)
             for (before, point), end_s in zip(pairwise(told), ends_s, strict=False)
@@ -125,6 +127,15 @@ def change_events(search: Search) -> Iterator[Event]:
             wall_s = wall_time_at(search.connection, segment.run_id, point.sim_time_s)
             details = {"before": before.value, "after": point.value}
             yield Event("change", *place, wall_s, name, details, ongoing=end_s is None)
+
+
+def _last_ends_s(search: Search, signal: Signal, told: Sequence[Point]) -> float | None:
+    """When the newest of some values ended; None where it goes on, or began elsewhere."""
+    begin_s = told[-1].sim_time_s if told else math.inf
+    if not search.segment.start_s <= begin_s < search.segment.end_s:
+        return None
+    after = Segment(search.segment.run_id, begin_s, just_after(search.ended_s))
+    return value_ended_s(search.connection, after, signal, search.deadline)
 
 
 def _without_measurements(points: Sequence[Point]) -> Sequence[Point]:

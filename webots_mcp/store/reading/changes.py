@@ -18,10 +18,17 @@ from webots_mcp.store.signals.registry import Signal
 
 MOST_VALUES: Final = 20
 
+# Of all changes of a signal only those of the segment are looked at, and the one in force before.
 _CHANGES: Final = (
-    "SELECT sim_time_s, value FROM change WHERE run_id = ? AND signal_id = ? AND sim_time_s < ? "
-    "ORDER BY state_id"
+    "SELECT sim_time_s, value FROM change WHERE run_id = :run AND signal_id = :signal "
+    "AND sim_time_s < :end AND state_id >= coalesce((SELECT max(state_id) FROM change "
+    "WHERE run_id = :run AND signal_id = :signal AND state_id <= ("
+    "SELECT id FROM state WHERE run_id = :run AND sim_time_s <= :start "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1)), 0) AND state_id < coalesce(("
+    "SELECT id FROM state WHERE run_id = :run AND sim_time_s >= :end "
+    "ORDER BY sim_time_s, id LIMIT 1), 1e18) ORDER BY state_id LIMIT :most"
 )
+_ROW_IN_FORCE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s <= ?"
 # Of each table the first bucket: in `all_rollup` SQLite would sort all of them.
 _FIRST_VALUE: Final = "SELECT min(first_sim_time_s) FROM ({})".format(
     " UNION ALL ".join(
@@ -44,16 +51,26 @@ def change_points(
     segment: Segment,
     signals: Sequence[Signal],
     deadline: Deadline,
+    *,
+    since: bool = True,
 ) -> dict[str, list[Point]]:
     """The change points of text and boolean signals in a segment, at any length of it.
 
     The first point is the value in force when the segment begins; its time may lie before. They
     come from the change table, and from the rows after the watermark until the deadline.
+
+    Args:
+        connection: Any.
+        segment: Which stretch.
+        signals: Text and flags.
+        deadline: For all reading.
+        since: Whether it matters when the value in force at the begin began. Without it no rows
+            before the segment are read, and that point may lie at any time before.
     """
-    points = {signal.name: _stored(connection, segment, signal, deadline) for signal in signals}
+    from_s = -math.inf if since else _in_force_s(connection, segment)
+    points = {each.name: _stored(connection, segment, each, deadline, from_s) for each in signals}
     mark = watermark(connection, segment.run_id)
-    before_end = Segment(segment.run_id, float("-inf"), segment.end_s)
-    late = rows_after(connection, before_end, mark)
+    late = rows_after(connection, Segment(segment.run_id, from_s, segment.end_s), mark)
     if late is not None and signals:
         columns = read_columns(connection, late, signals, deadline, after_id=mark)
         for signal in signals:
@@ -62,6 +79,25 @@ def change_points(
     if signals:
         _splice_kept(connection, segment, signals, deadline, points)
     return {name: _from(found, segment.start_s) for name, found in points.items()}
+
+
+def value_ended_s(
+    connection: sqlite3.Connection, segment: Segment, signal: Signal, deadline: Deadline
+) -> float | None:
+    """When the value in force at the begin of a segment ended in it; None where it did not."""
+    stored = _stored(connection, segment, signal, deadline, segment.start_s, most=2)
+    stored = _from(stored, segment.start_s)
+    end_s = just_after(stored[1].sim_time_s) if len(stored) > 1 else segment.end_s
+    first = Segment(segment.run_id, segment.start_s, end_s)
+    points = change_points(connection, first, [signal], deadline, since=False)[signal.name]
+    return points[1].sim_time_s if len(points) > 1 else None
+
+
+def _in_force_s(connection: sqlite3.Connection, segment: Segment) -> float:
+    """The time of the row whose values are in force when the segment begins."""
+    asked = (segment.run_id, segment.start_s)
+    (row_s,) = connection.execute(_ROW_IN_FORCE, asked).fetchone()
+    return segment.start_s if row_s is None else row_s
 
 
 def _splice_kept(
@@ -87,15 +123,23 @@ def _splice_kept(
 
 
 def _stored(
-    connection: sqlite3.Connection, segment: Segment, signal: Signal, deadline: Deadline
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signal: Signal,
+    deadline: Deadline,
+    from_s: float,
+    most: int = -1,
 ) -> list[Point]:
+    """The points from the change table; numbers, which are not in it, from rows since `from_s`."""
     if signal.id is None:
         return []
-    rows = connection.execute(_CHANGES, (segment.run_id, signal.id, segment.end_s))
+    asked = {"run": segment.run_id, "signal": signal.id, "most": most}
+    asked |= {"start": segment.start_s, "end": segment.end_s}
+    rows = connection.execute(_CHANGES, asked)
     if signal.kind == "bool":
         return [Point(time_s, None if value is None else value == "true") for time_s, value in rows]
     points = [Point(time_s, value) for time_s, value in rows]
-    return [*_earlier(connection, segment, signal, points, deadline), *points]
+    return [*_earlier(connection, segment, signal, points, deadline, from_s), *points]
 
 
 def _earlier(
@@ -104,15 +148,19 @@ def _earlier(
     signal: Signal,
     points: list[Point],
     deadline: Deadline,
+    from_s: float,
 ) -> list[Point]:
     """The points from before the first stored one: then it was a number, which has none stored."""
+    if points and points[0].sim_time_s <= segment.start_s:
+        return []
     values = {"run": segment.run_id, "signal": signal.id}
     first = connection.execute(_FIRST_VALUE, values).fetchone()
     end_s = min(points[0].sim_time_s if points else math.inf, segment.end_s)
     if first is None or first[0] is None or first[0] >= end_s:
         return []
     found: list[Point] = []
-    rows = read_columns(connection, Segment(segment.run_id, first[0], end_s), [signal], deadline)
+    before = Segment(segment.run_id, max(first[0], from_s), end_s)
+    rows = read_columns(connection, before, [signal], deadline)
     _append_changes(found, zip(rows.times, rows.values[signal.name], strict=True))
     return found
 

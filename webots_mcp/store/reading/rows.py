@@ -293,9 +293,11 @@ def _count_odd(columns: Columns, signals: Sequence[Signal], odds: Sequence[str |
     """Count what was odd in the newest rows, whose values are there."""
     if not any(odds):
         return
+    told = {odd: odd_names(odd) for odd in set(odds)}  # mostly the same in all rows
+    named = {odd: [each.name for each in signals if each.name in told[odd]] for odd in told}
     for row, odd in enumerate(odds, len(columns.ids) - len(odds)):
-        reasons = odd_names(odd)
-        for name in [signal.name for signal in signals if signal.name in reasons]:
+        reasons = told[odd]
+        for name in named[odd]:
             if is_odd(reasons, name, columns.values[name][row]):
                 columns.odd.setdefault(name, Counter())[reasons[name]] += 1
 

@@ -118,6 +118,26 @@ def test_its_rows_come_page_by_page_each_once(connection: sqlite3.Connection) ->
     assert len(found) == len(query_rows(connection, inside(connection)[1], ["n"], limit=1000).ids)
 
 
+def test_calls_of_one_step_come_each_once_wherever_a_page_ends() -> None:
+    with closing(MemoryDatabase()) as database:
+        robot = InProcessSupervisor("rover")
+        with MCPBridge(robot, throttle_interval=4, database=database) as bridge:
+            for number in range(60):
+                if number % 3 == 0:
+                    robot.step(STEP_MS)
+                bridge.publish({"n": number})
+            bridge.keep("a look")
+        with closing(connect(database, "writer")) as connection:
+            for limit in range(1, 8):
+                found, cursor = list[object](), 0
+                while cursor is not None:
+                    whole = resolve_range(connection)
+                    page = query_rows(connection, whole, ["n"], limit=limit, after_id=cursor)
+                    found += page.values["n"]
+                    cursor = page.cursor
+                assert found == list(range(60))
+
+
 def test_an_answer_says_what_is_kept_and_why(connection: sqlite3.Connection) -> None:
     (note,) = [note for note in ranges(connection)[0].notes if "full rate" in note]
     assert f"n == {HIT}" in note

@@ -72,7 +72,7 @@ def change_points(
     mark = watermark(connection, segment.run_id)
     late = rows_after(connection, Segment(segment.run_id, from_s, segment.end_s), mark)
     if late is not None and signals:
-        columns = read_columns(connection, late, signals, deadline, after_id=mark)
+        columns = read_columns(connection, late, signals, deadline, after=mark)
         for signal in signals:
             new = zip(columns.times, columns.values[signal.name], strict=True)
             _append_changes(points[signal.name], new)

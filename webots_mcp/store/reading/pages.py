@@ -11,13 +11,13 @@ from typing import Final
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import Value
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
-from webots_mcp.store.reading.ranges import Segment, TimeRange, just_after
+from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.rollups import rows_after
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.store.states import fetch_state
+from webots_mcp.store.states import State, fetch_state
 
 MOST_ROWS: Final = 1000
 
@@ -74,11 +74,11 @@ def query_rows(
     room = limit + 1  # one more, to know whether there is a next page
     deadline = Deadline(deadline_s)
     for segment in time_range.segments:
-        rest, beyond = _rest(connection, segment, after_id)
+        rest, after = _rest(connection, segment, after_id)
         if rest is not None and room > 0 and not any(part.cut for part in parts):
             parts.append(
                 read_columns(
-                    connection, rest, signals, deadline, after_id=beyond, limit=room, exact=True
+                    connection, rest, signals, deadline, after=after, limit=room, exact=True
                 )
             )
             room -= len(parts[-1].ids)
@@ -87,18 +87,18 @@ def query_rows(
 
 def _rest(
     connection: sqlite3.Connection, segment: Segment, after_id: int
-) -> tuple[Segment | None, int]:
-    """The part that may have rows after that one, and the id after which they are.
+) -> tuple[Segment | None, int | State]:
+    """The part that may have rows after that one, and after what they come.
 
-    At full rate ids do not rise with time: there the rows after its time are meant.
+    At full rate ids do not rise with time: there the row itself tells its place.
     """
-    if not segment.full_rate or after_id == 0:
-        return rows_after(connection, segment, max(after_id, 0)), max(after_id, 0)
-    row = fetch_state(connection, after_id)
+    if segment.full_rate and after_id == 0:
+        return segment, 0
+    row = fetch_state(connection, after_id) if segment.full_rate else None
     if row is None or row.run_id != segment.run_id:
         return rows_after(connection, segment, max(after_id, 0)), max(after_id, 0)
-    start_s = max(segment.start_s, just_after(row.sim_time_s))
-    return (replace(segment, start_s=start_s) if start_s < segment.end_s else None), 0
+    start_s = max(segment.start_s, row.sim_time_s)
+    return (replace(segment, start_s=start_s) if start_s < segment.end_s else None), row
 
 
 def _page(

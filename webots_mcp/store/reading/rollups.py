@@ -167,7 +167,7 @@ def read_pieces(
     for grain, part in parts:
         pieces.add_rollups(connection, segment.run_id, grain, part, deadline)
     if (late := rows_after(connection, middle, mark)) is not None:
-        pieces.add_rows(read_columns(connection, late, signals, deadline, after_id=mark))
+        pieces.add_rows(read_columns(connection, late, signals, deadline, after=mark))
     pieces.add_rows(read_columns(connection, foot, signals, deadline))
     return pieces
 

@@ -20,6 +20,7 @@ from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.batch import is_odd, odd_names
 from webots_mcp.store.signals.flatten import parse, reductions, shown
 from webots_mcp.store.signals.registry import Signal
+from webots_mcp.store.states import State
 
 orjson: Any
 try:
@@ -38,6 +39,7 @@ _IN_SEGMENT: Final = (
 # negative ids.
 _STATES: Final = (("id", "state"),)
 _EVERY_STATE: Final = (*_STATES, ("-id", "kept_state"))
+_PLACE: Final = "sim_time_s, wall_time_s, abs(row_id), row_id"  # among the rows of both
 KEPT_STATES: Final = (("-id", "kept_state"),)
 _FEWER_THAN: Final = (
     "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = ? AND sim_time_s >= ? "
@@ -126,7 +128,7 @@ def read_columns(
     signals: Sequence[Signal],
     deadline: Deadline,
     *,
-    after_id: int = 0,
+    after: int | State = 0,
     limit: int = -1,
     exact: bool = False,
     tables: Sequence[tuple[str, str]] | None = None,
@@ -138,7 +140,8 @@ def read_columns(
         segment: Which rows.
         signals: Which values of them; none for times only.
         deadline: After it no further rows are read, and the answer says that it was cut.
-        after_id: Only rows with greater ids: those after the watermark, or after a page.
+        after: Only rows with greater ids: those after the watermark, or after a page. Of a segment
+            at full rate, whose ids do not rise with time, the row before.
         limit: At most so many rows; -1 for all.
         exact: Integers beyond 2^63 as they are, of which floats are made elsewhere.
         tables: `KEPT_STATES` for the rows that only kept stretches have; None for all rows of a
@@ -148,10 +151,11 @@ def read_columns(
     decode = exact or len(signals) > MAX_EXTRACTED or any(signal.decoded for signal in signals)
     read = _read_decoded if decode else _read_extracted
     bounds = (segment.run_id, segment.start_s, segment.end_s)
+    after_id, place = (after, None) if isinstance(after, int) else (0, after)
     parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id)
     if tables is None:
         tables = _EVERY_STATE if segment.full_rate and after_id == 0 else _STATES
-    asked = _Rows(tables, parameters, limit)
+    asked = _Rows(tables, parameters, limit, place)
     try:
         with deadline.interrupting(connection):
             read(connection, signals, asked, columns, deadline)
@@ -183,6 +187,7 @@ class _Rows:
     tables: Sequence[tuple[str, str]]
     bounds: tuple[object, ...]
     limit: int
+    after: State | None
 
     def query(self, what: str, paths: Sequence[str] = ()) -> tuple[str, list[object]]:
         """A query for columns after the id, in order, and its values."""
@@ -190,10 +195,16 @@ class _Rows:
             f"SELECT {key} AS row_id, {what} FROM {table} {_IN_SEGMENT}"
             for key, table in self.tables
         ]
-        tie = "wall_time_s" if len(parts) > 1 else "row_id"
         values = [value for _ in parts for value in (*paths, *self.bounds)]
-        query = f"{' UNION ALL '.join(parts)} ORDER BY sim_time_s, {tie} LIMIT ?"
-        return query, [*values, self.limit]
+        order = _PLACE if len(parts) > 1 else "sim_time_s, row_id"
+        query = " UNION ALL ".join(parts)
+        if self.after is not None:
+            row = self.after
+            query = f"SELECT * FROM ({query}) WHERE ({_PLACE}) > (?, ?, ?, ?)"
+            values += [row.sim_time_s, row.wall_time_s, abs(row.id), row.id]
+        elif len(parts) > 1:
+            query = f"SELECT * FROM ({query})"  # a union is ordered by its columns only
+        return f"{query} ORDER BY {order} LIMIT ?", [*values, self.limit]
 
 
 def _read_extracted(

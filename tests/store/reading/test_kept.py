@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+import signal
 import sqlite3
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import closing
+from pathlib import Path
 
 import pytest
 
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
+from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.export.rows import Source
 from webots_mcp.store.questions.events import EventOptions, find_events
@@ -136,6 +141,48 @@ def test_calls_of_one_step_come_each_once_wherever_a_page_ends() -> None:
                     found += page.values["n"]
                     cursor = page.cursor
                 assert found == list(range(60))
+
+
+_KILLED = """
+import os, signal, sys
+from webots_mcp import MCPBridge
+from webots_mcp.standin import InProcessSupervisor
+
+robots = [InProcessSupervisor(name) for name in ("left", "right")]
+bridges = [MCPBridge(robot, data_dir=sys.argv[1], throttle_interval=10) for robot in robots]
+for number in range(501):
+    for robot, bridge in zip(robots, bridges):
+        robot.step(16)
+        if number == 500:
+            bridge.keep("a look")
+        bridge.publish({"n": number})
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no SIGKILL")
+def test_what_was_not_written_of_a_stretch_before_a_kill_is_not_told_as_kept(
+    tmp_path: Path,
+) -> None:
+    line = [sys.executable, "-c", _KILLED, str(tmp_path)]
+    assert subprocess.run(line, check=False).returncode == -signal.SIGKILL
+    with closing(connect(tmp_path / DATABASE_NAME, "writer")) as connection:
+        for robot in ("left", "right"):
+            whole = resolve_range(connection, robot=robot)
+            (note,) = [note for note in whole.notes if "full rate" in note]
+            (run_id,) = [segment.run_id for segment in whole.segments]
+            sql = (
+                "SELECT min(sim_time_s), max(sim_time_s), count(*) FROM kept_state WHERE run_id = ?"
+            )
+            first_s, last_s, rows = connection.execute(sql, (run_id,)).fetchone()
+            assert 0 < rows < 300
+            assert f"-{last_s:.3f} s" in note
+            assert f"rows after {last_s:.3f} s are not written" in note
+            written = resolve_range(connection, robot=robot, start_s=first_s, end_s=last_s)
+            numbers = query_rows(connection, written, ["n"], limit=1000).values["n"]
+            assert numbers == list(range(int(numbers[0] or 0), int(numbers[-1] or 0) + 1))
+            rest = resolve_range(connection, robot=robot, start_s=last_s + STEP_MS / 1000)
+            assert not rest.segments[0].full_rate
 
 
 def test_an_answer_says_what_is_kept_and_why(connection: sqlite3.Connection) -> None:

@@ -22,6 +22,16 @@ _STRETCHES: Final = (
     f"AND typeof(start_sim_time_s) {_IS_NUMBER} AND typeof(end_sim_time_s) {_IS_NUMBER} "
     "ORDER BY start_sim_time_s DESC LIMIT ?"
 )
+# Of a stretch that was not ended, up to when its rows are there, which are written in order; and
+# whether rows that the throttle let through follow each other after that. NULL where it is whole.
+_WRITTEN: Final = (
+    "SELECT CASE WHEN (SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = :run "
+    "AND sim_time_s > time_s AND sim_time_s <= :end LIMIT 2)) = 2 THEN time_s END FROM ("
+    "SELECT coalesce(max(sim_time_s), :start) AS time_s FROM kept_state "
+    "WHERE run_id = :run AND sim_time_s BETWEEN :start AND :end) "
+    "WHERE EXISTS (SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
+    "WHERE r.id = :run AND r.last_sim_time_s < :end AND s.throttle_interval > 1)"
+)
 _IN: Final = "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 _ANY: Final = f"SELECT EXISTS (SELECT 1 FROM {{table}} {_IN})"
 _COUNT: Final = f"SELECT count(*) FROM (SELECT 1 FROM {{table}} {_IN} LIMIT {MOST_ROWS + 1})"
@@ -39,9 +49,19 @@ class KeptStretch(NamedTuple):
 def kept_stretches(
     connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
 ) -> list[KeptStretch]:
-    """The stretches that touch [start_s, end_s) of a run, in order."""
+    """The stretches that touch [start_s, end_s) of a run, in order, as far as they are written."""
     rows = connection.execute(_STRETCHES, (run_id, start_s, end_s, MOST_STRETCHES)).fetchall()
-    return [KeptStretch(*row) for row in reversed(rows)]
+    return [_as_written(connection, run_id, KeptStretch(*row)) for row in reversed(rows)]
+
+
+def _as_written(connection: sqlite3.Connection, run_id: int, stretch: KeptStretch) -> KeptStretch:
+    """A controller that is killed leaves a stretch whose first rows are there, and not the last."""
+    values = {"run": run_id, "start": stretch.start_s, "end": stretch.end_s}
+    (until_s,) = connection.execute(_WRITTEN, values).fetchone() or (None,)
+    if until_s is None:
+        return stretch
+    reason = f"{stretch.reason}; rows after {until_s:.3f} s are not written"
+    return stretch._replace(end_s=until_s, reason=reason)
 
 
 def kept_parts(

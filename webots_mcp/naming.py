@@ -36,6 +36,7 @@ USUAL_POSITIONS: Final = (
     *_AXES[1:],  # at the top
 )
 NO_POSITION: Final = "no position is known: publish pose: [x, y], position: {x, y} or gps in metres"
+NAME_POSITION: Final = f"{NO_POSITION}, or name the signals of both: position=[x, y]"
 _LONGEST_COMPARED: Final = 100  # characters of a name
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from tests.recordings.rover import GAP_S, NAN_S, STUCK_S, WALL_START_S
 from tests.recordings.rows import Recorded
-from tests.server.conftest import ask, fail, pictures_of, text_of
+from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
 from tests.server.story import WAYS, Way, client_on, copy_of, rows_of, write_story
 from webots_mcp.connection import connect
 from webots_mcp.store.detection.event import EventOptions
@@ -58,6 +58,27 @@ async def test_since_when_is_it_stuck_is_one_call_in_both_eras_and_over_stdio(
     assert stuck["start_s"] == pytest.approx(STUCK_S[0], abs=0.2)
     assert stuck["duration_s"] == pytest.approx(STUCK_S[1] - STUCK_S[0], abs=0.3)
     assert (stuck["details"]["mode"], stuck["@mode"], stuck["@pose.0"]) == ("cruise", "cruise", 8.0)
+
+
+async def test_position_and_mode_can_be_named(recorded: Recorded, connect: Connect) -> None:
+    robot = recorded.robot()
+    for step in range(200):
+        x_mm = 30.0 * min(step, 100)  # it drives 3 m in 10 s, and stands
+        robot.state(step * 0.1, {"lage": {"xMm": x_mm, "yMm": 0.0}, "betriebsart": 1})
+    named = {"position": ["lage.xMm", "lage.yMm"], "mode": "betriebsart"}
+    async with connect(read_only=True) as client:
+        unnamed = await ask(client, "webots_find_events", kinds=["stuck"])
+        assert "position=[x, y]" in str(unnamed["verdicts"]["not_searched"])
+        answer = await ask(client, "webots_find_events", kinds=["stuck"], **named)
+        (stuck,) = rows_of(answer["events"])
+        assert stuck["start_s"] == pytest.approx(10.0, abs=0.2)
+        assert stuck["details"]["x_m"] == pytest.approx(3.0, abs=0.05)
+        compared = await ask(client, "webots_compare_runs", run_ids=[robot.run_id], **named)
+        medians = {each["name"]: each["median"] for each in rows_of(compared["measures"])}
+        assert medians["distance_m"] == [pytest.approx(3.0, rel=0.05)]
+        assert medians["share of 1"] == [1.0]
+        wrong = await fail(client, "webots_compare_runs", position=["lage.xMm"])
+        assert "position" in wrong
 
 
 async def test_every_answer_says_about_which_robot_and_run_and_as_of_when(story: Path) -> None:

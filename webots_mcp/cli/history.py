@@ -151,6 +151,13 @@ def trends(arguments: argparse.Namespace) -> None:
     print_notes(found.notes)
 
 
+MOTION: Final[tuple[Argument, ...]] = (
+    argument("--position", nargs=2, metavar=("X", "Y"),
+             help="the signals of the position, if their names do not tell"),
+    argument("--mode", metavar="NAME", help="the signal of the mode, a text or a number"),
+)  # fmt: skip
+
+
 @question(
     "events", DATA_DIR, DATABASE, *RANGE, JSON,
     argument("--kind", action="append", metavar="KIND", help="only this kind; may be repeated"),
@@ -161,6 +168,7 @@ def trends(arguments: argparse.Namespace) -> None:
     argument("--below", type=float, metavar="X", help="where the signals were below X"),
     argument("--for", type=float, default=0.0, dest="for_s", metavar="S",
              help="for at least S simulated seconds"),
+    *MOTION,
     count("-n", "at most N events", default=50),
     argument("--after", metavar="CURSOR", help="what an answer with that cursor left out"),
 )  # fmt: skip
@@ -254,13 +262,18 @@ def write_picture(file: Path, picture: Picture) -> None:
     argument("--trials", type=int, dest="trial_set", metavar="SET",
              help="the runs of a trial set, by their parameters"),
     argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
+    *MOTION,
     count("-n", "the N that differ most", default=15),
 )  # fmt: skip
 def compare(arguments: argparse.Namespace) -> None:
     """What runs came to: distance, time per mode, events, and the signals that differ most."""
+    from webots_mcp.store.detection.event import EventOptions, both_of
     from webots_mcp.store.questions.compare import compare_code, compare_runs, compare_trials
 
-    wanted: dict[str, Any] = {"names": arguments.signal or ["*"], "limit": arguments.limit}
+    options = EventOptions(position=both_of(arguments.position), mode=arguments.mode)
+    wanted: dict[str, Any] = {
+        "names": arguments.signal or ["*"], "limit": arguments.limit, "options": options,
+    }  # fmt: skip
     if arguments.run_ids and arguments.trial_set is not None:
         raise InvalidInputError("name runs or give --trials, not both")
     with reading(arguments) as connection:
@@ -290,7 +303,7 @@ def scope_of(arguments: argparse.Namespace) -> Scope:
 
 
 def _options(arguments: argparse.Namespace) -> EventOptions:
-    from webots_mcp.store.detection.event import EventOptions
+    from webots_mcp.store.detection.event import EventOptions, both_of
     from webots_mcp.store.detection.threshold import thresholds_on
 
     limits = thresholds_on(
@@ -302,6 +315,8 @@ def _options(arguments: argparse.Namespace) -> EventOptions:
         signals=tuple(arguments.signal or "*"),
         thresholds=limits,
         where=arguments.where,
+        position=both_of(arguments.position),
+        mode=arguments.mode,
     )
 
 

@@ -108,6 +108,14 @@ RunIds = Annotated[
     list[Id] | None,
     Field(max_length=10, description="From webots_list_runs."),
 ]
+Position = Annotated[
+    list[Annotated[str, Field(max_length=LONGEST_NAME)]] | None,
+    Field(min_length=2, max_length=2, description="Signals of x and y, if not found by name."),
+]
+Mode = Annotated[
+    str | None,
+    Field(max_length=LONGEST_NAME, description="Signal of the mode, if not found by name."),
+]
 # What a client gives for a `Scope`, which tools take whole.
 SCOPE: Final = {
     "last_s": LastS,

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.recordings.rover import Recorder
+from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
 from webots_mcp.store.questions.outcomes import Measure
 
@@ -70,6 +71,26 @@ def test_what_no_run_has_is_told_as_not_known(empty: sqlite3.Connection) -> None
     assert "distance_m" not in {each.name for each in found.measures}
     (names,) = (names for names, why in found.not_known.items() if "no position is known" in why)
     assert names.split(", ") == ["distance_m", "mean_speed_m_s", "still per min", "stuck per min"]
+
+
+def with_names_of_its_own(time_s: float) -> dict[str, Any]:
+    """In millimetres, with a mode that is a number; it stands from 10 to 16 and 28 to 34 s."""
+    x, y = stuck_twice(time_s)["pose"]
+    return {"lage": {"xMm": 1000 * x, "yMm": 1000 * y}, "betriebsart": 1 if time_s < 30 else 2}
+
+
+def test_who_asks_names_the_position_and_a_mode_that_is_a_number(
+    empty: sqlite3.Connection,
+) -> None:
+    record(empty, "a", with_names_of_its_own)
+    (why,) = (why for names, why in compare_runs(empty, [1]).not_known.items() if "stuck" in names)
+    assert "position=[x, y]" in why
+    options = EventOptions(position=("lage.xMm", "lage.yMm"), mode="betriebsart")
+    found = compare_runs(empty, [1], options=options)
+    assert medians(measure(found, "distance_m")) == [pytest.approx(0.3 * 28, rel=0.05)]
+    assert medians(measure(found, "stuck per min")) == [pytest.approx(3.0, abs=0.02)]
+    assert medians(measure(found, "share of 1")) == [pytest.approx(0.75, abs=0.01)]
+    assert medians(measure(found, "share of 2")) == [pytest.approx(0.25, abs=0.01)]
 
 
 def test_a_run_without_a_mode_was_in_no_mode_for_no_known_time(empty: sqlite3.Connection) -> None:

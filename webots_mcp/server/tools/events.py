@@ -26,11 +26,13 @@ from webots_mcp.server.parameters import (
     AnyNames,
     Kinds,
     LogLevel,
+    Mode,
+    Position,
     ShownLimit,
     TextCursor,
 )
 from webots_mcp.server.results import Table
-from webots_mcp.store.detection.event import Event, EventOptions, Threshold
+from webots_mcp.store.detection.event import Event, EventOptions, Threshold, both_of
 from webots_mcp.store.detection.threshold import thresholds_on
 from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.questions.events import Events, Found, search_events
@@ -65,6 +67,8 @@ def webots_find_events(
     stuck_m: Annotated[
         float, Field(gt=0, description="... stays within so many metres (more if noisy).")
     ] = EventOptions.stuck_m,
+    position: Position = None,
+    mode: Mode = None,
     log_level: LogLevel = "warning",
     limit: ShownLimit = None,
     cursor: TextCursor = "",
@@ -82,6 +86,8 @@ def webots_find_events(
         thresholds=thresholds,
         stuck_s=stuck_s,
         stuck_m=stuck_m,
+        position=both_of(position),
+        mode=mode,
         log_level=log_level,
     )
     with recording.view(scope.robot, scope.run_id) as view:

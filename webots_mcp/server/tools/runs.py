@@ -31,6 +31,8 @@ from webots_mcp.server.parameters import (
     AnyNames,
     Cursor,
     Limit,
+    Mode,
+    Position,
     RobotName,
     RunId,
     RunIds,
@@ -40,6 +42,7 @@ from webots_mcp.server.parameters import (
 from webots_mcp.server.results import Table
 from webots_mcp.server.shortening import DETAIL_BUDGET, WHOLE, shorten
 from webots_mcp.store.analysis.spread import Spread
+from webots_mcp.store.detection.event import EventOptions, both_of
 from webots_mcp.store.questions.compare import (
     Comparison,
     Difference,
@@ -124,6 +127,8 @@ def webots_compare_runs(
     signals: AnyNames = None,
     limit: ShownLimit = None,
     trial_set: TrialSetId = None,
+    position: Position = None,
+    mode: Mode = None,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
@@ -135,10 +140,13 @@ def webots_compare_runs(
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
+    options = EventOptions(position=both_of(position), mode=mode)
     first = run_ids[0] if run_ids else _first_run(recording, trial_set) if trial_set else None
     with recording.view(robot, first) as view:
         return answer_about(
-            view, ComparisonAnswer, lambda: _compared(view, run_ids, trial_set, signals, limit)
+            view,
+            ComparisonAnswer,
+            lambda: _compared(view, run_ids, trial_set, signals, limit, options),
         )
 
 
@@ -235,14 +243,16 @@ def _compared(
     set_id: int | None,
     names: Sequence[str] | None,
     limit: int | None,
+    options: EventOptions,
 ) -> dict[str, Any]:
-    wanted, most = names or ("*",), limit or DEFAULT_DIFFERENCES
+    asked: dict[str, Any] = {"names": names or ("*",), "options": options}
+    asked["limit"] = limit or DEFAULT_DIFFERENCES
     if run_ids:
-        found = compare_runs(view.connection, run_ids, names=wanted, limit=most)
+        found = compare_runs(view.connection, run_ids, **asked)
     elif set_id:
-        found = compare_trials(view.connection, set_id, names=wanted, limit=most)
+        found = compare_trials(view.connection, set_id, **asked)
     else:
-        found = compare_code(view.connection, robot=view.robot.name, names=wanted, limit=most)
+        found = compare_code(view.connection, robot=view.robot.name, **asked)
     differing = [each for each in found.differences if _differs(each)]
     groups, measures = _groups(found), _measures(found)
     told = [str(table.rows) for table in (groups, measures) if table]

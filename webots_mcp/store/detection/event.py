@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -61,6 +62,19 @@ class Threshold:
         return value > self.above if self.above is not None else value < (self.below or 0.0)
 
 
+def both_of(names: Sequence[str] | None) -> tuple[str, str] | None:
+    """The signals of x and y that were named, if any.
+
+    Raises:
+        InvalidInputError: They are not two.
+    """
+    if names is None:
+        return None
+    if len(names) != 2:
+        raise InvalidInputError(f"position={list(names)} must name two signals, of x and of y")
+    return names[0], names[1]
+
+
 @dataclass(frozen=True)
 class EventOptions:
     """What counts as an event.
@@ -71,7 +85,8 @@ class EventOptions:
         signals: Names, with `*`, of the signals that are looked at.
         position: The two signals of the position in metres; None finds them by name (`pose.0`
             and `pose.1`, `position.x` and `position.y`, `gps.0` and so on).
-        mode: The text signal of the mode; None finds it by name (`mode`, `state`, ...).
+        mode: The signal of the mode, a text or a number; None finds a text by name (`mode`,
+            `state`, ...).
         moving_modes: Modes in which the robot should move; None for those in which it has been
             seen moving, in this run or an earlier one.
         commanded: The signal of the commanded speed; None finds it by name (`commanded`, `cmd`,

@@ -21,6 +21,7 @@ from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.habits import MovedIn
 from webots_mcp.store.detection.motion import Motion, tracks_in
 from webots_mcp.store.reading.rows import Columns
+from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal
 
 Flags = NDArray[np.bool_]
@@ -120,7 +121,7 @@ def _by_mode(
     """Rows whose mode is one in which this robot moves."""
     if motion.mode is None or motion.mode.name not in columns.values:
         return np.zeros(len(columns.times), np.bool_), [], []
-    modes = columns.values[motion.mode.name]
+    modes = [shown(mode) for mode in columns.values[motion.mode.name]]
     reasons = {mode: _moves_in(mode, options, moved_in) for mode in dict.fromkeys(modes)}
     why = [reason for reason in reasons.values() if reason]
     against = [

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from webots_mcp.naming import NO_POSITION
+from webots_mcp.naming import NAME_POSITION
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.standstill import find_standstills
 from webots_mcp.store.analysis.track import Track, tracks_of
@@ -68,7 +68,7 @@ def find_standings(search: Search) -> Standings:
     """Find them once for all kinds that tell of them."""
     position = search.motion.position
     if position is None:
-        raise NotSearchableError(NO_POSITION)
+        raise NotSearchableError(NAME_POSITION)
     columns = search.view.places(search.motion.evidence, search.options.stuck_s)
     tracks = _tracks(search, position, columns)
     found = _standings(search, tracks, columns)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
-from webots_mcp.naming import NO_POSITION
+from webots_mcp.naming import NAME_POSITION
 from webots_mcp.store.analysis.spread import (
     Spread,
     Verdict,
@@ -33,8 +33,7 @@ SAMPLE_S: Final = 0.5  # between the positions from which a long run's distance 
 _SHARE: Final = "share of "
 _RATE: Final = " per min"
 NO_MODE: Final = (
-    "no mode is known: publish one as a text, such as mode; webots_get_trends tells the time in "
-    "each value of any text, webots_find_events(where='NAME == 1') when a number had a value"
+    "no mode is known: publish one as a text, such as mode, or name the signal of one: mode=NAME"
 )
 _SPEED: Final = "mean_speed_m_s"
 
@@ -194,7 +193,7 @@ def _outcome(
     figures: dict[str, float | None] = {}
     not_known: dict[str, str] = {}
     if part.motion.position is None:
-        not_known["distance_m, mean_speed_m_s"] = NO_POSITION
+        not_known["distance_m, mean_speed_m_s"] = NAME_POSITION
     else:
         distance_m = None if purged else _distance(connection, part, deadline)
         speed = None if distance_m is None else distance_m / duration_s

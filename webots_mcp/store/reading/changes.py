@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import pairwise
 from typing import Final, NamedTuple
 
@@ -14,6 +15,7 @@ from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rollups import rows_after
 from webots_mcp.store.reading.rows import read_columns
 from webots_mcp.store.rollup.rolling import watermark
+from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal
 
 MOST_VALUES: Final = 20
@@ -54,7 +56,7 @@ def change_points(
     *,
     since: bool = True,
 ) -> dict[str, list[Point]]:
-    """The change points of text and boolean signals in a segment, at any length of it.
+    """The change points of signals in a segment, at any length of it.
 
     The first point is the value in force when the segment begins; its time may lie before. They
     come from the change table, and from the rows after the watermark until the deadline.
@@ -62,13 +64,16 @@ def change_points(
     Args:
         connection: Any.
         segment: Which stretch.
-        signals: Text and flags.
+        signals: Text and flags; of numbers, each counts as its text, and all rows are read.
         deadline: For all reading.
         since: Whether it matters when the value in force at the begin began. Without it no rows
             before the segment are read, and that point may lie at any time before.
     """
     from_s = -math.inf if since else _in_force_s(connection, segment)
-    points = {each.name: _stored(connection, segment, each, deadline, from_s) for each in signals}
+    numbers = [each for each in signals if each.is_number]
+    points = _of_numbers(connection, segment, numbers, deadline) if numbers else {}
+    signals = [each for each in signals if not each.is_number]
+    points |= {each.name: _stored(connection, segment, each, deadline, from_s) for each in signals}
     mark = watermark(connection, segment.run_id)
     late = rows_after(connection, Segment(segment.run_id, from_s, segment.end_s), mark)
     if late is not None and signals:
@@ -79,6 +84,19 @@ def change_points(
     if signals:
         _splice_kept(connection, segment, signals, deadline, points)
     return {name: _from(found, segment.start_s) for name, found in points.items()}
+
+
+def _of_numbers(
+    connection: sqlite3.Connection, segment: Segment, signals: Sequence[Signal], deadline: Deadline
+) -> dict[str, list[Point]]:
+    """Of numbers no change is stored; the one in force at the begin stands in the row before."""
+    from_s = _in_force_s(connection, segment)
+    columns = read_columns(connection, replace(segment, start_s=from_s), signals, deadline)
+    points: dict[str, list[Point]] = {each.name: [] for each in signals}
+    for name, found in points.items():
+        texts = [shown(value) for value in columns.values[name]]
+        _append_changes(found, zip(columns.times, texts, strict=True))
+    return points
 
 
 def value_ended_s(

@@ -278,3 +278,29 @@ def test_an_export_has_each_call_once_and_in_order(
     numbers = [row.values["n"] for row in kept.rows()]
     assert numbers == [row.values["n"] for row in every.rows()]
     assert len(numbers) == kept.total
+
+
+@pytest.mark.parametrize(
+    ("interval", "every", "leans"), [(10, 7, True), (10, 2500, False), (1, 7, False)]
+)
+def test_a_mean_that_leans_towards_the_hits_of_a_breakpoint_is_told(
+    interval: int, every: int, leans: bool
+) -> None:
+    with closing(MemoryDatabase()) as database:
+        robot = InProcessSupervisor("rover")
+        with MCPBridge(robot, throttle_interval=interval, database=database) as bridge:
+            bridge.breakpoint("v > 5", "log")
+            for number in range(2000):
+                robot.step(STEP_MS)
+                bridge.publish({"v": 1.0 if number % every else 10.0})
+        with closing(connect(database, "writer")) as connection:
+            whole = resolve_range(connection)
+            mean = (
+                query_history(connection, whole, ["v"], max_points=1).runs[0].numbers[0].whole.mean
+            )
+    truth = 1 + 9 / every
+    assert mean is not None
+    assert (abs(mean - truth) > 0.1 * truth) is leans
+    rows = len({n for n in range(2000) if (n + 1) % interval == 0 or n % every == 0})
+    text = f"of {rows} rows of run 1 up to 286 are there because a breakpoint was hit"
+    assert [text in note for note in whole.notes] == [True] * leans

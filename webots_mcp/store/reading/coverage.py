@@ -19,6 +19,23 @@ _ROW_IN: Final = (
 _LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 _FIRST_FROM: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s >= ?"
 
+# Of the rows of a throttled recording those that a breakpoint's hit let through: so many at least,
+# and how many rows there are, counted no further than matters.
+_HITS: Final = (
+    "SELECT count(*) FROM (SELECT 1 FROM event WHERE run_id = :run AND sim_time_s >= :start "
+    "AND sim_time_s < :end AND kind = 'breakpoint' GROUP BY sim_time_s LIMIT :most)"
+)
+_ROWS: Final = (
+    "SELECT count(*) FROM (SELECT 1 FROM state WHERE run_id = :run AND sim_time_s >= :start "
+    "AND sim_time_s < :end LIMIT :most)"
+)
+_IS_THROTTLED: Final = (
+    "SELECT 1 FROM run r JOIN session s ON s.id = r.session_id "
+    "WHERE r.id = ? AND s.throttle_interval > 1"
+)
+_MOST_HITS: Final = 1000
+_LEAST_ROWS_PER_HIT: Final = 200  # fewer than 0.5 % of the rows hardly move a mean
+
 
 def row_before(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float | None:
     """The time of a run's newest row before a time; None where there is none."""
@@ -68,3 +85,20 @@ def _gap_notes(
     after_s = connection.execute(_FIRST_FROM, (run_id, end_s)).fetchone()[0]
     if before_s is not None and after_s is not None:
         yield f"no row: nothing was recorded between {before_s:g} and {after_s:g} s of run {run_id}"
+
+
+def hit_notes(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> Iterator[str]:
+    """That means lean towards the rows that a breakpoint's hits have added to a throttled run."""
+    if connection.execute(_IS_THROTTLED, (run_id,)).fetchone() is None:
+        return
+    values = {"run": run_id, "start": start_s, "end": end_s, "most": _MOST_HITS}
+    (hits,) = connection.execute(_HITS, values).fetchone()
+    values["most"] = _LEAST_ROWS_PER_HIT * hits
+    (rows,) = connection.execute(_ROWS, values).fetchone()
+    if hits and rows < _LEAST_ROWS_PER_HIT * hits:
+        yield (
+            f"of {rows} rows of run {run_id} up to {hits} are there because a breakpoint was hit: "
+            "means and counts of rows lean towards them"
+        )

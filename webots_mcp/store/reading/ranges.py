@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
-from webots_mcp.store.reading.coverage import coverage_notes, purge_notes
+from webots_mcp.store.reading.coverage import coverage_notes, hit_notes, purge_notes
 from webots_mcp.store.reading.kept import is_at_full_rate, kept_notes
 from webots_mcp.store.reading.moments import moment_of, shown_time
 from webots_mcp.store.reading.subject import Subject, find_subject
@@ -278,9 +278,16 @@ def _in_simulation_time(
     segment = Segment(run_id, start, end, open_start=start_s is None, open_end=end_s is None)
     notes = [*coverage_notes(connection, run_id, (start, end), bounds)]
     notes += _too_young(connection, subject, last_s, newest_s - first_s)
-    notes += kept_notes(connection, run_id, start, end)
-    segments = (_rated(connection, segment),)
-    return TimeRange(subject.robot_id, subject.robot, segments, "simulation", tuple(notes))
+    segment = _rated(connection, segment)
+    notes += _rate_notes(connection, segment)
+    return TimeRange(subject.robot_id, subject.robot, (segment,), "simulation", tuple(notes))
+
+
+def _rate_notes(connection: sqlite3.Connection, segment: Segment) -> list[str]:
+    """Where more than what the throttle lets through is a row."""
+    span = (segment.run_id, segment.start_s, segment.end_s)
+    hits = () if segment.full_rate else hit_notes(connection, *span)
+    return [*kept_notes(connection, *span), *hits]
 
 
 def _too_young(
@@ -316,7 +323,7 @@ def _in_wall_time(
     notes = [] if segments else [f"no row of robot {subject.robot!r} in that wall time"]
     for segment in segments:
         notes += purge_notes(connection, segment.run_id, segment.start_s)
-        notes += kept_notes(connection, segment.run_id, segment.start_s, segment.end_s)
+        notes += _rate_notes(connection, segment)
     if len(runs) > MOST_RUNS:
         notes.append(f"only the newest {MOST_RUNS} runs in that wall time are looked at")
     return TimeRange(subject.robot_id, subject.robot, segments, "wall", tuple(notes))

@@ -101,3 +101,10 @@ def test_narrow_bends_of_a_slow_robot_are_no_turns_on_the_spot() -> None:
     tracks = [noisy_track(bends, 0.5, 0.03, seed) for seed in range(8)]
     ratios = [path_length_m(track) / length_m for track, length_m in tracks]
     assert float(np.median(ratios)) == pytest.approx(1.0, abs=0.05)
+
+
+@pytest.mark.parametrize("noise_m", [0.005, 0.01, 0.03])
+def test_of_many_robots_at_rest_hardly_one_is_said_to_have_moved(noise_m: float) -> None:
+    tracks = [noisy_track([(120.0, 0.0, 0.0)], 0.008, noise_m, seed)[0] for seed in range(15)]
+    moved_m = [path_length_m(track) for track in tracks]
+    assert np.count_nonzero(moved_m) <= 1

@@ -49,7 +49,7 @@ def smooth(values: Array, rows: int) -> tuple[Array, float]:
     Chemistry 36, 1964): a bend that is long beside the window stays as it is. At the ends the
     parabola through the first or last window is taken.
     """
-    rows = min(rows, len(values) - 1 + len(values) % 2)
+    rows = _fitting(rows, len(values))
     if rows < FEWEST_SMOOTHED:
         return values, 1.0
     fit = _parabola(rows)
@@ -58,6 +58,25 @@ def smooth(values: Array, rows: int) -> tuple[Array, float]:
     smoothed[:half] = (fit @ values[:rows])[:half]
     smoothed[-half:] = (fit @ values[-rows:])[-half:]
     return smoothed, float(np.sqrt(fit[half] @ fit[half]))
+
+
+def variance_along(count: int, rows: int) -> Array:
+    """Of the noise in each of so many smoothed values, as a ratio to that of those in the middle.
+
+    The parabola is less certain at the ends: there it is up to four times as much.
+    """
+    variance = np.ones(count)
+    rows = _fitting(rows, count)
+    if rows >= FEWEST_SMOOTHED:
+        fit, half = _parabola(rows), rows // 2
+        ratios = np.einsum("ij,ij->i", fit, fit) / (fit[half] @ fit[half])
+        variance[:half], variance[-half:] = ratios[:half], ratios[-half:]
+    return variance
+
+
+def _fitting(rows: int, count: int) -> int:
+    """An odd number of rows that are not more than there are."""
+    return min(rows, count - 1 + count % 2)
 
 
 def kept_alike(rows: int) -> Array:

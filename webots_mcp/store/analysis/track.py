@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import log, sqrt
 from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, Indexes, np
-from webots_mcp.store.analysis.noise import FEWEST_SMOOTHED, kept_alike, noise_of, smooth
+from webots_mcp.store.analysis.noise import (
+    FEWEST_SMOOTHED,
+    kept_alike,
+    noise_of,
+    smooth,
+    variance_along,
+)
 from webots_mcp.store.analysis.rhythm import rhythm_of
 
-LEG_NOISE: Final = 7.0  # a leg is longer than so many deviations of the smoothed position
+FALSE_LEGS: Final = 0.003  # so many may noise alone make of a robot at rest, on average
+GAP_NOISE: Final = 7.0  # deviations of the position: so far it went at least during a gap
 FINEST_LEG_M: Final = 0.02  # smoothing that makes legs so short is enough
 SHARPEST_ARC_RAD: Final = 2.7  # from leg to leg; who turns farther went back
 LONGEST_SMOOTHING_S: Final = 1.2  # a turn of 1.5 rad/s is cut by 0.7 % then, by 5 % in 2 s
@@ -90,19 +98,31 @@ def _smoothing_rows(times: Array, noise_m: float) -> int:
     interval_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     if noise_m == 0 or interval_s <= 0:
         return 1
-    wanted = _PARABOLA_GAIN * (LEG_NOISE * noise_m / FINEST_LEG_M) ** 2
+    wanted = _PARABOLA_GAIN * (_leg_noise(len(times), 1) * noise_m / FINEST_LEG_M) ** 2
     most = max(FEWEST_SMOOTHED, LONGEST_SMOOTHING_S / interval_s)
     return 2 * int(min(wanted, most) / 2) + 1
+
+
+def _leg_noise(rows: int, smoothed_rows: int) -> float:
+    """How many deviations of the smoothed position a leg is longer than.
+
+    Of two places that noise alone tells apart the distance is above d deviations with a probability
+    of exp(-d**2 / 4) (Rayleigh); the more independent places there are, the more pairs are.
+    """
+    places = rows * min(1.0, _PARABOLA_GAIN / smoothed_rows)
+    return sqrt(4 * log(max(places, 2.0) / FALSE_LEGS))
 
 
 def path_length_m(track: Track) -> float:
     """Metres travelled: the sum of legs that are longer than noise makes them.
 
     From row to row a noise of 1 cm would add up to metres while the robot stands still. A leg ends
-    where the smoothed position is 7 standard deviations of what is left of the noise away from
-    where it began; what is shorter at the end is left out. Across its direction that noise makes a
-    leg longer (along it the next one makes up for it), which is taken off again; and the way is
-    longer than a leg by as much as an arc is, that turns from one leg to the next as they do.
+    where the smoothed position is 6.6 (of 200 independent places) to 8.9 (of a million) standard
+    deviations of what is left of the noise away from where it began; within half a window of an
+    end, where more is left, of that. What is shorter at the end is left out. Across its direction
+    that noise makes a leg longer (along it the next one makes up for it), which is taken off
+    again; and the way is longer than a leg by as much as an arc is, that turns from one leg to the
+    next as they do.
     """
     corners = _corners(track)
     along, across = np.diff(track.x[corners]), np.diff(track.y[corners])
@@ -119,11 +139,17 @@ def path_length_m(track: Track) -> float:
 
 def _corners(track: Track) -> Indexes:
     """The rows in which one leg ends and the next begins."""
-    shortest_m2 = (LEG_NOISE * track.left_m) ** 2
-    corners: list[int] = []
+    variance = variance_along(len(track.times), track.smoothed_rows)
+    shortest_m2 = (_leg_noise(len(variance), track.smoothed_rows) * track.left_m) ** 2 / 2
+    away_m2 = (track.x - track.x[:1]) ** 2 + (track.y - track.y[:1]) ** 2
+    first = np.flatnonzero(away_m2 > shortest_m2 * (variance + variance[:1]))[:1]
+    corners: list[int] = [0] if len(variance) else []
     from_x = from_y = np.inf
-    for row, (x, y) in enumerate(zip(track.x.tolist(), track.y.tolist(), strict=True)):
-        if (x - from_x) ** 2 + (y - from_y) ** 2 > shortest_m2:
+    going = slice(int(first[0]), None) if len(first) else slice(0, 0)
+    limits = shortest_m2 * (variance + 1)
+    places = zip(*(each[going].tolist() for each in (track.x, track.y, limits)), strict=True)
+    for row, (x, y, limit) in enumerate(places, going.start):
+        if (x - from_x) ** 2 + (y - from_y) ** 2 > limit:
             corners.append(row)
             from_x, from_y = x, y
     return np.array(corners, np.intp)
@@ -138,5 +164,5 @@ def travelled_m(tracks: list[Track]) -> float:
         float(np.hypot(after.x[0] - before.x[-1], after.y[0] - before.y[-1]))
         for before, after in pairwise(tracks)
     ]
-    least_m = LEG_NOISE * max((track.noise_m for track in tracks), default=0.0)
+    least_m = GAP_NOISE * max((track.noise_m for track in tracks), default=0.0)
     return sum(map(path_length_m, tracks)) + sum(way_m for way_m in across_m if way_m > least_m)

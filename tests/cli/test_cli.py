@@ -139,7 +139,9 @@ def test_a_file_that_is_no_database_is_one_line_and_exit_code_2(
     file = tmp_path / "notes.txt"
     file.write_text("certainly no database, " * 100)
     assert main(["status", "--database", str(file)]) == 2
-    assert "not a database" in capsys.readouterr().err
+    assert (
+        "is no SQLite database: name the one that a bridge records into" in capsys.readouterr().err
+    )
 
 
 def test_the_tail_ends_with_the_newest_lines_of_every_kind(

@@ -203,6 +203,22 @@ def test_a_run_that_does_not_exist_cannot_be_kept(
     assert "no run 9" in complaint(capsys, "keep", "9", "--database", str(database))
 
 
+@pytest.mark.parametrize("words", [["label", "9", "good"], ["compare", "9"]])
+def test_where_a_run_has_to_be_named_nobody_is_told_to_leave_it_out(
+    words: list[str], database: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = complaint(capsys, *words, "--database", str(database))
+    assert "no run 9: the newest runs are [" in said
+    assert "leave" not in said
+
+
+def test_a_plan_that_is_not_there_is_bad_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = complaint(capsys, "trials", str(tmp_path / "nix.toml"))
+    assert "nix.toml cannot be read: No such file" in said
+
+
 @pytest.mark.parametrize("limit", ["", "none", "500", "5 parsecs", "1GB,2GB", "-3d", "1GB;2d"])
 def test_a_limit_that_is_none_is_told_how_to_write_one(
     limit: str, database: Path, capsys: pytest.CaptureFixture[str]

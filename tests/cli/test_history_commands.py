@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.recordings.rows import Recorded
 from tests.server.story import write_story
 from webots_mcp.cli import COMMANDS, main
 from webots_mcp.cli.tables import print_table, text_of
@@ -82,6 +83,33 @@ def test_compare_says_what_differs(say: Say) -> None:
     assert line_with(say("compare"), "commanded_m_s", "0.2", "0.3")
     assert line_with(say("compare"), "mean_speed_m_s", "0.2", "0.3")
     assert line_with(say("compare", "1", "3"), "mean run 1", "mean run 3", "effect run 3")
+
+
+def test_compare_says_how_runs_ended_with_which_code_and_what_only_some_of_them_have(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    published = {"arm": {"grip": 1.0, "reach": 2.0}, "rover": {"speed": 3.0}}
+    for name, reason in zip(published, ("finished", "crashed"), strict=True):
+        robot = recorded.robot(name)
+        for step in range(60):
+            robot.state(step / 10, published[name])
+        robot.end_run(reason)
+    recorded.close()
+    assert main(["compare", "1", "2", "--data-dir", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert line_with(said, "run 1 ", "finished", "aaaaaaaa")
+    assert line_with(said, "run 2 ", "crashed", "aaaaaaaa")
+    assert line_with(said, "note: only in run 1: grip, reach")
+    assert line_with(said, "note: only in run 2: speed")
+    assert "what differs most first" not in said
+
+
+def test_json_names_the_fields_of_what_it_has(say: Say) -> None:
+    summary = json.loads(say("trends", "pose.0", "--run", "3", "--json"))["runs"][0]["numbers"][0]
+    assert summary["summary"]["rows"] == 600
+    spread = json.loads(say("compare", "1", "3", "--json"))["measures"][0]["spread"][0]
+    assert set(spread) == {"median", "low", "high"}
 
 
 @pytest.mark.parametrize(("name", "start"), [("a.png", b"\x89PNG"), ("a.svg", b"<?xml")])

@@ -6,10 +6,10 @@ import argparse
 import json
 import sqlite3
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, fields, is_dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, cast
 
 from webots_mcp.cli.command import (
     DATA_DIR,
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.questions.trends import RunTrends, StateTrend
     from webots_mcp.store.reading.ranges import Scope, TimeRange
 
+_MOST_NAMED: Final = 20
 RUN: Final = argument(
     "--run", type=int, dest="run_id", metavar="ID", help="that run instead of the newest one"
 )
@@ -324,7 +325,18 @@ def print_json(found: Any) -> None:
     """Print the answer of a question, a dataclass, as one object."""
     assert is_dataclass(found)
     assert not isinstance(found, type)
-    print(json.dumps(asdict(found), ensure_ascii=False))
+    print(json.dumps(_with_names(asdict(found)), ensure_ascii=False))
+
+
+def _with_names(value: Any) -> Any:
+    """The fields of named tuples by their names; JSON by itself knows them as lists."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    if isinstance(value, dict):
+        return {name: _with_names(each) for name, each in cast("dict[Any, Any]", value).items()}
+    if isinstance(value, (list, tuple)):
+        return [_with_names(each) for each in cast("Sequence[Any]", value)]
+    return value
 
 
 def _clock(wall_time_s: float) -> str:
@@ -391,11 +403,13 @@ def _print_comparison(found: Comparison) -> None:
             group.name,
             ", ".join(str(run.run_id) for run in group.runs),
             group.total_duration_s,
+            _each(run.end_reason or "going on" for run in group.runs),
+            _each((run.controller_sha256 or "")[:8] for run in group.runs) or None,
             {name: ", ".join(map(str, each)) for name, each in group.parameters.items()} or None,
         ]
         for group in found.groups
     ]
-    print_table(("", "runs", "total_duration_s", "parameters"), groups)
+    print_table(("", "runs", "total_duration_s", "ended by", "code", "parameters"), groups)
     names: Sequence[str] = [group.name for group in found.groups]
     print(f"\nThe first {found.compared_s:.3f} s of each run:")
     verdicts = [f"{name} differs" for name in names[1:]]
@@ -413,7 +427,25 @@ def _print_comparison(found: Comparison) -> None:
     if found.differences:
         _print_differences(found, verdicts)
     unknown = [f"not known: {figures}: {why}" for figures, why in found.not_known.items()]
-    print_notes([*found.notes, *unknown])
+    print_notes([*found.notes, *unknown, *_only_in(found)])
+
+
+def _each(texts: Iterable[str]) -> str:
+    """Each text once."""
+    return ", ".join(dict.fromkeys(filter(None, texts)))
+
+
+def _only_in(found: Comparison) -> list[str]:
+    """The signals that some groups lack, by the groups that have them."""
+    names_by_groups: dict[str, list[str]] = {}
+    for name, groups in found.only_in.items():
+        names_by_groups.setdefault(" and ".join(groups), []).append(name)
+    return [f"only in {groups}: {_listed(names)}" for groups, names in names_by_groups.items()]
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return ", ".join(names[:_MOST_NAMED]) + more
 
 
 def _print_differences(found: Comparison, verdicts: Sequence[str]) -> None:

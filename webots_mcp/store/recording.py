@@ -51,6 +51,7 @@ GETTING_STARTED: Final = (
     "elsewhere, start the server with --data-dir or --database."
 )
 
+_NO_DATABASE: Final = "file is not a database"  # SQLite's words
 _FROZEN: Final = "the file cannot be written from here: read as it lies on the disk"
 _NOT_IN: Final = (
     "; without what waits beside it in {} files named ...-waiting-...: a copy of all of them where "
@@ -306,6 +307,11 @@ def _explain(error: Exception, database: Database) -> str:
         )
     if is_about_a_value(error):
         return f"the database at {name} holds a value that cannot be read: {text}"
+    if _NO_DATABASE in text:
+        return (
+            f"{name} is no SQLite database: name the one that a bridge records into. If this was "
+            "it, the file is damaged, and the bridge moves it aside at its next start"
+        )
     if is_damage(error):
         return (
             f"the database at {name} is damaged ({text}): the bridge moves such a file aside at "

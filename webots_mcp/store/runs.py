@@ -77,4 +77,4 @@ def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | No
     ids = [row[0] for row in connection.execute(_NEWEST_IDS, {"robot_id": robot_id}).fetchall()]
     whose = "" if robot_id is None else " of this robot"
     known = f"the newest runs{whose} are {ids}" if ids else f"no run{whose} was recorded"
-    return f"no run {run_id}{whose}: {known}; leave run_id out for the current run"
+    return f"no run {run_id}{whose}: {known}"

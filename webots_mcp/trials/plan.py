@@ -137,14 +137,16 @@ def read_plan(file: Path, search: Search | None = None) -> WorldPlan:
     """Read a plan, for a search or without one.
 
     Raises:
-        InvalidInputError: It is no TOML, or says something that is not possible; the text names it.
-        OSError: It cannot be read.
+        InvalidInputError: It cannot be read, is no TOML, or says something that is not possible;
+            the text names it.
     """
     toml: Any = import_module("tomllib" if sys.version_info >= (3, 11) else "tomli")
     try:
         found = cast("dict[str, Any]", toml.loads(file.read_text("utf-8")))
     except ValueError as error:  # also what is not UTF-8
         raise InvalidInputError(f"{file} is no TOML: {error}") from error
+    except OSError as error:
+        raise InvalidInputError(f"the plan {file} cannot be read: {error.strerror}") from error
     try:
         return _plan_of(found, file.resolve().parent, search)
     except InvalidInputError as error:

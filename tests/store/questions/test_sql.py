@@ -127,6 +127,7 @@ def test_a_value_of_gigabytes_is_refused(rover: sqlite3.Connection) -> None:
         ("SELECT * FROM states", "state"),
         ("SELECT battery_v FROM state", "json_extract"),
         ("SELEC 1", "begins with 'SELEC'"),
+        (" ", "the statement is empty: give one"),
         ("SELECT FROM", "syntax error"),
     ],
 )

@@ -116,12 +116,14 @@ def require_select(statement: str) -> None:
     Raises:
         InvalidInputError: The text says with what it begins.
     """
+    if not statement.strip():
+        raise InvalidInputError("the statement is empty: give one such as SELECT count(*) FROM run")
     begin = _BEGINS.match(statement)
     word = begin.group(1).upper() if begin else ""
     if word not in ("SELECT", "WITH", "VALUES", "EXPLAIN"):
         raise InvalidInputError(
-            f"only one reading statement is allowed (SELECT, WITH ... SELECT, EXPLAIN QUERY PLAN), "
-            f"this begins with {word or 'nothing'!r}"
+            "only one reading statement is allowed (SELECT, WITH ... SELECT, EXPLAIN QUERY PLAN), "
+            + (f"this begins with {word!r}" if word else "this begins with no word")
         )
 
 

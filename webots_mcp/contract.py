@@ -72,6 +72,7 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "reset_state": BuiltInAction(needs_supervisor=False, runs_user_code=True),
     "set_parameters": BuiltInAction(needs_supervisor=False),
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),
+    "keep": BuiltInAction(needs_supervisor=False),
 }
 
 BreakpointAction = Literal["pause", "log", "keep"]

@@ -235,7 +235,7 @@ CREATE TABLE retention_limit (
 	rows BIGINT, 
 	age_s FLOAT /* since it was recorded, in wall time */, 
 	times FLOAT /* run only: what is left of one stays so many times longer than its states; 0 for ever */, 
-	set_by TEXT NOT NULL /* serve, prune or keep */, 
+	set_by TEXT NOT NULL /* serve, prune or retain */, 
 	set_wall_time_s FLOAT NOT NULL, 
 	PRIMARY KEY (kind)
 );

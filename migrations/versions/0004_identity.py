@@ -121,7 +121,7 @@ def upgrade() -> None:
         sa.Column("rows", sa.BigInteger()),
         sa.Column("age_s", sa.Float(), comment="since it was recorded, in wall time"),
         sa.Column("times", sa.Float(), comment=TIMES),
-        sa.Column("set_by", sa.Text(), nullable=False, comment="serve, prune or keep"),
+        sa.Column("set_by", sa.Text(), nullable=False, comment="serve, prune or retain"),
         sa.Column("set_wall_time_s", sa.Float(), nullable=False),
         sa.PrimaryKeyConstraint("kind"),
     )

@@ -140,7 +140,8 @@ def test_a_file_that_is_no_database_is_one_line_and_exit_code_2(
     file.write_text("certainly no database, " * 100)
     assert main(["status", "--database", str(file)]) == 2
     assert (
-        "is no SQLite database: name the one that a bridge records into" in capsys.readouterr().err
+        "notes.txt is not a database: name the one that a bridge records into\n"
+        in capsys.readouterr().err
     )
 
 

@@ -176,11 +176,11 @@ def test_prune_deletes_what_the_dry_run_told(say: Say, database: Path) -> None:
 
 
 def test_a_run_that_is_kept_is_named_and_stays(say: Say, database: Path) -> None:
-    assert say("keep", "1") == ""
+    assert say("retain", "1") == ""
     nothing, note = say("prune", "--keep-states", "400rows").splitlines()
     assert nothing == "nothing is beyond the limits"
     assert "kept because of a label, a note or a mark, and not counted: run 1, about " in note
-    say("keep", "1", "--release")
+    say("retain", "1", "--release")
     say("prune", "--keep-states", "400rows")
     assert query(database, "SELECT purged_rows FROM run WHERE id = 1") == [(458,)]
 
@@ -200,7 +200,7 @@ def test_prune_shrinks_the_file(say: Say, database: Path) -> None:
 def test_a_run_that_does_not_exist_cannot_be_kept(
     database: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert "no run 9" in complaint(capsys, "keep", "9", "--database", str(database))
+    assert "no run 9" in complaint(capsys, "retain", "9", "--database", str(database))
 
 
 @pytest.mark.parametrize("words", [["label", "9", "good"], ["compare", "9"]])
@@ -229,7 +229,7 @@ def test_a_limit_that_is_none_is_told_how_to_write_one(
 
 
 @pytest.mark.parametrize(
-    "arguments", [["export"], ["prune"], ["prune", "--dry-run"], ["keep", "1"]]
+    "arguments", [["export"], ["prune"], ["prune", "--dry-run"], ["retain", "1"]]
 )
 def test_without_a_recording_each_says_so(
     arguments: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -61,7 +61,7 @@ def run(site: Path, commands: list[list[str]]) -> subprocess.CompletedProcess[st
 
 def test_most_commands_work_without_a_package(site: Path, database: Path) -> None:
     commands = [
-        ["status"], ["tail", "--no-follow"], ["runs"], ["export"], ["prune"], ["keep", "1"]
+        ["status"], ["tail", "--no-follow"], ["runs"], ["export"], ["prune"], ["retain", "1"]
     ]  # fmt: skip
     lines = [[name, *rest, "--database", str(database)] for name, *rest in commands]
     ended = run(site, lines)

@@ -65,6 +65,10 @@ def test_send_pause_step_and_resume(
     assert main(["step", *where, "5"]) == 0
     assert "steps 5" in capsys.readouterr().out
     assert main(["resume", *where]) == 0
+    assert main(["keep", *where, "7"]) == 0
+    assert Recording(file).rows("SELECT reason FROM kept_stretch") == ["7"]
+    assert main(["keep", *where, " "]) == 2
+    assert "reason is a text that says why" in capsys.readouterr().err
     assert main(["send", *where, "break_down"]) == 2
     assert "the gear is gone" in capsys.readouterr().err
 

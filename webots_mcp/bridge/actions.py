@@ -219,6 +219,18 @@ def arm_breakpoints(context: Context, command: Command) -> Progress:
     yield
 
 
+@_built_in
+def keep(context: Context, command: Command) -> Progress:
+    """Keep the last seconds and those to come at full rate, for a `reason`."""
+    reason, sim_time_s = command.params.get("reason"), context.clock.sim_time_s
+    if not isinstance(reason, str) or not reason.strip():
+        raise InvalidInputError(f"reason is a text that says why, not {reason!r:.80}")
+    if not context.keeper.keep(reason):
+        raise CommandRefusedError(context.keeper.why_not)
+    return {"run_id": context.clock.run.id, "kept_around_s": sim_time_s}
+    yield
+
+
 def _run_until(context: Context, command: Command, goal: Goal) -> Progress:
     """Set what the goal asks for, run until it is reached, and say how far it came."""
     watch, pause, finish = context.watch, context.pause, _finish_of(context, command, goal.then)

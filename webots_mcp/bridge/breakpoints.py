@@ -235,7 +235,7 @@ class Breakpoints:
         if each.action == "pause" and not self._simulation.supervisor:
             data["not_paused"] = _CANNOT_PAUSE
         if each.action == "keep" and not self._keeper.enabled:
-            data["not_kept"] = _CANNOT_KEEP
+            data["not_kept"] = self._keeper.why_not
         self._journal.event("breakpoint", data, each.condition.text)
 
     def _begin_run(self) -> None:
@@ -273,7 +273,6 @@ class Breakpoints:
 
 
 _KEEPING: Final = ("pause", "keep")  # who pauses wants to see what came before
-_CANNOT_KEEP: Final = "the bridge holds nothing: keep_last_s is 0"
 _CANNOT_PAUSE: Final = (
     "the robot is no Supervisor: set its field `supervisor` to TRUE in the world file"
 )

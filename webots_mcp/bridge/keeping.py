@@ -157,6 +157,13 @@ class Keeper:
         self._record(stretch)
         return True
 
+    @property
+    def why_not(self) -> str:
+        """Why nothing can be kept."""
+        if not self.enabled:
+            return "the bridge holds nothing: keep_last_s is 0"
+        return f"{MOST_KEPT_S:g} s of this run are kept at full rate: no more will be"
+
     def write_all(self) -> None:
         """Write what is kept now: the loop is about to stand still, or to end."""
         while self._unwritten:
@@ -178,8 +185,7 @@ class Keeper:
             return True
         if self._kept_s < float("inf"):
             self._kept_s = float("inf")
-            text = f"{MOST_KEPT_S:g} s of this run are kept at full rate: no more will be"
-            self._journal.log("warning", "bridge", text)
+            self._journal.log("warning", "bridge", self.why_not)
         return False
 
     def _begin_run(self) -> None:

@@ -110,7 +110,7 @@ def prune(arguments: argparse.Namespace) -> None:
     """Delete what is beyond the limits, and give the space back to the disk.
 
     Rows go in the order in which they were recorded, whatever their run. Runs with a label (but
-    that of a trial) or a note, and those marked by 'webots-mcp keep', lose nothing and do not
+    that of a trial) or a note, and those marked by 'webots-mcp retain', lose nothing and do not
     count. A LIMIT is a size
     (500MB), an age (30d), a number of rows (100000rows), several of them with commas between; all,
     which keeps everything; or default. What is given belongs to the database from then on, and
@@ -140,11 +140,11 @@ def prune(arguments: argparse.Namespace) -> None:
 
 
 @command(
-    "keep", DATA_DIR, DATABASE,
+    "retain", DATA_DIR, DATABASE,
     argument("run_ids", type=int, nargs="*", metavar="RUN", help="as 'webots-mcp runs' lists them"),
     argument("--release", action="store_true", help="let retention have them again"), *LIMITS,
 )  # fmt: skip
-def keep(arguments: argparse.Namespace) -> None:
+def retain(arguments: argparse.Namespace) -> None:
     """Mark runs of which nothing is ever pruned, or set how much is kept of the others.
 
     The limits belong to the database and hold at once, whoever maintains it; 'default' goes back
@@ -155,10 +155,10 @@ def keep(arguments: argparse.Namespace) -> None:
 
     limits = limits_of(arguments)
     if not arguments.run_ids and not limits:
-        raise InvalidInputError("name runs to keep, or a limit to set: --keep-states 20GB")
+        raise InvalidInputError("name runs to retain, or a limit to set: --keep-states 20GB")
     with _writable(arguments) as (_, connection):
         mark_kept(connection, arguments.run_ids, keep=not arguments.release)
-        set_limits(connection, limits, "keep")
+        set_limits(connection, limits, "retain")
 
 
 @command(

@@ -37,8 +37,8 @@ def serve(arguments: argparse.Namespace) -> None:
         claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
 
     While it runs, and unless it is --read-only, the oldest of what is beyond the limits is deleted.
-    Limits belong to the database: what 'webots-mcp prune' or 'keep' has set, or another server that
-    runs, holds on, and is said.
+    Limits belong to the database: what 'webots-mcp prune' or 'retain' has set,
+    or another server that runs, holds on, and is said.
     A LIMIT is a size (500MB), an age (30d), a number of rows (100000rows), several of them with
     commas between, or all, which keeps everything. 'webots-mcp prune --dry-run' with the same
     limits tells what would go.

@@ -100,6 +100,19 @@ def send(arguments: argparse.Namespace) -> None:
     _conclude(answer, arguments)
 
 
+@command(
+    "keep", *_WHERE, TIMEOUT,
+    argument("reason", metavar="REASON", help="why, as it is told with the stretch"),
+)  # fmt: skip
+def keep(arguments: argparse.Namespace) -> None:
+    """Keep the last seconds of a running controller at full rate, and the two that follow.
+
+    Each call of publish in them becomes a row, also those that the throttle drops.
+    """
+    arguments.action, arguments.settings = "keep", [f"reason={json.dumps(arguments.reason)}"]
+    send(arguments)
+
+
 @command("pause", *_WHERE, TIMEOUT)
 def pause(arguments: argparse.Namespace) -> None:
     """Pause the simulation; its controller goes on answering."""

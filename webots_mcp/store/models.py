@@ -525,5 +525,5 @@ class RetentionLimit(SQLModel, table=True):
     times: float | None = _number(
         "run only: what is left of one stays so many times longer than its states; 0 for ever"
     )
-    set_by: str = _text("serve, prune or keep", nullable=False)
+    set_by: str = _text("serve, prune or retain", nullable=False)
     set_wall_time_s: float = _number(nullable=False)

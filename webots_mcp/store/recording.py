@@ -24,7 +24,7 @@ from webots_mcp.connection import (
     is_unwritable,
     text_of,
 )
-from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
 from webots_mcp.entries import waiting_paths
 from webots_mcp.errors import (
     DatabaseError,
@@ -308,9 +308,11 @@ def _explain(error: Exception, database: Database) -> str:
     if is_about_a_value(error):
         return f"the database at {name} holds a value that cannot be read: {text}"
     if _NO_DATABASE in text:
+        moved = isinstance(database, Path) and database.name == DATABASE_NAME
+        aside = "; a bridge that finds it there moves it aside and begins a new one"
         return (
-            f"{name} is no SQLite database: name the one that a bridge records into. If this was "
-            "it, the file is damaged, and the bridge moves it aside at its next start"
+            f"the file {name} is not a database: name the one that a bridge records into"
+            + aside * moved
         )
     if is_damage(error):
         return (

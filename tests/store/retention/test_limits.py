@@ -56,15 +56,15 @@ def another_server(connection: sqlite3.Connection, pid: int) -> Generator[None]:
     connection.execute("DELETE FROM lease")
 
 
-def test_keep_sets_a_limit_and_deletes_nothing(say: Say, recorded: Recorded) -> None:
-    assert say("keep", "--keep-states", "30rows", "--keep-runs", "all") == ""
+def test_retain_sets_a_limit_and_deletes_nothing(say: Say, recorded: Recorded) -> None:
+    assert say("retain", "--keep-states", "30rows", "--keep-runs", "all") == ""
     assert recorded.rows() == {1: 20, 2: 20}
     assert in_force(recorded.connection).state.rows == 30
-    assert "states 30rows (set by keep, " in say("status")
-    assert "runs all (set by keep, " in say("status")
+    assert "states 30rows (set by retain, " in say("status")
+    assert "runs all (set by retain, " in say("status")
     assert "logs 100.0 MB (default)" in say("status")
     shown = json.loads(say("status", "--json"))
-    assert shown["limits"]["states"].startswith("30rows (set by keep")
+    assert shown["limits"]["states"].startswith("30rows (set by retain")
     assert shown["file"]["file_bytes"] > shown["file"]["free_in_file_bytes"] >= 0
 
 
@@ -73,7 +73,7 @@ def test_who_maintains_keeps_to_what_was_set(say: Say, recorded: Recorded) -> No
     upkeep = Upkeep(recorded.folder, interval_s=0, budget_s=60)
     upkeep(recorded.connection)
     assert recorded.rows() == {1: 20, 2: 20}
-    say("keep", "--keep-states", "30rows")
+    say("retain", "--keep-states", "30rows")
     while recorded.rows() != {1: 10, 2: 20}:
         upkeep(recorded.connection)
 
@@ -88,14 +88,14 @@ def test_prune_sets_what_it_is_given_and_a_dry_run_only_tries_it(
     recorded.publish(100.0, {"x": 1})
     say("prune")
     assert recorded.rows() == {1: 9, 2: 21}
-    say("keep", "--keep-states", "default")
+    say("retain", "--keep-states", "default")
     assert in_force(recorded.connection) == DEFAULT
 
 
-def test_keep_without_runs_and_limits_says_what_it_takes(
+def test_retain_without_runs_and_limits_says_what_it_takes(
     recorded: Recorded, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["keep", "--data-dir", str(tmp_path)]) == 2
+    assert main(["retain", "--data-dir", str(tmp_path)]) == 2
     assert "--keep-states 20GB" in capsys.readouterr().err
 
 
@@ -106,12 +106,12 @@ def test_a_server_sets_what_nobody_has_set_and_what_an_earlier_server_had(
     for size in (60 * MB, 5 * MB):
         assert ask_at_start(db, {"state": Limit(size_bytes=size)}) == []
         assert in_force(db).state.size_bytes == size
-    set_limits(db, {"state": Limit(size_bytes=80 * MB), "outlive": 3.0}, "keep")
+    set_limits(db, {"state": Limit(size_bytes=80 * MB), "outlive": 3.0}, "retain")
     (states,) = ask_at_start(db, {"state": Limit(size_bytes=5 * MB), "outlive": 3.0})
     assert states.startswith(
-        "--keep-states 5.0 MB is not in force: the database keeps 80.0 MB (set by keep, "
+        "--keep-states 5.0 MB is not in force: the database keeps 80.0 MB (set by retain, "
     )
-    assert states.endswith("'webots-mcp keep --keep-states ...' changes it")
+    assert states.endswith("'webots-mcp retain --keep-states ...' changes it")
     assert in_force(db).state.size_bytes == 80 * MB
 
 

@@ -1,7 +1,7 @@
 """The limits of a database belong to it, not to who maintains it: set once, they hold for all.
 
-`prune` and `keep` set what a person asks for. A server sets what nobody has set, or what an earlier
-server set that no longer runs; beside another server it says what holds instead.
+`prune` and `retain` set what a person asks for. A server sets what nobody has set, or what an
+earlier server set that no longer runs; beside another server it says what holds instead.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, Setting]:
         except (KeyError, TypeError, InvalidInputError) as error:
             raise InvalidInputError(
                 f"the row {kind!r} of the table retention_limit is no limit ({error}): set it "
-                "again with 'webots-mcp keep'"
+                "again with 'webots-mcp retain'"
             ) from error
         settings[name] = Setting(value, set_by, set_s)
     return settings
@@ -130,7 +130,7 @@ def unheeded(connection: sqlite3.Connection, asked: Asked) -> list[str]:
         option = option_of(_KIND_OF[name])
         found.append(
             f"{option} {_text(value)} is not in force: the database keeps {_said(setting)}; "
-            f"'webots-mcp keep {option} ...' changes it"
+            f"'webots-mcp retain {option} ...' changes it"
         )
     return found
 

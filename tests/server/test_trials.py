@@ -6,6 +6,7 @@ import json
 import os
 import signal
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -54,6 +55,7 @@ pathlib.Path(sys.argv[1]).write_text(str(os.getpid()))
 main(["serve", "--database", sys.argv[2]])
 """
 DISTANCE = "max(pose.x) - min(pose.x) + max(pose.y) - min(pose.y)"
+HANGS_AT = 99.0
 SPEEDS = {"speed": [1.0, 2.0, 3.0, 4.0, 5.0]}
 
 
@@ -64,12 +66,19 @@ class TunableDriver(Driver):
         super().__init__(file)
         self.kp = self.bridge.parameter("kp", 2.0, low=0, high=100)
         self.gait = self.bridge.parameter("gait", "trot", choices=["trot", "walk"])
+        self.goes_on = threading.Event()
 
     def run(self) -> None:
         while self.robot.step(STEP_MS) != -1:
             distance = self.kp.value * self.robot.getTime()
             self.bridge.publish({"distance": distance, "gait": self.gait.value})
+            if self.kp.value == HANGS_AT and self.robot.getTime() > 0.1:
+                self.goes_on.wait()
             self.bridge.get_command()
+
+    def stop(self) -> None:
+        self.goes_on.set()
+        super().stop()
 
 
 @pytest.fixture
@@ -290,6 +299,17 @@ async def test_a_trial_without_a_score_or_an_end_failed_and_is_not_zero(
         assert "longer than 0.05 s" in row["why"]
 
 
+async def test_a_loop_that_hangs_fails_its_trial_with_the_time_that_it_reached(
+    connect: Connect, tunable: TunableDriver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("webots_mcp.server.trial_worker._PATIENCE_S", 0.1)
+    async with connect() as client:
+        answer = await trials(client, parameters={"kp": [HANGS_AT]}, trial_timeout_s=1)
+        (row,) = rows_of(answer["ranked"])
+        assert row["why"].startswith("never reached its end, but 0.112 s: it took longer than 1 s")
+        assert "does not come to bridge.get_command() any more" in answer["state"]
+
+
 async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(
     connect: Connect, tunable: TunableDriver
 ) -> None:
@@ -305,6 +325,24 @@ async def test_a_pause_by_somebody_else_stops_the_set_and_it_can_go_on(
         assert told["over"] == 0
         assert f"webots_run_trials(trial_set={first['trial_set']}) goes on" in told["hint"]
         assert await value_of(client, "kp") == 2.0
+
+
+async def test_a_parameter_that_somebody_else_sets_stops_the_set(
+    connect: Connect, tunable: TunableDriver
+) -> None:
+    async with connect() as client:
+        await ask(client, "webots_set_parameters", values={"kp": 3.0})
+        plan = {"parameters": {"kp": [1.0]}, "until": "gait == 'walk'", "for_s": 100_000}
+        await trials(client, **plan, timeout_s=0.2)
+        await ask(client, "webots_set_parameters", values={"gait": "walk"})
+        with anyio.fail_after(20):
+            while (told := await ask(client, "webots_get_trials"))["state"] == "under way":
+                await anyio.sleep(0.02)
+        assert told["state"].startswith(
+            "stopped: trial 1 was interrupted: gait was set to walk at "
+        )
+        assert told["over"] == 0
+        assert await value_of(client, "kp") == 3.0
 
 
 async def test_rows_that_were_purged_leave_the_score_and_the_answer_says_so(

@@ -18,12 +18,11 @@ from typing import Any, Final
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.server.running import ACTION
 from webots_mcp.server.target import find_target
-from webots_mcp.store.parameters import described
+from webots_mcp.store.parameters import described, parameters_of
 from webots_mcp.store.questions.score import score_run
 from webots_mcp.store.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.robots import robot_name
-from webots_mcp.store.runs import fetch_run
 from webots_mcp.store.trials import (
     Result,
     Trial,
@@ -50,6 +49,11 @@ _ENDS: Final = {"condition held": "until", "time over": "for_s"}
 _RUN_OF: Final = (
     "SELECT min(id) FROM run WHERE session_id = ? AND started_wall_time_s >= "
     "(SELECT claimed_wall_time_s FROM command WHERE id = ?)"
+)
+# Rows may follow the last heartbeat.
+_REACHED: Final = (
+    "SELECT max(last_sim_time_s, coalesce((SELECT max(sim_time_s) FROM state WHERE run_id = run.id)"
+    ", last_sim_time_s)) FROM run WHERE id = ?"
 )
 _HANGS: Final = (
     "the loop of robot {!r} does not come to bridge.get_command() any more: see what it waits for, "
@@ -224,6 +228,7 @@ class TrialWorker(threading.Thread):
                 return Result(run_id, None, f"{_reached(connection, run_id)}: {why}")
             told: Mapping[str, Any] = command.decoded_result() or {}
             if told.get("ended") in _ENDS:
+                _require_untouched(connection, trial, run_id, told["sim_time_s"])
                 return self._scored(connection, run_id, told)
             return Result(run_id, None, self._why_not(connection, trial, run_id, told))
 
@@ -348,8 +353,25 @@ def _value(parameter: Mapping[str, Any]) -> Any:
     return parameter["default"] if parameter["value"] is None else parameter["value"]
 
 
+def _require_untouched(
+    connection: sqlite3.Connection, trial: Trial, run_id: int, end_s: float
+) -> None:
+    """A score of other values than those of the trial would be ranked as theirs.
+
+    Raises:
+        CommandRefusedError: Somebody set a parameter before the trial was over.
+    """
+    for name, parameter in parameters_of(connection, [run_id])[run_id].items():
+        for later in parameter.settings[1:]:
+            if later.set_by == "command" and later.sim_time_s < end_s:
+                raise CommandRefusedError(
+                    f"trial {trial.number} was interrupted: {name} was set to {later.value} "
+                    f"at {later.sim_time_s:.3f} s"
+                )
+
+
 def _reached(connection: sqlite3.Connection, run_id: int | None) -> str:
     if run_id is None:
         return "its run did not begin"
-    run = fetch_run(connection, run_id)
-    return f"never reached its end, but {run.last_sim_time_s:.3f} s"
+    reached_s = connection.execute(_REACHED, (run_id,)).fetchone()[0]
+    return f"never reached its end, but {reached_s:.3f} s"

@@ -172,7 +172,7 @@ CREATE TABLE rollup (
 	sum FLOAT, 
 	squares FLOAT /* sum of squared deviations from sum / count */, 
 	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, 
+	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, 
 	PRIMARY KEY (run_id, signal_id, bucket), 
 	CONSTRAINT fk_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
@@ -260,15 +260,11 @@ CREATE TABLE recent_rollup (
 	sum FLOAT, 
 	squares FLOAT /* sum of squared deviations from sum / count */, 
 	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, 
+	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, 
 	PRIMARY KEY (run_id, bucket, signal_id), 
 	CONSTRAINT fk_recent_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
  WITHOUT ROWID;
-CREATE VIEW all_rollup AS
-/* Rollups, those of buckets that are over and the newest. */
-SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines FROM rollup
-UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines FROM recent_rollup;
 CREATE VIEW robot_period AS
 /* How long a text or flag of the state kept a value. Signals that never changed have none. */
 SELECT (
@@ -316,10 +312,15 @@ CREATE TABLE coarse_rollup (
 	squares FLOAT /* sum of squared deviations from sum / count */, 
 	sines FLOAT /* angles only: sum of sines */, 
 	cosines FLOAT /* angles only: sum of cosines */, 
+	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
 	PRIMARY KEY (run_id, signal_id, bucket), 
 	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
  WITHOUT ROWID;
+CREATE VIEW all_rollup AS
+/* Rollups, those of buckets that are over and the newest. */
+SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step FROM rollup
+UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step FROM recent_rollup;
 CREATE TABLE breakpoint (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	robot_id INTEGER NOT NULL, 

@@ -1,6 +1,7 @@
 """Rollups of 500 s beside those of 10 s: a long recording is read fast as a whole.
 
 They are made from those of 10 s while the server maintains the database, also of older recordings.
+Rollups tell the largest step between values that follow each other.
 
 And parameters that a controller declares, and the values that they had in each run; breakpoints;
 how many of its publish() calls a session records; trials. The views robot_now and robot_trajectory
@@ -37,6 +38,11 @@ NUMBERS = {
     "sines": "angles only: sum of sines",
     "cosines": "angles only: sum of cosines",
 }
+STEP = {
+    "largest_step": "largest difference of values that follow each other; null in those of older "
+    "versions"
+}
+ROLLUPS = ("rollup", "recent_rollup")
 UUID = "random (version 4); names the row among those of all machines"
 PROCESS = "which process of that pid; null where the system does not tell"
 NOW_UTC = "strftime('%Y-%m-%d %H:%M:%f', v.wall_time_s, 'unixepoch')"
@@ -156,6 +162,10 @@ def upgrade() -> None:
         ),
     )
     create_coarse_rollup()
+    for table in ROLLUPS:
+        for name, comment in STEP.items():
+            op.add_column(table, sa.Column(name, sa.Float(), comment=comment))
+    replace_all_rollup([*COUNTS, *NUMBERS, *STEP])
     op.add_column(
         "session",
         sa.Column(
@@ -175,6 +185,15 @@ def upgrade() -> None:
         for view in ("robot_now", "robot_trajectory"):
             replace_in_view(view, {OLD_POSITION: POSITION, OLD_MODE: MODE})
         op.execute("PRAGMA user_version = 5")
+
+
+def replace_all_rollup(figures: list[str]) -> None:
+    """Make the view of both tables of rollups again, with these figures."""
+    columns = ", ".join(["run_id", "signal_id", "bucket", *figures])
+    tables = "\nUNION ALL ".join(f"SELECT {columns} FROM {table}" for table in ROLLUPS)
+    said = "/* Rollups, those of buckets that are over and the newest. */"
+    op.execute("DROP VIEW all_rollup")
+    op.execute(f"CREATE VIEW all_rollup AS\n{said}\n{tables}")
 
 
 def replace_in_view(view: str, texts: dict[str, str]) -> None:
@@ -201,7 +220,10 @@ def create_coarse_rollup() -> None:
             sa.Column(name, sa.Integer(), server_default=zero, nullable=False, comment=comment)
             for name, comment in COUNTS.items()
         ),
-        *(sa.Column(name, sa.Float(), comment=comment) for name, comment in NUMBERS.items()),
+        *(
+            sa.Column(name, sa.Float(), comment=comment)
+            for name, comment in (NUMBERS | STEP).items()
+        ),
         sa.ForeignKeyConstraint(
             ["run_id"], ["run.id"], name=op.f("fk_coarse_rollup_run_id"), ondelete="CASCADE"
         ),
@@ -479,6 +501,10 @@ def downgrade() -> None:
     op.drop_table("parameter_value")
     op.drop_table("parameter")
     op.drop_table("coarse_rollup")
+    replace_all_rollup([*COUNTS, *NUMBERS])
+    for table in ROLLUPS:
+        for name in STEP:
+            op.drop_column(table, name)
     op.drop_column("run", "coarse_end")
     if op.get_context().dialect.name == "sqlite":
         op.execute("PRAGMA user_version = 4")

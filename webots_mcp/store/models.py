@@ -223,6 +223,9 @@ class _Summary(SQLModel):
     squares: float | None = _figure("sum of squared deviations from sum / count")
     sines: float | None = _figure("angles only: sum of sines")
     cosines: float | None = _figure("angles only: sum of cosines")
+    largest_step: float | None = _figure(
+        "largest difference of values that follow each other; null in those of older versions"
+    )
 
 
 class Rollup(_Summary, table=True):

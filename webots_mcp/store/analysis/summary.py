@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from operator import attrgetter, mul, ne
+from operator import attrgetter, mul, ne, sub
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.naming import Value
@@ -31,6 +31,8 @@ class Summary(NamedTuple):
         squares: Sum of squared deviations from the mean.
         sines: Sum of sines, of an angle in whatever unit.
         cosines: Sum of cosines, of an angle in whatever unit.
+        largest_step: Largest difference between values that follow each other; None also where it
+            is not known: in rollups of older versions.
     """
 
     rows: int = 0
@@ -48,6 +50,7 @@ class Summary(NamedTuple):
     squares: float | None = None
     sines: float | None = None
     cosines: float | None = None
+    largest_step: float | None = None
 
     @property
     def mean(self) -> float | None:
@@ -148,7 +151,13 @@ def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = 
         math.fsum(map(mul, deviations, deviations)),
         math.fsum(map(math.sin, numbers)) if angle else None,
         math.fsum(map(math.cos, numbers)) if angle else None,
+        _largest_step(numbers) if low < high else 0.0,
     )
+
+
+def _largest_step(numbers: Sequence[float]) -> float:
+    steps = list(map(sub, numbers[1:], numbers))
+    return float(max(max(steps), -min(steps)))
 
 
 def summarise_numbers(
@@ -168,11 +177,11 @@ def summarise_numbers(
     angles = numbers * (math.tau / turn) if turn else None
     low, high = int(numbers.argmin()), int(numbers.argmax())
     total = float(numbers.sum())
-    deviations = numbers - total / count
+    deviations, steps = numbers - total / count, np.diff(numbers)
     return Summary(
         count if rows is None else rows,
         count,
-        int(np.count_nonzero(np.diff(numbers))),
+        int(np.count_nonzero(steps)),
         *_at(times, numbers, 0),
         *_at(times, numbers, -1),
         *_at(times, numbers, low),
@@ -181,6 +190,7 @@ def summarise_numbers(
         inner(deviations, deviations),
         None if angles is None else float(np.sin(angles).sum()),
         None if angles is None else float(np.cos(angles).sum()),
+        float(np.abs(steps).max(initial=0.0)),
     )
 
 
@@ -272,6 +282,7 @@ def merge(parts: Sequence[Summary]) -> Summary:
         _merged_squares(filled, total / count),
         _sum_where_angle(filled, "sines"),
         _sum_where_angle(filled, "cosines"),
+        _merged_largest_step(filled),
     )
 
 
@@ -307,6 +318,15 @@ def _merged_squares(parts: Sequence[Any], mean: float) -> float:
         part.squares + part.present * shift * shift
         for part, shift in zip(parts, shifts, strict=True)
     )
+
+
+def _merged_largest_step(parts: Sequence[Any]) -> float | None:
+    """Not known where it is not of a part, or where values of one part lie within another."""
+    largest: list[Any] = _column(parts, "largest_step")
+    borders = list(pairwise(parts))
+    if None in largest or any(a.last_sim_time_s > b.first_sim_time_s for a, b in borders):
+        return None
+    return max([*largest, *(abs(b.first - a.last) for a, b in borders)])
 
 
 def _sum_where_angle(parts: Sequence[Summary], field: str) -> float | None:

@@ -13,9 +13,11 @@ from webots_mcp.store.detection.motion import in_metres
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.rows import Numbers
 from webots_mcp.store.signals.registry import Signal
+from webots_mcp.units import metres_in
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
 LEAPS_SHARE: Final = 0.5  # of the time that is left; what is read in it serves swings as well
+_LEAST_SHARE: Final = 0.7  # of a distance, less than the root of a half
 _ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to the same value
 
 
@@ -54,11 +56,13 @@ def _jump(search: Search, signal: Signal, jump: Jump) -> Event:
 
 def _leaps(search: Search) -> Iterator[Event]:
     """The position changed by more than driving explains."""
-    if search.motion.position is None:
+    if (position := search.motion.position) is None:
         return
+    # In one of the two directions it is farther than that.
+    least_steps = [_LEAST_SHARE * search.options.jump_m / metres_in(each.name) for each in position]
     leaps: dict[float, float] = {}
-    for numbers in search.view.stretches(search.motion.position, LEAPS_SHARE):
-        leaps |= _leaps_in(numbers, search.motion.position, search.options.jump_m)
+    for numbers in search.view.stretches(position, LEAPS_SHARE, least_steps):
+        leaps |= _leaps_in(numbers, position, search.options.jump_m)
     for time_s in sorted(leaps):
         yield search.event("jump", time_s, time_s, "position", distance_m=leaps[time_s])
 

@@ -34,7 +34,8 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             f"robot swings with: name them in signals ({listed(left, _MOST_NAMED)})",
         )
     found: dict[str, list[Swing]] = {}
-    for numbers in search.view.stretches(signals, 1.0):
+    at_rest = [0.0] * len(signals)  # without any step there is no swing
+    for numbers in search.view.stretches(signals, 1.0, at_rest):
         for index, signal in enumerate(signals):
             if search.is_over("oscillation", signals[index:]):
                 break

@@ -15,7 +15,7 @@ from typing import Final, Protocol
 
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.rhythm import GAP_INTERVALS, usual_interval_s
-from webots_mcp.store.analysis.summary import Summary, summarise_numbers
+from webots_mcp.store.analysis.summary import Summary, merge, summarise_numbers
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.intervals import (
     Condition,
@@ -28,7 +28,7 @@ from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rollups import read_pieces, rows_after
 from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of, read_columns
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
-from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, totals
+from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, buckets, totals
 from webots_mcp.store.rollup.rolling import watermark
 from webots_mcp.store.signals.registry import Signal
 
@@ -49,6 +49,9 @@ _COUNTS: Final = {"rows": "sum", "present": "sum", "changes": "sum"}
 _WIDTHS: Final = (  # also at its border with the bucket before
     "SELECT bucket, max(max - min, abs(first - lag(last, 1, first) OVER (ORDER BY bucket))) "
     f"{_OF_SIGNAL} AND first IS NOT NULL"
+)
+_ROWS_IN: Final = (
+    "SELECT count(*) FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 )
 _FIRST_ROW: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
 _RESTING: Final = (
@@ -105,10 +108,18 @@ class View(Protocol):
         """Where a jump may be."""
         ...
 
-    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Numbers]:
+    def stretches(
+        self, signals: Sequence[Signal], share: float, least_steps: Sequence[float] | None = None
+    ) -> Iterator[Numbers]:
         """All rows in stretches, the newest first, as many as a share of the time allows.
 
         Each reaches so far into the one after it that what lies across the border is whole in one.
+
+        Args:
+            signals: Which numbers.
+            share: Of the time that is left.
+            least_steps: Of each signal: a stretch may be left out in which none of them changes by
+                more than that from one row to the next. None for all stretches.
         """
         ...
 
@@ -182,7 +193,9 @@ class RowView:
         """All of it."""
         yield Course(*self._columns.numbers(signal.name))
 
-    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Numbers]:
+    def stretches(
+        self, signals: Sequence[Signal], share: float, least_steps: Sequence[float] | None = None
+    ) -> Iterator[Numbers]:
         """All rows at once."""
         yield numbers_of(self._columns, signals)
 
@@ -308,7 +321,9 @@ class LongView:
                 return
             yield Course(*self._numbers(signal, bucket), self._usual_steps(signal))
 
-    def stretches(self, signals: Sequence[Signal], share: float) -> Iterator[Numbers]:
+    def stretches(
+        self, signals: Sequence[Signal], share: float, least_steps: Sequence[float] | None = None
+    ) -> Iterator[Numbers]:
         """What there is no time for is noted."""
         self._note_purged()
         deadline = self._deadline.part(share)
@@ -323,10 +338,31 @@ class LongView:
                 )
                 return
             end_s = min(self._segment.end_s, part.end_s + ACROSS_S)
-            yield self._stretch(replace(part, end_s=end_s), signals, deadline)
+            whole = replace(part, end_s=end_s)
+            if least_steps is None or not self._is_calm(whole, signals, least_steps):
+                yield self._stretch(whole, signals, deadline)
             if part.start_s <= first_s:
                 return
             left = replace(left, end_s=part.start_s)
+
+    def _is_calm(
+        self, part: Segment, signals: Sequence[Signal], least_steps: Sequence[float]
+    ) -> bool:
+        """Whether rollups rule out that one of the signals changes by more than that at once.
+
+        They do where all rows around the part are in them, each with a number.
+        """
+        span = range(bucket_of(part.start_s), bucket_of(part.end_s) + 1)
+        ends_s = span.start * BUCKET_S, span.stop * BUCKET_S
+        rows = self._connection.execute(_ROWS_IN, (part.run_id, *ends_s)).fetchone()[0]
+        for signal, least_step in zip(signals, least_steps, strict=True):
+            found = buckets(self._connection, part.run_id, signal.id or 0, span)
+            whole = merge([Summary(), *(summary for _, summary in found)])
+            if whole.present != rows or whole.largest_step is None:
+                return False
+            if whole.largest_step > least_step:
+                return False
+        return True
 
     def _stretch(self, part: Segment, signals: Sequence[Signal], deadline: Deadline) -> Numbers:
         """Read with what other kinds will ask of the same rows, and kept for them."""

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import shutil
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
+from mcp import Client
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, text_of
 from tests.server.malformed import Damage, damages, record, unusable_answers
+from webots_mcp.server import create_server
 
 pytestmark = pytest.mark.anyio
 
-# Of each column one in turn; `python -m tests.server.malformed` tries all there are.
+# Of each column one in turn, and of the tools each third: `python -m tests.server.malformed` tries
+# all there are.
 TRIED = (b"\x00\xff\x01", '{"x": ', "[1, 2]", '{"x": "\\ud800"}')
 TABLES = ("robot", "session", "run", "state", "event", "command", "log", "image", "signal",
           "rollup", "change", "breakpoint", "trial_set", "trial")  # fmt: skip
@@ -36,7 +42,18 @@ async def test_a_wrong_value_anywhere_leaves_every_tool_with_an_answer(
     assert by_column
     for number, tried in enumerate(by_column.values()):
         damage = tried[number % len(tried)]
-        assert (await unusable_answers(base, tmp_path / str(number), damage))[1] == []
+        asked = slice(number % 3, None, 3)
+        assert (await unusable_answers(base, tmp_path / str(number), damage, asked))[1] == []
+
+
+async def test_trials_of_a_robot_that_cannot_be_read_are_told(base: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "copy"
+    shutil.copytree(base, folder)
+    with closing(sqlite3.connect(folder / "webots.db")) as connection, connection:
+        Damage("robot", "name", b"\xff").apply(connection)
+    async with Client(create_server(folder / "webots.db", folder)) as client:
+        answer = await ask(client, "webots_get_trials")
+    assert answer["trial_set"] == 1
 
 
 @pytest.mark.parametrize(

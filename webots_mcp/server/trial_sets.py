@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Final
 
 from webots_mcp.conditions.score import parse_score
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import require_known
 from webots_mcp.server.budget import (
     condensed,
@@ -144,9 +145,10 @@ def told_of_set(recording: Recording, set_id: int | None) -> dict[str, Any]:
 
 
 def _header(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
-    if found.robot_id is None:
-        return header_of_only(connection)
-    return look(connection, robot_name(connection, found.robot_id)).header()
+    with suppress(NothingRecordedError):  # the trials are there all the same
+        if found.robot_id is not None:
+            return look(connection, robot_name(connection, found.robot_id)).header()
+    return header_of_only(connection)
 
 
 def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:

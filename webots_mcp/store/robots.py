@@ -39,8 +39,15 @@ def list_robots(connection: sqlite3.Connection, now_s: float) -> list[Robot]:
 
 
 def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
-    """The name of the robot of that id, which has to exist."""
-    return connection.execute(_NAME, (robot_id,)).fetchone()[0]
+    """The name of the robot of that id.
+
+    Raises:
+        NothingRecordedError: Its row is not there, or cannot be read.
+    """
+    row = connection.execute(_NAME, (robot_id,)).fetchone()
+    if row is None:
+        raise NothingRecordedError(f"robot {robot_id} has no row that can be read")
+    return row[0]
 
 
 def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float) -> Robot:

@@ -113,7 +113,7 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
     recorded = bool(window.rows.segments)
     told = trends(view.connection, window.rows, limit=MOST_SIGNALS).runs if recorded else ()
     newest = told[-_TOLD_RUNS:]
-    budget = BUDGET // 2 // max(len(newest), 1)
+    budget = 2 * BUDGET // 5 // max(len(newest), 1)
     found = search_events(view.connection, window.around, None if recorded else _ROWLESS)
     happened = [event for event in found.events if _in_window(event, window, wall_start_s)]
     in_window = found.only(happened)

@@ -37,6 +37,16 @@ async def test_a_way_there_and_back_has_a_distance_and_no_displacement(
     assert answer["rows"] == 3
 
 
+async def test_a_way_in_metres_that_no_robot_drives_is_doubted(
+    connect: Connect, rover: RecordedRobot
+) -> None:
+    drive(rover, [0, 0], [300, 400], [0, 0])
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_s=60)
+    assert answer["movement"]["distance_m"] == 1000.0
+    assert "pose.0 is taken as metres" in answer["movement"]["unit"]
+
+
 async def test_a_lost_position_does_not_count_as_a_way(
     connect: Connect, rover: RecordedRobot
 ) -> None:

@@ -10,7 +10,12 @@ from typing import Any
 from webots_mcp.server.bounds import newest_runs
 from webots_mcp.server.budget import figure, seconds
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import find_motion, path_length, places_of
+from webots_mcp.store.detection.motion import (
+    doubt_of_unit,
+    find_motion,
+    path_length,
+    places_of,
+)
 from webots_mcp.store.reading.coverage import row_before
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
@@ -71,13 +76,19 @@ def movement(
     if position is None:
         return None
     deadline = Deadline(deadline_s)
-    names = {"position": [signal.name for signal in position]}
+    names: dict[str, Any] = {"position": [signal.name for signal in position]}
     ways: dict[int, dict[str, Any]] = {}
+    speeds_m_s: list[float] = []
     for segment in found.segments:
         part = read_columns(view.connection, segment, position, deadline)
         missing = {"rows_missing_from_s": seconds((part.times or [segment.start_s])[-1])}
         if way := (_way(part, position) or {}) | (missing if part.cut else {}):
             ways[segment.run_id] = way
+            took_s = part.times[-1] - part.times[0] if part.times else 0.0
+            went_m: float = way.get("distance_m") or 0.0
+            speeds_m_s.append(went_m / took_s if took_s else 0.0)
+    if doubt := doubt_of_unit(position, max(speeds_m_s, default=0.0)):
+        names |= {"unit": doubt}
     if len(ways) > 1:
         return names | {"runs": [{"run_id": run_id, **way} for run_id, way in ways.items()]}
     return next((names | way for way in ways.values()), None)

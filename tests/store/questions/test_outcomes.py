@@ -93,6 +93,14 @@ def test_who_asks_names_the_position_and_a_mode_that_is_a_number(
     assert medians(measure(found, "share of 2")) == [pytest.approx(0.25, abs=0.01)]
 
 
+def test_metres_that_no_robot_drives_are_doubted(empty: sqlite3.Connection) -> None:
+    record(empty, "a", lambda time_s: {"pose": [300.0 * time_s, 0.0]})
+    record(empty, "a", driving)
+    why = compare_runs(empty, [1, 2]).not_known["distance_m, mean_speed_m_s"]
+    assert why.startswith("run 1: pose.0 is taken as metres")
+    assert "pose_mm" in why
+
+
 def test_a_run_without_a_mode_was_in_no_mode_for_no_known_time(empty: sqlite3.Connection) -> None:
     record(empty, "a", driving)
     record(empty, "a", without_mode)

@@ -16,10 +16,12 @@ from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.units import METRES, metres_in
+from webots_mcp.units import METRES, metres_in, unit_in
 
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.track import Track
+
+IMPLAUSIBLE_M_S: Final = 50.0  # a mean speed beyond is hardly that of a robot
 
 _TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps))*$"
 _COMMANDED: Final = re.compile(
@@ -163,6 +165,17 @@ def _first(
 def in_metres(signal: Signal, lengths: Array) -> Array:
     """Lengths that a signal holds, in metres; they are metres where its name has no unit."""
     return lengths * metres_in(signal.name)
+
+
+def doubt_of_unit(position: tuple[Signal, Signal], speed_m_s: float) -> str | None:
+    """That a position without a unit in its names is hardly in metres; None where it may be."""
+    name = position[0].name
+    if speed_m_s <= IMPLAUSIBLE_M_S or unit_in(name):
+        return None
+    return (
+        f"{name} is taken as metres, since its name has no unit, but robots are not so fast: if it "
+        "is in mm, say so in its name (pose_mm, x_mm)"
+    )
 
 
 def places_of(columns: Columns, position: tuple[Signal, Signal]) -> tuple[Array, Array, Array]:

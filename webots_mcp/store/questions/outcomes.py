@@ -17,7 +17,7 @@ from webots_mcp.store.analysis.spread import (
     verdicts_on,
 )
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import Motion, path_length, position_noise
+from webots_mcp.store.detection.motion import Motion, doubt_of_unit, path_length, position_noise
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Collected, collect
 from webots_mcp.store.questions.runs import run_info
@@ -198,6 +198,8 @@ def _outcome(
         distance_m = None if purged else _distance(connection, part, deadline)
         speed = None if distance_m is None else distance_m / duration_s
         figures |= {"distance_m": distance_m, _SPEED: speed}
+        if doubt := doubt_of_unit(part.motion.position, speed or 0.0):
+            not_known["distance_m, mean_speed_m_s"] = doubt
     modes = _mode_times(connection, part, deadline)
     figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
     if not modes:

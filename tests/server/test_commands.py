@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import sqlite3
 import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +22,10 @@ from tests.server.conftest import Connect, ask, fail
 from tests.store.test_queue import claim
 from webots_mcp.connection import connect as connect_database
 from webots_mcp.errors import CommandRefusedError
+from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.keyboard import press_reset
 from webots_mcp.store.queue import CommandQueue, fetch_command, list_commands
+from webots_mcp.store.recording import Recording
 
 pytestmark = pytest.mark.anyio
 
@@ -371,3 +375,32 @@ def test_on_macos_the_reset_keys_are_sent_by_osascript(
     else:
         press_reset("darwin")
     assert 'keystroke "t" using {command down, shift down}' in said.read_text()
+
+
+async def test_who_is_interrupted_while_a_command_is_being_sent_leaves_none_behind(
+    recorded: Recorded, file: Path
+) -> None:
+    robot, sending = recorded.robot(), threading.Event()
+
+    class Told(Recording):
+        @contextmanager
+        def writer(self) -> Generator[sqlite3.Connection]:
+            sending.set()
+            with super().writer() as connection:
+                yield connection
+
+    async def report(done: float, total: float | None, text: str) -> None: ...
+
+    recorded.connection.execute("BEGIN IMMEDIATE")  # the sending thread waits for the lock
+    dispatcher = Dispatcher(Told(file, file.parent), report)
+    asking = asyncio.ensure_future(dispatcher.ask("rover", "pause", 10))
+    assert await asyncio.to_thread(sending.wait, 30)
+    asking.cancel()  # as Ctrl-C does: not by a scope of anyio's
+    for _ in range(100):
+        await asyncio.sleep(0)
+    assert not asking.done(), "it has still to learn what was sent"
+    recorded.connection.execute("COMMIT")
+    with pytest.raises(asyncio.CancelledError):
+        await asking
+    sent = list_commands(recorded.connection, robot.id, limit=9)
+    assert [command.status for command in sent] == ["cancelled"]

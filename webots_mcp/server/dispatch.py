@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Awaitable, Callable, Mapping
+from functools import partial
 from typing import Any, Final
 
 import anyio
@@ -58,7 +60,7 @@ class Dispatcher:
             NothingRecordedError: There is no robot to ask.
         """
         started_s = time.monotonic()
-        sent = await to_thread.run_sync(self._enqueue, robot, action, params or {}, timeout_s)
+        sent = await self._send(robot, action, params or {}, timeout_s)
         command = await self._outcome(sent, timeout_s)
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
@@ -74,6 +76,20 @@ class Dispatcher:
         command = await self._watch(command_id, timeout_s)
         waited_s = round(time.monotonic() - started_s, 3)
         return await to_thread.run_sync(self._answer, command, waited_s)
+
+    async def _send(
+        self, robot: str | None, action: str, params: Mapping[str, Any], timeout_s: float
+    ) -> Command:
+        sending = _Sending(partial(self._enqueue, robot, action, params, timeout_s))
+        try:
+            sent = await to_thread.run_sync(sending.send)
+            assert sent is not None, "stopped below only"
+            return sent
+        except (anyio.get_cancelled_exc_class(), KeyboardInterrupt):
+            with anyio.CancelScope(shield=True):
+                if (sent := await to_thread.run_sync(sending.stop)) is not None:
+                    await to_thread.run_sync(self._leave, sent)
+            raise
 
     async def _outcome(self, command: Command, timeout_s: float) -> Command:
         try:
@@ -152,6 +168,28 @@ class Dispatcher:
             if command.action == RUN:
                 return RunAnswer(**facts, **told_of_run(view, command))
             return CommandAnswer(**facts, result=shown_result(command))
+
+
+class _Sending:
+    """Sends a command in a thread, which goes on when Ctrl-C ends the task that waits for it."""
+
+    def __init__(self, enqueue: Callable[[], Command]) -> None:
+        self._enqueue = enqueue
+        self._lock = threading.Lock()
+        self._sent: Command | None = None
+        self._stopped = False
+
+    def send(self) -> Command | None:
+        with self._lock:
+            if not self._stopped:
+                self._sent = self._enqueue()
+            return self._sent
+
+    def stop(self) -> Command | None:
+        """From now on nothing is sent; what was."""
+        with self._lock:
+            self._stopped = True
+            return self._sent
 
 
 def shown_result(command: Command, budget: int = RESULT_BUDGET) -> Any:

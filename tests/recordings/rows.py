@@ -10,7 +10,7 @@ import time
 from typing import Any
 
 from webots_mcp.connection import connect
-from webots_mcp.contract import Database
+from webots_mcp.contract import Database, new_uuid
 from webots_mcp.schema import create_schema
 
 
@@ -118,6 +118,12 @@ class RecordedRobot:
     def event(self, sim_time_s: float, kind: str, name: str | None, data: object) -> int:
         values = self._stamped(sim_time_s) | {"kind": kind, "name": name, "data": json.dumps(data)}
         return insert(self.connection, "event", values)
+
+    def kept(self, start_s: float, end_s: float, reason: str) -> int:
+        """A stretch at full rate."""
+        values = {"run_id": self.run_id, "uuid": new_uuid(), "wall_time_s": self.now}
+        span = {"start_sim_time_s": start_s, "end_sim_time_s": end_s}
+        return insert(self.connection, "kept_stretch", values | span | {"reason": reason})
 
     def image(self, sim_time_s: float, path: str, **changes: Any) -> int:
         values = self._stamped(sim_time_s) | {

@@ -242,6 +242,19 @@ async def test_the_full_state_has_events_and_the_recorders_health(
     assert health["controller_sha256"] == "a" * 64
 
 
+async def test_the_full_state_says_which_seconds_were_kept_last(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    robot.state(60.0, {"x": 1})
+    async with connect() as client:
+        assert "kept_at_full_rate" not in (await ask(client, "webots_get_full_state"))["recorder"]
+        robot.kept(5.0, 12.0, "breakpoint 1: front_m < 0.1")
+        robot.kept(40.0, 47.0, "error: the gear is gone")
+        answer = await ask(client, "webots_get_full_state")
+    assert answer["recorder"]["kept_at_full_rate"] == "40.000-47.000 s: error: the gear is gone"
+
+
 async def test_the_world_is_described_with_its_companions(
     connect: Connect, recorded: Recorded
 ) -> None:

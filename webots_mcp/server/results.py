@@ -79,7 +79,7 @@ class FullStateAnswer(Answer):
     replaced: dict[str, str] | None = None
     events: Table | None = None
     recorder: dict[str, Any] | None = Field(
-        default=None, description="Rows waiting and dropped, last error, controller code."
+        default=None, description="Rows waiting and dropped, last kept stretch, error, controller."
     )
 
 

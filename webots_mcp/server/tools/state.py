@@ -20,6 +20,7 @@ from webots_mcp.server.shortening import (
     shorten,
 )
 from webots_mcp.store.events import newest_events
+from webots_mcp.store.reading.kept import newest_kept
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.sessions import fetch_session
 from webots_mcp.store.states import State, select
@@ -195,6 +196,7 @@ def _recorder(view: View) -> dict[str, Any] | None:
     error = cut_text(session.last_error, _ERROR_CHARACTERS) if session.last_error else None
     return {
         "rows_recorded": view.run.rows if view.run else 0,
+        **_kept(view),
         **waiting(view.connection, session),
         "rows_dropped": session.rows_dropped,
         "last_error": error,
@@ -205,6 +207,15 @@ def _recorder(view: View) -> dict[str, Any] | None:
         "git_commit": session.git_commit,
         "versions": session.versions,
     }
+
+
+def _kept(view: View) -> dict[str, str]:
+    """Which seconds of the run were kept last at full rate, and why."""
+    newest = newest_kept(view.connection, view.run.id) if view.run else None
+    if newest is None:
+        return {}
+    span = f"{newest.start_s:.3f}-{newest.end_s:.3f} s"
+    return {"kept_at_full_rate": f"{span}: {cut_text(newest.reason, _ERROR_CHARACTERS)}"}
 
 
 def _replaced_in(state: State, part: dict[str, Any]) -> dict[str, str] | None:

@@ -8,6 +8,7 @@ states (extremes, changes, conditions) takes in both.
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from typing import Final, NamedTuple
 
@@ -52,6 +53,12 @@ def kept_stretches(
     """The stretches that touch [start_s, end_s) of a run, in order, as far as they are written."""
     rows = connection.execute(_STRETCHES, (run_id, start_s, end_s, MOST_STRETCHES)).fetchall()
     return [_as_written(connection, run_id, KeptStretch(*row)) for row in reversed(rows)]
+
+
+def newest_kept(connection: sqlite3.Connection, run_id: int) -> KeptStretch | None:
+    """The stretch of a run that begins last."""
+    row = connection.execute(_STRETCHES, (run_id, -math.inf, math.inf, 1)).fetchone()
+    return row and _as_written(connection, run_id, KeptStretch(*row))
 
 
 def _as_written(connection: sqlite3.Connection, run_id: int, stretch: KeptStretch) -> KeptStretch:

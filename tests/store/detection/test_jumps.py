@@ -144,3 +144,19 @@ def test_which_beam_is_the_shortest_neither_jumps_nor_freezes(
     asked = EventOptions(kinds=("jump", "flat"), signals=("lidar.argmin",))
     found = find_events(empty, resolve_range(empty), asked).verdicts.not_searched
     assert all("leaps and rests by nature" in found[kind] for kind in ("jump", "flat"))
+
+
+def test_what_is_rarer_is_the_disturbance_wherever_it_begins(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    low_s = [(10.0, 14.0), (25.0, 27.5), (40.0, 46.0)]
+
+    def front(time_s: float) -> dict[str, Any]:
+        low = any(start_s <= time_s < end_s for start_s, end_s in low_s)
+        far_mm = 800 if time_s < 12 else 600
+        return {"front_mm": (40 if low else far_mm) + 2 * math.sin(3 * time_s)}
+
+    record(empty, front)
+    found = [(each.start_s, each.end_s) for each in jumps(empty) if each.details["after"] < 100]
+    assert found == [pytest.approx(each, abs=0.11) for each in low_s]
+    assert len(jumps(empty)) == 3

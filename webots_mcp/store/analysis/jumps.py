@@ -14,6 +14,7 @@ MOST_JUMPS_SHARE: Final = 0.1  # of the rows: more of them are how the signal is
 LEAST_STEPS: Final = 10
 LONGEST_EXCURSION: Final = 5  # rows that a value which otherwise rests may be elsewhere
 BACK_SHARE: Final = 0.2  # of a step: who comes back to so near where it began is back
+BACK_HALF: Final = 0.5  # of a step: who comes back by so much to where it usually is, as well
 MOTION_SHARE: Final = 0.5  # of a step: the least of one beside it, if both are of one motion
 POSITION_STEPS: Final = 5.0  # a position jumps by so many times its 99th percentile step
 WHOLE_TURNS: Final = (math.tau, 360.0)
@@ -48,11 +49,11 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
         times: Of the values.
         values: In order.
         score: How much larger than usual a step has to be.
-        usual: The sizes of steps to compare with; None for those of the values themselves.
+        usual: Values one after the other whose steps and level to compare with; None for the same.
     """
     steps = np.abs(np.diff(values))
     backs = _come_back(times, values, steps)
-    sizes = usual if usual is not None else steps[_stay(backs, len(steps))]
+    sizes = steps[_stay(backs, len(steps))] if usual is None else np.abs(np.diff(usual))
     sizes = sizes[sizes > 0]
     if len(sizes) < LEAST_STEPS:
         return [_jump(times, values, row, float(times[back])) for row, back in backs.items()]
@@ -61,7 +62,10 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
     wide = np.flatnonzero(steps > limit)
     far = _step(values[wide], values[wide + 1]) > limit * _intervals(times, wide)
     alone = far & ~_in_motion(values, wide)
-    return list(_with_return([_jump(times, values, row) for row in wide[alone].tolist()]))
+    jumps = [_jump(times, values, row) for row in wide[alone].tolist()]
+    if len(jumps) < 2:
+        return jumps
+    return list(_with_return(jumps, float(np.median(values if usual is None else usual))))
 
 
 def are_usual(jumps: Sequence[Jump], rows: int) -> bool:
@@ -121,19 +125,38 @@ def _step(before: Array, after: Array) -> Array:
     return np.min([far, *(np.where(largest <= turn, turn - far, far) for turn in WHOLE_TURNS)], 0)
 
 
-def _with_return(jumps: Sequence[Jump]) -> Iterator[Jump]:
-    """A jump and the next one back to about where it began are one."""
+def _with_return(jumps: Sequence[Jump], usual: float) -> Iterator[Jump]:
+    """A jump away from where it usually is and the next one back are one.
+
+    Usual is the median: the level at which it is for the greater share of the time. Back is also
+    who comes to where it usually is, in one step of at least half the size.
+
+    Args:
+        jumps: In order.
+        usual: Jumps towards it begin nothing.
+    """
     index = 0
     while index < len(jumps):
         jump = jumps[index]
         following = jumps[index + 1] if index + 1 < len(jumps) else None
-        size = abs(jump.after - jump.before)
-        if following is not None and abs(following.after - jump.before) < BACK_SHARE * size:
+        if following is not None and _is_excursion(jump, following, usual):
             yield replace(jump, back_s=following.sim_time_s)
             index += 2
         else:
             yield jump
             index += 1
+
+
+def _is_excursion(jump: Jump, following: Jump, usual: float) -> bool:
+    """Whether one leads away from where it usually is, and the other from there back."""
+    size, way_back = jump.after - jump.before, following.before - following.after
+    if abs(jump.after - usual) < abs(jump.before - usual):
+        return False
+    if abs(following.after - jump.before) < BACK_SHARE * abs(size):
+        return True
+    from_there = abs(following.before - jump.after) < BACK_SHARE * abs(size)
+    nearer = abs(following.after - usual) < abs(following.before - usual)
+    return from_there and nearer and way_back / size >= BACK_HALF
 
 
 def find_leaps(times: Array, x: Array, y: Array, at_least_m: float) -> list[tuple[float, float]]:

@@ -37,7 +37,7 @@ def jump_events(search: Search) -> Iterator[Event]:
             jump
             for course in search.view.courses(signal)
             for jump in find_jumps(
-                course.times, course.numbers, search.options.jump_score, course.usual_steps
+                course.times, course.numbers, search.options.jump_score, course.usual
             )
         ]
         if are_usual(jumps, search.view.summary(signal).present):

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.analysis.rhythm import GAP_INTERVALS, usual_interval_s
 from webots_mcp.store.analysis.summary import Summary, merge, summarise_numbers
 from webots_mcp.store.reading.deadline import Deadline
@@ -65,12 +65,12 @@ class Course:
     """Numbers of a signal in which jumps are looked for.
 
     Attributes:
-        usual_steps: Sizes of steps to compare with; None for those of the numbers themselves.
+        usual: Numbers one after the other to compare with; None for the same.
     """
 
     times: Array
     numbers: Array
-    usual_steps: Array | None = None
+    usual: Array | None = None
 
 
 class View(Protocol):
@@ -319,7 +319,8 @@ class LongView:
             if self._deadline.passed:
                 self._cut()
                 return
-            yield Course(*self._numbers(signal, bucket), self._usual_steps(signal))
+            usual = self._sample.numbers(signal.name)[1]
+            yield Course(*self._numbers(signal, bucket), usual)
 
     def stretches(
         self, signals: Sequence[Signal], share: float, least_steps: Sequence[float] | None = None
@@ -437,9 +438,6 @@ class LongView:
         end_s = min(self._segment.end_s, (bucket + 1) * BUCKET_S + self._join_s)
         part = replace(self._segment, start_s=start_s, end_s=end_s)
         return read_columns(self._connection, part, [signal], self._deadline).numbers(signal.name)
-
-    def _usual_steps(self, signal: Signal) -> Array:
-        return np.abs(np.diff(self._sample.numbers(signal.name)[1]))
 
 
 def _bucket(wide: tuple[float, int]) -> int:

@@ -1,5 +1,5 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 5;
+PRAGMA user_version = 6;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
@@ -311,16 +311,11 @@ CREATE TABLE coarse_rollup (
 	sum FLOAT, 
 	squares FLOAT /* sum of squared deviations from sum / count */, 
 	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, 
-	largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */, 
+	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, 
 	PRIMARY KEY (run_id, signal_id, bucket), 
 	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
  WITHOUT ROWID;
-CREATE VIEW all_rollup AS
-/* Rollups, those of buckets that are over and the newest. */
-SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step FROM rollup
-UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step FROM recent_rollup;
 CREATE TABLE breakpoint (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	robot_id INTEGER NOT NULL, 
@@ -375,17 +370,9 @@ CREATE TABLE trial_set (
 	created_wall_time_s FLOAT NOT NULL, 
 	host TEXT /* of the process at work */, 
 	pid INTEGER, 
-	process TEXT /* which process of that pid; null where the system does not tell */, 
-	robot_id INTEGER /* in whose simulation the trials run; null: each in one of its own */, 
-	session_id INTEGER /* of the controller that was tried */, 
-	former_values TEXT /* JSON object: its parameters before, until they are set back */, 
-	stop_reason TEXT /* why it does not go on although trials wait */, 
-	CONSTRAINT fk_trial_set_robot_id FOREIGN KEY(robot_id) REFERENCES robot (id) ON DELETE SET NULL, 
-	CONSTRAINT fk_trial_set_session_id FOREIGN KEY(session_id) REFERENCES session (id) ON DELETE SET NULL
-);
+	process TEXT /* which process of that pid; null where the system does not tell */
+, robot_id INTEGER /* in whose simulation the trials run; null: each in one of its own */ CONSTRAINT fk_trial_set_robot_id REFERENCES robot (id) ON DELETE SET NULL, session_id INTEGER /* of the controller that was tried */ CONSTRAINT fk_trial_set_session_id REFERENCES session (id) ON DELETE SET NULL, former_values TEXT /* JSON object: its parameters before, until they are set back */ NULL, stop_reason TEXT /* why it does not go on although trials wait */ NULL);
 CREATE UNIQUE INDEX ix_trial_set_uuid ON trial_set (uuid);
-CREATE INDEX ix_trial_set_robot_id ON trial_set (robot_id);
-CREATE INDEX ix_trial_set_session_id ON trial_set (session_id);
 CREATE TABLE trial (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	trial_set_id INTEGER NOT NULL, 
@@ -408,6 +395,21 @@ CREATE TABLE trial (
 );
 CREATE INDEX ix_trial_run_id ON trial (run_id);
 CREATE UNIQUE INDEX ix_trial_uuid ON trial (uuid);
+CREATE VIEW robot_parameter AS
+/* The values that parameters had in each run, each from a time on; true and false as text. */
+SELECT r.name AS robot, v.run_id, v.name,
+  CASE json_type(v.j) WHEN 'true' THEN 'true' WHEN 'false' THEN 'false'
+    ELSE json_extract(v.j, '$') END AS value,
+  p.unit, v.sim_time_s AS since_s, strftime('%Y-%m-%d %H:%M:%f', v.wall_time_s, 'unixepoch') AS utc, v.is_default, v.set_by, v.command_id
+FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
+JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
+LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
+CREATE VIEW all_rollup AS
+/* Rollups, those of buckets that are over and the newest. */
+SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step FROM rollup
+UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step FROM recent_rollup;
+CREATE INDEX ix_trial_set_robot_id ON trial_set (robot_id);
+CREATE INDEX ix_trial_set_session_id ON trial_set (session_id);
 CREATE TABLE kept_stretch (
 	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
 	run_id INTEGER NOT NULL, 
@@ -432,15 +434,6 @@ CREATE TABLE kept_state (
 	CONSTRAINT uq_kept_state_run_id UNIQUE (run_id, call)
 );
 CREATE INDEX ix_kept_state_run_id_sim_time_s ON kept_state (run_id, sim_time_s);
-CREATE VIEW robot_parameter AS
-/* The values that parameters had in each run, each from a time on; true and false as text. */
-SELECT r.name AS robot, v.run_id, v.name,
-  CASE json_type(v.j) WHEN 'true' THEN 'true' WHEN 'false' THEN 'false'
-    ELSE json_extract(v.j, '$') END AS value,
-  p.unit, v.sim_time_s AS since_s, strftime('%Y-%m-%d %H:%M:%f', v.wall_time_s, 'unixepoch') AS utc, v.is_default, v.set_by, v.command_id
-FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
-JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
-LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
 CREATE VIEW every_state AS
 /* All states of a run, those that only kept stretches have included: they have no state_id. */
 SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
@@ -571,4 +564,4 @@ SELECT (
     (SELECT value FROM json_tree(j) WHERE type = 'text' AND lower(key) IN ('state', 'status')
       ORDER BY length(replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '')), replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS mode, s.odd
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
-INSERT INTO alembic_version (version_num) VALUES ('0005');
+INSERT INTO alembic_version (version_num) VALUES ('0006');

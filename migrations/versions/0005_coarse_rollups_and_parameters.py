@@ -1,7 +1,6 @@
 """Rollups of 500 s beside those of 10 s: a long recording is read fast as a whole.
 
 They are made from those of 10 s while the server maintains the database, also of older recordings.
-Rollups tell the largest step between values that follow each other.
 
 And parameters that a controller declares, and the values that they had in each run; breakpoints;
 how many of its publish() calls a session records; trials. The views robot_now and robot_trajectory
@@ -38,11 +37,6 @@ NUMBERS = {
     "sines": "angles only: sum of sines",
     "cosines": "angles only: sum of cosines",
 }
-STEP = {
-    "largest_step": "largest difference of values that follow each other; null in those of older "
-    "versions"
-}
-ROLLUPS = ("rollup", "recent_rollup")
 UUID = "random (version 4); names the row among those of all machines"
 PROCESS = "which process of that pid; null where the system does not tell"
 NOW_UTC = "strftime('%Y-%m-%d %H:%M:%f', v.wall_time_s, 'unixepoch')"
@@ -58,24 +52,6 @@ JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name"""
 
 
-EVERY_STATE = """
-CREATE VIEW every_state AS
-/* All states of a run, those that only kept stretches have included: they have no state_id. */
-SELECT id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
-UNION ALL
-SELECT NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state"""
-
-ROBOT_KEPT = """
-CREATE VIEW robot_kept AS
-/* Stretches that are kept at full rate: from when to when, why, how many states each has. */
-SELECT r.name AS robot, k.run_id, k.id AS stretch_id, k.start_sim_time_s AS start_s,
-  min(k.end_sim_time_s, max(u.last_sim_time_s, k.start_sim_time_s)) AS end_s,
-  (SELECT count(*) FROM every_state s WHERE s.run_id = k.run_id
-    AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) AS states,
-  strftime('%Y-%m-%d %H:%M:%f', k.wall_time_s, 'unixepoch') AS utc, k.reason
-FROM kept_stretch k JOIN run u ON u.id = k.run_id JOIN robot r ON r.id = u.robot_id"""
-
-
 def first_of(paths: str) -> str:
     """The first of these places in a state that holds something; null where it is no JSON."""
     found = ",\n    ".join(f"json_extract(j, '$.{path}')" for path in paths.split())
@@ -85,24 +61,15 @@ def first_of(paths: str) -> str:
 def coordinate(usual: str, other: str) -> str:
     """The x (`key`) or y (`value`) of the first usual pair of two numbers, or of any branch."""
     return f"""coalesce(
-    (SELECT json_extract(j, '$.' || {usual}) * {metres("p.key")}
-      FROM json_each('{PAIRS}') p
+    (SELECT json_extract(j, '$.' || {usual}) FROM json_each('{PAIRS}') p
       WHERE json_type(j, '$.' || p.key) {IS_NUMBER} AND json_type(j, '$.' || p.value) {IS_NUMBER}
       LIMIT 1),
-    (SELECT {other}.value * {metres("x.path")}
-      FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
+    (SELECT {other}.value FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
       WHERE x.key = 'x' AND y.key = 'y' AND x.type {IS_NUMBER} AND y.type {IS_NUMBER}
         AND NOT EXISTS (SELECT 1 FROM json_each('{ELSEWHERE}') w WHERE
           instr(replace(lower({NAME.format("x.path")}), '_', '.') || '.', '.' || w.value || '.'))
       ORDER BY NOT EXISTS (SELECT 1 FROM json_each('{json.dumps(BRANCHES)}') w
         WHERE {NAME.format("x.path")} LIKE '%.' || w.value), {NAME.format("x.path")} LIMIT 1))"""
-
-
-def metres(path: str) -> str:
-    """What one of the unit that stands in a path is in metres: 1 where there is none."""
-    name = f"{NAME.format(path)} || '.'"
-    cases = " ".join(f"WHEN {name} GLOB '*_{unit}.*' THEN {size}" for unit, size in UNITS.items())
-    return f"CASE {cases} ELSE 1 END"
 
 
 def word(words: str) -> str:
@@ -120,10 +87,7 @@ def word(words: str) -> str:
 # As webots_mcp/naming.py had them; a later change there takes a migration of its own.
 IS_NUMBER = "IN ('integer', 'real')"
 BRANCHES = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
-UNITS = {"mm": 0.001, "cm": 0.01}
-LENGTHS = ("m", "cm", "mm")
-NAMED = [(f"x_{unit}", f"y_{unit}") for unit in LENGTHS]
-AXES = (("[0]", "[1]"), (".x", ".y"), *((f".{x}", f".{y}") for x, y in NAMED))
+AXES = (("[0]", "[1]"), (".x", ".y"), (".x_m", ".y_m"))
 ELSEWHERE = json.dumps([
     "accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass",
     "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed",
@@ -131,11 +95,8 @@ ELSEWHERE = json.dumps([
     "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel",
     "reference", "setpoint", "target", "waypoint",
 ])  # fmt: skip
-USUAL = [
-    *((branch + x, branch + y) for branch in BRANCHES for x, y in AXES),
-    *((f"{branch}_{unit}[0]", f"{branch}_{unit}[1]") for branch in BRANCHES for unit in LENGTHS),
-]
-PAIRS = json.dumps(dict([*USUAL, ("x", "y"), *NAMED]))
+USUAL = [(branch + x, branch + y) for branch in BRANCHES for x, y in AXES]
+PAIRS = json.dumps(dict([*USUAL, ("x", "y"), ("x_m", "y_m")]))
 NAME = """replace(replace(replace({}, '"', ''), '[', '.'), ']', '')"""
 OLD_POSITION = f"""
   {first_of("pose[0] pose.x position[0] position.x gps[0] gps.x x")} AS x_m,
@@ -162,10 +123,6 @@ def upgrade() -> None:
         ),
     )
     create_coarse_rollup()
-    for table in ROLLUPS:
-        for name, comment in STEP.items():
-            op.add_column(table, sa.Column(name, sa.Float(), comment=comment))
-    replace_all_rollup([*COUNTS, *NUMBERS, *STEP])
     op.add_column(
         "session",
         sa.Column(
@@ -177,23 +134,11 @@ def upgrade() -> None:
     create_parameter_value()
     create_trial_set()
     create_trial()
-    create_kept_stretch()
-    create_kept_state()
     if op.get_context().dialect.name == "sqlite":
-        for created in (ROBOT_PARAMETER, EVERY_STATE, ROBOT_KEPT):
-            op.get_bind().exec_driver_sql(created.strip())
+        op.get_bind().exec_driver_sql(ROBOT_PARAMETER.strip())
         for view in ("robot_now", "robot_trajectory"):
             replace_in_view(view, {OLD_POSITION: POSITION, OLD_MODE: MODE})
         op.execute("PRAGMA user_version = 5")
-
-
-def replace_all_rollup(figures: list[str]) -> None:
-    """Make the view of both tables of rollups again, with these figures."""
-    columns = ", ".join(["run_id", "signal_id", "bucket", *figures])
-    tables = "\nUNION ALL ".join(f"SELECT {columns} FROM {table}" for table in ROLLUPS)
-    said = "/* Rollups, those of buckets that are over and the newest. */"
-    op.execute("DROP VIEW all_rollup")
-    op.execute(f"CREATE VIEW all_rollup AS\n{said}\n{tables}")
 
 
 def replace_in_view(view: str, texts: dict[str, str]) -> None:
@@ -220,10 +165,7 @@ def create_coarse_rollup() -> None:
             sa.Column(name, sa.Integer(), server_default=zero, nullable=False, comment=comment)
             for name, comment in COUNTS.items()
         ),
-        *(
-            sa.Column(name, sa.Float(), comment=comment)
-            for name, comment in (NUMBERS | STEP).items()
-        ),
+        *(sa.Column(name, sa.Float(), comment=comment) for name, comment in NUMBERS.items()),
         sa.ForeignKeyConstraint(
             ["run_id"], ["run.id"], name=op.f("fk_coarse_rollup_run_id"), ondelete="CASCADE"
         ),
@@ -362,33 +304,10 @@ def create_trial_set() -> None:
         sa.Column("host", sa.Text(), comment="of the process at work"),
         sa.Column("pid", sa.Integer()),
         sa.Column("process", sa.Text(), comment=PROCESS),
-        sa.Column(
-            "robot_id",
-            sa.Integer(),
-            comment="in whose simulation the trials run; null: each in one of its own",
-        ),
-        sa.Column("session_id", sa.Integer(), comment="of the controller that was tried"),
-        sa.Column(
-            "former_values",
-            sa.Text(),
-            comment="JSON object: its parameters before, until they are set back",
-        ),
-        sa.Column("stop_reason", sa.Text(), comment="why it does not go on although trials wait"),
-        sa.ForeignKeyConstraint(
-            ["robot_id"], ["robot.id"], name=op.f("fk_trial_set_robot_id"), ondelete="SET NULL"
-        ),
-        sa.ForeignKeyConstraint(
-            ["session_id"],
-            ["session.id"],
-            name=op.f("fk_trial_set_session_id"),
-            ondelete="SET NULL",
-        ),
         sa.PrimaryKeyConstraint("id"),
         sqlite_autoincrement=True,
     )
     op.create_index(op.f("ix_trial_set_uuid"), "trial_set", ["uuid"], unique=True)
-    op.create_index(op.f("ix_trial_set_robot_id"), "trial_set", ["robot_id"])
-    op.create_index(op.f("ix_trial_set_session_id"), "trial_set", ["session_id"])
 
 
 def create_trial() -> None:
@@ -431,65 +350,7 @@ def create_trial() -> None:
     op.create_index(op.f("ix_trial_uuid"), "trial", ["uuid"], unique=True)
 
 
-def create_kept_stretch() -> None:
-    op.create_table(
-        "kept_stretch",
-        sa.Column("id", sa.Integer(), nullable=False),
-        sa.Column("run_id", sa.Integer(), nullable=False),
-        sa.Column("uuid", sa.Text(), nullable=False, comment=UUID),
-        sa.Column("start_sim_time_s", sa.Float(), nullable=False),
-        sa.Column(
-            "end_sim_time_s",
-            sa.Float(),
-            nullable=False,
-            comment="ahead of the newest row while it goes on",
-        ),
-        sa.Column("wall_time_s", sa.Float(), nullable=False, comment="when it was asked for"),
-        sa.Column("reason", sa.Text(), nullable=False, comment="why it is kept"),
-        sa.ForeignKeyConstraint(
-            ["run_id"], ["run.id"], name=op.f("fk_kept_stretch_run_id"), ondelete="CASCADE"
-        ),
-        sa.PrimaryKeyConstraint("id"),
-        sqlite_autoincrement=True,
-    )
-    op.create_index(
-        op.f("ix_kept_stretch_run_id_start_sim_time_s"),
-        "kept_stretch",
-        ["run_id", "start_sim_time_s"],
-    )
-    op.create_index(op.f("ix_kept_stretch_uuid"), "kept_stretch", ["uuid"], unique=True)
-
-
-def create_kept_state() -> None:
-    op.create_table(
-        "kept_state",
-        sa.Column("id", sa.Integer(), nullable=False),
-        sa.Column("run_id", sa.Integer(), nullable=False),
-        sa.Column(
-            "call",
-            sa.Integer(),
-            comment="its number in the session; null where retention moved it here from state",
-        ),
-        sa.Column("sim_time_s", sa.Float(), nullable=False),
-        sa.Column("wall_time_s", sa.Float(), nullable=False),
-        sa.Column("data", sa.Text(), nullable=False, comment="JSON object"),
-        sa.Column("odd", sa.Text(), comment="as in state"),
-        sa.ForeignKeyConstraint(
-            ["run_id"], ["run.id"], name=op.f("fk_kept_state_run_id"), ondelete="CASCADE"
-        ),
-        sa.PrimaryKeyConstraint("id"),
-        sa.UniqueConstraint("run_id", "call", name=op.f("uq_kept_state_run_id")),
-        sqlite_autoincrement=True,
-    )
-    op.create_index(op.f("ix_kept_state_run_id_sim_time_s"), "kept_state", ["run_id", "sim_time_s"])
-
-
 def downgrade() -> None:
-    if op.get_context().dialect.name == "sqlite":
-        op.execute("DROP VIEW robot_kept")
-        op.execute("DROP VIEW every_state")
-    op.drop_table("kept_state")
-    op.drop_table("kept_stretch")
     op.drop_table("trial")
     op.drop_table("trial_set")
     op.drop_table("breakpoint")
@@ -501,10 +362,6 @@ def downgrade() -> None:
     op.drop_table("parameter_value")
     op.drop_table("parameter")
     op.drop_table("coarse_rollup")
-    replace_all_rollup([*COUNTS, *NUMBERS])
-    for table in ROLLUPS:
-        for name in STEP:
-            op.drop_column(table, name)
     op.drop_column("run", "coarse_end")
     if op.get_context().dialect.name == "sqlite":
         op.execute("PRAGMA user_version = 4")

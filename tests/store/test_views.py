@@ -15,6 +15,7 @@ import pytest
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
 from webots_mcp.connection import connect
+from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.naming import USUAL_POSITIONS, flatten
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion, in_metres
@@ -254,9 +255,9 @@ def test_the_views_come_and_go_with_their_revision_and_the_data_stays(tmp_path: 
         assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
         assert rows(connection, "SELECT keep, purged_rows FROM run") == [(0, 0)]
 
-        assert upgrade(file) == (3, 5)
+        assert upgrade(file) == (3, SCHEMA_VERSION)
         assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
-        assert downgrade(file, "0003") == (5, 3)
+        assert downgrade(file, "0003") == (SCHEMA_VERSION, 3)
         assert rows(connection, "SELECT x_m FROM robot_now") == [(1,)]
 
         assert downgrade(file, "0002") == (3, 2)

@@ -41,15 +41,15 @@ _Seconds = Annotated[float, AfterValidator(_as_seconds)]
 _Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
 RobotName = Annotated[
     Annotated[str, Field(max_length=LONGEST_NAME)] | None,
-    Field(description="Where several are live."),
+    Field(description="If several are live."),
 ]
-RunId = Annotated[Id | None, Field(description="Instead of its current run.")]
-TrialSetId = Annotated[Id | None, Field(description="Of webots_get_trials.")]
+RunId = Annotated[Id | None, Field(description="Else the current run.")]
+TrialSetId = Annotated[Id | None, Field(description="From webots_run_trials.")]
 LastS = Annotated[
     _Duration | None,
-    Field(description="The last seconds of simulation time."),
+    Field(description="The last simulated seconds."),
 ]
-StartS = Annotated[_Seconds | None, Field(description="From this simulation time on.")]
+StartS = Annotated[_Seconds | None, Field(description="From this simulation time.")]
 EndS = Annotated[_Seconds | None, Field(description="Before this simulation time.")]
 TimeoutS = Annotated[
     float,
@@ -60,7 +60,7 @@ Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
 # A number is as good; one type that holds both is shorter than two.
 _WallTime = Annotated[float | str | None, WithJsonSchema({"type": "string"})]
-Since = Annotated[_WallTime, Field(description="From this wall time on: ISO 8601, Unix seconds.")]
+Since = Annotated[_WallTime, Field(description="From this wall time: ISO 8601, Unix seconds.")]
 Until = Annotated[_WallTime, Field(description="Before this wall time.")]
 Names = Annotated[
     list[str],
@@ -100,21 +100,21 @@ TimelineKinds = Annotated[
 ]
 ShownLimit = Annotated[
     int | None,
-    Field(ge=1, le=500, description="At most so many; by default a short answer."),
+    Field(ge=1, le=500, description="Most shown; few by default."),
 ]
-LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: this level and above.")]
+LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: from this level.")]
 Limit = Annotated[int, Field(ge=1, le=500, description="At most so many.")]
 RunIds = Annotated[
     list[Id] | None,
     Field(max_length=10, description="From webots_list_runs."),
 ]
 Position = Annotated[
-    list[Annotated[str, Field(max_length=LONGEST_NAME)]] | None,
-    Field(min_length=2, max_length=2, description="Signals of x and y, if not found by name."),
+    list[str] | None,
+    Field(min_length=2, max_length=2, description="Signals of x and y, if not found."),
 ]
 Mode = Annotated[
     str | None,
-    Field(max_length=LONGEST_NAME, description="Signal of the mode, if not found by name."),
+    Field(max_length=LONGEST_NAME, description="Signal of the mode, if not found."),
 ]
 # What a client gives for a `Scope`, which tools take whole.
 SCOPE: Final = {

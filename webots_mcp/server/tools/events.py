@@ -62,10 +62,10 @@ def webots_find_events(
     below: Annotated[float | None, Field(description="... or below this")] = None,
     for_s: Annotated[float, Field(ge=0, description="... for at least so long.")] = 0,
     stuck_s: Annotated[
-        float, Field(gt=0, description="Still is who for so long ...")
+        float, Field(gt=0, description="Still: at least so long ...")
     ] = EventOptions.stuck_s,
     stuck_m: Annotated[
-        float, Field(gt=0, description="... stays within so many metres (more if noisy).")
+        float, Field(gt=0, description="... within so many metres.")
     ] = EventOptions.stuck_m,
     position: Position = None,
     mode: Mode = None,
@@ -75,7 +75,7 @@ def webots_find_events(
 ) -> EventsAnswer:
     """What went wrong, since when, how often: searches the values, by default of the whole run.
 
-    Many alike events of one signal are told as one, counted. verdicts: what was found, what
+    Many alike events are told as one, counted. verdicts: what was found, what
     is absent, what was not looked for and why. What is not shown is counted; cursor shows it.
     """
     thresholds = thresholds_on(signals or (), above, below, for_s)

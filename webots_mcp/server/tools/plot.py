@@ -45,15 +45,15 @@ def webots_plot(
     run_ids: RunIds = None,
     trial_set: TrialSetId = None,
     width_px: Annotated[
-        int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="Wider: more detail.")
+        int, Field(ge=LEAST_WIDTH_PX, le=MOST_PX, description="Pixels.")
     ] = WIDTH_PX,
     height_px: Annotated[
-        int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="Higher: more.")
+        int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="Pixels.")
     ] = HEIGHT_PX,
 ) -> list[str | Image]:
     """A picture of signals over time (mean line, min-max band, modes, events), way, or trials.
 
-    Without signals those that changed most; a trajectory finds the position by itself, or takes
+    Without signals those that changed most; a trajectory finds the position, or takes
     the two signals x and y. Several run_ids are laid over each other, each from its start.
     trial_set: scores over one or two parameters, as signals.
     """

@@ -92,7 +92,7 @@ async def webots_run_trials(
 
 @tool("Get trials", READS)
 def webots_get_trials(recording: Recording, trial_set: TrialSetId = None) -> TrialsAnswer:
-    """How far trials are, also those from a shell; the parameters, ranked by their scores."""
+    """How far trials are, also those from a shell; the parameters, ranked by score."""
     return TrialsAnswer(**trial_sets.told_of_set(recording, trial_set))
 
 

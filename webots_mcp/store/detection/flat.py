@@ -72,7 +72,7 @@ def _alike(events: Sequence[Event], unit: str) -> str:
 
 FLAT: Final = EventKind(
     "flat",
-    "it froze",
+    "frozen",
     flat_events,
     lasts=True,
     least_s=lambda options: options.flat_s,

@@ -37,7 +37,7 @@ STILL: Final = EventKind(
 )
 STUCK: Final = EventKind(
     "stuck",
-    "it stood and should have moved",
+    "though it should have moved",
     stuck_events,
     lasts=True,
     least_s=_least_s,

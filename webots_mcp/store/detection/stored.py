@@ -242,7 +242,7 @@ def _bounds(segment: Segment) -> tuple[float, ...]:
     return (segment.run_id, segment.holds_from_s, segment.holds_to_s, *walls)
 
 
-RUN: Final = EventKind("run", "it began or ended", run_events, stored=True, counted=False)
+RUN: Final = EventKind("run", "began or ended", run_events, stored=True, counted=False)
 GAP: Final = EventKind("gap", "no rows", gap_events, stored=True)
 CHANGE: Final = EventKind("change", "of a text or flag", change_events, stored=True, routine=True)
 COMMAND: Final = EventKind("command", "", command_events, stored=True, drawn=5)

@@ -74,7 +74,7 @@ def _for_s(options: EventOptions) -> float:
 
 THRESHOLD: Final = EventKind(
     "threshold",
-    "see above and below",
+    "see above, below",
     threshold_events,
     usual=lambda options: bool(options.thresholds),
     lasts=True,

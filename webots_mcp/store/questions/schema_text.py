@@ -10,8 +10,18 @@ _OBJECTS: Final = (
     "SELECT name, type, sql FROM sqlite_master WHERE type IN ('table', 'view') "
     "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' ORDER BY type, rowid"
 )
+# What serves the recording itself: a question needs the names at most.
+_BOOKKEEPING: Final = ("lease", "watermark", "recording", "retention_limit", "kept_state")
+_BOOKKEEPING_COLUMNS: Final = (
+    "uuid",
+    "process",
+    "adopted_rows",
+    "last_seen_monotonic_s",
+    "hold_mode",
+    "rolled_state_id",
+    "coarse_end",
+)
 _COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
-# A column that was added later stands on the line of the last one, after a comma.
 # A column that was added later stands on the line of the last one, after a comma.
 _COMMENT: Final = re.compile(r'(?:^|,)\s*"?(\w+)"?\s[^\n,]*?/\* (.*?) \*/', re.MULTILINE)
 _RULES: Final = (
@@ -33,13 +43,16 @@ def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:
 def describe_schema(connection: sqlite3.Connection) -> str:
     """One line for tables and views with the same columns: those of the first, with comments.
 
-    What is said of a column is not repeated for one of the same name in a later table.
+    What is said of a column is not repeated for one of the same name in a later table. Bookkeeping
+    is named only.
     """
     columns = columns_by_table(connection)
     names: dict[frozenset[str], list[str]] = {}
     listed: dict[frozenset[str], str] = {}
     told = set[tuple[str, str]]()
     for name, kind, sql in connection.execute(_OBJECTS).fetchall():
+        if name in _BOOKKEEPING:
+            continue
         same = frozenset(columns[name])
         names.setdefault(same, []).append(f"{kind} {name}")
         if same not in listed:
@@ -47,8 +60,17 @@ def describe_schema(connection: sqlite3.Connection) -> str:
             listed[same] = _listed(columns[name], dict(each for each in found if each not in told))
             told.update(found)
     lines = (f"{', '.join(alike)}: {listed[same]}" for same, alike in names.items())
-    return "\n".join((_RULES, *lines))
+    return "\n".join((_RULES, *lines, _bookkeeping()))
 
 
 def _listed(columns: list[str], comments: dict[str, str]) -> str:
-    return ", ".join(f"{name} [{comments[name]}]" if name in comments else name for name in columns)
+    return ", ".join(
+        f"{name} [{comments[name]}]" if name in comments else name
+        for name in columns
+        if name not in _BOOKKEEPING_COLUMNS
+    )
+
+
+def _bookkeeping() -> str:
+    tables, columns = ", ".join(_BOOKKEEPING), ", ".join(_BOOKKEEPING_COLUMNS)
+    return f"bookkeeping, not listed: tables {tables}; columns {columns}"

@@ -29,7 +29,7 @@ def data_dir(tmp_path: Path) -> Iterator[Path]:
         ("trends --robot rover --last 3 --since 0", "use --start and --end (simulation time)"),
         ("trends --robot rover --last 3 --since 0", "or --since and --until (wall time)"),
         ("trends", "say which one with --robot NAME"),
-        ("trends --run 77", "leave --run out"),
+        ("trends --run 77", "no run 77: the newest runs are"),
         ("compare 77 78", "no run 77"),
         ("history mode --robot rover --points 5000", "--points 5000 must be from 1 to 500"),
         ("runs -n 5000", "-n 5000 must be from 1 to"),

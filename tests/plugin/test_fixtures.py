@@ -373,7 +373,7 @@ def test_a_controller_that_cannot_be_meant_is_refused_at_once(
 
 def test_a_simulation_that_never_ran_has_no_recording(webots_simulation: SimulationFactory) -> None:
     simulation = webots_simulation()
-    with pytest.raises(NoDatabaseError, match="has recorded there yet"):
+    with pytest.raises(NoDatabaseError, match="there is no folder"):
         simulation.recording.states()
     assert simulation.time_s == 0.0
 

@@ -62,8 +62,9 @@ class Control:
             return None
         self._advance_all()
         if due:
-            self._next_poll_s = now + POLL_INTERVAL_S
             handled = self._serve_one()
+            # Commands seldom come alone: after one, the next round looks for another.
+            self._next_poll_s = now + POLL_INTERVAL_S if handled is None else now
         return self._serve_pause() or handled
 
     def _serve_pause(self) -> Command | None:

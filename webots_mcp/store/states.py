@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import math
 import sqlite3
 from dataclasses import dataclass
 from typing import Any, Final, cast
@@ -54,6 +53,8 @@ _BY_ID: Final = f"SELECT {_COLUMNS} FROM state WHERE id = ?"
 _KEPT_BY_ID: Final = f"SELECT -id, {_COLUMNS.partition(', ')[2]} FROM kept_state WHERE id = -?"
 _OF_RUN: Final = f"SELECT {_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s, id"
 
+# A blob is greater than any number or text: a time that is no number is met too, and told.
+_LATER_THAN_ANY: Final = b"\xff"
 PACE_ROWS: Final = 6
 PACE_WINDOW_S: Final = 5.0
 _PACE_WINDOW_ROWS: Final = 500
@@ -64,12 +65,16 @@ _SHOWN_KEY_CHARACTERS: Final = 40
 
 def newest_state(connection: sqlite3.Connection, run_id: int) -> State | None:
     """The latest row of a run."""
-    return state_at(connection, run_id, math.inf)
+    return _state_up_to(connection, run_id, _LATER_THAN_ANY)
 
 
 def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> State | None:
     """The latest row of a run up to that simulation time."""
-    row = connection.execute(_NEWEST, {"run": run_id, "until": sim_time_s}).fetchone()
+    return _state_up_to(connection, run_id, sim_time_s)
+
+
+def _state_up_to(connection: sqlite3.Connection, run_id: int, until: float | bytes) -> State | None:
+    row = connection.execute(_NEWEST, {"run": run_id, "until": until}).fetchone()
     return State(*row) if row else None
 
 

@@ -59,16 +59,17 @@ _COUNT_PURGED: Final = (
     "(SELECT count(*) FROM going WHERE run_id = run.id) WHERE id IN (SELECT run_id FROM going)"
 )
 # What goes from the states and lies in a kept stretch stays with it, under a limit of its own.
+# CROSS JOIN: SQLite would go through all states in their order rather than sort the few that go.
 _MOVE_KEPT: Final = (
     "INSERT INTO kept_state (run_id, sim_time_s, wall_time_s, data, odd) "
-    "SELECT s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd FROM state s "
-    "JOIN going g ON g.id = s.id WHERE EXISTS (SELECT 1 FROM kept_stretch k "
+    "SELECT s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd FROM going g "
+    "CROSS JOIN state s ON s.id = g.id WHERE EXISTS (SELECT 1 FROM kept_stretch k "
     "WHERE k.run_id = s.run_id AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) "
-    "ORDER BY s.id"
+    "ORDER BY g.id"
 )
 _END_KEEPING: Final = (
-    "DELETE FROM kept_stretch WHERE EXISTS (SELECT 1 FROM kept_state s JOIN going g ON g.id = s.id "
-    "WHERE s.run_id = kept_stretch.run_id "
+    "DELETE FROM kept_stretch WHERE EXISTS (SELECT 1 FROM going g "
+    "CROSS JOIN kept_state s ON s.id = g.id WHERE s.run_id = kept_stretch.run_id "
     "AND s.sim_time_s BETWEEN kept_stretch.start_sim_time_s AND kept_stretch.end_sim_time_s)"
 )
 _BEFORE_DELETION: Final = {"state": (_COUNT_PURGED, _MOVE_KEPT), "kept_state": (_END_KEEPING,)}

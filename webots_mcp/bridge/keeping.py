@@ -52,7 +52,9 @@ class Stretch:
     def add_reason(self, reason: str) -> None:
         """Note why it is kept, once."""
         text = storable(cut(reason, _MOST_REASON_CHARACTERS))
-        if text not in self.reasons and len(self.reasons) < _MOST_REASONS:
+        # An exception is also logged, as "error: " and the same.
+        told = any(f": {text}".endswith(f": {known}") for known in self.reasons)
+        if not told and len(self.reasons) < _MOST_REASONS:
             self.reasons.append(text)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from math import nan
 from typing import Any
 
@@ -10,7 +11,7 @@ from webots_mcp.standin.frame import Vector
 from webots_mcp.standin.vrml import Node
 
 
-class MotionSensor(Device):
+class MotionSensor(Device, ABC):
     """Three numbers along the sensor's own axes; a disabled axis shows NaN."""
 
     def description(self) -> dict[str, Any]:
@@ -25,9 +26,9 @@ class MotionSensor(Device):
             resolved(self.node, value) if on else nan for value, on in zip(felt, axes, strict=True)
         ]
 
+    @abstractmethod
     def feel(self, period_s: float) -> Vector:
         """What is felt now, along the axes of the world."""
-        raise NotImplementedError
 
 
 class Accelerometer(MotionSensor):

@@ -228,7 +228,7 @@ def test_an_exception_that_leaves_the_with_block_keeps_the_last_call(
     assert kept_numbers(recording) == [list(range(58))]
     ((*_, end_s, reason),) = recording.rows(STRETCHES)
     assert end_s == pytest.approx(robot.getTime())
-    assert reason.count("KeyError") == 1  # it is logged as well
+    assert "KeyError" in reason
 
 
 def test_0_seconds_hold_and_keep_nothing_and_a_hit_says_so(

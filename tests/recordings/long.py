@@ -10,7 +10,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, Final
 
-from tests.recordings.rover import WALL_START_S, Recorder
+from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.store.rollup.rolling import roll
@@ -24,9 +24,7 @@ def build(file: Path, rows: int, *, rolled: bool = True) -> None:
     """Make the file: one robot, one run of that many rows."""
     with closing(connect(file, "writer", create=True)) as connection:
         create_schema(connection)
-        recorder = Recorder(connection)
-        robot_id = recorder.robot("rover")
-        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+        recorder = start_run(connection)
         connection.execute("BEGIN IMMEDIATE")
         connection.executemany(_INSERT, _rows(recorder.run_id, rows))
         recorder.wall_s = WALL_START_S + rows * INTERVAL_S

@@ -95,6 +95,14 @@ class Recorder:
         )
 
 
+def start_run(connection: sqlite3.Connection, robot: str = "rover") -> Recorder:
+    """A recorder that writes into the first run of a robot."""
+    recorder = Recorder(connection)
+    robot_id = recorder.robot(robot)
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    return recorder
+
+
 def record_rover(connection: sqlite3.Connection) -> None:
     """Write the whole story: robot 1, runs 1 to 3."""
     recorder = Recorder(connection)

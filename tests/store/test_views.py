@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from tests.memory import memory_connection
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import Recorder, start_run
 from webots_mcp.connection import connect
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.naming import USUAL_POSITIONS, flatten
@@ -47,9 +47,7 @@ VIEWS = {
 def recorder() -> Iterator[Recorder]:
     """A run that a test fills by SQL."""
     with memory_connection() as connection:
-        recorder = Recorder(connection)
-        robot_id = recorder.robot("rover")
-        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+        recorder = start_run(connection)
         yield recorder
 
 
@@ -246,9 +244,7 @@ def test_the_views_come_and_go_with_their_revision_and_the_data_stays(tmp_path: 
     file = tmp_path / "webots.db"
     upgrade(file, "0002")
     with closing(connect(file, "writer")) as connection:
-        recorder = Recorder(connection)
-        robot_id = recorder.robot("rover")
-        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+        recorder = start_run(connection)
         recorder.publish(0.0, {"pose": [1, 2, 3]})
 
         assert upgrade(file, "0003") == (2, 3)

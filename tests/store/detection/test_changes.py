@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.ranges import resolve_range
@@ -20,9 +20,7 @@ def changes(connection: sqlite3.Connection) -> Events:
 def test_a_text_now_and_then_among_numbers_hides_no_change_of_the_mode(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(300):
         mixed = "n/a" if 100 <= step < 120 else step * 0.25
         mode = "drive" if step < 50 else "return"
@@ -38,9 +36,7 @@ def test_a_text_now_and_then_among_numbers_hides_no_change_of_the_mode(
 
 
 def test_a_mode_that_is_a_number_as_text_changes(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(90):
         recorder.publish(step * 0.1, {"level": str(step // 30)})
     found = changes(empty)
@@ -51,9 +47,7 @@ def test_a_mode_that_is_a_number_as_text_changes(empty: sqlite3.Connection) -> N
 def test_of_a_mode_that_is_a_number_the_way_to_its_changes_is_named(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(90):
         recorder.publish(step * 0.1, {"betriebsart": step // 30})
     assert "where='changed(NAME)'" in changes(empty).verdicts.not_searched["change"]

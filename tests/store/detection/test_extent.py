@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rover import WALL_START_S, Recorder
+from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import resolve_range
@@ -22,9 +22,7 @@ GOES_ON_S = 300.0
 @pytest.fixture
 def standing(empty: sqlite3.Connection, tier: str) -> sqlite3.Connection:
     """For 100 s the robot is stuck, its sensor silent, its battery low and its heading flat."""
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(empty)
     for step in range(4000):
         time_s = round(step * 0.1, 6)
         stands = STOPS_S <= time_s < GOES_ON_S
@@ -91,9 +89,7 @@ def test_two_limits_on_one_signal_are_two_events(standing: sqlite3.Connection) -
 def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
     empty: sqlite3.Connection, tier: str
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(empty)
     for step in range(2000):
         late = {"late_m": 1.0 + step} if step >= 1500 else {}
         recorder.publish(round(step * 0.1, 6), {"x": step, **late})
@@ -107,9 +103,7 @@ def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
 def test_what_a_short_stretch_costs_does_not_grow_with_the_run(
     empty: sqlite3.Connection, rolled: bool
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(empty)
     costs = [after_so_many_rows(recorder, empty, rows, rolled) for rows in (2000, 10_000)]
     assert costs[1] < 1.5 * costs[0]
 

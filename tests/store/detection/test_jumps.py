@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.ranges import resolve_range
@@ -21,9 +21,7 @@ def record(
     connection: sqlite3.Connection, state: Callable[[float], dict[str, Any]], *, gap: bool = False
 ) -> None:
     """200 s, with rows missing from 95 to 105 s if there is a gap."""
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(connection)
     for step in range(2000):
         if not (gap and 950 <= step < 1050):
             recorder.publish(step * 0.1, state(step * 0.1))

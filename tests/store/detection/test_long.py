@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.memory import memory_connection
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.registry import asked_kinds
@@ -34,9 +34,7 @@ def long(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.
     """500 s that are long: a leap and a swing are in the oldest part, another at a border."""
     monkeypatch.setattr(rows, "RAW_ROWS", 1000)
     monkeypatch.setattr(views, "STRETCH_ROWS", 1500)
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(empty)
     for step in range(5000):
         recorder.publish(step * 0.1, state(step * 0.1))
     roll(empty, 100_000)
@@ -98,9 +96,7 @@ def test_ruling_leaps_out_changes_none_that_are_found(
     with memory_connection() as connection, pytest.MonkeyPatch.context() as patch:
         patch.setattr(rows, "RAW_ROWS", 20)
         patch.setattr(views, "STRETCH_ROWS", 15)
-        recorder = Recorder(connection)
-        robot_id = recorder.robot("rover")
-        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+        recorder = start_run(connection)
         time_s, place = 0.0, [0.0, 0.0]
         for index, (later_s, *moves) in enumerate(steps):
             time_s += later_s

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.errors import UnknownSignalError
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import Events, find_events
@@ -23,9 +23,7 @@ State = Callable[[float], dict[str, Any]]
 
 def record(connection: sqlite3.Connection, state: State, *, until_s: float = 120.0) -> None:
     """Rows every 0.1 s, rolled up."""
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(connection)
     connection.execute("BEGIN")
     for step in range(round(until_s * 10)):
         recorder.publish(round(step * 0.1, 6), state(round(step * 0.1, 6)))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.ranges import resolve_range
@@ -26,9 +26,7 @@ def ask(
     seconds: float = 60.0,
 ) -> Events:
     """What is told of so many seconds with a row at each interval."""
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(connection)
     connection.execute("BEGIN")
     for step in range(round(seconds / interval_s)):
         recorder.publish(round(step * interval_s, 6), state(step * interval_s))
@@ -80,9 +78,7 @@ def test_a_command_that_was_in_force_for_a_moment_is_no_evidence(
 
 
 def test_who_stands_while_rows_come_seldom_stands(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(empty)
     times = [0.032 * step for step in range(1000)] + [32.0 + 0.5 * step for step in range(60)]
     for time_s in times:
         recorder.publish(time_s, {"pose": [0.2 * min(time_s, 32.0), 0.0]})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import sqlite3
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.questions.events import find_events
@@ -14,9 +14,7 @@ from webots_mcp.store.reading.ranges import resolve_range
 
 def ask(connection: sqlite3.Connection, rows: int, *kinds: str) -> Verdicts:
     """What is said of a robot that drives on, with a row every 0.1 s."""
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(connection)
     for row in range(rows):
         time_s = row / 10
         state = {"pose": [0.2 * time_s, 0.0], "heading": 0.0, "temp_c": math.sin(time_s)}

@@ -20,7 +20,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.memory import memory_connection
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import Recorder, start_run
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.export import FORMATS, export, export_file, format_of
@@ -38,9 +38,7 @@ def recorder() -> Iterator[Recorder]:
 @contextmanager
 def recorded_run() -> Generator[Recorder]:
     with memory_connection() as connection:
-        recorder = Recorder(connection)
-        robot_id = recorder.robot("rover")
-        recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+        recorder = start_run(connection)
         yield recorder
 
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import Recorder, start_run
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.store.detection.event import EventOptions, Threshold
 from webots_mcp.store.questions.events import Events, find_events
@@ -28,10 +28,7 @@ def spans(events: Events) -> list[tuple[float, float]]:
 @pytest.fixture
 def counting(empty: sqlite3.Connection) -> Recorder:
     """A run in which `n` counts, a row each 0.1 s."""
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
-    return recorder
+    return start_run(empty)
 
 
 def test_each_stretch_is_told_with_begin_end_and_values(rover: sqlite3.Connection) -> None:
@@ -174,17 +171,15 @@ def test_thresholds_are_a_short_form_of_a_condition(
     empty: sqlite3.Connection, values: list[float | None], for_s: float, above: bool
 ) -> None:
     empty.execute("DELETE FROM robot")
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("rover")
-    run_id = recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(empty)
     for step, value in enumerate([*values, 1.0]):
         recorder.publish(step * 0.1, {"x": value})
-    whole = resolve_range(empty, run_id=run_id)
+    whole = resolve_range(empty, run_id=recorder.run_id)
     limit = Threshold("x", **{"above" if above else "below": 1.0}, for_s=for_s)
     short = find_events(empty, whole, EventOptions(kinds=("threshold",), thresholds=(limit,)))
     text = f"x {'>' if above else '<'} 1" + (f" for {for_s}" if for_s else "")
 
-    held = ask(empty, text, run_id=run_id)
+    held = ask(empty, text, run_id=recorder.run_id)
 
     told = [(event.start_s + for_s, event.end_s) for event in short.events]
     assert [(event.start_s, event.end_s) for event in held.events] == [

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.recordings.rover import WALL_START_S, Recorder
+from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.analysis.jumps import find_jumps
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
@@ -165,9 +165,7 @@ def test_a_limit_keeps_rare_kinds_and_says_what_is_left_out(rover: sqlite3.Conne
 
 def record_a_busy_run(connection: sqlite3.Connection) -> Recorder:
     """100 s in which a flag changes each second, with 3 warnings, and 2 pictures a second."""
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(connection)
     picture = {"kind": "camera", "width": 1, "height": 1, "bytes": 1}
     for step in range(1000):
         recorder.publish(step * 0.1, {"lit": step // 10 % 2 == 0, "mode": "ab"[step // 20 % 2]})
@@ -281,9 +279,7 @@ def test_noise_neither_jumps_nor_swings(seed: int) -> None:
 
 def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tuple[Event, ...]:
     """Ten seconds of driving and ten of standing; each signal has a value for either."""
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(200):
         state = {name: pair[step > 100] for name, pair in moving_and_standing.items()}
         recorder.publish(step * 0.1, state | {"gps": {"x": min(step, 100) * 0.02, "y": 0}})
@@ -348,9 +344,7 @@ def test_without_any_evidence_a_standstill_says_that_there_is_none(
 
 
 def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(300):
         turned, driven = max(0, step - 150) * 0.05, min(step, 150) * 0.02
         place = [driven, 0.0, math.remainder(turned, 2 * math.pi)]
@@ -362,18 +356,14 @@ def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
 
 
 def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(300):
         recorder.publish(step * 0.1, {"gps": {"x": step * 0.03, "y": 0}})
     assert "0.9 m in 3 s" in ask(empty, "stuck").verdicts.absent["stuck"]
 
 
 def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in (*range(100), *range(200, 300)):
         recorder.publish(step * 0.1, {"gps": {"x": 1.0, "y": 0.0}})
     assert spans(ask(empty, "still")) == [(0.0, 9.9), (20.0, 29.9)]
@@ -382,9 +372,7 @@ def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
 def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     recorder.publish(0.0, {"mode": "drive", "range": 1.0})
     told = ask(empty, "stuck", bounds={"run_id": 1}).verdicts
     assert "no position is known" in told.not_searched["stuck"] and not told.absent

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rover import WALL_PER_SIM, Recorder, record_rover
+from tests.recordings.rover import WALL_PER_SIM, Recorder, record_rover, start_run
 from webots_mcp.errors import (
     InvalidInputError,
     NothingRecordedError,
@@ -43,29 +43,25 @@ def test_a_long_list_comes_in_pages(rover: sqlite3.Connection) -> None:
 
 
 def test_a_run_that_goes_on_counts_its_newest_rows(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    run_id = recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(20):
         recorder.publish(float(step), {"x": step})
         if step == 9:
             beat = "UPDATE run SET rows = 10, last_sim_time_s = 9.0, last_wall_time_s = ?"
             empty.execute(beat, (recorder.wall_s,))
-    run = run_info(empty, run_id)
+    run = run_info(empty, recorder.run_id)
     assert (run.rows, run.duration_s, run.wall_duration_s) == (20, 19.0, 19.0 * WALL_PER_SIM)
 
 
 def test_a_pause_is_no_part_of_the_real_time_factor(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    run_id = recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     recorder.publish(0.0, {"x": 0})
-    assert run_info(empty, run_id).real_time_factor is None
+    assert run_info(empty, recorder.run_id).real_time_factor is None
     recorder.insert("event", **recorder.at(2.0), kind="pause")
     recorder.run_start_s += 20
     recorder.insert("event", **recorder.at(2.0), kind="resume")
     recorder.publish(5.0, {"x": 1})
-    run = run_info(empty, run_id)
+    run = run_info(empty, recorder.run_id)
     assert (run.held_s, run.real_time_factor) == (20.0, 1 / WALL_PER_SIM)
 
 
@@ -279,10 +275,8 @@ def test_a_signal_that_only_one_run_has_is_named(empty: sqlite3.Connection) -> N
 
 
 def test_runs_of_two_robots_can_be_compared(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
     for name, x in (("a", 1.0), ("b", 3.0)):
-        robot_id = recorder.robot(name)
-        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        recorder = start_run(empty, name)
         for step in range(30):
             recorder.publish(float(step), {"filler_" + name: 0, "x": x + step % 2, "scan": None})
     comparison = compare_runs(empty, [1, 2], names=["x", "scan"])

@@ -6,7 +6,7 @@ import sqlite3
 
 import pytest
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
 from webots_mcp.store.questions.score import score_run
 
@@ -47,13 +47,11 @@ def test_only_what_came_up_to_the_end_is_scored(rover: sqlite3.Connection) -> No
 def test_a_kind_that_cannot_be_looked_for_leaves_the_run_without_a_score(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("lamp")
-    run_id = recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(empty, "lamp")
     for step in range(20):
         recorder.publish(step * 0.1, {"light": step})
 
-    found = score_run(empty, run_id, "last(light) - count(stuck)")
+    found = score_run(empty, recorder.run_id, "last(light) - count(stuck)")
 
     assert found.value is None
     assert "count(stuck) is not known" in str(found.why)
@@ -62,9 +60,8 @@ def test_a_kind_that_cannot_be_looked_for_leaves_the_run_without_a_score(
 def test_a_run_without_rows_and_one_with_purged_rows_have_no_score(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("rover")
-    run_id = recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(empty)
+    run_id = recorder.run_id
 
     found = score_run(empty, run_id, "duration")
     assert (found.value, found.why) == (

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.questions.series import NumberColumns, query_history
 from webots_mcp.store.reading.pages import query_rows
@@ -90,9 +90,7 @@ def test_odd_values_are_named(rover: sqlite3.Connection) -> None:
 
 
 def test_a_value_that_is_no_number_is_named_within_its_array(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(30):
         state = {"short": [None, step, None if step < 9 else 1], "long": [1.0] * 30 + [None]}
         odd = {"short.*": "nan", "long.*": "inf"}
@@ -163,9 +161,7 @@ def test_absurd_questions_are_refused(rover: sqlite3.Connection) -> None:
 
 
 def test_rows_after_the_watermark_are_in_the_answer(empty: sqlite3.Connection, tier: str) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(600):
         recorder.publish(step * 0.1, {"x": float(step), "mode": f"m{step // 200}"})
         if step == 450:
@@ -178,9 +174,7 @@ def test_rows_after_the_watermark_are_in_the_answer(empty: sqlite3.Connection, t
 
 def test_integers_beyond_64_bits_stay_what_they_are_in_rows(empty: sqlite3.Connection) -> None:
     numbers = [2**63 - 1, 2**63, -(2**63) - 1, 10**30 + 1]
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step, number in enumerate(numbers):
         recorder.publish(float(step), {"ticks": number})
     assert list(query_rows(empty, resolve_range(empty), ["ticks"]).values["ticks"]) == numbers
@@ -191,9 +185,7 @@ def test_integers_beyond_64_bits_stay_what_they_are_in_rows(empty: sqlite3.Conne
 def test_the_mean_of_an_angle_is_circular_in_degrees_as_in_radians(
     empty: sqlite3.Connection, tier: str, name: str, turn: float, around: float
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(200):
         share = around + (0.02 if step % 2 else -0.02)
         value = share % 1.0 if name == "heading_deg" else math.remainder(share, 1.0)

@@ -6,7 +6,7 @@ import sqlite3
 
 import pytest
 
-from tests.recordings.rover import WALL_START_S, Recorder
+from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.questions.timeline import timeline
@@ -47,9 +47,7 @@ def test_a_cursor_that_is_none_is_refused(rover: sqlite3.Connection) -> None:
 
 
 def test_what_was_logged_after_the_last_row_is_told(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     recorder.publish(1.0, {"x": 1})
     recorder.insert("log", **recorder.at(1.5), level="error", source="controller", message="bye")
     empty.execute("UPDATE run SET ended_wall_time_s = 2e9, last_sim_time_s = 1.6")

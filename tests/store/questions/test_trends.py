@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, trends
 from webots_mcp.store.reading.ranges import resolve_range
@@ -71,9 +71,7 @@ def record(
     connection: sqlite3.Connection, *, rows: int, interval_s: float, **courses: Course
 ) -> None:
     """One run, rolled up: each signal by name with its course."""
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(connection)
     connection.execute("BEGIN")
     for index in range(rows):
         time_s = round(index * interval_s, 6)
@@ -240,9 +238,7 @@ def test_the_ends_of_what_rises_are_told_apart(empty: sqlite3.Connection) -> Non
 def test_what_stepped_from_one_rest_to_another_is_flat_since_the_step(
     empty: sqlite3.Connection, tier: str, step: float
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for row in range(1200):
         time_s = row / 10
         recorder.publish(time_s, {"x": min(time_s, 40.0) + step * (time_s >= 70.3)})

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.memory import memory_connection
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.series import query_history
@@ -41,9 +41,7 @@ TIMES = clock_times()
 def clock(request: pytest.FixtureRequest) -> Iterator[sqlite3.Connection]:
     """A mode that changes in every 7th row, and a log line in every 5th."""
     with memory_connection() as connection:
-        recorder = Recorder(connection)
-        robot_id = recorder.robot("r")
-        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        recorder = start_run(connection)
         for row, time_s in enumerate(TIMES):
             recorder.publish(time_s, {"mode": "ab"[row // 7 % 2], "row": row})
             if row % 5 == 0:

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tests.memory import memory_connection
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.reading.gaps import rhythm_in
 from webots_mcp.store.reading.ranges import Segment
@@ -30,9 +30,7 @@ def test_gaps_are_those_of_the_rows(
     steps = [gaps.get(step, 1.0) * interval_s for step in range(300)]
     times = [round(time_s, 6) for time_s in accumulate(steps)]
     with memory_connection() as connection:
-        recorder = Recorder(connection)
-        robot_id = recorder.robot("r")
-        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        recorder = start_run(connection)
         for time_s in times:
             recorder.publish(time_s, {"x": 1.0})
         recorder.end_run("finished")

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.memory import memory_connection
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows as columns
@@ -24,9 +24,7 @@ Spans = list[tuple[str | None, float, float]]
 def record(
     connection: sqlite3.Connection, states: Sequence[dict[str, Any]], every_s: float
 ) -> None:
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(connection)
     connection.execute("BEGIN")
     for step, state in enumerate(states):
         recorder.publish(round(step * every_s, 6), {"row": step, **state})

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.memory import memory_connection
-from tests.recordings.rover import WALL_START_S, Recorder
+from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from webots_mcp.errors import (
     AmbiguousRobotError,
     InvalidRangeError,
@@ -161,10 +161,8 @@ def test_what_was_never_recorded_is_named_as_such(
         resolve_range(rover, run_id=99)
     with pytest.raises(NothingRecordedError):
         resolve_range(empty)
-    recorder = Recorder(empty)
     for name in ("a", "b"):
-        robot_id = recorder.robot(name)
-        recorder.run(recorder.session(robot_id, "x"), robot_id)
+        start_run(empty, name)
     with pytest.raises(AmbiguousRobotError):
         resolve_range(empty)
     with pytest.raises(NothingRecordedError, match="no state row"):

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.memory import memory_connection
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import Recorder, start_run
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.store.analysis.summary import Summary, summarise
@@ -57,9 +57,7 @@ def test_pieces_of_any_stretch_are_what_its_rows_come_to(
 
 
 def record(connection: sqlite3.Connection, steps: list[Row], *, ended: bool = True) -> list[Row]:
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(connection)
     recorded: list[Row] = []
     time_s = 0.0
     for step_s, published in steps:

@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.memory import memory_connection
-from tests.recordings.rover import Recorder, record_rover
+from tests.recordings.rover import Recorder, record_rover, start_run
 from webots_mcp.connection import connect, never_wait
 from webots_mcp.naming import flatten
 from webots_mcp.schema import create_schema
@@ -146,9 +146,7 @@ def _roll_all(file: Path) -> None:
 def test_what_was_summed_up_from_rollups_that_went_on_meanwhile_is_not_stored(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     recorder.publish(0.0, {"x": 1})
     before = held(empty, recorder.run_id, watermark(empty, recorder.run_id))
     roll(empty)
@@ -162,10 +160,8 @@ def test_a_batch_that_is_stored_in_part_is_finished_later_and_counted_once(tmp_p
     file = tmp_path / "webots.db"
     with closing(connect(file, "writer", create=True)) as writer:
         create_schema(writer)
-        recorder = Recorder(writer)
         for name in ("a", "b", "c"):
-            robot_id = recorder.robot(name)
-            recorder.run(recorder.session(robot_id, "x"), robot_id)
+            recorder = start_run(writer, name)
             for step in range(30):
                 recorder.publish(float(step), {"x": step, "mode": "ab"[step % 2]})
         with closing(connect(file, "writer", patient=False)) as other:
@@ -199,9 +195,7 @@ def _lock_at(writer: sqlite3.Connection, other: sqlite3.Connection, what: str) -
 def test_buckets_that_are_over_stand_by_signal_and_the_newest_side_by_side(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(35):
         recorder.publish(float(step), {"x": step})
         roll(empty)
@@ -235,9 +229,7 @@ def _everything(connection: sqlite3.Connection) -> list[list[Any]]:
 
 
 def test_an_unreadable_row_costs_itself_and_not_the_rollup(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     recorder.publish(0.0, {"x": 1})
     recorder.insert("state", **recorder.at(1.0), data='{"x": NaN')
     recorder.insert("state", **recorder.at(2.0), data="[1, 2]")
@@ -251,9 +243,7 @@ def test_an_integer_beyond_64_bits_stops_neither_the_rollups_nor_an_answer(
     empty: sqlite3.Connection, power: int, tier: str
 ) -> None:
     number, usable = 2**power, power < 300
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(200):
         recorder.publish(float(step), {"hash": number + step, "x": step, "array": [number] * 20})
     if tier == "rollups":
@@ -269,9 +259,7 @@ def test_an_integer_beyond_64_bits_stops_neither_the_rollups_nor_an_answer(
 def test_a_row_that_cannot_be_stored_costs_itself_and_not_the_rollup(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(20):
         half_a_character = "\\ud800" if step in (7, 8) else "a"
         data = f'{{"x": {step}, "text": "{half_a_character}"}}'
@@ -283,9 +271,7 @@ def test_a_row_that_cannot_be_stored_costs_itself_and_not_the_rollup(
 
 
 def test_change_points_carry_on_across_batches(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for index, mode in enumerate(["a", "a", "b", "b", None, None, "a"]):
         recorder.publish(float(index), {"mode": mode, "on": index > 3})
     while not roll(empty, 2).done:
@@ -300,9 +286,7 @@ def test_change_points_carry_on_across_batches(empty: sqlite3.Connection) -> Non
 
 
 def test_a_heading_in_degrees_is_no_angle_in_radians(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     recorder.publish(0.0, {"heading": 3.0, "yaw": 3.0})
     roll(empty)
     recorder.publish(1.0, {"heading": 270.0, "yaw": -3.0})
@@ -314,9 +298,7 @@ def test_a_heading_in_degrees_is_no_angle_in_radians(empty: sqlite3.Connection) 
 def test_a_robot_that_invents_names_for_ever_does_not_fill_the_register(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for index in range(30):
         recorder.publish(float(index), {f"key{index}_{i}": i for i in range(100)})
     roll(empty)

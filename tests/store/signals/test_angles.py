@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.questions.trend import Trend
@@ -32,9 +32,7 @@ def turning(time_s: float) -> dict[str, Any]:
 
 
 def test_the_third_item_of_a_planar_pose_is_an_angle(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(empty)
     for second in range(200):
         recorder.publish(float(second), turning(float(second)))
     before = known_signals(empty, resolve_range(empty))
@@ -53,9 +51,7 @@ def test_unwrapping_is_numpys(angles: Array) -> None:
 
 def trend_of(connection: sqlite3.Connection, name: str, course: Callable[[float], float]) -> Trend:
     """One minute of it, a row each 0.1 s."""
-    recorder = Recorder(connection)
-    robot_id = recorder.robot("rover")
-    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    recorder = start_run(connection)
     for step in range(600):
         recorder.publish(step * 0.1, {name: course(step * 0.1)})
     roll(connection, 100_000)

@@ -6,7 +6,7 @@ import sqlite3
 
 import pytest
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import flatten
 from webots_mcp.store.questions.trends import trends
@@ -79,9 +79,7 @@ STRANGE = (
 
 @pytest.mark.parametrize("rolled", [False, True])
 def test_whatever_a_key_is_called_it_is_a_signal(empty: sqlite3.Connection, rolled: bool) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(30):
         flat = {name: step + index for index, name in enumerate(STRANGE)}
         recorder.publish(float(step), {**flat, "deep": flat})
@@ -98,9 +96,7 @@ def test_whatever_a_key_is_called_it_is_a_signal(empty: sqlite3.Connection, roll
 def test_a_key_called_like_the_default_pattern_does_not_hide_the_others(
     empty: sqlite3.Connection,
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     recorder.publish(0.0, {"*": 1, "x": 2, "a": {"*": 3, "b": 4}})
     known = catalogue(empty, find_subject(empty))
     assert [signal.name for signal in resolve_signals(known, ["*"])] == ["*", "x", "a.*", "a.b"]
@@ -118,9 +114,7 @@ def test_an_unknown_name_is_answered_with_near_ones(rover: sqlite3.Connection) -
 
 
 def test_rows_that_do_not_hold_a_signal_have_no_value_of_it(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(40):
         recorder.publish(float(step), {"x": step} | ({"lidar": 1.0} if step < 10 else {}))
         if step in (4, 25):
@@ -135,9 +129,7 @@ def test_rows_that_do_not_hold_a_signal_have_no_value_of_it(empty: sqlite3.Conne
 def test_a_signal_that_changes_its_kind_is_told_the_same_before_and_after_rolling(
     empty: sqlite3.Connection, course: str
 ) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     for step in range(300):
         kind = course[step * len(course) // 300]
         value = {"t": "word", "n": step // 50, "b": step % 100 < 50, "_": None}[kind]
@@ -149,9 +141,7 @@ def test_a_signal_that_changes_its_kind_is_told_the_same_before_and_after_rollin
 
 
 def test_rows_not_rolled_up_yet_are_in_the_list(empty: sqlite3.Connection) -> None:
-    recorder = Recorder(empty)
-    robot_id = recorder.robot("r")
-    recorder.run(recorder.session(robot_id, "x"), robot_id)
+    recorder = start_run(empty)
     recorder.publish(0.0, {"x": 1.0})
     roll(empty)
     recorder.publish(1.0, {"x": 5.0, "y": None})

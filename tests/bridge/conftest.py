@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -29,22 +30,16 @@ class Recording:
 
     def rows(self, sql: str, *values: object) -> list[Any]:
         """All rows; rows of one column as plain values."""
-        connection = connect(self.database, "reader")
-        try:
+        with closing(connect(self.database, "reader")) as connection:
             found = connection.execute(sql, values).fetchall()
-        finally:
-            connection.close()
         return [row[0] if len(row) == 1 else row for row in found]
 
     def states(self) -> list[dict[str, Any]]:
         return [json.loads(text) for text in self.rows("SELECT data FROM state ORDER BY id")]
 
     def send(self, action: str, /, time_to_live_s: float = 10, **params: object) -> int:
-        connection = connect(self.database, "writer")
-        try:
+        with closing(connect(self.database, "writer")) as connection:
             return send(connection, action, params, time_to_live_s)
-        finally:
-            connection.close()
 
     def fate(self, command_id: int) -> tuple[str, Any, str | None]:
         """Status, result and error of a command."""
@@ -65,6 +60,15 @@ def send(
     )
     assert cursor.lastrowid is not None
     return cursor.lastrowid
+
+
+@contextmanager
+def write_lock(file: Path) -> Generator[sqlite3.Connection]:
+    """Another writer in the middle of its transaction."""
+    with closing(connect(file, "writer")) as other:
+        other.execute("BEGIN IMMEDIATE")
+        yield other
+        other.commit()
 
 
 @pytest.fixture(params=["orjson", "standard library"])

@@ -22,6 +22,7 @@ from tests.bridge.conftest import (
     heartbeat_now,
     keep_in_memory,
     numbers,
+    write_lock,
 )
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import backlog
@@ -63,13 +64,10 @@ def test_the_last_error_stays_short_however_many_rows_are_dropped(
 ) -> None:
     monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 1)
     keep_in_memory(bridge)
-    other = connect(file, "writer")
-    other.execute("BEGIN IMMEDIATE")
-    for n in range(50):
-        bridge.publish({"n": n})
-    assert bridge.stats().last_error == "rows are being dropped: database is locked"
-    other.execute("COMMIT")
-    other.close()
+    with write_lock(file):
+        for n in range(50):
+            bridge.publish({"n": n})
+        assert bridge.stats().last_error == "rows are being dropped: database is locked"
     bridge.publish({"n": 50})
     catch_up(bridge)
     (told,) = filed.rows("SELECT data FROM event WHERE kind = 'dropped'")
@@ -81,12 +79,9 @@ def test_a_run_counts_the_rows_that_are_in_the_database(
 ) -> None:
     monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 3)
     keep_in_memory(bridge)
-    other = connect(file, "writer")
-    other.execute("BEGIN IMMEDIATE")
-    for n in range(9):
-        bridge.publish({"n": n})
-    other.execute("COMMIT")
-    other.close()
+    with write_lock(file):
+        for n in range(9):
+            bridge.publish({"n": n})
     catch_up(bridge)
     heartbeat_now(bridge)
     assert numbers(filed) == [6, 7, 8]
@@ -102,13 +97,10 @@ def test_what_is_told_of_dropped_rows_is_stamped_with_the_time_of_now(
 ) -> None:
     monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 1)
     keep_in_memory(bridge)
-    other = connect(file, "writer")
-    other.execute("BEGIN IMMEDIATE")
-    for n in range(5):
-        robot.step(STEP_MS)
-        bridge.publish({"n": n})
-    other.execute("COMMIT")
-    other.close()
+    with write_lock(file):
+        for n in range(5):
+            robot.step(STEP_MS)
+            bridge.publish({"n": n})
     bridge.publish({"n": 5})
     catch_up(bridge)
     told = filed.rows("SELECT sim_time_s FROM event WHERE kind = 'dropped'")
@@ -215,11 +207,8 @@ def test_a_row_that_waits_with_a_lone_surrogate_is_dropped_and_stops_no_other(
     bridge: MCPBridge, file: Path, filed: Recording
 ) -> None:
     bridge.publish({"n": 0, "\ud800": "a"})
-    other = connect(file, "writer")
-    other.execute("BEGIN IMMEDIATE")
-    bridge.publish({"n": 1, "\ud800": "b"})
-    other.execute("COMMIT")
-    other.close()
+    with write_lock(file):
+        bridge.publish({"n": 1, "\ud800": "b"})
     bridge.publish({"n": 2, "\ud800": "c"})
     catch_up(bridge)
     assert numbers(filed) == [0, 1, 2]

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from tests.bridge.conftest import STEP_MS, Recording, catch_up, eager, heartbeat_now
+from tests.bridge.conftest import STEP_MS, Recording, catch_up, eager, heartbeat_now, write_lock
 from tests.bridge.test_parameters import VALUES, ask
 from webots_mcp import MCPBridge, MemoryDatabase
-from webots_mcp.connection import connect
 from webots_mcp.contract import PARAMETERS_VARIABLE
 from webots_mcp.standin import InProcessSupervisor
 
@@ -172,14 +171,11 @@ def test_rows_that_wait_are_taken_in_with_the_values_in_order(
 ) -> None:
     with MCPBridge(robot, throttle_interval=1, database=file) as bridge:
         kp = bridge.parameter("kp", 2.0)
-        writer = connect(file, "writer")
-        writer.execute("BEGIN IMMEDIATE")
-        kp.set(3.0)
-        bridge.get_command()
-        bridge.parameter("late", 1.0)
-        assert bridge.stats().rows_waiting == 3
-        writer.execute("COMMIT")
-        writer.close()
+        with write_lock(file):
+            kp.set(3.0)
+            bridge.get_command()
+            bridge.parameter("late", 1.0)
+            assert bridge.stats().rows_waiting == 3
         catch_up(bridge)
     assert [row[1:3] for row in filed.rows(VALUES)] == [
         ("kp", "2.0"),

@@ -22,6 +22,7 @@ from tests.bridge.conftest import (
     keep_in_memory,
     numbers,
     send,
+    write_lock,
 )
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import backlog, recorder
@@ -46,16 +47,13 @@ def test_rows_that_meet_a_lock_wait_and_are_written_in_order(
     bridge: MCPBridge, file: Path, filed: Recording
 ) -> None:
     bridge.publish({"n": 0})
-    other = connect(file, "writer")
-    other.execute("BEGIN IMMEDIATE")
-    started_s = time.perf_counter()
-    for n in range(1, 100):
-        bridge.publish({"n": n})
-    assert time.perf_counter() - started_s < 1  # a single wait for the lock would be five
-    assert bridge.stats().rows_waiting == 99
-    assert numbers(filed) == [0]
-    other.execute("COMMIT")
-    other.close()
+    with write_lock(file):
+        started_s = time.perf_counter()
+        for n in range(1, 100):
+            bridge.publish({"n": n})
+        assert time.perf_counter() - started_s < 1  # a single wait for the lock would be five
+        assert bridge.stats().rows_waiting == 99
+        assert numbers(filed) == [0]
     bridge.publish({"n": 100})
     catch_up(bridge)
     assert numbers(filed) == list(range(101))
@@ -70,12 +68,9 @@ def test_beyond_the_limit_the_oldest_rows_are_dropped_counted_and_told(
 ) -> None:
     monkeypatch.setattr(backlog, "MAX_WAITING_ROWS", 10)
     keep_in_memory(bridge)
-    other = connect(file, "writer")
-    other.execute("BEGIN IMMEDIATE")
-    for n in range(25):
-        bridge.publish({"n": n})
-    other.execute("COMMIT")
-    other.close()
+    with write_lock(file):
+        for n in range(25):
+            bridge.publish({"n": n})
     bridge.publish({"n": 25})
     catch_up(bridge)
     assert numbers(filed) == list(range(15, 26))
@@ -312,12 +307,9 @@ def test_a_command_that_meets_a_lock_is_claimed_with_the_next_call(
     bridge: MCPBridge, file: Path, filed: Recording
 ) -> None:
     bridge.register_command("greet", lambda _: "hello")
-    other = connect(file, "writer")
-    other.execute("BEGIN IMMEDIATE")
-    sent = send(other, "greet", {})
-    assert bridge.get_command() is None
-    other.execute("COMMIT")
-    other.close()
+    with write_lock(file) as other:
+        sent = send(other, "greet", {})
+        assert bridge.get_command() is None
     poll_until(bridge, lambda: filed.fate(sent)[0] == "done")
     assert filed.fate(sent)[1] == "hello"
 
@@ -345,11 +337,8 @@ def test_an_answer_that_meets_a_lock_is_written_later(
 def test_rows_of_a_loop_that_stands_still_are_written_by_the_maintainer(
     bridge: MCPBridge, file: Path, filed: Recording
 ) -> None:
-    other = connect(file, "writer")
-    other.execute("BEGIN IMMEDIATE")
-    bridge.publish({"n": 1})
-    other.execute("COMMIT")
-    other.close()
+    with write_lock(file):
+        bridge.publish({"n": 1})
     deadline_s = time.monotonic() + 10
     while not numbers(filed):
         assert time.monotonic() < deadline_s

@@ -23,6 +23,7 @@ from tests.bridge.conftest import (
     keep_in_memory,
     numbers,
     waiting_file,
+    write_lock,
 )
 from webots_mcp import MCPBridge
 from webots_mcp.adoption import adopt
@@ -67,8 +68,7 @@ def bridge(robot: InProcessSupervisor, file: Path) -> Iterator[MCPBridge]:
 @pytest.fixture
 def locked(bridge: MCPBridge, file: Path) -> Iterator[sqlite3.Connection]:
     """Another writer in the middle of its transaction."""
-    with closing(connect(file, "writer")) as other:
-        other.execute("BEGIN IMMEDIATE")
+    with write_lock(file) as other:
         yield other
 
 
@@ -241,13 +241,11 @@ def test_rows_that_waited_are_followed_by_later_ones_and_the_file_goes_with_the_
     robot: InProcessSupervisor, file: Path, filed: Recording
 ) -> None:
     with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
-        with closing(connect(file, "writer")) as other:
-            for n in range(0, 60, 3):
-                bridge.publish({"n": n})
-                other.execute("BEGIN IMMEDIATE")
+        for n in range(0, 60, 3):
+            bridge.publish({"n": n})
+            with write_lock(file):
                 bridge.publish({"n": n + 1})
                 bridge.publish({"n": n + 2})
-                other.execute("ROLLBACK")
         catch_up(bridge)
         path = waiting_file(bridge)
         assert path.exists()
@@ -260,14 +258,12 @@ def test_what_waits_when_a_bridge_closes_is_kept_and_said(
     robot: InProcessSupervisor, file: Path, filed: Recording, capfd: pytest.CaptureFixture[str]
 ) -> None:
     bridge = MCPBridge(robot, data_dir=file.parent, throttle_interval=1)
-    with closing(connect(file, "writer")) as other:
-        other.execute("BEGIN IMMEDIATE")
+    with write_lock(file):
         bridge.publish({"n": 1})
         path = waiting_file(bridge)
         bridge.close()
         assert bridge.stats().rows_dropped == 0
         assert f"rows wait in {path}, because database is locked" in capfd.readouterr().err
-        other.execute("ROLLBACK")
     assert adopt_into(file) > 0
     assert numbers(filed) == [1]
     assert filed.rows("SELECT end_reason FROM session") == ["finished"]
@@ -403,12 +399,10 @@ def test_a_session_that_was_deleted_while_its_rows_waited_is_entered_again(
     bridge: MCPBridge, robot: InProcessSupervisor, file: Path, filed: Recording
 ) -> None:
     bridge.publish({"n": 0})
-    with closing(connect(file, "writer")) as other:
-        other.execute("BEGIN IMMEDIATE")
+    with write_lock(file) as other:
         bridge.publish({"n": 1})
         for table in ("state", "event", "log", "run", "session"):
             other.execute(f"DELETE FROM {table}")
-        other.execute("COMMIT")
     bridge.publish({"n": 2})
     catch_up(bridge)
     assert numbers(filed) == [1, 2]

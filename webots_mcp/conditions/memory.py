@@ -8,14 +8,16 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Final, Generic, Protocol, TypeVar
 
-from webots_mcp.conditions.reading import Read, State
+from webots_mcp.conditions.reading import State
 from webots_mcp.errors import ConditionFailedError
 from webots_mcp.naming import Value
 
 SAME_TIME_S: Final = 1e-6  # a clock that adds up steps is off by less
 _PLACES_KEPT: Final = 200  # of one displacement
+
+Answer = TypeVar("Answer")
 
 
 class Memory(Protocol):
@@ -30,78 +32,84 @@ class Memory(Protocol):
         ...
 
 
-class _Holding:
+class _Asking(Generic[Answer]):
+    """Asks something of every state and keeps what follows from the answers."""
+
+    def __init__(self, ask: Callable[[State], Answer]) -> None:
+        self._ask = ask
+        self._error: ConditionFailedError | None = None
+        self.forget()
+
+    def forget(self) -> None:
+        """A new run has begun."""
+        raise NotImplementedError
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """Take in a state; why it could not be asked is raised when the result is read."""
+        self._error = None
+        try:
+            answer = self._ask(state)
+        except ConditionFailedError as error:
+            self._error = error
+        else:
+            self._take_in(answer, sim_time_s)
+
+    def _take_in(self, answer: Answer, sim_time_s: float) -> None:
+        raise NotImplementedError
+
+    def _check(self) -> None:
+        if self._error is not None:
+            raise self._error
+
+
+class _Holding(_Asking[Answer]):
     """Whether something holds, as of the state that was taken in last."""
 
-    _error: ConditionFailedError | None = None
     _holds = False
 
     def holds(self, state: State) -> bool:
         """It could be asked of that state; else the error says why not."""
-        if self._error is not None:
-            raise self._error
+        self._check()
         return self._holds
 
 
-class Changed(_Holding):
+class Changed(_Holding[Value]):
     """Whether a value is another than the last one that was there."""
-
-    def __init__(self, read: Read) -> None:
-        self._read = read
-        self.forget()
 
     def forget(self) -> None:
         """What comes first is no change."""
         self._last: Value = None
         self._holds = False
 
-    def update(self, state: State, sim_time_s: float) -> None:
+    def _take_in(self, answer: Value, sim_time_s: float) -> None:
         """A missing value is no change, and neither is its return as it was."""
-        self._error = None
-        try:
-            value = self._read(state)
-        except ConditionFailedError as error:
-            self._error = error
-            return
-        self._holds = value is not None and self._last is not None and value != self._last
-        if value is not None:
-            self._last = value
+        self._holds = answer is not None and self._last is not None and answer != self._last
+        if answer is not None:
+            self._last = answer
 
 
-class Rate:
+class Rate(_Asking[int | float | None]):
     """How fast a value changes, per second, from one state that has it to the next."""
-
-    def __init__(self, read: Callable[[State], int | float | None]) -> None:
-        self._read = read
-        self._error: ConditionFailedError | None = None
-        self.forget()
 
     def forget(self) -> None:
         """There is a rate from the second value on."""
         self._last: tuple[float, float] | None = None
         self._rate: float | None = None
 
-    def update(self, state: State, sim_time_s: float) -> None:
+    def _take_in(self, answer: int | float | None, sim_time_s: float) -> None:
         """While time stands still the rate stays as it is."""
-        self._error = None
-        try:
-            value = self._read(state)
-        except ConditionFailedError as error:
-            self._error = error
-            return
-        if value is None:
+        if answer is None:
             self._rate = None
         elif self._last is None:
-            self._last = (sim_time_s, value)
+            self._last = (sim_time_s, answer)
         elif (passed_s := sim_time_s - self._last[0]) > SAME_TIME_S:
-            rate = (value - self._last[1]) / passed_s
+            rate = (answer - self._last[1]) / passed_s
             self._rate = rate if -math.inf < rate < math.inf else None
-            self._last = (sim_time_s, value)
+            self._last = (sim_time_s, answer)
 
     def read(self, state: State) -> float | None:
         """As of the state that was taken in last."""
-        if self._error is not None:
-            raise self._error
+        self._check()
         return self._rate
 
 
@@ -146,28 +154,21 @@ class Displacement:
         return math.hypot(self._here[0] - was_x, self._here[1] - was_y)
 
 
-class Lasting(_Holding):
+class Lasting(_Holding[bool]):
     """Whether a condition held in every state of at least so many seconds."""
 
     def __init__(self, condition: Callable[[State], bool], seconds: float) -> None:
-        self._condition = condition
+        super().__init__(condition)
         self._seconds = seconds
-        self.forget()
 
     def forget(self) -> None:
         """It holds since no time at all."""
         self._since_s: float | None = None
         self._holds = False
 
-    def update(self, state: State, sim_time_s: float) -> None:
+    def _take_in(self, answer: bool, sim_time_s: float) -> None:
         """Between two states in both of which it holds it counts as unbroken."""
-        self._error = None
-        try:
-            holds = self._condition(state)
-        except ConditionFailedError as error:
-            self._error = error
-            return
-        if not holds:
+        if not answer:
             self._since_s = None
             self._holds = False
             return

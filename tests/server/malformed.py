@@ -188,35 +188,50 @@ def damages(file: Path) -> Iterator[Damage]:
     connection.close()
 
 
-async def unusable_answers(
-    base: Path, folder: Path, damage: Damage, part: slice = slice(None)
-) -> tuple[int, list[str]]:
-    """How many calls were made on a copy with this damage, and those that gave nothing usable.
+class Damaged:
+    """A copy of a recording on which one server answers, damaged anew for each question."""
 
-    Args:
-        base: The folder that is copied.
-        folder: The copy.
-        damage: Done to it.
-        part: Which of the calls are made; all take a second of processor time.
-    """
-    shutil.copytree(base, folder)
-    with closing(sqlite3.connect(folder / "webots.db")) as connection, connection:
-        try:
-            damage.apply(connection)
-        except sqlite3.IntegrityError:  # the schema itself keeps it out
+    def __init__(self, base: Path, folder: Path) -> None:
+        shutil.copytree(base, folder)
+        self._sound, self._file = base / "webots.db", folder / "webots.db"
+        self.client = Client(create_server(self._file, folder))
+
+    def damage(self, damage: Damage) -> bool:
+        """Bring the copy back to what it was and do this to it; False if the schema keeps it out.
+
+        Every call of a tool opens the database anew, so that nothing is left of the damage before.
+        """
+        sound, copy = sqlite3.connect(self._sound), sqlite3.connect(self._file)
+        with closing(sound), closing(copy), copy:
+            sound.backup(copy)
+            try:
+                damage.apply(copy)
+            except sqlite3.IntegrityError:
+                return False
+        return True
+
+    async def unusable_answers(
+        self, damage: Damage, part: slice = slice(None)
+    ) -> tuple[int, list[str]]:
+        """How many calls were made after this damage, and those that gave nothing usable.
+
+        Args:
+            damage: Done to a sound copy.
+            part: Which of the calls are made; all take half a second of processor time.
+        """
+        if not self.damage(damage):
             return 0, []
-    bad: list[str] = []
-    calls = (*READING, *(DRAWING if damage.table in _DRAWN else ()),
-             *(ACTING if damage.table in _ACTED_ON else ()))[part]  # fmt: skip
-    async with Client(create_server(folder / "webots.db", folder)) as client:
+        bad: list[str] = []
+        calls = (*READING, *(DRAWING if damage.table in _DRAWN else ()),
+                 *(ACTING if damage.table in _ACTED_ON else ()))[part]  # fmt: skip
         for tool, arguments in calls:
             with anyio.fail_after(60):
-                answer = await client.call_tool(tool, arguments)
+                answer = await self.client.call_tool(tool, arguments)
             said = "".join(block.text for block in answer.content if block.type == "text")
             rest = said.removeprefix(f"Error executing tool {tool}").strip(": ")
             if answer.is_error and (not rest or any(words in rest for words in _UNUSABLE)):
                 bad.append(f"{tool} after {damage}: {rest or 'plain'}"[:400])
-    return len(calls), bad
+        return len(calls), bad
 
 
 async def _survey(only: str) -> None:
@@ -226,11 +241,12 @@ async def _survey(only: str) -> None:
         base.mkdir()
         record(base / "webots.db")
         wanted = [damage for damage in damages(base / "webots.db") if only in str(damage)]
-        for number, damage in enumerate(wanted):
-            calls, unusable = await unusable_answers(base, Path(folder) / str(number), damage)
-            shutil.rmtree(Path(folder) / str(number))
-            made += calls
-            bad += unusable
+        damaged = Damaged(base, Path(folder) / "copy")
+        async with damaged.client:
+            for damage in wanted:
+                calls, unusable = await damaged.unusable_answers(damage)
+                made += calls
+                bad += unusable
     print(*bad, sep="\n")
     print(f"{len(wanted)} damages, {made} calls, {len(bad)} without a usable answer")
 

@@ -12,7 +12,7 @@ from mcp import Client
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail, text_of
-from tests.server.malformed import Damage, damages, record, unusable_answers
+from tests.server.malformed import Damage, Damaged, damages, record
 from webots_mcp.server import create_server
 
 pytestmark = pytest.mark.anyio
@@ -40,10 +40,12 @@ async def test_a_wrong_value_anywhere_leaves_every_tool_with_an_answer(
         if damage.table == table and damage.value in TRIED:
             by_column.setdefault(damage.column, []).append(damage)
     assert by_column
-    for number, tried in enumerate(by_column.values()):
-        damage = tried[number % len(tried)]
-        asked = slice(number % 3, None, 3)
-        assert (await unusable_answers(base, tmp_path / str(number), damage, asked))[1] == []
+    damaged = Damaged(base, tmp_path / "copy")
+    async with damaged.client:
+        for number, tried in enumerate(by_column.values()):
+            damage = tried[number % len(tried)]
+            asked = slice(number % 3, None, 3)
+            assert (await damaged.unusable_answers(damage, asked))[1] == []
 
 
 async def test_trials_of_a_robot_that_cannot_be_read_are_told(base: Path, tmp_path: Path) -> None:

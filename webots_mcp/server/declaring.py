@@ -71,8 +71,14 @@ class Declaration:
 
     def registered(self, recording: Recording) -> Tool:
         """The tool on a recording."""
+        on_recording = functools.partial(self._tool.fn, recording)
+        return self._tool.model_copy(update={"fn": on_recording})
+
+    @functools.cached_property
+    def _tool(self) -> Tool:
+        """On no recording yet. Its schemas, which take the SDK milliseconds, serve all servers."""
         return CheckedTool.from_function(
-            _bound(self.function, recording, only_reads=self.only_reads),
+            _answering(self.function, only_reads=self.only_reads),
             title=self.title,
             description=inspect.getdoc(self.function),
             annotations=self.annotations,
@@ -96,10 +102,8 @@ def tools_of(module: ModuleType, recording: Recording, *, read_only: bool) -> It
             yield declared.registered(recording)
 
 
-def _bound(
-    function: Callable[..., Any], recording: Recording, *, only_reads: bool
-) -> Callable[..., Any]:
-    """The function as the SDK calls it: on the recording, with an answer for whatever happens."""
+def _answering(function: Callable[..., Any], *, only_reads: bool) -> Callable[..., Any]:
+    """The function as the SDK calls it, after a recording; with an answer whatever happens."""
     empty = _empty_answer(function) if only_reads else None
     is_async = inspect.iscoroutinefunction(function)
 
@@ -107,7 +111,7 @@ def _bound(
     _, *parameters = signature.parameters.values()
     gathers = any(each.annotation is Scope for each in parameters)
 
-    async def call(arguments: dict[str, Any]) -> Any:
+    async def call(recording: Recording, arguments: dict[str, Any]) -> Any:
         if gathers:
             scope = Scope(**{name: arguments[name] for name in SCOPE})
             rest = {name: value for name, value in arguments.items() if name not in SCOPE}
@@ -117,16 +121,16 @@ def _bound(
         return await to_thread.run_sync(lambda: function(recording, **arguments))
 
     @functools.wraps(function)
-    async def wrapper(**arguments: Any) -> Any:
+    async def wrapper(recording: Recording, **arguments: Any) -> Any:
         unsound: Unsound | None = None
         try:
             if empty is not None:
                 try:
-                    return _as_result(await call(arguments))
+                    return _as_result(await call(recording, arguments))
                 except Exception as error:  # noqa: BLE001  (the next line tells which)
                     _require_over_a_value(error)
             with past_unsound_rows() as unsound:
-                return _as_result(await call(arguments), unsound)
+                return _as_result(await call(recording, arguments), unsound)
         except Exception as error:  # noqa: BLE001  (each becomes an answer)
             return _as_result(_answer_error(function.__name__, error, empty, unsound), unsound)
 

@@ -32,6 +32,7 @@ ALLOWED = {
     "adoption": {"connection", "entries", "errors", "notice"},
     "maintenance": {"adoption", "connection", "errors", "notice", "schema"},
     "standin": {"standin", "bundled"},
+    "webots": {"connection", "contract", "errors", "liveness", "webots"},
 }
 ENTRIES = {"bundled", "conditions", "maintenance", "naming", "parameter", "settlement", "units"}
 STDLIB = {
@@ -42,9 +43,11 @@ STDLIB = {
 }
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["store"] = STDLIB | {"store"}
-ALLOWED["trials"] = STDLIB | {"store", "trials"}
+ALLOWED["trials"] = STDLIB | {"store", "trials", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
-ALLOWED["server"] = STDLIB | {"store", "plotting", "trials", "server", "__version__"}
+ALLOWED["server"] = STDLIB | {
+    "store", "plotting", "trials", "server", "webots", "__version__"
+}  # fmt: skip
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
 ALLOWED["pytest_plugin"] = {"contract", "standin", "testing", "MCPBridge", "MemoryDatabase"}
 

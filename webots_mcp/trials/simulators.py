@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import signal
 import socket
 import subprocess
@@ -17,6 +16,7 @@ from typing import Final
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.liveness import process_alive
 from webots_mcp.trials import keeper
+from webots_mcp.webots.installations import find_webots
 
 CONSOLE: Final = "simulator.log"
 
@@ -32,20 +32,16 @@ def webots(world: str) -> list[str]:
     Raises:
         CommandRefusedError: There is no Webots.
     """
-    program = _find_webots()
+    program = _program()
     options = ("--batch", "--mode=fast", "--minimize", "--no-rendering", "--stdout", "--stderr")
     return [program, *options, f"--port={_free_port()}", world]
 
 
-def _find_webots() -> str:
-    home = os.environ.get("WEBOTS_HOME")
-    found = shutil.which("webots") or (shutil.which("webots", path=home) if home else None)
-    if found is None:
-        raise CommandRefusedError(
-            "there is no program 'webots' on the PATH or in WEBOTS_HOME: install Webots, or try on "
-            "the stand-in with --stand-in"
-        )
-    return found
+def _program() -> str:
+    try:
+        return str(find_webots().program)
+    except CommandRefusedError as error:
+        raise CommandRefusedError(f"{error}; or try on the stand-in with --stand-in") from error
 
 
 def _free_port() -> int:

@@ -1,5 +1,5 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 6;
+PRAGMA user_version = 7;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
@@ -172,7 +172,7 @@ CREATE TABLE rollup (
 	sum FLOAT, 
 	squares FLOAT /* sum of squared deviations from sum / count */, 
 	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, 
+	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, 
 	PRIMARY KEY (run_id, signal_id, bucket), 
 	CONSTRAINT fk_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
@@ -260,7 +260,7 @@ CREATE TABLE recent_rollup (
 	sum FLOAT, 
 	squares FLOAT /* sum of squared deviations from sum / count */, 
 	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, 
+	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, 
 	PRIMARY KEY (run_id, bucket, signal_id), 
 	CONSTRAINT fk_recent_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
@@ -311,7 +311,7 @@ CREATE TABLE coarse_rollup (
 	sum FLOAT, 
 	squares FLOAT /* sum of squared deviations from sum / count */, 
 	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, 
+	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, swings TEXT /* JSON: the swings of what a robot swings with, each as [begin, end, half swings, period in s, amplitude, explained share]; null where they were not looked for */ NULL, 
 	PRIMARY KEY (run_id, signal_id, bucket), 
 	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
@@ -404,10 +404,6 @@ SELECT r.name AS robot, v.run_id, v.name,
 FROM (SELECT *, CASE WHEN json_valid(value) THEN value END AS j FROM parameter_value) v
 JOIN run u ON u.id = v.run_id JOIN robot r ON r.id = u.robot_id
 LEFT JOIN parameter p ON p.robot_id = u.robot_id AND p.name = v.name;
-CREATE VIEW all_rollup AS
-/* Rollups, those of buckets that are over and the newest. */
-SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step FROM rollup
-UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step FROM recent_rollup;
 CREATE INDEX ix_trial_set_robot_id ON trial_set (robot_id);
 CREATE INDEX ix_trial_set_session_id ON trial_set (session_id);
 CREATE TABLE kept_stretch (
@@ -564,4 +560,8 @@ SELECT (
     (SELECT value FROM json_tree(j) WHERE type = 'text' AND lower(key) IN ('state', 'status')
       ORDER BY length(replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '')), replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') LIMIT 1)) AS mode, s.odd
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
-INSERT INTO alembic_version (version_num) VALUES ('0006');
+CREATE VIEW all_rollup AS
+/* Rollups, those of buckets that are over and the newest. */
+SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM rollup
+UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM recent_rollup;
+INSERT INTO alembic_version (version_num) VALUES ('0007');

@@ -226,6 +226,12 @@ class _Summary(SQLModel):
     largest_step: float | None = _figure(
         "largest difference of values that follow each other; null in those of older versions"
     )
+    first_until_sim_time_s: float | None = _figure(
+        "up to then it had its first number; null in older versions"
+    )
+    last_since_sim_time_s: float | None = _figure(
+        "from then on it had its last number; null in older versions"
+    )
 
 
 class Rollup(_Summary, table=True):
@@ -262,6 +268,10 @@ class CoarseRollup(_Summary, table=True):
     run_id: int = _key("run")
     signal_id: int = _key(None, "signal.id, of the run's robot")
     bucket: int = _key(None, "floor(sim_time_s / 500)")
+    swings: str | None = _text(
+        "JSON: the swings of what a robot swings with, each as [begin, end, half swings, period "
+        "in s, amplitude, explained share]; null where they were not looked for",
+    )
 
 
 class Change(SQLModel, table=True):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import compress, count, pairwise
 from operator import attrgetter, mul, ne, sub
 from typing import Any, Final, NamedTuple, cast
 
@@ -33,6 +33,8 @@ class Summary(NamedTuple):
         cosines: Sum of cosines, of an angle in whatever unit.
         largest_step: Largest difference between values that follow each other; None also where it
             is not known: in rollups of older versions.
+        first_until_sim_time_s: Up to then it had its first value; not known as the largest step.
+        last_since_sim_time_s: From then on it had its last value.
     """
 
     rows: int = 0
@@ -51,6 +53,8 @@ class Summary(NamedTuple):
     sines: float | None = None
     cosines: float | None = None
     largest_step: float | None = None
+    first_until_sim_time_s: float | None = None
+    last_since_sim_time_s: float | None = None
 
     @property
     def mean(self) -> float | None:
@@ -152,12 +156,19 @@ def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = 
         math.fsum(map(math.sin, numbers)) if angle else None,
         math.fsum(map(math.cos, numbers)) if angle else None,
         _largest_step(numbers) if low < high else 0.0,
+        number_times[_rest(numbers) - 1],
+        number_times[-_rest(numbers[::-1])],
     )
 
 
 def _largest_step(numbers: Sequence[float]) -> float:
     steps = list(map(sub, numbers[1:], numbers))
     return float(max(max(steps), -min(steps)))
+
+
+def _rest(numbers: Sequence[float]) -> int:
+    """How many of the first ones are the same."""
+    return next(compress(count(1), map(ne, numbers, numbers[1:])), len(numbers))
 
 
 def summarise_numbers(
@@ -171,17 +182,18 @@ def summarise_numbers(
         rows: Of which so many held one; None for as many.
         turn: A whole turn of what is an angle, in its unit.
     """
-    count = len(numbers)
-    if not count:
+    present = len(numbers)
+    if not present:
         return Summary(rows or 0)
     angles = numbers * (math.tau / turn) if turn else None
     low, high = int(numbers.argmin()), int(numbers.argmax())
     total = float(numbers.sum())
-    deviations, steps = numbers - total / count, np.diff(numbers)
+    deviations, steps = numbers - total / present, np.diff(numbers)
+    changes = np.flatnonzero(steps)
     return Summary(
-        count if rows is None else rows,
-        count,
-        int(np.count_nonzero(steps)),
+        present if rows is None else rows,
+        present,
+        len(changes),
         *_at(times, numbers, 0),
         *_at(times, numbers, -1),
         *_at(times, numbers, low),
@@ -191,6 +203,8 @@ def summarise_numbers(
         None if angles is None else float(np.sin(angles).sum()),
         None if angles is None else float(np.cos(angles).sum()),
         float(np.abs(steps).max(initial=0.0)),
+        float(times[changes[0] if len(changes) else -1]),
+        float(times[changes[-1] + 1 if len(changes) else 0]),
     )
 
 
@@ -261,14 +275,14 @@ def merge(parts: Sequence[Summary]) -> Summary:
     filled = [part for part in parts if part.sum is not None]
     if not filled:
         return _merged_without_numbers(rows, [part for part in parts if part.present])
-    count = sum(part.present for part in filled)
+    present = sum(part.present for part in filled)
     total = math.fsum(_column(filled, "sum"))
     low = min(filled, key=attrgetter("min"))
     high = max(filled, key=attrgetter("max"))
     first, last = filled[0], filled[-1]
     return Summary(
         rows,
-        count,
+        present,
         sum(part.changes for part in filled) + sum(a.last != b.first for a, b in pairwise(filled)),
         first.first,
         first.first_sim_time_s,
@@ -279,10 +293,10 @@ def merge(parts: Sequence[Summary]) -> Summary:
         high.max,
         high.max_sim_time_s,
         total,
-        _merged_squares(filled, total / count),
+        _merged_squares(filled, total / present),
         _sum_where_angle(filled, "sines"),
         _sum_where_angle(filled, "cosines"),
-        _merged_largest_step(filled),
+        *_merged_steps(filled),
     )
 
 
@@ -320,13 +334,28 @@ def _merged_squares(parts: Sequence[Any], mean: float) -> float:
     )
 
 
-def _merged_largest_step(parts: Sequence[Any]) -> float | None:
-    """Not known where it is not of a part, or where values of one part lie within another."""
-    largest: list[Any] = _column(parts, "largest_step")
+def _merged_steps(parts: Sequence[Any]) -> tuple[float | None, float | None, float | None]:
+    """The largest step, and until and since when the first and the last value were there.
+
+    Not known where they are not of a part, or where values of one part lie within another.
+    """
     borders = list(pairwise(parts))
+    largest: list[Any] = _column(parts, "largest_step")
     if None in largest or any(a.last_sim_time_s > b.first_sim_time_s for a, b in borders):
-        return None
-    return max([*largest, *(abs(b.first - a.last) for a, b in borders)])
+        return None, None, None
+    largest += [abs(b.first - a.last) for a, b in borders]
+    if parts[0].first_until_sim_time_s is None or None in _column(parts, "last_since_sim_time_s"):
+        return max(largest), None, None
+    until_s, since_s = parts[0].first_until_sim_time_s, parts[-1].last_since_sim_time_s
+    for before, after in borders:
+        if before.min != before.max or before.last != after.first:
+            break
+        until_s = after.first_until_sim_time_s
+    for before, after in reversed(borders):
+        if after.min != after.max or before.last != after.first:
+            break
+        since_s = before.last_since_sim_time_s
+    return max(largest), until_s, since_s
 
 
 def _sum_where_angle(parts: Sequence[Summary], field: str) -> float | None:

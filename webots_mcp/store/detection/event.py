@@ -10,6 +10,8 @@ from typing import Any, Final
 from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import Value
+from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS
+from webots_mcp.store.rollup.swings import LONGEST_PERIOD_S
 
 LEVELS: Final = LOG_LEVELS
 
@@ -121,8 +123,8 @@ class EventOptions:
     flat_s: float = 20.0
     jump_score: float = 12.0
     jump_m: float = 0.3
-    oscillation_turns: int = 6
-    oscillation_period_s: float = 5.0
+    oscillation_turns: int = LEAST_HALF_SWINGS
+    oscillation_period_s: float = LONGEST_PERIOD_S
     log_level: str = "warning"
 
     def __post_init__(self) -> None:

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from webots_mcp.naming import listed
-from webots_mcp.store.analysis.features import unwrap
-from webots_mcp.store.analysis.swings import Swing, find_swings, joined_swings
+from webots_mcp.store.analysis.swings import Swing, joined_swings
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.reading.rows import Numbers
+from webots_mcp.store.rollup.swings import may_swing, swings_in
 from webots_mcp.store.signals.registry import Signal
 
 _MOST_NAMED: Final = 5
-# What a robot swings with; sensors swing by nature while it drives.
-_SWINGING: Final = re.compile(
-    r"(^|[._])(heading|yaw|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"
-    r"|left|right|cmd|command\w*|error)([._]|$)",
-    re.IGNORECASE,
-)
 
 
 def oscillation_events(search: Search) -> Iterator[Event]:
@@ -33,13 +25,7 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             f"not in {len(left)} of {len(search.numbers)} signals, whose names are not of what a "
             f"robot swings with: name them in signals ({listed(left, _MOST_NAMED)})",
         )
-    found: dict[str, list[Swing]] = {}
-    at_rest = [0.0] * len(signals)  # without any step there is no swing
-    for numbers in search.view.stretches(signals, 1.0, at_rest):
-        for index, signal in enumerate(signals):
-            if search.is_over("oscillation", signals[index:]):
-                break
-            found.setdefault(signal.name, []).extend(_swings(search, signal, numbers))
+    found = _found(search, signals)
     for name, swings in found.items():
         for swing in joined_swings(swings):
             details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
@@ -47,19 +33,28 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             yield search.event("oscillation", *ends, name, turns=swing.half_swings, **details)
 
 
+def _found(search: Search, signals: Sequence[Signal]) -> dict[str, list[Swing]]:
+    """Those that are kept, and in the rows of which none are."""
+    options = search.options
+    asked = options.oscillation_turns, options.oscillation_period_s
+    usual = asked == (EventOptions.oscillation_turns, EventOptions.oscillation_period_s)
+    kept, found = search.view.kept_swings(signals if usual else ())
+    for some, outside in (
+        ([each for each in signals if each.name in found], kept),
+        ([each for each in signals if each.name not in found], range(0)),
+    ):
+        at_rest = [0.0] * len(some)  # without any step there is no swing
+        for numbers in search.view.stretches(some, 1.0, at_rest, outside) if some else ():
+            for index, signal in enumerate(some):
+                if search.is_over("oscillation", some[index:]):
+                    break
+                found.setdefault(signal.name, []).extend(swings_in(numbers, signal, *asked))
+    return found
+
+
 def _swinging(search: Search) -> list[Signal]:
     asked = search.options.signals != EventOptions.signals
-    return [each for each in search.numbers if asked or _SWINGING.search(each.name)]
-
-
-def _swings(search: Search, signal: Signal, numbers: Numbers) -> list[Swing]:
-    times, values = numbers.of(signal.name)
-    return find_swings(
-        times,
-        unwrap(values, signal.turn) if signal.turn else values,
-        least_half_swings=search.options.oscillation_turns,
-        longest_period_s=search.options.oscillation_period_s,
-    )
+    return [each for each in search.numbers if asked or may_swing(each)]
 
 
 def _least_s(options: EventOptions) -> float:

@@ -16,6 +16,7 @@ from typing import Final, Protocol
 from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.analysis.rhythm import GAP_INTERVALS, usual_interval_s
 from webots_mcp.store.analysis.summary import Summary, merge, summarise_numbers
+from webots_mcp.store.analysis.swings import Swing
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.intervals import (
     Condition,
@@ -30,6 +31,7 @@ from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of,
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, buckets, totals
 from webots_mcp.store.rollup.rolling import watermark
+from webots_mcp.store.rollup.swings import ACROSS_S, STRETCH_ROWS, kept_swings
 from webots_mcp.store.signals.registry import Signal
 
 READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
@@ -37,10 +39,9 @@ JUMP_BUCKETS: Final = 20  # of each signal of a long segment that are read
 JUMP_RANGE: Final = 3.0  # times the usual range of a bucket: there may be a jump in it
 SAMPLES_PER_STAY: Final = 5
 SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
-STRETCH_ROWS: Final = 10_000  # at once, of all rows of a long segment
 MOST_KEPT: Final = 10_000_000  # numbers of 8 bytes, of stretches that are asked for again
-ACROSS_S: Final = 20.0  # of the next stretch: longer than six half swings of the longest period
 LATE_S: Final = 60.0  # the rollups are usually a few seconds behind
+_NOTHING: Final = range(0)
 
 _OF_SIGNAL: Final = (
     "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
@@ -108,8 +109,16 @@ class View(Protocol):
         """Where a jump may be."""
         ...
 
+    def kept_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
+        """Swings that were found before; and of which buckets, where all of a signal's are."""
+        ...
+
     def stretches(
-        self, signals: Sequence[Signal], share: float, least_steps: Sequence[float] | None = None
+        self,
+        signals: Sequence[Signal],
+        share: float,
+        least_steps: Sequence[float] | None = None,
+        outside: range = _NOTHING,
     ) -> Iterator[Numbers]:
         """All rows in stretches, the newest first, as many as a share of the time allows.
 
@@ -120,6 +129,7 @@ class View(Protocol):
             share: Of the time that is left.
             least_steps: Of each signal: a stretch may be left out in which none of them changes by
                 more than that from one row to the next. None for all stretches.
+            outside: Buckets that are not read, but for what lies across their borders.
         """
         ...
 
@@ -193,8 +203,16 @@ class RowView:
         """All of it."""
         yield Course(*self._columns.numbers(signal.name))
 
+    def kept_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
+        """None: all rows are there to look in."""
+        return _NOTHING, {}
+
     def stretches(
-        self, signals: Sequence[Signal], share: float, least_steps: Sequence[float] | None = None
+        self,
+        signals: Sequence[Signal],
+        share: float,
+        least_steps: Sequence[float] | None = None,
+        outside: range = _NOTHING,
     ) -> Iterator[Numbers]:
         """All rows at once."""
         yield numbers_of(self._columns, signals)
@@ -322,14 +340,35 @@ class LongView:
             usual = self._sample.numbers(signal.name)[1]
             yield Course(*self._numbers(signal, bucket), usual)
 
+    def kept_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
+        """Those of the coarse rollups that lie inside."""
+        start, end = -(-self._segment.start_s // BUCKET_S), self._segment.end_s // BUCKET_S
+        return kept_swings(self._connection, self._segment, range(int(start), int(end)), signals)
+
     def stretches(
-        self, signals: Sequence[Signal], share: float, least_steps: Sequence[float] | None = None
+        self,
+        signals: Sequence[Signal],
+        share: float,
+        least_steps: Sequence[float] | None = None,
+        outside: range = _NOTHING,
     ) -> Iterator[Numbers]:
         """What there is no time for is noted."""
-        self._note_purged()
         deadline = self._deadline.part(share)
         first_s = max(self._segment.start_s, self._purged_until_s or -math.inf)
-        left = self._segment
+        for part in _around(self._segment, outside):
+            if part.start_s < first_s:
+                self._note_purged()
+            yield from self._stretches(part, first_s, deadline, signals, least_steps)
+
+    def _stretches(
+        self,
+        left: Segment,
+        first_s: float,
+        deadline: Deadline,
+        signals: Sequence[Signal],
+        least_steps: Sequence[float] | None,
+    ) -> Iterator[Numbers]:
+        end_of_all_s, first_s = left.end_s, max(first_s, left.start_s)
         while left.end_s > first_s:
             part = newest_part(self._connection, left, STRETCH_ROWS)
             if deadline.passed:
@@ -338,8 +377,7 @@ class LongView:
                     f"not before {reached_s:.3f} s, the time was over; ask end_s={reached_s:.3f}"
                 )
                 return
-            end_s = min(self._segment.end_s, part.end_s + ACROSS_S)
-            whole = replace(part, end_s=end_s)
+            whole = replace(part, end_s=min(end_of_all_s, part.end_s + ACROSS_S))
             if least_steps is None or not self._is_calm(whole, signals, least_steps):
                 yield self._stretch(whole, signals, deadline)
             if part.start_s <= first_s:
@@ -438,6 +476,16 @@ class LongView:
         end_s = min(self._segment.end_s, (bucket + 1) * BUCKET_S + self._join_s)
         part = replace(self._segment, start_s=start_s, end_s=end_s)
         return read_columns(self._connection, part, [signal], self._deadline).numbers(signal.name)
+
+
+def _around(segment: Segment, buckets: range) -> list[Segment]:
+    """What of a segment is not in some buckets inside of it, the newest first."""
+    if not buckets:
+        return [segment]
+    start_s, end_s = buckets.start * BUCKET_S, buckets.stop * BUCKET_S
+    after = replace(segment, start_s=max(segment.start_s, end_s - ACROSS_S))
+    before = replace(segment, end_s=min(segment.end_s, start_s + ACROSS_S))
+    return [after, before] if segment.start_s < start_s else [after]
 
 
 def _bucket(wide: tuple[float, int]) -> int:

@@ -20,6 +20,9 @@ _BOOKKEEPING_COLUMNS: Final = (
     "hold_mode",
     "rolled_state_id",
     "coarse_end",
+    "first_until_sim_time_s",
+    "last_since_sim_time_s",
+    "swings",
 )
 _COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
 # A column that was added later stands on the line of the last one, after a comma.

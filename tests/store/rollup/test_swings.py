@@ -47,7 +47,7 @@ def state(time_s: float) -> dict[str, Any]:
 
 
 def swings_of(connection: sqlite3.Connection, **asked: Any) -> list[tuple[float, ...]]:
-    options = EventOptions(**{"kinds": ("oscillation",), **asked})
+    options = EventOptions(kinds=("oscillation",), **asked)
     found = find_events(connection, resolve_range(connection), options, deadline_s=60.0)
     assert "not before" not in found.verdicts.not_searched.get("oscillation", "")
     figures = ("period_s", "amplitude", "turns")

@@ -56,7 +56,7 @@ def describe_schema(connection: sqlite3.Connection) -> str:
     for name, kind, sql in connection.execute(_OBJECTS).fetchall():
         if name in _BOOKKEEPING:
             continue
-        same = frozenset(columns[name])
+        same = frozenset(columns[name]).difference(_BOOKKEEPING_COLUMNS)
         names.setdefault(same, []).append(f"{kind} {name}")
         if same not in listed:
             found = dict.fromkeys(_COMMENT.findall(sql) if kind == "table" else ())

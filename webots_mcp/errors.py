@@ -21,6 +21,7 @@ of its own.
     │   ├── InvalidConditionError
     │   └── InvalidRangeError
     ├── NothingRecordedError        the question is fine, the recording has no answer yet
+    ├── LeaseLostError              another process does by now what this one did
     ├── ConditionFailedError        a condition met values that it cannot be asked of
     └── CommandRefusedError         the simulation or the robot cannot do what was asked
         └── InterruptedCommandError something else ended it before it was done
@@ -100,6 +101,10 @@ class InvalidRangeError(InvalidInputError):
 
 class NothingRecordedError(WebotsMCPError):
     """The question is fine, but nothing has been recorded that answers it."""
+
+
+class LeaseLostError(WebotsMCPError):
+    """Another process took a job over from this one, which had been stopped for too long."""
 
 
 class ConditionFailedError(WebotsMCPError):

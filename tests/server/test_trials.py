@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -439,6 +440,60 @@ async def test_a_set_whose_server_was_killed_is_gone_on_with_by_another(
         assert await value_of(client, "speed") == 1.0
     sent = filed.rows("SELECT count(*) FROM command WHERE action = 'run'")
     assert sent == [6], "what the killed server had sent was not sent again"
+
+
+def let_leases_run_out(file: Path) -> None:
+    """As time does, where nobody renews them."""
+    with closing(database(file, "writer")) as connection:
+        connection.execute("UPDATE lease SET until_wall_time_s = 1.0 WHERE name <> 'maintainer'")
+
+
+async def test_a_set_whose_server_was_stopped_is_taken_over_and_never_run_by_both(
+    simulation: Simulation, filed: Recording, data_dir: Path, release: Path, tmp_path: Path
+) -> None:
+    file, pid = data_dir / "webots.db", tmp_path / "pid"
+    server = StdioServerParameters(
+        command=sys.executable, args=["-c", SERVER, str(pid), str(file)], env=dict(os.environ)
+    )
+    asked = {"parameters": SPEEDS, "score": "last(released)", "until": "released > 0"}
+    told: list[dict[str, Any]] = []
+
+    async def ask_the_stopped_one(client: Client) -> None:
+        told.append(await ask(client, "webots_run_trials", **asked, timeout_s=90))
+
+    async with Client(server) as client, anyio.create_task_group() as tasks:
+        tasks.start_soon(ask_the_stopped_one, client)
+        await _until(filed, "SELECT count(*) FROM command WHERE status = 'claimed'", 1)
+        async with Client(create_server(file, data_dir)) as other:
+            os.kill(int(pid.read_text()), signal.SIGSTOP)
+            assert (await ask(other, "webots_get_trials"))["state"] == "under way"
+            let_leases_run_out(file)
+            assert (await ask(other, "webots_get_trials"))["state"] == "left by a server that ended"
+            await ask(other, "webots_run_trials", trial_set=1, timeout_s=0.1)
+            os.kill(int(pid.read_text()), signal.SIGCONT)
+            release.touch()
+            answer = await ask(other, "webots_run_trials", trial_set=1, timeout_s=90)
+            assert (answer["state"], answer["over"]) == ("done", 6)
+            assert await value_of(other, "speed") == 1.0
+    assert (told[0]["state"], told[0]["over"]) == ("done", 6)
+    assert filed.rows("SELECT count(*) FROM command WHERE action = 'run'") == [6]
+    assert filed.rows("SELECT count(*) FROM command WHERE action = 'cancel_run'") == [0]
+
+
+@pytest.mark.parametrize("renewed", [True, False])
+async def test_a_set_at_work_on_another_host_is_its_own_as_long_as_it_renews_the_lease(
+    connect: Connect, tunable: TunableDriver, file: Path, renewed: bool
+) -> None:
+    async with connect() as client:
+        await trials(client, parameters={"kp": [1.0, 2.0]})
+        with closing(database(file, "writer")) as connection:
+            connection.execute("UPDATE trial_set SET host = 'elsewhere', pid = 1, process = 'x'")
+            connection.execute("UPDATE trial SET status = 'waiting', run_id = NULL, score = NULL")
+            until_s = time.time() + (20 if renewed else -1)
+            values = ("trial set 1", "elsewhere 1", until_s)
+            connection.execute("INSERT INTO lease VALUES (?, ?, ?)", values)
+        answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=1 if renewed else 60)
+        assert answer["state"] == ("under way" if renewed else "done")
 
 
 async def test_a_server_that_ends_leaves_the_parameters_as_they_were(

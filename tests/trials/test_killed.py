@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -118,3 +120,31 @@ def test_who_is_ended_in_the_middle_is_gone_on_from(
     assert rows(project, "SELECT count(*), count(DISTINCT uuid) FROM run") == [(4, 4)]
     assert rows(project, "SELECT count(*) FROM trial_set") == [(1,)]
     assert list((project / "data" / "trials").iterdir()) == []
+
+
+def test_who_was_stopped_until_another_took_over_writes_nothing_more(
+    project: Path, plan: Write, run: Run
+) -> None:
+    plan('score = "last(x)"\nfor_s = 3\nrepeats = 2\n[grid]\nspeed = [1.0, 2.0]')
+    process = subprocess.Popen(
+        command(project, "--jobs", "2"),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    wait_for_trial(project, 2)
+    process.send_signal(signal.SIGSTOP)
+    refused = run("--jobs", "2")
+    assert f"process {process.pid} on " in refused.stderr
+    with closing(sqlite3.connect(project / "data" / "webots.db")) as connection, connection:
+        connection.execute("UPDATE lease SET until_wall_time_s = 1.0")
+    answer = json.loads(run("--jobs", "2", "--json").stdout)
+    process.send_signal(signal.SIGCONT)
+    _, said = process.communicate(timeout=30)
+
+    assert process.returncode == 2, said
+    assert "trial set 1 was taken over by another process" in said
+    assert [len(each["scores"]) for each in answer["sets"]] == [2, 2]
+    done = "SELECT count(*), count(DISTINCT run_id) FROM trial WHERE status = 'done'"
+    assert rows(project, done) == [(4, 4)]
+    assert rows(project, "SELECT count(*) FROM run") == [(4,)]

@@ -36,6 +36,7 @@ from webots_mcp.store.trials import (
     create_trial_set,
     fetch_trial_set,
     find_trial_set,
+    is_at_work,
     ranking_of,
     stop_trial_set,
     trials_of,
@@ -156,7 +157,7 @@ def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
     best = best_of(plan)
     over = sum(each.is_over for each in trials)
     planned = count_planned(plan, trials)
-    state, hint = _state(found, planned - over)
+    state, hint = _state(found, planned - over, at_work=is_at_work(connection, found))
     ranking = ranking_of(trials, best)
     rows = fitting(_rows(ranking, trials), _TABLE_BUDGET)
     left_out = len(ranking.sets) - len(rows)
@@ -177,10 +178,10 @@ def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
     }
 
 
-def _state(found: TrialSet, left: int) -> tuple[str, str | None]:
+def _state(found: TrialSet, left: int, *, at_work: bool) -> tuple[str, str | None]:
     """Whether it goes on, and what to do next."""
     again = f"webots_run_trials(trial_set={found.id})"
-    if found.is_at_work:
+    if at_work:
         if found.stop_reason:
             return f"stopping: {found.stop_reason}", None
         return "under way", f"{again} waits for it, with cancel=true it stops"

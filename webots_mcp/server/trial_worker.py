@@ -15,9 +15,10 @@ import time
 from collections.abc import Mapping
 from typing import Any, Final
 
-from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
 from webots_mcp.server.running import ACTION
 from webots_mcp.server.target import find_target
+from webots_mcp.store.leases import Job
 from webots_mcp.store.parameters import described, parameters_of
 from webots_mcp.store.questions.score import score_run
 from webots_mcp.store.queue import Command, CommandQueue, fetch_command, find_command
@@ -84,7 +85,7 @@ class TrialWorker(threading.Thread):
         self._set_id = set_id
         self._stopping = threading.Event()
         with recording.writer() as connection:
-            take_up(connection, set_id)
+            self._job = Job(recording, take_up(connection, set_id))
             self._set = fetch_trial_set(connection, set_id)
             self._robot = robot_name(connection, self._set.robot_id or 0)
         self._plan: Plan = stored_plan(self._set.plan)
@@ -95,10 +96,19 @@ class TrialWorker(threading.Thread):
         self.join(2 * _END_PATIENCE_S + 1)
 
     def run(self) -> None:
-        """Run what is left of the set."""
+        """Run what is left of the set, as long as it is ours."""
+        try:
+            with self._job.renewed():
+                self._work()
+        except LeaseLostError as error:
+            _log.warning("%s", error)
+
+    def _work(self) -> None:
         try:
             while (trial := self._next()) is not None:
                 self._try(trial)
+        except LeaseLostError:
+            raise
         except _ServerEndsError:
             pass
         except WebotsMCPError as error:
@@ -125,17 +135,17 @@ class TrialWorker(threading.Thread):
             command = self._watched(self._sent(trial), self._plan.timeout_s)
             result = self._result(trial, command)
         except BaseException:
-            with self._recording.writer() as connection:
+            with self._job.writer() as connection:
                 put_back(connection, trial)
             raise
-        with self._recording.writer() as connection:
+        with self._job.writer() as connection:
             finish_trial(connection, trial, result)
         if not command.is_final:
             raise CommandRefusedError(_HANGS.format(self._robot))
 
     def _sent(self, trial: Trial) -> Command:
         """The command that runs a trial; one that was sent already is not sent again."""
-        with self._recording.writer() as connection:
+        with self._job.writer() as connection:
             known = find_command(connection, _key(trial))
             if known is not None:
                 return known
@@ -204,7 +214,7 @@ class TrialWorker(threading.Thread):
 
     def _take_back(self, command: Command) -> None:
         """It does not run, or ends now."""
-        with self._recording.writer() as connection:
+        with self._job.writer() as connection:
             queue = CommandQueue(connection)
             if not queue.cancel(command.id, "its trial was ended"):
                 params = {"command_id": command.id}
@@ -268,7 +278,7 @@ class TrialWorker(threading.Thread):
 
     def _say_why(self, reason: str) -> None:
         """Why the set does not go on; what was said first counts."""
-        with self._recording.writer() as connection:
+        with self._job.writer() as connection:
             if fetch_trial_set(connection, self._set_id).stop_reason is None:
                 stop_trial_set(connection, self._set_id, reason)
 
@@ -276,15 +286,16 @@ class TrialWorker(threading.Thread):
         """Set the parameters back, and let others work on the set."""
         try:
             self._give_back()
+        except LeaseLostError:
+            raise
         except WebotsMCPError as error:
             _log.warning("trial set %d: the parameters were not set back: %s", self._set_id, error)
-        finally:
-            with self._recording.writer() as connection:
-                lay_down(connection, self._set_id)
+        with self._job.writer() as connection:
+            lay_down(connection, self._set_id, self._job.lease)
 
     def _give_back(self) -> None:
         """A controller that has ended has no values any more."""
-        with self._recording.writer() as connection:
+        with self._job.writer() as connection:
             noted = fetch_trial_set(connection, self._set_id)
             if noted.former_values is None:
                 return
@@ -294,7 +305,7 @@ class TrialWorker(threading.Thread):
         if command is not None:
             command = self._settled(command.id, patience_s, hurried=True)
         if command is None or command.status == "done":
-            with self._recording.writer() as connection:
+            with self._job.writer() as connection:
                 borrow_parameters(connection, self._set_id, noted.session_id, None)
         else:
             self._say_why(f"its parameters were not set back: {command.error or command.status}")

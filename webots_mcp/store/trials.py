@@ -15,6 +15,7 @@ from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import process_alive, process_identity
 from webots_mcp.store.analysis.ranking import Best, Outcome, Ranking, rank
+from webots_mcp.store.leases import Lease, give_back, holder_of, take
 from webots_mcp.store.rows import columns_of
 
 _NEW_SET: Final = (
@@ -30,6 +31,7 @@ _OF_ROBOT: Final = "SELECT id FROM trial_set WHERE robot_id = ? ORDER BY id DESC
 _STOP: Final = "UPDATE trial_set SET stop_reason = ? WHERE id = ?"
 _BORROW: Final = "UPDATE trial_set SET session_id = ?, former_values = ? WHERE id = ?"
 _WORK: Final = "UPDATE trial_set SET host = ?, pid = ?, process = ? WHERE id = ?"
+_FORGET: Final = "UPDATE trial SET pid = NULL, process = NULL WHERE trial_set_id = ?"
 _BEGIN: Final = (
     "UPDATE trial SET status = 'running', started_wall_time_s = ?, pid = ?, process = ? "
     "WHERE id = ?"
@@ -63,11 +65,16 @@ class TrialSet:
     stop_reason: str | None
 
     @property
-    def is_at_work(self) -> bool:
-        """Whether a process works on it; one on another host counts as alive."""
+    def job(self) -> str:
+        """The name of the lease of whoever works on it."""
+        return f"trial set {self.id}"
+
+    @property
+    def is_left(self) -> bool:
+        """Whether the process that worked on it is known to be gone, without waiting."""
         if self.pid is None:
-            return False
-        return self.host != host_name() or process_alive(self.pid, self.process, time.time())
+            return True
+        return self.host == host_name() and not process_alive(self.pid, self.process, time.time())
 
 
 @dataclass(frozen=True)
@@ -167,8 +174,7 @@ def create_trial_set(
 
 def add_trial(connection: sqlite3.Connection, set_id: int, values: dict[str, Any]) -> Trial:
     """Enter one more trial of a set that is searched as it goes on."""
-    with transaction(connection):
-        _enter(connection, set_id, len(trials_of(connection, set_id)) + 1, values)
+    _enter(connection, set_id, len(trials_of(connection, set_id)) + 1, values)
     return trials_of(connection, set_id)[-1]
 
 
@@ -183,7 +189,7 @@ def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
     """In one simulation one set at a time."""
     for (set_id,) in connection.execute(_OF_ROBOT, (robot_id,)).fetchall():
         found = fetch_trial_set(connection, set_id)
-        if found.is_at_work:
+        if is_at_work(connection, found):
             raise CommandRefusedError(
                 f"trial set {set_id} of this robot is under way: wait for it with "
                 f"webots_run_trials(trial_set={set_id}), or end it with cancel=true"
@@ -216,6 +222,11 @@ def fetch_trial_set(connection: sqlite3.Connection, set_id: int) -> TrialSet:
     return TrialSet(*row)
 
 
+def is_at_work(connection: sqlite3.Connection, found: TrialSet) -> bool:
+    """Whether a process works on a set: it lives, as far as can be told, and renews its lease."""
+    return not found.is_left and holder_of(connection, found.job) is not None
+
+
 def next_trial(connection: sqlite3.Connection, set_id: int) -> Trial | None:
     """The trial that is to be run next, or was begun; None where all are over."""
     row = connection.execute(_NEXT, (set_id,)).fetchone()
@@ -245,26 +256,31 @@ def trials_of(connection: sqlite3.Connection, set_id: int) -> list[Trial]:
     return [Trial(*row) for row in connection.execute(_TRIALS, (set_id,)).fetchall()]
 
 
-def take_up(connection: sqlite3.Connection, set_id: int) -> None:
-    """Become the process that works on a set.
+def take_up(connection: sqlite3.Connection, set_id: int) -> Lease:
+    """Become the process that works on a set, as long as it renews the lease.
 
     Raises:
         CommandRefusedError: Another one does.
     """
     with transaction(connection):
         found = fetch_trial_set(connection, set_id)
-        if found.is_at_work:
+        lease = take(connection, found.job, forced=found.is_left)
+        if lease is None:
             raise CommandRefusedError(
                 f"process {found.pid} on {found.host} works on trial set {set_id}: wait for it, "
                 "or end it"
             )
+        if found.host not in (None, host_name()):  # nobody here knows of its simulators
+            connection.execute(_FORGET, (set_id,))
         own = os.getpid()
         connection.execute(_WORK, (host_name(), own, process_identity(own), set_id))
+    return lease
 
 
-def lay_down(connection: sqlite3.Connection, set_id: int) -> None:
-    """Let others work on a set."""
+def lay_down(connection: sqlite3.Connection, set_id: int, lease: Lease) -> None:
+    """Let others work on a set: at once, where this is in the transaction of a `Job`."""
     connection.execute(_WORK, (None, None, None, set_id))
+    give_back(connection, lease)
 
 
 def begin_trial(connection: sqlite3.Connection, trial: Trial, pid: int | None = None) -> Trial:
@@ -283,17 +299,9 @@ def put_back(connection: sqlite3.Connection, trial: Trial) -> None:
 def finish_trial(connection: sqlite3.Connection, trial: Trial, result: Result) -> None:
     """Enter what became of it; its run gets a label, unless it has one."""
     label = f"trial {trial.number} of set {trial.trial_set_id}: {spelled(trial.values)}"[:100]
-    with transaction(connection):
-        connection.execute(
-            _FINISH,
-            {
-                **vars(result),
-                "id": trial.id,
-                "status": result.status,
-                "now": time.time(),
-            },
-        )
-        connection.execute(_LABEL, (label, result.run_id))
+    now = {"id": trial.id, "status": result.status, "now": time.time()}
+    connection.execute(_FINISH, vars(result) | now)
+    connection.execute(_LABEL, (label, result.run_id))
 
 
 def spelled(values: Mapping[str, Any]) -> str:

@@ -14,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -31,6 +32,7 @@ from webots_mcp.errors import (
     NoDatabaseError,
 )
 from webots_mcp.settlement import settle
+from webots_mcp.store.leases import Job
 from webots_mcp.store.merging import merge
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.questions.score import score_run
@@ -74,6 +76,7 @@ class Workshop:
         stopping: Once it is set, running trials end soon and wait to be run again.
         search: Says the parameters of the trial after those that there are, or None where there is
             none; None where all were entered with the set.
+        job: The set, as long as this process works on it.
     """
 
     recording: Recording
@@ -81,6 +84,17 @@ class Workshop:
     command: Command
     stopping: threading.Event
     search: Search | None = None
+    job: Job | None = None
+
+    def writer(self) -> AbstractContextManager[sqlite3.Connection]:
+        """For what only the process may write that works on the set; see `Job.writer`."""
+        assert self.job is not None  # `run_trials` has taken it up
+        return self.job.writer()
+
+    def require_held(self) -> None:
+        """See `Job.require_held`."""
+        with self.writer():
+            pass
 
     def folder(self, trial: Trial) -> Path:
         """The data folder of a trial."""
@@ -102,8 +116,18 @@ def run_trials(workshop: Workshop, set_id: int, jobs: int, told: Told) -> None:
         StoppedError: Somebody wanted them to stop; what ran waits to be run again.
     """
     with workshop.recording.writer() as connection:
-        take_up(connection, set_id)
+        lease = take_up(connection, set_id)
         trials = trials_of(connection, set_id)
+    job = Job(workshop.recording, lease)
+    try:
+        with job.renewed():
+            _run_left(replace(workshop, job=job), set_id, trials, jobs, told)
+    finally:
+        with job.writer() as connection:
+            lay_down(connection, set_id, lease)
+
+
+def _run_left(workshop: Workshop, set_id: int, trials: list[Trial], jobs: int, told: Told) -> None:
     for trial in trials:
         if trial.is_over:
             shutil.rmtree(workshop.folder(trial), ignore_errors=True)
@@ -114,8 +138,6 @@ def run_trials(workshop: Workshop, set_id: int, jobs: int, told: Told) -> None:
     finally:
         workshop.stopping.set()
         pool.shutdown()  # the set is ours as long as a trial of it runs
-        with workshop.recording.writer() as connection:
-            lay_down(connection, set_id)
 
 
 def _next_trial(workshop: Workshop, set_id: int, left: deque[Trial]) -> Trial | None:
@@ -124,9 +146,13 @@ def _next_trial(workshop: Workshop, set_id: int, left: deque[Trial]) -> Trial | 
         return left.popleft()
     if workshop.search is None:
         return None
-    with workshop.recording.writer() as connection:
-        values = workshop.search(workshop.plan, trials_of(connection, set_id))
-        return None if values is None else add_trial(connection, set_id, values)
+    with workshop.recording.reader() as connection:
+        trials = trials_of(connection, set_id)
+    values = workshop.search(workshop.plan, trials)
+    if values is None:
+        return None
+    with workshop.writer() as connection:
+        return add_trial(connection, set_id, values)
 
 
 def _run_all(
@@ -161,10 +187,11 @@ def run_trial(workshop: Workshop, trial: Trial) -> Result:
         result = _recorded_result(workshop, trial)
     if result is None:
         result = _run(workshop, trial)
-    with workshop.recording.writer() as connection:
-        if result.run_id is not None:
+    if result.run_id is not None:
+        with workshop.recording.writer() as connection:
             merged = merge(connection, workshop.recording.data_dir, folder / DATABASE_NAME)
-            result = _with_run(result, merged, folder)
+        result = _with_run(result, merged, folder)
+    with workshop.writer() as connection:
         finish_trial(connection, trial, result)
     shutil.rmtree(folder, ignore_errors=True)
     return result
@@ -190,6 +217,7 @@ def _recorded_result(workshop: Workshop, trial: Trial) -> Result | None:
 
 def _run(workshop: Workshop, trial: Trial) -> Result:
     folder, plan = workshop.folder(trial), workshop.plan
+    workshop.require_held()  # in that folder another process may record by now
     shutil.rmtree(folder, ignore_errors=True)
     make_folder(folder)
     if workshop.stopping.is_set():
@@ -202,16 +230,17 @@ def _run(workshop: Workshop, trial: Trial) -> Result:
     simulator = Simulator(workshop.command(plan.world), folder, environment)
     watch = Watch(plan)
     try:
-        with workshop.recording.writer() as connection:
+        with workshop.writer() as connection:
             begin_trial(connection, trial, simulator.pid)
         simulator.start()
         end, why = _watched(workshop, watch, simulator, folder)
     except BaseException:
         simulator.end()
-        with workshop.recording.writer() as connection:
+        with workshop.writer() as connection:
             put_back(connection, trial)
         raise
     simulator.end()
+    workshop.require_held()
     return _concluded(folder, plan, trial, watch, end, why)
 
 

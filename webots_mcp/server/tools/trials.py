@@ -19,7 +19,7 @@ from webots_mcp.server.parameters import RobotName, TimeoutS, TrialSetId
 from webots_mcp.server.trial_worker import TrialWorkers
 from webots_mcp.store.analysis.ranking import Best
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import fetch_trial_set, progress_of
+from webots_mcp.store.trials import fetch_trial_set, is_at_work, progress_of
 
 _WAIT_S: Final = 60.0
 _TRIAL_S: Final = 300.0
@@ -100,7 +100,7 @@ def _take_up(recording: Recording, workers: TrialWorkers, set_id: int, *, cancel
     """Go on with a set, or end it, unless somebody is at it already."""
     trial_sets.require_ours(recording, set_id)
     with recording.reader() as connection:
-        at_work = fetch_trial_set(connection, set_id).is_at_work
+        at_work = is_at_work(connection, fetch_trial_set(connection, set_id))
     if cancel:
         trial_sets.cancel(recording, set_id)
     elif not at_work:
@@ -113,7 +113,9 @@ async def _wait(recording: Recording, ctx: Context[Any], set_id: int, timeout_s:
     """Until nobody works on the set any more, or the time is over."""
     until_s, report_s = time.monotonic() + timeout_s, time.monotonic() + _REPORT_EVERY_S
     with recording.reader() as connection:
-        while fetch_trial_set(connection, set_id).is_at_work and time.monotonic() < until_s:
+        while time.monotonic() < until_s:
+            if not is_at_work(connection, fetch_trial_set(connection, set_id)):
+                return
             if time.monotonic() >= report_s:
                 report_s += _REPORT_EVERY_S
                 await ctx.report_progress(*progress_of(connection, set_id))

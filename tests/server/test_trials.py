@@ -20,6 +20,7 @@ from mcp import Client, MCPError, StdioServerParameters
 
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, data_dir, filed, has_states, start  # fixtures
+from tests.processes.stopping import stop_between_writes
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
 from tests.server.story import rows_of
@@ -465,7 +466,7 @@ async def test_a_set_whose_server_was_stopped_is_taken_over_and_never_run_by_bot
         tasks.start_soon(ask_the_stopped_one, client)
         await _until(filed, "SELECT count(*) FROM command WHERE status = 'claimed'", 1)
         async with Client(create_server(file, data_dir)) as other:
-            os.kill(int(pid.read_text()), signal.SIGSTOP)
+            stop_between_writes(int(pid.read_text()), file)
             assert (await ask(other, "webots_get_trials"))["state"] == "under way"
             let_leases_run_out(file)
             assert (await ask(other, "webots_get_trials"))["state"] == "left by a server that ended"

@@ -16,6 +16,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.processes.stopping import stop_between_writes
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.liveness import process_identity
 
@@ -133,7 +134,7 @@ def test_who_was_stopped_until_another_took_over_writes_nothing_more(
         text=True,
     )
     wait_for_trial(project, 2)
-    process.send_signal(signal.SIGSTOP)
+    stop_between_writes(process.pid, project / "data" / "webots.db")
     refused = run("--jobs", "2")
     assert f"process {process.pid} on " in refused.stderr
     with closing(sqlite3.connect(project / "data" / "webots.db")) as connection, connection:

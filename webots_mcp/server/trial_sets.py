@@ -26,6 +26,7 @@ from webots_mcp.server.target import find_target
 from webots_mcp.server.tuning import settable
 from webots_mcp.store.analysis.ranking import Ranked, Ranking
 from webots_mcp.store.questions.score import require_kinds
+from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.recording import Recording, look
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.trials import (
@@ -138,11 +139,16 @@ def told_of_set(recording: Recording, set_id: int | None) -> dict[str, Any]:
         NothingRecordedError: There is no database.
     """
     with recording.reader() as connection:
-        number = find_trial_set(connection) if set_id is None else set_id
-        if number is None:
-            return {**header_of_only(connection), "hint": "no trials were begun: webots_run_trials"}
-        found = fetch_trial_set(connection, number)
-        return {**_header(connection, found), **_told(connection, found)}
+        return _told_of_set(connection, set_id)
+
+
+@in_one_snapshot
+def _told_of_set(connection: sqlite3.Connection, set_id: int | None) -> dict[str, Any]:
+    number = find_trial_set(connection) if set_id is None else set_id
+    if number is None:
+        return {**header_of_only(connection), "hint": "no trials were begun: webots_run_trials"}
+    found = fetch_trial_set(connection, number)
+    return {**_header(connection, found), **_told(connection, found)}
 
 
 def _header(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:

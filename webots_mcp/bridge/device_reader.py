@@ -37,6 +37,8 @@ class DeviceReader:
 
     def read(self) -> dict[str, object]:
         """What the devices say; without what cannot be read, which is counted."""
+        if self._simulation.over:
+            return {}
         started_s = time.perf_counter()
         try:
             return read_devices(self._simulation.robot)

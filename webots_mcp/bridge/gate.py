@@ -33,6 +33,11 @@ class Step(NamedTuple):
     ends: bool
     make: Callable[[], int]
 
+    @property
+    def finishes(self) -> bool:
+        """It is the second half of a step that was begun before: `stepEnd`."""
+        return self.ends and not self.begins
+
 
 Guard = Callable[[Step], int]
 

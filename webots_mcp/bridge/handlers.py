@@ -24,6 +24,7 @@ class Handlers:
 
     Attributes:
         running: A function is at work: this call comes from within it.
+        loop_looks: The loop asks for commands, and may do something with what it gets.
     """
 
     def __init__(self, recorder: Recorder, pause: Pause) -> None:
@@ -31,6 +32,7 @@ class Handlers:
         self._pause = pause
         self._handlers: dict[str, Handler] = {}
         self.running = False
+        self.loop_looks = True
 
     def register(self, action: str, handler: Handler) -> None:
         """Make a custom action known, here and in the session's row.
@@ -67,9 +69,12 @@ class Handlers:
         said = f"no action {action!r}; this robot knows {', '.join(known)}"
         if self._handlers:
             return said
+        said += ": its controller has registered none (bridge.register_command)"
+        if not self.loop_looks:
+            return said
         return (
-            f"{said}: its controller has registered none (bridge.register_command). "
-            "get_command() returned the command; whether the loop did anything with it is not known"
+            f"{said}. get_command() returned the command; whether the loop did anything with it "
+            "is not known"
         )
 
     def _call(self, handler: Handler, command: Command) -> object:

@@ -11,6 +11,8 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.bridge import open_bridges
+from webots_mcp.bridge.attachment import Attachment
+from webots_mcp.bridge.commands import Command
 from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.handlers import Handler
@@ -45,6 +47,12 @@ _KEEPING: Final = ("error", "critical")  # log levels
 
 class MCPBridge:
     """Records what a controller publishes, and runs the commands that are sent to it.
+
+    One line records what the robot's devices say and serves commands, at each step:
+
+        bridge = MCPBridge.attach(robot)
+
+    A loop that says for itself what is worth knowing:
 
         bridge = MCPBridge(robot)
         while robot.step(time_step) != -1:
@@ -100,8 +108,59 @@ class MCPBridge:
         self._session = Session(simulation, *where, throttle, keep_last_s, self._errors)
         self._publisher = self._session.publisher
         self._session.begin()
-        open_bridges.enter(robot, OpenBridge(self.close, self._leave_to_parent))
+        self._attachment: Attachment | None = None
+        open_bridges.enter(robot, OpenBridge(self, self.close, self._leave_to_parent))
         atexit.register(self._close_at_exit)
+
+    # -- without another line ------------------------------------------------------------------
+
+    @classmethod
+    def attach(cls, robot: Any, **options: Any) -> MCPBridge:
+        """Record what the devices say, and serve commands, with each `step` of the robot.
+
+            bridge = MCPBridge.attach(robot)
+            while robot.step(time_step) != -1:
+                ...
+
+        It does not matter where and how the controller steps: in a subclass with a `step` of its
+        own, in a function of another module, by `stepBegin` and `stepEnd`; only a method that
+        was stored before (`step = robot.step`) is not seen. Each step that lets time pass
+        publishes once (see `auto_publish`), when it ends; commands are served when a step
+        begins, `step(0)` too. The step returns what Webots answers. After a -1 all is written,
+        and Webots is asked nothing any more.
+
+        What the controller publishes itself is recorded together with what the devices say. One
+        that calls `get_command()` as well gets the command that was served last. The steps of a
+        handler are recorded, and no other command is served in them.
+
+        Args:
+            robot: As of `MCPBridge`. Its open bridge is attached, if it has one.
+            options: As of `MCPBridge`.
+
+        Returns:
+            The robot's bridge; `detach()` lets its steps alone again.
+
+        Raises:
+            ValueError: Options are given and the robot has a bridge already.
+        """
+        bridge = open_bridges.find(robot)
+        if not isinstance(bridge, MCPBridge):
+            bridge = cls(robot, **options)
+        elif options:
+            raise ValueError(
+                f"the robot has a bridge already: {', '.join(options)} cannot be set any more; "
+                "close() that bridge first, or attach(robot) without options"
+            )
+        if bridge._attachment is None:
+            bridge._attachment = Attachment(bridge._session, bridge._serve, bridge._errors)
+            bridge._attachment.begin()
+        return bridge
+
+    def detach(self) -> None:
+        """Let the robot's steps alone; from now on the loop publishes and asks for commands."""
+        if self._attachment is not None:
+            self._attachment.end()
+            self._attachment = None
 
     # -- the loop ------------------------------------------------------------------------------
 
@@ -118,7 +177,10 @@ class MCPBridge:
             force: Record this call whatever its number.
         """
         try:
-            self._publisher.publish(state, force)
+            if self._attachment is None:
+                self._publisher.publish(state, force)
+            else:
+                self._publisher.publish_devices(state, include_time=True, force=force)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("publish", error)
 
@@ -135,9 +197,10 @@ class MCPBridge:
             returned too, and its answer is that it failed.
         """
         try:
-            command = self._session.serve()
-            if self._close_after_answer:
-                self.close()
+            command = self._serve()
+            if self._attachment is not None:
+                served_by_step = self._attachment.take_command()
+                command = command or served_by_step
             return command.as_dict() if command else None
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("get_command", error)
@@ -378,6 +441,9 @@ class MCPBridge:
             self._close_after_answer = True  # else the command would never be answered
             return
         try:
+            if self._attachment is not None:
+                self._attachment.publish_missing()
+            self.detach()
             self._session.let_go()
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("close", error)
@@ -401,6 +467,12 @@ class MCPBridge:
 
     # -- inside --------------------------------------------------------------------------------
 
+    def _serve(self) -> Command | None:
+        command = self._session.serve()
+        if self._close_after_answer:
+            self.close()
+        return command
+
     def _keep_before_end(self, error: BaseException) -> None:
         if not self._closed:
             self.keep(f"the controller ended by {describe(error)}")
@@ -408,6 +480,7 @@ class MCPBridge:
     def _leave_to_parent(self) -> None:
         """In a forked child: leave the session to the parent; what is published here is dropped."""
         self._closed = True
+        self.detach()
         self._session.context.recorder.abandon()
 
     def _close_at_exit(self) -> None:

@@ -14,10 +14,12 @@ class OpenBridge(NamedTuple):
     """What can be asked of a bridge here.
 
     Attributes:
+        bridge: The bridge itself.
         close: End its session, for a reason.
         abandon: In a forked child: leave the session to the parent.
     """
 
+    bridge: object
     close: Callable[[str], object]
     abandon: Callable[[], object]
 
@@ -28,6 +30,12 @@ _bridges: dict[int, OpenBridge] = {}
 def enter(robot: object, bridge: OpenBridge) -> None:
     """From now on this is the robot's bridge."""
     _bridges[id(robot)] = bridge
+
+
+def find(robot: object) -> object | None:
+    """The robot's bridge, if it has one that is open."""
+    open_bridge = _bridges.get(id(robot))
+    return None if open_bridge is None else open_bridge.bridge
 
 
 def leave(robot: object) -> None:

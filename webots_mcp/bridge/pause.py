@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
-from typing import Final
+from typing import Final, Protocol
 
 from webots_mcp.bridge.commands import Command
 from webots_mcp.bridge.gate import QUIT, Step
@@ -14,6 +14,18 @@ from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.contract import PAUSED, STEPPING
 
 PUMP_INTERVAL_S: Final = 0.01
+
+
+class Companion(Protocol):
+    """What goes along with each step of the controller's."""
+
+    def before(self, step: Step) -> None:
+        """The controller asks for a step."""
+        ...
+
+    def after(self, step: Step, answer: int) -> None:
+        """It is answered; the controller hears of it next."""
+        ...
 
 
 class Pause:
@@ -50,6 +62,7 @@ class Pause:
         self._user_code_depth = 0  # a handler may ask for commands itself
         self._awaiting_step = False
         self._ask_before_steps: Callable[[], object] | None = None
+        self._companion: Companion | None = None
         self.active = False
         self.cause: dict[str, object] = {}
         self.serve: Callable[[], object] = self.pump
@@ -112,6 +125,16 @@ class Pause:
         self._ask_before_steps = ask
         self._guard_steps()
 
+    def go_along(self, companion: Companion | None) -> None:
+        """Let it go along with each step from now on. None: nothing does any more."""
+        self._companion = companion
+        self._guard_steps()
+
+    @property
+    def in_user_code(self) -> bool:
+        """A handler or a callback runs."""
+        return self._user_code_depth > 0
+
     @contextmanager
     def awaiting_step(self) -> Generator[None]:
         """While something is to come with the end of a step: it is told before the loop goes on."""
@@ -150,15 +173,25 @@ class Pause:
 
     def _guard_steps(self) -> None:
         """Outside of a pause the steps of user code are only told: they show that it lives."""
-        told = self._awaiting_step or self._ask_before_steps is not None
-        needed = self.active or self._user_code_depth > 0 or told
+        asked = self._ask_before_steps is not None or self._companion is not None
+        needed = self.active or self.in_user_code or self._awaiting_step or asked
         self._simulation.guard_steps(self._on_step if needed else None)
 
     def _on_step(self, step: Step) -> int:
+        companion = self._companion
+        if companion is None:
+            return self._answer(step)
+        companion.before(step)
+        answer = self._answer(step)
+        if self._companion is companion:  # it may have been told to go meanwhile
+            companion.after(step, answer)
+        return answer
+
+    def _answer(self, step: Step) -> int:
         if step.begins and self._ask_before_steps is not None and not self.active:
             self._ask_before_steps()
         if self.active and step.begins:
-            if self._user_code_depth:
+            if self.in_user_code:
                 self.pump()  # a person may have ended the pause by now
             else:
                 self.serve()

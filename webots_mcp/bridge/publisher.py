@@ -55,7 +55,9 @@ class Publisher:
         if keeper.busy:
             keeper.go_on()
 
-    def publish_devices(self, extra: Mapping[Any, Any], include_time: bool) -> None:
+    def publish_devices(
+        self, extra: Mapping[Any, Any], include_time: bool, force: bool = False
+    ) -> None:
         """Record what the devices say; they are read if it is this call's turn.
 
         Where breakpoints are armed or a run has a goal, they are read in every call; where the
@@ -66,9 +68,9 @@ class Publisher:
         keeper, throttle = self._keeper, self._throttle
         due = keeper.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
         if due or self._breakpoints.concerned or self._watch.asks_states:
-            self.publish(self._read(extra, include_time), force=False)
+            self.publish(self._read(extra, include_time), force)
             return
-        if throttle.admits(self._heartbeat.loop is not None):
+        if throttle.admits(force or self._heartbeat.loop is not None):
             self._record(self._read(extra, include_time))
         elif keeper.fills:
             keeper.leave_out(self.devices.why)
@@ -104,5 +106,5 @@ class Publisher:
 def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
     """As many items as it says; a mapping of the user's own may never come to its end."""
     if not isinstance(extra, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
-        raise TypeError(f"extra is a dict, got {type(extra).__name__}")
+        raise TypeError(f"a state is a dict, got {type(extra).__name__}")
     return dict(islice(extra.items(), len(extra)))

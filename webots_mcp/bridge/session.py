@@ -125,7 +125,7 @@ class Session:
         command = self.control.serve()
         self.context.heartbeat.poll()
         if simulation.over:
-            self._end()
+            self.end()
         return command
 
     def _take_wanted_parameters(self) -> None:
@@ -162,9 +162,10 @@ class Session:
     def _end_reason(self) -> str:
         return "reload" if self.context.reloads.requested_by else "finished"
 
-    def _end(self) -> None:
+    def end(self) -> None:
         """Webots may kill the process from here on, or let the loop say its last words."""
         self.control.report_end(extern=self._identity.extern)
+        self.context.keeper.write_all()
         self.context.recorder.end(self._end_reason, self.context.clock.sim_time_s)
 
     def _flush_if_idle(self) -> None:

@@ -38,7 +38,7 @@ CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wai
 _UNWRITABLE: Final = ("readonly database", "unable to open database file")
 _CALLED_OFF: Final = "called off"
 _DAMAGE: Final = ("malformed", "not a database", "unsupported file format")
-_SAYS_NOTHING: Final = "malformed database, which SQLite names in bytes that are no text"
+_SAYS_NOTHING: Final = "malformed database, which SQLite names in bytes that are not text"
 _ABOUT_A_VALUE: Final = (
     "malformed JSON", "JSON cannot hold", "JSON path", "to UTF-8 column", "integer overflow",
     "user-defined function",
@@ -352,7 +352,7 @@ def _file_uri(file: Database, create: bool) -> str:
 def _why_none_is_in(folder: Path) -> str:
     if folder.is_dir():
         return "no controller with an MCPBridge has recorded there yet"
-    return f"{folder} is no folder" if folder.exists() else f"there is no folder {folder}"
+    return f"{folder} is not a folder" if folder.exists() else f"there is no folder {folder}"
 
 
 def _make(file: Path) -> None:

@@ -68,7 +68,7 @@ class SchemaTooOldError(DatabaseError):
 
 
 class InvalidInputError(WebotsMCPError):
-    """An argument is out of bounds or makes no sense together with another."""
+    """An argument is out of bounds, or contradicts another."""
 
 
 class UnknownRobotError(InvalidInputError):

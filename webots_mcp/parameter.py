@@ -119,7 +119,7 @@ def declare(
 
 
 def require_known(names: Sequence[str], known: Sequence[str]) -> None:
-    """Refuse names of which no parameter is declared.
+    """Refuse names that no declared parameter has.
 
     Raises:
         InvalidInputError: It names them, and the declared names most like the first of them.

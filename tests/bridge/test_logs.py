@@ -63,7 +63,7 @@ def test_a_level_that_is_none_counts_as_info_and_is_said(
     with MCPBridge(robot, database=database) as bridge:
         bridge.log("text", level=level)
     assert recording.rows("SELECT level, message FROM log") == [("info", "text")]
-    assert "is none of debug, info, warning, error, critical" in capfd.readouterr().err
+    assert "is not one of debug, info, warning, error, critical" in capfd.readouterr().err
 
 
 def test_a_long_line_is_cut_and_says_so(bridge: MCPBridge, recording: Recording) -> None:

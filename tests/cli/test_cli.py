@@ -232,7 +232,7 @@ def test_the_tail_ends_with_its_reader_also_where_nothing_is_recorded(
 
 
 @pytest.mark.parametrize(
-    ("data_dir", "why"), [("nowhere", "there is no folder"), ("notes.txt", "is no folder")]
+    ("data_dir", "why"), [("nowhere", "there is no folder"), ("notes.txt", "is not a folder")]
 )
 def test_a_data_folder_that_is_none_is_said_to_be_none(
     data_dir: str, why: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -52,7 +52,7 @@ def test_an_export_is_whole_but_for_the_row_that_cannot_be_read(
         )
     assert main(["export", "--database", str(file), "-o", str(table)]) == 0
     assert len(table.read_text().splitlines()) == rows - 1
-    assert "data is no sound JSON" in capsys.readouterr().err
+    assert "data holds no valid JSON" in capsys.readouterr().err
 
 
 def test_what_was_left_out_is_said_on_stderr(
@@ -65,4 +65,4 @@ def test_what_was_left_out_is_said_on_stderr(
     assert main(["status", "--database", str(file)]) == 0
     answer = capsys.readouterr()
     assert "rover" in answer.out
-    assert answer.err == "webots-mcp: left out: session 1: actions is no sound JSON\n"
+    assert answer.err == "webots-mcp: left out: session 1: actions holds no valid JSON\n"

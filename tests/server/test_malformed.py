@@ -61,9 +61,9 @@ async def test_trials_of_a_robot_that_cannot_be_read_are_told(base: Path, tmp_pa
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (Damage("state", "data", "nonsense"), "state 2: data is no sound JSON"),
-        (Damage("state", "sim_time_s", "late"), "state 2: sim_time_s is no sound number"),
-        (Damage("state", "odd", "[]"), "state 2: odd is no sound JSON"),
+        (Damage("state", "data", "nonsense"), "state 2: data holds no valid JSON"),
+        (Damage("state", "sim_time_s", "late"), "state 2: sim_time_s holds no valid number"),
+        (Damage("state", "odd", "[]"), "state 2: odd holds no valid JSON"),
     ],
 )
 async def test_a_row_that_is_left_out_is_named_and_the_others_are_told(
@@ -86,7 +86,7 @@ async def test_where_nothing_is_left_the_answer_names_what_was_left_out(
 ) -> None:
     robot = recorded.robot()
     Damage("run", "last_wall_time_s", "x").apply(recorded.connection)
-    said = f"run {robot.run_id}: last_wall_time_s is no sound number"
+    said = f"run {robot.run_id}: last_wall_time_s holds no valid number"
     async with connect() as client:
         assert said in (await ask(client, "webots_get_world_info"))["left_out"]
         assert said in text_of(await client.call_tool("webots_get_camera", {}))

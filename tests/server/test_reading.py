@@ -344,18 +344,18 @@ async def test_a_big_picture_is_scaled_and_the_original_named(
     ("path", "said"),
     [
         ("gone.png", "the file is gone"),
-        ("", "is no regular file"),
-        ("text.png", "is no usable PNG or JPEG"),
+        ("", "is not a regular file"),
+        ("text.png", "is not a usable PNG or JPEG"),
         ("../../etc/passwd", "outside the data folder"),
         ("/etc/passwd", "outside the data folder"),
-        ("a\0.png", "is no usable path"),
-        ("x" * 256, "is no usable path"),
-        ("x/" * 3000, "is no usable path"),
-        ("text.png/eye.png", "is no usable path"),
+        ("a\0.png", "is not a usable path"),
+        ("x" * 256, "is not a usable path"),
+        ("x/" * 3000, "is not a usable path"),
+        ("text.png/eye.png", "is not a usable path"),
         ("sparse.png", "it has 2,000,000,000 bytes, 64,000,000 is the limit"),
         ("wide.png", "it has 64,000,000 pixels, 50,000,000 is the limit"),
-        ("cut.png", "is no usable PNG or JPEG"),
-        ("frame.gif", "is no usable PNG or JPEG"),
+        ("cut.png", "is not a usable PNG or JPEG"),
+        ("frame.gif", "is not a usable PNG or JPEG"),
     ],
 )
 async def test_a_picture_that_cannot_be_shown_says_why(
@@ -390,8 +390,8 @@ async def test_a_link_or_a_pipe_in_the_place_of_a_picture_is_not_opened(
     async with connect() as client:
         for path, said in (
             ("out.png", "outside the data folder"),
-            ("loop.png", "is no usable path"),
-            ("pipe.png", "is no regular file"),
+            ("loop.png", "is not a usable path"),
+            ("pipe.png", "is not a regular file"),
         ):
             robot.image(1.0, path)
             assert said in await fail(client, "webots_get_camera"), path

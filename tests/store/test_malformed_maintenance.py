@@ -46,7 +46,7 @@ def test_a_row_that_cannot_be_summed_up_costs_only_itself_and_is_named(
     assert roll(recorded.connection).rows == 3
     rolled = dict(recorded.connection.execute(ROLLED).fetchall())
     assert rolled == {"x": 2}
-    assert f"state 2: {damage.column} is no sound" in capsys.readouterr().err
+    assert f"state 2: {damage.column} holds no valid" in capsys.readouterr().err
     assert roll(recorded.connection) == (0, True)
 
 

@@ -62,5 +62,5 @@ class DeviceReader:
 
 
 def _why(interval: int, usual_us: float) -> str:
-    share = f"of auto_publish() one call in {interval}"
+    share = f"one call of auto_publish() in {interval}"
     return f"{share}, because reading the devices takes {usual_us:.0f} us"

@@ -67,7 +67,7 @@ class MCPBridge:
     Args:
         robot: The controller's `Robot` or `Supervisor`, or an instance of a subclass.
         data_dir: Folder of the database and the pictures; see `resolve_data_dir`.
-        throttle_interval: Every so many calls of `publish` one is recorded; the environment
+        throttle_interval: One call of `publish` in this many is recorded; the environment
             variable `WEBOTS_MCP_THROTTLE_INTERVAL` overrides it.
         keep_last_s: Seconds of simulation time before a moment that are kept at full rate: every
             call of `publish`, also those that the throttle drops (see `keep`). They are held in
@@ -240,7 +240,7 @@ class MCPBridge:
     # -- beside the state ----------------------------------------------------------------------
 
     def log(self, message: object, level: str | int = "info") -> None:
-        """Record a line, of which the first 10,000 characters are kept.
+        """Record a line; its first 10,000 characters are kept.
 
         Args:
             message: Its text.
@@ -269,7 +269,7 @@ class MCPBridge:
             known = find_log_level(level)
             if known is None:
                 names = ", ".join(LOG_LEVELS)
-                self._errors.warn("level", f"log level {level!r:.80} is none of {names}")
+                self._errors.warn("level", f"log level {level!r:.80} is not one of {names}")
             text = text_of(message)
             self._session.context.journal.log(known or "info", "controller", text, logger)
             if known in _KEEPING:

@@ -224,7 +224,7 @@ class Parameters:
         if len(self._held) >= MOST_PARAMETERS:
             raise ValueError(
                 f"parameter {declaration.name!r} would be number {MOST_PARAMETERS + 1}: a "
-                f"controller has {MOST_PARAMETERS} at most; what is no setting belongs into a file"
+                f"controller has {MOST_PARAMETERS} at most; what is not a setting belongs in a file"
             )
         value, setter = declaration.default, CODE
         given = self._start_values.take(declaration)

@@ -106,7 +106,7 @@ def encode_png(bgra: bytes, width: int, height: int) -> bytes:
         ValueError: The image does not have 4 * width * height bytes.
     """
     if len(bgra) != 4 * width * height:
-        raise ValueError(f"{len(bgra)} bytes are no image of {width} x {height} pixels")
+        raise ValueError(f"{len(bgra)} bytes are not an image of {width} x {height} pixels")
     rgb = bytearray(3 * width * height)
     rgb[0::3], rgb[1::3], rgb[2::3] = bgra[2::4], bgra[1::4], bgra[0::4]
     stride = 3 * width

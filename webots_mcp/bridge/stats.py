@@ -9,7 +9,7 @@ class BridgeStats(NamedTuple):
     """What a bridge recorded so far, and what it could not.
 
     Attributes:
-        ring_interval: Of `auto_publish` one call in so many is held in the ring buffer.
+        ring_interval: One call of `auto_publish` in this many is held in the ring buffer.
     """
 
     rows_written: int

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 
 class Throttle:
-    """Every so many calls one is recorded, and whenever somebody waits for the newest state.
+    """One call in so many is recorded, and whenever somebody waits for the newest state.
 
     Attributes:
-        interval: Every so many.
+        interval: One call in this many.
 
     Raises:
         ValueError: The interval is less than 1.

@@ -145,7 +145,7 @@ def prune(arguments: argparse.Namespace) -> None:
     argument("--release", action="store_true", help="let retention have them again"), *LIMITS,
 )  # fmt: skip
 def retain(arguments: argparse.Namespace) -> None:
-    """Mark runs of which nothing is ever pruned, or set how much is kept of the others.
+    """Mark runs that are never pruned, or set how much is kept of the others.
 
     The limits belong to the database and hold at once, whoever maintains it; 'default' goes back
     to what holds where nothing is set. 'webots-mcp status' shows them.

@@ -71,7 +71,7 @@ LIMITS: Final = (
         metavar="TIMES",
         dest="outlive",
         default=_Default("outlive"),
-        help="keep what is left of a run so many times longer than its states (%(default)s), or "
+        help="keep what is left of a run this many times longer than its states (%(default)s), or "
         "for ever: all",
     ),
 )
@@ -81,7 +81,7 @@ def limits_of(arguments: argparse.Namespace) -> dict[str, Limit | float | None]:
     """The limits that were given, by the names of `Retention`; None goes back to the default.
 
     Raises:
-        InvalidInputError: A text is no limit, or a number is negative.
+        InvalidInputError: A text is not a limit, or a number is negative.
     """
     from webots_mcp.store.retention import DEFAULT
     from webots_mcp.store.retention.notation import parse_limit

@@ -33,7 +33,7 @@ TIMEOUT: Final = argument(
     default=600.0,
     dest="timeout_s",
     metavar="S",
-    help="wait so many wall seconds (600)",
+    help="wait up to S wall seconds (600)",
 )
 
 
@@ -42,7 +42,7 @@ TIMEOUT: Final = argument(
     *_WHERE,
     TIMEOUT,
     argument("--until", metavar="CONDITION", help="such as 'front_m < 0.1 for 0.5'"),
-    argument("--for", dest="for_s", type=float, metavar="S", help="for so many simulated seconds"),
+    argument("--for", dest="for_s", type=float, metavar="S", help="for S simulated seconds"),
     argument("--reset", action="store_true", help="reset the world first"),
     argument("--pace", choices=["fast", "real_time", "as_it_is"], default="fast"),
     argument("--then", choices=["pause", "go_on", "as_before"], default="pause"),
@@ -129,7 +129,7 @@ def resume(arguments: argparse.Namespace) -> None:
 
 @command(
     "step", *_WHERE, TIMEOUT,
-    argument("steps", nargs="?", default="1", metavar="N", help="so many rounds of its loop (1)"),
+    argument("steps", nargs="?", default="1", metavar="N", help="N rounds of its loop (1)"),
 )  # fmt: skip
 def step(arguments: argparse.Namespace) -> None:
     """Let the controller's own loop come round N times, then pause."""

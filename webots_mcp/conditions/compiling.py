@@ -124,7 +124,7 @@ class Compiler(Nodes):
         return holds
 
     def _lasting(self, node: ast.Tuple) -> Holds:
-        """A pair whose comma is a `for`; there are no other commas outside of calls."""
+        """A pair whose comma is a `for`; no other comma stands outside a call."""
         places = self._durations_between(node)
         if not places:
             self._refuse(node, "commas stand between the values of a function only")

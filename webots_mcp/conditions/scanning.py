@@ -1,6 +1,6 @@
 """The text of a condition, made ready for Python's parser: signs of the language only.
 
-`a < 1 for 0.5` is no expression of Python's. With a comma in the place of `for` it is a pair,
+`a < 1 for 0.5` is not an expression of Python's. With a comma in the place of `for` it is a pair,
 whose precedence is the one that is wanted: lower than `or`. Real commas stand in calls only. And
 `pose.0`, as signals are called, becomes `pose[0]`.
 """

@@ -180,7 +180,7 @@ def mode_signal(known: Known, wanted: str | None) -> str | None:
     """The text signal that colours a picture: the one wanted, else one that is named like a mode.
 
     Raises:
-        UnknownSignalError: There is none of the wanted name.
+        UnknownSignalError: No signal has the wanted name.
         InvalidInputError: The wanted signal holds numbers.
     """
     if wanted == "":

@@ -54,7 +54,7 @@ def plot(
 
     Raises:
         InvalidInputError: And its kin: an unknown signal, run, robot, kind or format; a range that
-            makes no sense; a size out of bounds. The text tells what there is.
+            contradicts another; a size out of bounds. The text lists what there is.
         NothingRecordedError: There is nothing to draw in the range.
     """
     sheet = Sheet(width_px, height_px, image_format)

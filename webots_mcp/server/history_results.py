@@ -110,7 +110,7 @@ class RunTrendTables(BaseModel):
     end_s: float | None
     rows: int
     from_means_of_s: float | None = Field(
-        default=None, description="Courses and slopes come from means of so many seconds."
+        default=None, description="Courses and slopes come from means over this many seconds."
     )
     numbers: Table | None = Field(default=None, description="What changed most is first.")
     states: Table | None = Field(default=None, description="Text and flags that changed.")
@@ -256,13 +256,13 @@ class ComparisonAnswer(NotedAnswer):
 
     groups: Table | None = None
     compared_s: float | None = Field(
-        default=None, description="All figures are about the first so many seconds of each run."
+        default=None, description="All figures are about the first seconds of each run, this many."
     )
     measures: Table | None = Field(
         default=None,
         description="Each run as a whole: median over the runs of each group, and their range. "
         "different: of each group but the first; null where it cannot be told, then runs_wanted: "
-        "so many runs of each would tell, if they went on like these.",
+        "this many runs of each would tell, if they went on like these.",
     )
     not_known: dict[str, str] | None = Field(
         default=None, description="Figures that are null, or not of everything: why; what to do."

@@ -79,7 +79,7 @@ MaxPoints = Annotated[
     Field(
         ge=1,
         le=500,
-        description="At most so many buckets, or rows with raw.",
+        description="The most buckets, or rows with raw.",
     ),
 ]
 Kind = Annotated[
@@ -103,7 +103,7 @@ ShownLimit = Annotated[
     Field(ge=1, le=500, description="Most shown; few by default."),
 ]
 LogLevel = Annotated[contract.LogLevel, Field(description="Of log lines: from this level.")]
-Limit = Annotated[int, Field(ge=1, le=500, description="At most so many.")]
+Limit = Annotated[int, Field(ge=1, le=500, description="The most to return.")]
 RunIds = Annotated[
     list[Id] | None,
     Field(max_length=10, description="From webots_list_runs."),

@@ -64,13 +64,13 @@ def begin_set(
 
     Args:
         recording: Of the robot.
-        parameters: Sets of values, or a grid of which every combination is tried.
+        parameters: Sets of values, or a grid whose every combination is tried.
         robot: Whose controller; None for the only live one.
         asked: The other fields of a `Plan`.
 
     Raises:
         InvalidInputError: The controller does not declare a parameter or not with such a value,
-            a signal of the score or of `until` was never recorded, or the plan makes no sense.
+            a signal of the score or of `until` was never recorded, or the plan contradicts itself.
         CommandRefusedError: Nobody alive could run them, or another set of the robot is not over.
     """
     sets = combinations(dict(parameters)) if isinstance(parameters, Mapping) else parameters

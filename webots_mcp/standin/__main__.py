@@ -64,7 +64,7 @@ def _parser() -> argparse.ArgumentParser:
         "--mode", choices=("pause", "realtime", "fast"), default="realtime", help="as for Webots"
     )
     parser.add_argument(
-        "--duration", type=float, metavar="S", help="end after so many seconds of simulated time"
+        "--duration", type=float, metavar="S", help="end after S seconds of simulated time"
     )
     parser.add_argument(
         "--robot",

@@ -70,9 +70,9 @@ def inside(data_dir: Path, path: str) -> Path:
             "kept; or this is not the data folder that the controller records into"
         ) from error
     except (OSError, ValueError, RuntimeError) as error:  # too long, a NUL, a loop of links
-        raise InvalidInputError(f"{path[:_SHOWN_PATH]!r} is no usable path: {error}") from error
+        raise InvalidInputError(f"{path[:_SHOWN_PATH]!r} is not a usable path: {error}") from error
     if not stat.S_ISREG(mode):
-        raise InvalidInputError(f"{file} is no regular file and is not opened")
+        raise InvalidInputError(f"{file} is not a regular file and is not opened")
     return file
 
 
@@ -87,7 +87,7 @@ def opened(file: Path, formats: tuple[str, ...] = ("PNG", "JPEG")) -> Generator[
         formats: Those that are allowed, as Pillow names them.
 
     Raises:
-        InvalidInputError: It is no complete picture of these formats, or is too large.
+        InvalidInputError: It is not a complete picture of these formats, or is too large.
     """
     from PIL import Image as Pictures
 
@@ -98,7 +98,8 @@ def opened(file: Path, formats: tuple[str, ...] = ("PNG", "JPEG")) -> Generator[
             _require_at_most(MAX_PIXELS, "pixels", picture.width * picture.height)
             yield picture
     except Exception as error:  # Pillow raises nearly anything about a file that is damaged
-        raise InvalidInputError(f"{file} is no usable {' or '.join(formats)}: {error}") from error
+        usable = f"usable {' or '.join(formats)}"
+        raise InvalidInputError(f"{file} is not a {usable}: {error}") from error
 
 
 def _require_at_most(limit: int, of: str, found: int) -> None:

@@ -122,7 +122,7 @@ class CommandQueue:
             idempotency_key: A key of the caller's; one is made up if it is None.
 
         Raises:
-            InvalidInputError: The parameters are no plain JSON or too long, or the key already
+            InvalidInputError: The parameters are not plain JSON or too long, or the key already
                 belongs to another request.
             sqlite3.OperationalError: The database stayed locked.
         """
@@ -211,7 +211,7 @@ def _encode_params(params: Mapping[str, Any]) -> str:
     try:
         text = json.dumps(dict(params), allow_nan=False, ensure_ascii=False, sort_keys=True)
     except (TypeError, ValueError) as error:
-        raise InvalidInputError(f"params are no plain JSON: {error}") from error
+        raise InvalidInputError(f"params are not plain JSON: {error}") from error
     if (size := len(text.encode())) > MAX_PARAMS_BYTES:
         raise InvalidInputError(
             f"params are {size} bytes of JSON, at most {MAX_PARAMS_BYTES} are taken; "

@@ -59,7 +59,7 @@ class Unsound:
 
     def note(self, table: str, row: object, column: str, kind: str) -> None:
         """Called by SQLite for each such value; its row, or the value, is not seen."""
-        self._met[f"{table} {row}: {column} is no sound {kind}"] = None
+        self._met[f"{table} {row}: {column} holds no valid {kind}"] = None
 
     def described(self) -> list[str]:
         """The first few, and how many more there are."""

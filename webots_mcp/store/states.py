@@ -136,7 +136,7 @@ def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
         items = cast("list[Any]", value)
         if parts[0].isdecimal() and int(parts[0]) < len(items):
             return int(parts[0]), 1
-        raise InvalidInputError(f"path {path!r}: {parts[0]!r} is no index of {len(items)} items")
+        raise InvalidInputError(f"path {path!r}: {len(items)} items have no index {parts[0]!r}")
     raise InvalidInputError(f"path {path!r}: {parts[0]!r} asks for a part of a single value")
 
 

@@ -32,7 +32,7 @@ class Plan:
         score: See docs/trials.md.
         parameters: The sets that are tried; empty where they are searched for.
         best: Which scores are the best.
-        for_s: A trial ends after so many simulated seconds ...
+        for_s: A trial ends after this many simulated seconds ...
         until: ... or when this condition holds, whichever comes first.
         prune: A trial in which this condition holds is ended early, without a score.
         repeats: How often each set is tried. With 1, the first one is tried twice nevertheless:
@@ -119,7 +119,7 @@ class Plan:
 
 @dataclass(frozen=True, kw_only=True)
 class WorldPlan(Plan):
-    """A plan of which each trial runs in a simulator of its own.
+    """A plan whose trials each run in a simulator of their own.
 
     Attributes:
         world: The world file, with its full path.

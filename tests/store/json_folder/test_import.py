@@ -239,9 +239,13 @@ BAD = [
     ("status.json", b'{"a": "\xff"}', r"status\.json: no JSON"),
     ("status.json", '{"timestamp": "yesterday"}', "timestamp 'yesterday' is no ISO 8601 time"),
     ("logs/controller.log", "no time\n", r"controller\.log, line 1: expected '\[HH:MM:SS\]"),
-    ("logs/controller.log", "\n[12:00:00] a\n[12:61:00] b\n", r"line 3: \[12:61:00\] is no time"),
-    ("camera/frame_0000.png", b"\x89PNG\r\n\x1a\n but then not", r"frame_0000\.png is no usable"),
-    ("camera/frame_0000.png", b"", r"frame_0000\.png is no usable PNG"),
+    (
+        "logs/controller.log",
+        "\n[12:00:00] a\n[12:61:00] b\n",
+        r"line 3: \[12:61:00\] is not a time",
+    ),
+    ("camera/frame_0000.png", b"\x89PNG\r\n\x1a\n but then not", r"frame_0000\.png is not a"),
+    ("camera/frame_0000.png", b"", r"frame_0000\.png is not a usable PNG"),
     ("commands.json", '[{"action": "a"}, 3]', r"commands\.json: a command is an object"),
     ("commands.json", "{", r"commands\.json, line 1, column 2"),
     ("status.json", '{"x": ' + "9" * 100_000 + "}", r"status\.json: no JSON: Exceeds the limit"),
@@ -297,7 +301,7 @@ def test_what_may_never_end_is_not_read(
         file.symlink_to("/dev/zero")
     else:
         file.mkdir()
-    with pytest.raises(InvalidInputError, match=f"{file.name} is no regular file"):
+    with pytest.raises(InvalidInputError, match=f"{file.name} is not a regular file"):
         import_folder(database, peer.folder, data_dir)
     assert set(counts(database).values()) == {0}
 

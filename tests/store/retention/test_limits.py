@@ -157,5 +157,5 @@ def test_a_row_that_is_no_limit_is_named(recorded: Recorded, wrong: str) -> None
         "INSERT INTO retention_limit (kind, size_bytes, set_by, set_wall_time_s) "
         f"VALUES ({wrong}, 'hand', 0)"
     )
-    with pytest.raises(InvalidInputError, match="retention_limit is no limit"):
+    with pytest.raises(InvalidInputError, match="retention_limit is not a limit"):
         in_force(recorded.connection)

@@ -221,7 +221,7 @@ def test_a_rollup_that_no_server_wrote_costs_itself_and_not_the_maintenance(
     empty.execute("UPDATE run SET coarse_end = NULL")
     empty.execute(f"UPDATE rollup SET {column} = 'much' WHERE bucket = 3 AND signal_id = 1")
     finish(empty)
-    assert f"rollup 1/1/3: {column} is no sound" in capsys.readouterr().err
+    assert f"rollup 1/1/3: {column} holds no valid" in capsys.readouterr().err
     assert empty.execute("SELECT * FROM coarse_rollup WHERE bucket > 0").fetchall() == before
     assert empty.execute("SELECT coarse_end FROM run").fetchone() == (5,)
 

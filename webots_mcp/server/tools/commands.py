@@ -60,7 +60,7 @@ async def webots_wait_for_command(
 @tool("List the commands", READS)
 def webots_list_commands(
     recording: Recording,
-    limit: Annotated[int, Field(ge=1, le=200, description="At most so many.")] = 10,
+    limit: Annotated[int, Field(ge=1, le=200, description="The most to return.")] = 10,
     status: Annotated[
         CommandStatus | None, Field(description="Only commands in this state.")
     ] = None,

@@ -65,7 +65,7 @@ def webots_find_events(
         float, Field(gt=0, description="Still: at least so long ...")
     ] = EventOptions.stuck_s,
     stuck_m: Annotated[
-        float, Field(gt=0, description="... within so many metres.")
+        float, Field(gt=0, description="... within this many metres.")
     ] = EventOptions.stuck_m,
     position: Position = None,
     mode: Mode = None,

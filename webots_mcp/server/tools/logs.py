@@ -24,7 +24,7 @@ _BUDGET: Final = 6_000
 @tool("Get log lines", READS)
 def webots_get_logs(
     recording: Recording,
-    lines: Annotated[int, Field(ge=1, le=1000, description="At most so many lines.")] = 50,
+    lines: Annotated[int, Field(ge=1, le=1000, description="The most lines.")] = 50,
     filter_text: Annotated[
         str, Field(max_length=200, description="Only lines that contain this text.")
     ] = "",

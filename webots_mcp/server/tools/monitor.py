@@ -49,7 +49,7 @@ async def webots_monitor(
         Field(
             gt=0,
             le=86_400,
-            description="Do not watch: report at once on so many wall seconds before the "
+            description="Do not watch: report at once on this many wall seconds before the "
             "newest row.",
         ),
     ] = None,
@@ -95,7 +95,7 @@ def _watched(recording: Recording, robot: str, started_s: float) -> MonitorAnswe
 
 
 def look_back(recording: Recording, robot: str | None, lookback_s: float) -> MonitorAnswer:
-    """The report of so many wall seconds before the newest row."""
+    """A report of the wall seconds before the newest row."""
     with recording.view(robot) as view:
         run = view.require_run()
         newest_s = view.state.wall_time_s if view.state else run.last_wall_time_s

@@ -34,7 +34,7 @@ async def webots_run(
     for_s: Annotated[
         float | None,
         Field(
-            gt=0, le=MAX_RUN_S, description="For so many simulated seconds, or until, if before."
+            gt=0, le=MAX_RUN_S, description="For this many simulated seconds, or until, if before."
         ),
     ] = None,
     reset: Annotated[

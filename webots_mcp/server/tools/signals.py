@@ -45,7 +45,7 @@ def webots_list_signals(
 
 
 def signal_row(info: SignalInfo, rows: int) -> list[Any]:
-    """A signal of a run of so many rows, as a row under `SIGNAL_COLUMNS`."""
+    """A signal of a run of that many rows, as a row under `SIGNAL_COLUMNS`."""
     return [
         short_name(info.name),
         info.kind,

@@ -138,7 +138,7 @@ def is_there(file: Path) -> bool:
     except FileNotFoundError:
         return False
     if not stat.S_ISREG(mode):
-        raise InvalidInputError(f"{file} is no regular file: move it away and import the rest")
+        raise InvalidInputError(f"{file} is not a regular file: move it away and import the rest")
     return True
 
 
@@ -315,7 +315,7 @@ def _log_entries(file: Path) -> Iterator[tuple[Clock, str]]:
 def _clock(stamp: re.Match[str], file: Path, number: int) -> Clock:
     hour, minute, second = int(stamp[1]), int(stamp[2]), int(stamp[3])
     if hour > 23 or minute > 59 or second > 59:
-        raise InvalidInputError(f"{file}, line {number}: {stamp[0][:10]} is no time of day")
+        raise InvalidInputError(f"{file}, line {number}: {stamp[0][:10]} is not a time of day")
     return hour, minute, second
 
 

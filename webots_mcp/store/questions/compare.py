@@ -99,7 +99,7 @@ def compare_runs(
         connection: Any.
         run_ids: 1 to 10 different runs.
         names: Signals, with `*`.
-        limit: At most so many differences.
+        limit: The most differences to return.
         options: What counts as an event, and what the position and the mode are.
         deadline_s: After it, the answer is made from what was read, and the notes say so.
 

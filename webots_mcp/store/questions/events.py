@@ -73,7 +73,7 @@ class Events:
 
 @dataclass(frozen=True)
 class Found:
-    """All that happened in a range, of which an answer tells a part.
+    """All that happened in a range; an answer shows a part of it.
 
     Attributes:
         entries: In order, without what the pages before have told.
@@ -136,7 +136,7 @@ def find_events(
         connection: Any.
         time_range: From `resolve_range`.
         options: What counts as an event; None for the defaults.
-        limit: At most so many events: see `choose`.
+        limit: The most events to return: see `choose`.
         around: Signals whose values are told with each event; None for mode, position and
             commanded speed.
         group: Many dropouts, steps or silences of one signal are told as one event, which counts

@@ -74,7 +74,7 @@ class RunInfo:
         end_reason: None while it goes on; where its process is gone, how that will be judged.
         duration_s: Simulated seconds.
         held_s: Of the wall time, that for which the simulation was paused by a command.
-        rows: State rows, of which retention has deleted `purged_rows`.
+        rows: State rows; retention has deleted `purged_rows` of them.
         notable: How often what needs attention was stored: warnings, errors, dropped rows,
             failed or lost commands, trouble with storage.
         parameters: Those that are not as the code declared them, or differ between the runs that
@@ -158,7 +158,7 @@ def run_info(connection: sqlite3.Connection, run_id: int) -> RunInfo:
     """One run.
 
     Raises:
-        UnknownRunError: There is none of that id.
+        UnknownRunError: No run has that id.
     """
     (run,) = run_infos(connection, [run_id])
     return run
@@ -168,7 +168,7 @@ def run_infos(connection: sqlite3.Connection, run_ids: Sequence[int]) -> list[Ru
     """Several runs, in this order.
 
     Raises:
-        UnknownRunError: There is none of one of these ids.
+        UnknownRunError: One of these ids is no run's.
     """
     ids = [fetch_run(connection, run_id).id for run_id in run_ids]
     return _infos(connection, [connection.execute(_ONE, (each,)).fetchone() for each in ids])
@@ -190,7 +190,7 @@ def annotate_run(
         note: At most 4,000 characters; None leaves it as it is.
 
     Raises:
-        UnknownRunError: There is none of that id.
+        UnknownRunError: No run has that id.
         InvalidInputError: Neither is given, or one is too long.
     """
     if label is None and note is None:

@@ -62,7 +62,7 @@ class ChangeColumns:
     Attributes:
         points: The newest of its changes, [from then on, value]; the first of all is the value in
             force when the range begins.
-        total: How many points there are, of which `points` are the last.
+        total: How many points there are; `points` are the last of them.
         time_by_value_s: Simulated seconds in each value, the longest first.
     """
 

@@ -74,7 +74,7 @@ def query_sql(
         connection: Any.
         statement: One SQL statement.
         max_rows: 1 to 1,000.
-        max_bytes: At most so many bytes of values.
+        max_bytes: The most bytes of values to return.
         deadline_s: Wall time after which it is interrupted.
 
     Raises:

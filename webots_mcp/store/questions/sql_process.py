@@ -55,7 +55,7 @@ def decode(answer: bytes, exit_code: int, asked: Statement) -> Result:
 
     Raises:
         InvalidInputError: As `query_sql`.
-        WebotsMCPError: The process ended for another reason, which is none of the statement's.
+        WebotsMCPError: The process ended for another reason, not because of the statement.
     """
     if exit_code == _TIMED_OUT:
         raise InvalidInputError(too_slow(asked.deadline_s))

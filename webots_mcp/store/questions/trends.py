@@ -92,7 +92,7 @@ def trends(
         connection: Any.
         time_range: From `resolve_range`.
         names: Signals, with `*`.
-        limit: At most so many numeric signals per run: those that changed most.
+        limit: The most numeric signals to return per run: those that changed most.
         deadline_s: After it, what was read so far is the answer, and says so.
 
     Raises:

@@ -44,7 +44,7 @@ def parse_wall_time(value: float | str | None, default_s: float = math.nan) -> f
     except ValueError:
         seconds = _iso_seconds(str(value))
     if not math.isfinite(seconds):
-        raise InvalidRangeError(f"{value!r} is no finite time in Unix seconds")
+        raise InvalidRangeError(f"{value!r} is not a finite time in Unix seconds")
     return seconds
 
 

@@ -52,7 +52,7 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, Setting]:
     """What was set, by the names that it has in `Retention`; of the others the defaults hold.
 
     Raises:
-        InvalidInputError: The table holds what is no limit.
+        InvalidInputError: The table holds something that is not a limit.
     """
     settings: dict[str, Setting] = {}
     for kind, size_bytes, rows, age_s, times, set_by, set_s in connection.execute(_READ):
@@ -65,7 +65,7 @@ def read_settings(connection: sqlite3.Connection) -> dict[str, Setting]:
                 value = replace(of_kind, size_bytes=size_bytes, rows=rows, age_s=age_s)
         except (KeyError, TypeError, InvalidInputError) as error:
             raise InvalidInputError(
-                f"the row {kind!r} of the table retention_limit is no limit ({error}): set it "
+                f"the row {kind!r} of the table retention_limit is not a limit ({error}): set it "
                 "again with 'webots-mcp retain'"
             ) from error
         settings[name] = Setting(value, set_by, set_s)

@@ -51,8 +51,8 @@ def _parse_part(part: str, text: str) -> tuple[str, float]:
         if unit in _ROWS:
             return "rows", round(number)
     raise InvalidInputError(
-        f"{part!r} in {text!r} is no limit: write a size (500MB), an age (30d), a number of rows "
-        f"(100000rows), several of them with commas between, or {NO_LIMIT} to keep everything"
+        f"{part!r} in {text!r} is not a limit: write a size (500MB), an age (30d), a number of "
+        f"rows (100000rows), several of them with commas between, or {NO_LIMIT} to keep everything"
     )
 
 

@@ -23,7 +23,7 @@ _MARK: Final = "UPDATE run SET keep = ? WHERE id = ?"
 
 @dataclass(frozen=True)
 class Limit:
-    """How much of one kind is kept; None is no limit. What is oldest goes first.
+    """How much of one kind is kept; None is not a limit. What is oldest goes first.
 
     Attributes:
         size_bytes: So much on the disk, with the free room on the pages and the time index; within

@@ -72,7 +72,7 @@ class SignalList:
 
     Attributes:
         rows: State rows of the run.
-        total: How many match, of which `signals` are the first.
+        total: How many match; `signals` are the first of them.
         notes: What the asker should know.
     """
 

@@ -91,7 +91,7 @@ def test_parameters_that_are_no_json_are_refused(
     recorded: Recorded, params: dict[str, object]
 ) -> None:
     robot = recorded.robot()
-    with pytest.raises(InvalidInputError, match="no plain JSON"):
+    with pytest.raises(InvalidInputError, match="not plain JSON"):
         CommandQueue(recorded.connection).enqueue(robot.id, "go", params)
 
 

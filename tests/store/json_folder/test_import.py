@@ -237,13 +237,9 @@ BAD = [
     ("status.json", "", r"status\.json is empty: its controller was ended"),
     ("status.json", "[1, 2]", r"status\.json: a state is an object, this is a list"),
     ("status.json", b'{"a": "\xff"}', r"status\.json: no JSON"),
-    ("status.json", '{"timestamp": "yesterday"}', "timestamp 'yesterday' is no ISO 8601 time"),
+    ("status.json", '{"timestamp": "yesterday"}', "timestamp 'yesterday' is not an ISO 8601 time"),
     ("logs/controller.log", "no time\n", r"controller\.log, line 1: expected '\[HH:MM:SS\]"),
-    (
-        "logs/controller.log",
-        "\n[12:00:00] a\n[12:61:00] b\n",
-        r"line 3: \[12:61:00\] is not a time",
-    ),
+    ("logs/controller.log", "\n[12:00:00] a\n[12:61:00] b\n", r"line 3: \[12:61:00\] is not a"),
     ("camera/frame_0000.png", b"\x89PNG\r\n\x1a\n but then not", r"frame_0000\.png is not a"),
     ("camera/frame_0000.png", b"", r"frame_0000\.png is not a usable PNG"),
     ("commands.json", '[{"action": "a"}, 3]', r"commands\.json: a command is an object"),
@@ -346,7 +342,7 @@ def test_a_picture_that_was_cut_off_is_refused(
 ) -> None:
     file = peer.picture("camera/frame_0000.png")
     file.write_bytes(file.read_bytes()[:-20])
-    with pytest.raises(InvalidInputError, match="no usable PNG"):
+    with pytest.raises(InvalidInputError, match="not a usable PNG"):
         import_folder(database, peer.folder, data_dir)
 
 

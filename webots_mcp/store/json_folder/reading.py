@@ -251,7 +251,7 @@ def _moment(stamp: object, file: Path) -> float:
         return datetime.fromisoformat(str(stamp).replace("Z", "+00:00")).timestamp()
     except (ValueError, OverflowError, OSError) as error:
         shown = repr(stamp)[:_SHOWN]
-        raise InvalidInputError(f"{file}: timestamp {shown} is no ISO 8601 time") from error
+        raise InvalidInputError(f"{file}: timestamp {shown} is not an ISO 8601 time") from error
 
 
 def _read_log(file: Path, newest_s: float | None) -> FoundLog | None:

@@ -248,7 +248,7 @@ BAD = [
     ("status.json", '{"x": ' + "[" * 900 + "]" * 900 + "}", "nested over 100 levels, at 'x'"),
     ("status.json", '{"x": ' + "[" * 90_000, r"status\.json: no JSON"),
     ("status.json", '{"x": "' + "y" * 16_000_000 + '"}', "16,000,000 is the limit"),
-    ("status.json", '{"timestamp": "' + "9" * 9000 + '"}', r"timestamp '9{50,99} is no ISO"),
+    ("status.json", '{"timestamp": "' + "9" * 9000 + '"}', r"timestamp '9{50,99} is not an ISO"),
     ("commands.json", '{"action": {"a": ' + "[" * 900 + "]" * 900 + "}}", "nested over 100"),
     (
         "logs/controller.log",

@@ -140,7 +140,7 @@ def plain(value: Any) -> Any:
     return json.loads(encode(value).text)
 
 
-def is_small(value: object) -> bool:
+def _is_small(value: object) -> bool:
     """Whether a look at all of it, as `str` takes, ends soon."""
     try:
         _look((value,), MAX_PLAIN_VALUES, 0, _Converted())
@@ -153,7 +153,7 @@ def text_of(value: object) -> str:
     """A value as the text that a person reads; of a large one its JSON, which is bounded."""
     if isinstance(value, str):
         return value
-    is_large = issubclass(type(value), _MANY) and not is_small(value)
+    is_large = issubclass(type(value), _MANY) and not _is_small(value)
     return encode(value).text if is_large else str(value)
 
 

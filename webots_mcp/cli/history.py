@@ -232,7 +232,7 @@ def plot(arguments: argparse.Namespace) -> None:
             connection,
             "trajectory" if arguments.trajectory else "signals",
             [*arguments.signals, *behind_runs],
-            scope=scope_of(arguments),
+            scope=_scope_of(arguments),
             run_ids=run_ids,
             trial_set=arguments.trial_set,
             width_px=arguments.width_px,
@@ -293,10 +293,10 @@ def range_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> T
     """What the arguments of `RANGE` mean in the recording."""
     from webots_mcp.store.reading.ranges import find_range
 
-    return find_range(connection, scope_of(arguments))
+    return find_range(connection, _scope_of(arguments))
 
 
-def scope_of(arguments: argparse.Namespace) -> Scope:
+def _scope_of(arguments: argparse.Namespace) -> Scope:
     """What the arguments of `RANGE` ask for."""
     from webots_mcp.store.reading.ranges import Scope
 

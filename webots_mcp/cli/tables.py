@@ -31,7 +31,7 @@ def text_of(value: Any) -> str:
     if value is None:
         return ""
     if isinstance(value, float):
-        return number_text(value)
+        return _number_text(value)
     if isinstance(value, dict):
         members = cast("dict[str, Any]", value).items()
         return _one_line(", ".join(f"{name} {text_of(member)}" for name, member in members))
@@ -43,7 +43,7 @@ def _one_line(text: str) -> str:
     return line if len(line) <= _LONGEST_CELL else f"{line[: _LONGEST_CELL - 1]}…"
 
 
-def number_text(value: float) -> str:
+def _number_text(value: float) -> str:
     """4 significant digits, but never coarser than a thousandth."""
     if not math.isfinite(value):
         return str(value)

@@ -172,7 +172,7 @@ class Way(NamedTuple):
         return max(self.to_s - self.from_s, 0.0)
 
 
-def way_of(connection: sqlite3.Connection, command: Command) -> Way:
+def _way_of(connection: sqlite3.Connection, command: Command) -> Way:
     """How far it came, as the bridge says; while it does not, as far as its heartbeat shows."""
     if result := _result_of(command):
         run_id = result.get("run_id") or _run_of(connection, command)
@@ -198,7 +198,7 @@ def _seen_way(command: Command, run: tuple[int, float, float, float], beat_s: fl
     has_reset = began_wall_s >= claimed_wall_s
     from_s = 0.0 if has_reset else command.claimed_sim_time_s or 0.0
     wall_s = (command.finished_wall_time_s or time.time()) - max(claimed_wall_s, began_wall_s)
-    if params_of(command).get("reset") and not has_reset:
+    if _params_of(command).get("reset") and not has_reset:
         to_s = from_s
     return Way(run_id, from_s, to_s, pace(to_s - from_s, wall_s))
 
@@ -207,8 +207,8 @@ def progress_of(
     connection: sqlite3.Connection, command: Command
 ) -> tuple[float, float | None, str]:
     """Simulated seconds so far, those asked for, and a word."""
-    way = way_of(connection, command)
-    until, for_s = (params_of(command).get(name) for name in ("until", "for_s"))
+    way = _way_of(connection, command)
+    until, for_s = (_params_of(command).get(name) for name in ("until", "for_s"))
     if way.run_id is None:
         return 0.0, for_s, "waiting for the controller"
     of = f" of {for_s:g}" if for_s else ""
@@ -222,7 +222,7 @@ def _result_of(command: Command) -> dict[str, Any]:
     return cast("dict[str, Any]", result) if isinstance(result, dict) else {}
 
 
-def params_of(command: Command) -> Mapping[str, Any]:
+def _params_of(command: Command) -> Mapping[str, Any]:
     """What a command was sent with."""
     return json.loads(command.params)
 
@@ -232,7 +232,7 @@ def params_of(command: Command) -> Mapping[str, Any]:
 
 def told_of_run(view: View, command: Command) -> dict[str, Any]:
     """What an answer says of a `run` command: why it stopped, how far it came, what happened."""
-    way, result = way_of(view.connection, command), _result_of(command)
+    way, result = _way_of(view.connection, command), _result_of(command)
     stopped, why = _why_stopped(command, result)
     told: dict[str, Any] = {"stopped": stopped, "why_stopped": why}
     if way.run_id is None or stopped is None:
@@ -307,7 +307,7 @@ def _is_own(event: Event, command: Command) -> bool:
 
 def _last_rows(view: View, command: Command, way: Way, end_s: float) -> Any:
     """The last rows, of the condition's signals."""
-    until = params_of(command).get("until")
+    until = _params_of(command).get("until")
     rows = view.connection.execute(_LAST_ROWS, (way.run_id, end_s, _ROWS_AROUND)).fetchall()
     if until is None or not rows:
         return None

@@ -23,11 +23,11 @@ _WORD: Final = re.compile(r"[^\W\d_]+|\d+")
 
 def sensor_part(state: dict[str, Any], devices: dict[str, str]) -> dict[str, Any]:
     """The members of a state that are named after a sensor of the robot, or like one."""
-    sensors = sensor_devices(devices)
+    sensors = _sensor_devices(devices)
     return {key: state[key] for key in state if key in sensors or _sounds_like_a_sensor(key)}
 
 
-def sensor_devices(devices: dict[str, str]) -> dict[str, str]:
+def _sensor_devices(devices: dict[str, str]) -> dict[str, str]:
     """The devices that sense: name to class."""
     return {name: kind for name, kind in devices.items() if kind not in _NO_SENSORS}
 
@@ -41,7 +41,7 @@ def unnamed_devices(state: dict[str, Any], devices: dict[str, str]) -> dict[str,
     published = [_words(path) for path in _paths(state)]
     return {
         name: kind
-        for name, kind in sensor_devices(devices).items()
+        for name, kind in _sensor_devices(devices).items()
         if not any(_words(name) <= words for words in published)
     }
 

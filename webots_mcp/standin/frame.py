@@ -57,7 +57,7 @@ class Frame(NamedTuple):
         return Frame(cast("Matrix", tuple(product)), self.point(inner.translation))
 
 
-def rotation_matrix(axis_angle: Sequence[float]) -> Matrix:
+def _rotation_matrix(axis_angle: Sequence[float]) -> Matrix:
     """The matrix of an SFRotation (axis x, y, z and angle in radians)."""
     x, y, z, angle = axis_angle
     length = hypot(x, y, z)
@@ -76,4 +76,4 @@ def rotation_matrix(axis_angle: Sequence[float]) -> Matrix:
 def frame_of(translation: Sequence[float], axis_angle: Sequence[float]) -> Frame:
     """The frame that a `translation` and a `rotation` field describe."""
     x, y, z = translation
-    return Frame(rotation_matrix(axis_angle), (x, y, z))
+    return Frame(_rotation_matrix(axis_angle), (x, y, z))

@@ -75,7 +75,7 @@ def _begin_immediate(connection: sqlalchemy.Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
-def dump_schema() -> str:
+def _dump_schema() -> str:
     """The text of `schema.sql`: what the migrations make of an empty database.
 
     Regenerate it with `python -m webots_mcp.store.migrate > webots_mcp/schema.sql`.
@@ -98,4 +98,4 @@ def _pragma(connection: sqlite3.Connection, name: str) -> int:
 
 
 if __name__ == "__main__":
-    print(dump_schema(), end="")  # noqa: T201
+    print(_dump_schema(), end="")  # noqa: T201

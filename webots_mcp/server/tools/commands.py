@@ -79,7 +79,7 @@ def webots_list_commands(
         return _answer(view, commands, limit)
 
 
-def command_row(command: Command, now_s: float) -> list[Any]:
+def _command_row(command: Command, now_s: float) -> list[Any]:
     """A command as a row under `COMMAND_COLUMNS`."""
     took_s = None
     if command.finished_wall_time_s is not None:
@@ -97,7 +97,7 @@ def command_row(command: Command, now_s: float) -> list[Any]:
 
 
 def _answer(view: View, commands: list[Command], limit: int) -> CommandsAnswer:
-    rows = [command_row(command, view.now_s) for command in commands]
+    rows = [_command_row(command, view.now_s) for command in commands]
     return CommandsAnswer(
         **view.header(),
         commands=condensed(COMMAND_COLUMNS, rows),

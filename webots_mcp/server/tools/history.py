@@ -142,7 +142,7 @@ def _run_series(run: RunHistory) -> RunSeries:
             for columns in run.numbers
         }
         or None,
-        states={str(short_name(columns.name)): change_series(columns) for columns in run.changes}
+        states={str(short_name(columns.name)): _change_series(columns) for columns in run.changes}
         or None,
         rows=run.rows,
         gaps=[[seconds(gap.start_s), seconds(gap.end_s)] for gap in run.gaps[:_SHOWN_GAPS]] or None,
@@ -186,7 +186,7 @@ def _number_series(
     )
 
 
-def change_series(columns: ChangeColumns) -> ChangeSeries:
+def _change_series(columns: ChangeColumns) -> ChangeSeries:
     """A text or a flag as columns."""
     return ChangeSeries(
         since_s=[seconds(point.sim_time_s) for point in columns.points],

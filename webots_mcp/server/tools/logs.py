@@ -52,7 +52,7 @@ def webots_get_logs(
         return _answer(view, asked, lines)
 
 
-def log_row(line: LogLine) -> list[object]:
+def _log_row(line: LogLine) -> list[object]:
     """A line as a row under `LOG_COLUMNS`."""
     message = line.message if line.source == "controller" else f"{line.source}: {line.message}"
     if line.logger is not None:
@@ -68,7 +68,7 @@ def _answer(view: View, asked: LogFilter, limit: int) -> LogsAnswer:
     older = matching > len(shown)
     return LogsAnswer(
         **view.header(),
-        lines=Table(columns=list(LOG_COLUMNS), rows=[log_row(line) for line in shown]),
+        lines=Table(columns=list(LOG_COLUMNS), rows=[_log_row(line) for line in shown]),
         matching=matching,
         cursor=shown[0].id if older and shown else None,
         hint=_hint(asked, matching, len(shown)),

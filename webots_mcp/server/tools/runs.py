@@ -109,7 +109,7 @@ def webots_list_runs(
         found = list_runs(
             connection, robot=robot, limit=most, before_id=cursor, parameters=parameters
         )
-        rows = fitting([run_row(run) for run in found.runs])
+        rows = fitting([_run_row(run) for run in found.runs])
         older = len(rows) < len(found.runs)
         return RunsAnswer(
             **header,
@@ -182,7 +182,7 @@ def webots_annotate_run(
         annotate_run(connection, run.id, label=_change(label), note=_change(note))
     with recording.view(robot, run.id) as view:
         told = run_info(view.connection, run.id)
-        named = zip(RUN_COLUMNS, run_row(told), strict=True)
+        named = zip(RUN_COLUMNS, _run_row(told), strict=True)
         return RunsAnswer(**view.header(), run={k: v for k, v in named if v is not None})
 
 
@@ -202,7 +202,7 @@ def _values_of(parameters: Mapping[str, Any]) -> Any:
     return shorten(dict(parameters), DETAIL_BUDGET, WHOLE).value or None
 
 
-def run_row(run: RunInfo) -> list[Any]:
+def _run_row(run: RunInfo) -> list[Any]:
     """A run as a row under `RUN_COLUMNS`."""
     return [
         run.run_id,

@@ -44,7 +44,7 @@ def webots_list_signals(
         return answer_about(view, SignalsAnswer, lambda: _found(view, pattern, limit, cursor or 0))
 
 
-def signal_row(info: SignalInfo, rows: int) -> list[Any]:
+def _signal_row(info: SignalInfo, rows: int) -> list[Any]:
     """A signal of a run of that many rows, as a row under `SIGNAL_COLUMNS`."""
     return [
         short_name(info.name),
@@ -77,7 +77,7 @@ def _found(view: View, pattern: str, limit: int, start: int) -> dict[str, Any]:
         pattern=pattern,
         limit=start + limit,
     )
-    rows = fitting([signal_row(info, found.rows) for info in found.signals[start:]])
+    rows = fitting([_signal_row(info, found.rows) for info in found.signals[start:]])
     end = start + len(rows)
     more = end < found.total
     return {

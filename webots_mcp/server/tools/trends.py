@@ -80,10 +80,10 @@ def _found(view: View, asked: TimeRange, names: Sequence[str], limit: int | None
 def trend_tables(run: RunTrends, limit: int, budget: int) -> RunTrendTables:
     """The trends of a run as tables that fit the budget, in characters."""
     changed = [state for state in run.states if state.changes]
-    states = fitting([state_row(state) for state in changed], int(budget * _STATES_SHARE))
+    states = fitting([_state_row(state) for state in changed], int(budget * _STATES_SHARE))
     moving = _moving(run)
     rows = fitting(
-        [trend_row(trend) for trend in moving[:limit]], int(budget * (1 - _STATES_SHARE))
+        [_trend_row(trend) for trend in moving[:limit]], int(budget * (1 - _STATES_SHARE))
     )
     return RunTrendTables(
         run_id=run.run_id,
@@ -117,7 +117,7 @@ def _constants(run: RunTrends) -> list[str]:
     return numbers + states
 
 
-def trend_row(trend: Trend) -> list[Any]:
+def _trend_row(trend: Trend) -> list[Any]:
     """A number as a row under `TREND_COLUMNS`: extremes with their times are in what it says."""
     return [
         short_name(trend.name),
@@ -128,7 +128,7 @@ def trend_row(trend: Trend) -> list[Any]:
     ]
 
 
-def state_row(state: StateTrend) -> list[Any]:
+def _state_row(state: StateTrend) -> list[Any]:
     """A text or a flag as a row under `STATE_COLUMNS`."""
     times = [
         (shown(value), round(duration_s, 3)) for value, duration_s in state.time_by_value_s.items()

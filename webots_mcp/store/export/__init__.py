@@ -46,7 +46,7 @@ def export(
 
     Args:
         connection: Any; it is never kept busy for more than an instant.
-        wanted: From `resolve_range`.
+        wanted: From `find_range`.
         form: One of `FORMATS`.
         sink: Takes bytes; need not be seekable.
         progress: Called now and then with the rows read so far and in all.

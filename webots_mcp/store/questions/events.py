@@ -134,7 +134,7 @@ def find_events(
 
     Args:
         connection: Any.
-        time_range: From `resolve_range`.
+        time_range: From `find_range`.
         options: What counts as an event; None for the defaults.
         limit: The most events to return: see `choose`.
         around: Signals whose values are told with each event; None for mode, position and

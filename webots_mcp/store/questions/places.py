@@ -11,7 +11,7 @@ from webots_mcp.store.detection.event import Event
 Place = tuple[float, int, float, str, int]
 
 
-def in_order(event: Event) -> tuple[float, int, float]:
+def _in_order(event: Event) -> tuple[float, int, float]:
     """The one clock of all events: wall time, and where that is equal simulation time."""
     return event.wall_time_s, event.run_id, event.start_s
 
@@ -20,8 +20,8 @@ def placed(events: Iterable[Event]) -> list[tuple[Place, Event]]:
     """The events in order, each with its place; those of one kind and moment are numbered."""
     seen: Counter[tuple[float, int, float, str]] = Counter()
     entries: list[tuple[Place, Event]] = []
-    for event in sorted(events, key=lambda each: (*in_order(each), each.kind, each.name or "")):
-        moment = (*in_order(event), event.kind)
+    for event in sorted(events, key=lambda each: (*_in_order(each), each.kind, each.name or "")):
+        moment = (*_in_order(event), event.kind)
         entries.append(((*moment, seen[moment]), event))
         seen[moment] += 1
     return entries

@@ -132,7 +132,7 @@ def query_history(
 
     Args:
         connection: Any.
-        time_range: From `resolve_range`; over several runs each gets its share of the points.
+        time_range: From `find_range`; over several runs each gets its share of the points.
         names: Signals, with `*`.
         max_points: 1 to 500.
         max_changes: The most changes of a text or flag in a run; None for as many as points.

@@ -50,7 +50,7 @@ def timeline(
 
     Args:
         connection: Any.
-        time_range: From `resolve_range`.
+        time_range: From `find_range`.
         options: What counts as an event; None for what was stored when it happened (runs, gaps,
             changes, commands, logs from the level info on, notices, pictures).
         limit: 1 to 500.

@@ -90,7 +90,7 @@ def trends(
 
     Args:
         connection: Any.
-        time_range: From `resolve_range`.
+        time_range: From `find_range`.
         names: Signals, with `*`.
         limit: The most numeric signals to return per run: those that changed most.
         deadline_s: After it, what was read so far is the answer, and says so.
@@ -101,7 +101,8 @@ def trends(
     signals = signals_of(connection, time_range, names)
     deadline = Deadline(deadline_s)
     runs = [
-        run_trends(connection, segment, signals, limit, deadline) for segment in time_range.segments
+        _run_trends(connection, segment, signals, limit, deadline)
+        for segment in time_range.segments
     ]
     notes = [_unseen_swings(run) for run in runs if run.resolution_s is not None]
     return Trends(time_range.robot, tuple(runs), (*time_range.notes, *notes))
@@ -115,7 +116,7 @@ def _unseen_swings(run: RunTrends) -> str:
     )
 
 
-def run_trends(
+def _run_trends(
     connection: sqlite3.Connection,
     segment: Segment,
     signals: Sequence[Signal],

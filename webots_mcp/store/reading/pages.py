@@ -57,7 +57,7 @@ def query_rows(
 
     Args:
         connection: Any.
-        time_range: From `resolve_range`.
+        time_range: From `find_range`.
         names: Signals, with `*`.
         limit: 1 to 1,000.
         after_id: The `cursor` of the page before. Ids never come back, so rows that are recorded

@@ -105,11 +105,11 @@ def _signals_in(
             signal = seen_now(found.get(column.name), column)
             if signal is not None:
                 found[column.name] = signal
-    named = without_placeholders(found)
+    named = _without_placeholders(found)
     return named if len(found) == len(known) else by_name(list(named.values()))
 
 
-def without_placeholders(known: dict[str, Signal]) -> dict[str, Signal]:
+def _without_placeholders(known: dict[str, Signal]) -> dict[str, Signal]:
     """Without names that only ever held null and have others below them.
 
     `lidar: null` before the first scan is the missing value of `lidar.min` and the others.
@@ -241,7 +241,7 @@ def list_signals(
     known = registered(connection, subject.robot_id)
     now = (seen_now(known.get(name), column) for name, column in late.items())
     known |= {signal.name: signal for signal in now if signal}
-    known = without_placeholders(known)
+    known = _without_placeholders(known)
     there = {name: signal for name, signal in known.items() if signal.id in stored or name in late}
     matching = resolve_signals(there, [pattern]) if pattern != "*" else list(there.values())
     matching.sort(key=lambda signal: signal.name)

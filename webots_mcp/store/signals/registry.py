@@ -107,7 +107,7 @@ def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
     }
 
 
-def seen_in(column: BatchColumn, known: Kind = "null") -> Kind:
+def _seen_in(column: BatchColumn, known: Kind = "null") -> Kind:
     """The kind of a signal, after the values of this column."""
     planar = may_be_yaw(column.name) and f"{column.name[:-1]}3" not in _places_of(column.sample)
     for value in _telling(column):
@@ -144,19 +144,19 @@ def enter_signals(
 
 
 def _description(column: BatchColumn) -> tuple[object, ...] | None:
-    signal = unregistered(column)
+    signal = _unregistered(column)
     if signal is None:
         return None
     described = (signal.name, signal.kind, signal.unit, signal.path, signal.reduce)
     return (signal.robot_id, *described, column.first_wall_time_s, column.last_wall_time_s)
 
 
-def unregistered(column: BatchColumn) -> Signal | None:
+def _unregistered(column: BatchColumn) -> Signal | None:
     """A signal that is known from a column only; None where its value stands nowhere."""
     place = _places_of(column.sample).get(column.name)
     if place is None:
         return None
-    kind = seen_in(column)
+    kind = _seen_in(column)
     unit = unit_of(column.name, kind)
     return Signal(None, column.robot_id, column.name, kind, unit, place.path, place.reduce)
 
@@ -164,8 +164,8 @@ def unregistered(column: BatchColumn) -> Signal | None:
 def seen_now(signal: Signal | None, column: BatchColumn) -> Signal | None:
     """A signal as it is known after a column of it; None where it cannot be registered."""
     if signal is None:
-        return unregistered(column)
-    kind = seen_in(column, signal.kind)
+        return _unregistered(column)
+    kind = _seen_in(column, signal.kind)
     if kind == signal.kind:
         return signal
     return replace(signal, kind=kind, unit=unit_of(signal.name, kind))

@@ -1,0 +1,325 @@
+"""A client of Webots' own WebSocket, which listens at the port of `--port` in every Webots.
+
+It obeys orders only where Webots was started with `--stream`; the console it tells to anybody. It
+never sends the bare words `w3d` and `x3d`, which pause the simulation at its next step.
+"""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
+
+from webots_mcp.contract import host_name
+from webots_mcp.errors import CommandRefusedError
+from webots_mcp.webots.frames import MAX_FRAME_BYTES, FrameTrimmer
+
+if TYPE_CHECKING:
+    from websockets.frames import Frame
+
+Order = Literal["pause", "resume", "fast", "step", "reset", "reload"]
+
+ANSWER_S: Final = 1.0  # Webots answers at once, or it does not obey
+_CLOSING_S: Final = 0.2
+_CHUNK_BYTES: Final = 1 << 16
+_HEAD_END: Final = b"\r\n\r\n"
+_LONGEST_HEAD_BYTES: Final = 1 << 16
+# A robot of this name need not exist: asking for a window begins the logs for this client.
+_BEGIN_CONSOLE: Final = "robot:" + json.dumps(
+    {"name": "webots-mcp", "message": "init robot window"}, separators=(",", ":")
+)
+# What is sent, and how what comes back begins. The time in ms is a limit; negative: none.
+_ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
+    "pause": ("pause", ("pause",)),  # "paused by client", and "pause: <ms>" to the others
+    "resume": ("real-time:-1", ("real-time",)),
+    "fast": ("fast:-1", ("fast",)),
+    "step": ("step", ("pause", "step")),
+    "reset": ("reset", ("reset finished",)),
+    "reload": ("reload", ("delete world", "loading:", "world:", "scene load completed")),
+}
+_LATE_ANSWERS: Final = ("reset", "reload")  # may be answered to others, or much later
+
+
+class Address(NamedTuple):
+    """Where a Webots listens."""
+
+    host: str
+    port: int
+
+    def __str__(self) -> str:
+        return f"{self.host}:{self.port}"
+
+
+class Message(NamedTuple):
+    """What Webots sent: its text as far as it is kept, or that it answered a ping."""
+
+    text: str
+    is_pong: bool = False
+
+
+class ConsoleLine(NamedTuple):
+    """A line of Webots' console, of `stdout` or `stderr`."""
+
+    stream: str
+    text: str
+
+
+class Reply(NamedTuple):
+    """What came of an order.
+
+    Attributes:
+        heard: Webots' own words; None where it said nothing.
+        is_alive: Whether its main thread answered at all, so that it is not busy.
+    """
+
+    heard: str | None
+    is_alive: bool
+
+
+def address_of(instance: str) -> Address | None:
+    """Where the Webots of a session listens, from its `instance`; None where that is not told."""
+    host, _, port = instance.rpartition(":")
+    if not (host and port.isascii() and port.isdecimal() and 0 < int(port) < 1 << 16):
+        return None
+    return Address("127.0.0.1" if host == host_name() else host, int(port))
+
+
+class Stream:
+    """A connection to Webots, in this thread alone. Times are those of `time.monotonic`."""
+
+    def __init__(self, address: Address, until_s: float) -> None:
+        from websockets.client import ClientProtocol
+        from websockets.uri import parse_uri
+
+        self.address = address
+        self._protocol = ClientProtocol(
+            parse_uri(f"ws://{address}/"), max_size=MAX_FRAME_BYTES + _CHUNK_BYTES
+        )
+        self._trimmer = FrameTrimmer()
+        self._message = bytearray()
+        self._dropped_bytes = 0
+        self._socket = socket.create_connection(address, _left_s(until_s))
+        self._arrived: list[Message] = []
+        try:
+            self._shake_hands(until_s)
+        except BaseException:
+            self._socket.close()
+            raise
+
+    def send(self, text: str) -> None:
+        """Send a text."""
+        self._protocol.send_text(text.encode())
+        self._write()
+
+    def ping(self) -> None:
+        """Ask Webots' main thread for a sign of life, which comes after what was sent before."""
+        self._protocol.send_ping(b"webots-mcp")
+        self._write()
+
+    def receive(self, until_s: float) -> Message | None:
+        """The next message; None if none came in time.
+
+        Raises:
+            CommandRefusedError: Webots closed the connection.
+        """
+        while not self._arrived:
+            if not self._read(until_s):
+                return None
+        return self._arrived.pop(0)
+
+    @property
+    def dropped_bytes(self) -> int:
+        """What of long messages was not kept."""
+        return self._dropped_bytes + self._trimmer.trimmed_bytes
+
+    def close(self) -> None:
+        """Say goodbye, wait a moment for the same, and close the socket."""
+        until_s = time.monotonic() + _CLOSING_S
+        with suppress(OSError, CommandRefusedError):
+            self._protocol.send_close(1000)
+            self._write()
+            while self._read(until_s):
+                self._arrived.clear()
+        self._socket.close()
+
+    def _shake_hands(self, until_s: float) -> None:
+        self._protocol.send_request(self._protocol.connect())
+        self._write()
+        head = bytearray()
+        while _HEAD_END not in head and len(head) < _LONGEST_HEAD_BYTES:
+            data = self._bytes(until_s)
+            if data is None:
+                raise TimeoutError
+            if not data:
+                break
+            head += data
+        head_bytes, end, rest = bytes(head).partition(_HEAD_END)
+        self._protocol.receive_data(head_bytes + end)
+        self._protocol.events_received()
+        if self._protocol.handshake_exc is not None or not end:
+            why = self._protocol.handshake_exc or "it closed the connection"
+            raise CommandRefusedError(f"what listens at {self.address} is no Webots ({why})")
+        self._take(rest)
+
+    def _read(self, until_s: float) -> bool:
+        """Take what has come; False if nothing has in time."""
+        data = self._bytes(until_s)
+        if data is None:
+            return False
+        if data:
+            self._take(data)
+            self._write()  # pongs
+        if not data or (self._protocol.close_expected() and not self._arrived):
+            raise CommandRefusedError(f"Webots at {self.address} closed the connection")
+        return True
+
+    def _take(self, data: bytes) -> None:
+        self._protocol.receive_data(self._trimmer.feed(data))
+        for event in self._protocol.events_received():
+            self._take_frame(event)
+
+    def _take_frame(self, frame: Any) -> None:
+        from websockets.frames import Opcode
+
+        if frame.opcode is Opcode.PONG:
+            self._arrived.append(Message("", is_pong=True))
+        elif frame.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+            self._put_together(frame)
+
+    def _put_together(self, frame: Frame) -> None:
+        """Of the parts of a message as much as of a frame."""
+        room = MAX_FRAME_BYTES - len(self._message)
+        self._message += frame.data[:room]
+        self._dropped_bytes += max(len(frame.data) - room, 0)
+        if frame.fin:
+            self._arrived.append(Message(self._message.decode("utf-8", "replace")))
+            self._message = bytearray()
+
+    def _bytes(self, until_s: float) -> bytes | None:
+        """Of the socket; empty at its end, None where nothing came in time."""
+        self._socket.settimeout(_left_s(until_s))
+        try:
+            return self._socket.recv(_CHUNK_BYTES)
+        except (TimeoutError, BlockingIOError):
+            return None
+
+    def _write(self) -> None:
+        self._socket.settimeout(ANSWER_S)  # only a full buffer can make this wait
+        for data in self._protocol.data_to_send():
+            if data:
+                self._socket.sendall(data)
+
+
+@contextmanager
+def connected(address: Address, timeout_s: float) -> Generator[Stream]:
+    """A connection to Webots.
+
+    Raises:
+        CommandRefusedError: Nobody listens there, or it is no Webots, or it does not answer, or it
+            hung up.
+    """
+    try:
+        stream = Stream(address, time.monotonic() + timeout_s)
+    except TimeoutError as error:
+        raise CommandRefusedError(
+            f"what listens at {address} did not answer within {timeout_s:g} s: Webots' main thread "
+            "is busy, or it is no Webots"
+        ) from error
+    except OSError as error:
+        raise CommandRefusedError(f"no Webots listens at {address} ({error})") from error
+    try:
+        yield stream
+    except OSError as error:
+        raise CommandRefusedError(
+            f"the connection to Webots at {address} broke: {error}"
+        ) from error
+    finally:
+        stream.close()
+
+
+def give_order(address: Address, order: Order, timeout_s: float = ANSWER_S) -> Reply:
+    """Have Webots do something, and hear what it says to it.
+
+    Raises:
+        CommandRefusedError: There is no Webots to speak to.
+    """
+    words, answers = _ORDERS[order]
+    return _give(address, words, answers, timeout_s, late=order in _LATE_ANSWERS)
+
+
+def load_world(address: Address, file_name: str, timeout_s: float = ANSWER_S) -> Reply:
+    """Have Webots open another world of the folder of the present one.
+
+    Raises:
+        CommandRefusedError: There is no Webots to speak to.
+    """
+    return _give(address, f"load:{file_name}", _ORDERS["reload"][1], timeout_s, late=True)
+
+
+def _give(
+    address: Address, words: str, answers: tuple[str, ...], timeout_s: float, *, late: bool
+) -> Reply:
+    until_s = time.monotonic() + timeout_s
+    is_alive = False
+    with connected(address, timeout_s) as stream:
+        stream.send(words)
+        stream.ping()
+        while (message := stream.receive(until_s)) is not None:
+            if message.text.startswith(answers):
+                return Reply(message.text.partition("\n")[0][:200], is_alive=True)
+            is_alive = is_alive or message.is_pong
+            if is_alive and not late:
+                # Words are answered in their order: what comes now is about something else.
+                until_s = min(until_s, time.monotonic() + _CLOSING_S)
+    return Reply(None, is_alive)
+
+
+def no_obedience(address: Address, reply: Reply) -> str:
+    """Why Webots said nothing to an order, as far as that can be told."""
+    if reply.is_alive:
+        return (
+            f"Webots at {address} hears but does not obey: it was started without --stream (only a "
+            "start with it opens this way)"
+        )
+    return (
+        f"Webots at {address} did not answer within {ANSWER_S:g} s: it was started without "
+        "--stream, or its main thread is busy and may still obey later"
+    )
+
+
+def console(address: Address, timeout_s: float) -> Generator[list[ConsoleLine]]:
+    """Webots' console, from its first line that nobody has taken yet; works without `--stream`.
+
+    Yields at least once a second, also nothing, until who asks stops or Webots ends.
+
+    Args:
+        address: Where it listens.
+        timeout_s: For the connection.
+
+    Raises:
+        CommandRefusedError: There is no Webots to speak to, or it has ended.
+    """
+    with connected(address, timeout_s) as stream:
+        stream.send(_BEGIN_CONSOLE)
+        while True:
+            message = stream.receive(time.monotonic() + ANSWER_S)
+            yield [] if message is None else list(console_lines(message.text))
+
+
+def console_lines(text: str) -> Iterator[ConsoleLine]:
+    """The lines of a message; each names its stream, those that go on with it do not."""
+    kind = None
+    for line in text.splitlines():
+        head, colon, rest = line.partition(":")
+        if colon and head in ("stdout", "stderr"):
+            kind, line = head, rest
+        if kind is None:  # it is about something else
+            return
+        yield ConsoleLine(kind, line)
+
+
+def _left_s(until_s: float) -> float:
+    return max(until_s - time.monotonic(), 0.001)

@@ -264,6 +264,19 @@ def draw_creep(rng: np.random.Generator) -> LabelledRun:
     return driven(rng, phases, interval_s, noise_m)
 
 
+def draw_settling(rng: np.random.Generator) -> LabelledRun:
+    """Up to a place at a steady 1 to 4 mm/s for 40 to 90 s, 20 to 60 s there, and away.
+
+    How far it creeps is as long as the place is wide; from when on it stands shows in the rows.
+    """
+    interval_s, noise_m, speed = _setting(rng)
+    driving, other = _modes(rng)
+    phases = drive_of(rng, 20.0, speed, driving)
+    phases.append(phase(float(rng.uniform(40, 90)), float(rng.uniform(0.001, 0.004)), other))
+    phases.append(phase(float(rng.uniform(20, 60)), 0.0, other))
+    return driven(rng, [*phases, *drive_of(rng, 20.0, speed, driving)], interval_s, noise_m)
+
+
 def draw_turning(rng: np.random.Generator) -> LabelledRun:
     """Turns on the spot of 5 to 15 s, in the mode of the drive or in one of its own."""
     interval_s, noise_m, speed = _setting(rng)
@@ -294,6 +307,7 @@ DRAWN: Final[dict[str, Callable[[np.random.Generator], LabelledRun]]] = {
     "held": draw_held,
     "docking": draw_docking,
     "creep": draw_creep,
+    "settling": draw_settling,
     "turning": draw_turning,
     "rest": draw_rest,
     "drive": draw_drive,

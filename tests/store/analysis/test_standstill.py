@@ -58,3 +58,39 @@ def test_a_very_slow_robot_stands_from_when_it_stops(speed_m_s: float) -> None:
     track, _ = noisy_track([(60.0, speed_m_s, 0.0), (60.0, 0.0, 0.0)], 0.032, 0.0002)
     (found,) = find_standstills(track, RADIUS_M, LEAST_S)
     assert track.times[found.start] == pytest.approx(60.0, abs=0.001 / speed_m_s)
+
+
+CREEPS = (60.0, 0.001, 0.0)
+RESTS = (40.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.0005, 0.002, 0.005])
+@pytest.mark.parametrize("interval_s", [0.032, 0.1])
+@pytest.mark.parametrize(
+    ("phases", "ends_s"),
+    [
+        ([CREEPS, RESTS], (60, 100)),
+        ([RESTS, CREEPS], (0, 40)),
+        ([CREEPS, RESTS, CREEPS], (60, 100)),
+        ([(10.0, 0.2, 0.0), CREEPS, RESTS, (10.0, 0.2, 0.0)], (70, 110)),
+    ],
+    ids=["then rests", "rested", "rests between", "between drives"],
+)
+def test_who_creeps_stands_once_and_only_while_it_rests(
+    phases: list[tuple[float, float, float]],
+    ends_s: tuple[float, float],
+    interval_s: float,
+    noise_m: float,
+) -> None:
+    track, _ = noisy_track(phases, interval_s, noise_m, 3)
+    (found,) = find_standstills(track, RADIUS_M, LEAST_S)
+    told_s = track.times[found.start], track.times[found.last]
+    # At 1 mm/s three deviations of the noise are that many milliseconds; a place has a width.
+    assert told_s == pytest.approx(ends_s, abs=10)
+
+
+@pytest.mark.parametrize("noise_m", [0.0, 0.002, 0.01])
+def test_a_creep_that_bends_is_no_standstill(noise_m: float) -> None:
+    phases = [(10, 0.2, 0.0), (90, 0.002, 0.03), (10, 0.2, 0.0)]
+    track, _ = noisy_track(phases, 0.1, noise_m)
+    assert find_standstills(track, RADIUS_M, LEAST_S) == []

@@ -61,7 +61,11 @@ class RangeFinder(Ranger):
 
 
 def read(device: Any) -> Any:
-    return read_devices(SimpleNamespace(devices={"it": device}))["sensors"]["it"]  # type: ignore[index]
+    return read_devices(SimpleNamespace(devices={"it": device}), raising)["sensors"]["it"]  # type: ignore[index]
+
+
+def raising(_name: str, error: Exception) -> None:
+    raise error
 
 
 def test_a_force_3d_sensor_gives_a_bare_pointer_to_three_numbers() -> None:

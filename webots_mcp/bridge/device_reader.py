@@ -41,12 +41,15 @@ class DeviceReader:
             return {}
         started_s = time.perf_counter()
         try:
-            return read_devices(self._simulation.robot)
+            return read_devices(self._simulation.robot, self._failed)
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("auto_publish", error)
             return {}
         finally:
             self._count(1e6 * (time.perf_counter() - started_s))
+
+    def _failed(self, name: str, error: Exception) -> None:
+        self._errors.failed(f"auto_publish of the device {name!r}", error)
 
     def _count(self, duration_us: float) -> None:
         """The median of the last ones decides; a single slow one is no reason to tell."""

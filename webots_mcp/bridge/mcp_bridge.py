@@ -208,7 +208,10 @@ class MCPBridge:
     def auto_publish(
         self, extra: Mapping[Any, Any] | None = None, include_time: bool = True
     ) -> None:
-        """Publish what all enabled devices say: `sensors`, `motors`, and `pose` where it is known.
+        """Publish what all enabled devices say: `sensors`, `motors`, `actuators`, `pose`, ...
+
+        The rule for each class of devices is in `webots_mcp.bridge.devices`. Nothing is enabled or
+        changed, and no packet or key is taken.
 
         Args:
             extra: More keys; they win over those read from the devices.

@@ -15,8 +15,7 @@ from .sensors import PositionSensor
 @lacks(
     "available_force disableForceFeedback disableTorqueFeedback enableForceFeedback "
     "enableTorqueFeedback force force_feedback force_feedback_sampling_period "
-    "getAvailableForce getForceFeedback getForceFeedbackSamplingPeriod getMaxForce "
-    "getTorqueFeedback getTorqueFeedbackSamplingPeriod max_force setAvailableForce "
+    "getAvailableForce getForceFeedback getMaxForce getTorqueFeedback max_force setAvailableForce "
     "available_torque setAvailableTorque getAvailableTorque setControlPID setForce setTorque "
     "torque torque_feedback torque_feedback_sampling_period"
 )
@@ -61,6 +60,14 @@ class Motor(Device):
             return
         self._acceleration = acceleration
         self._session.change(self._tag, "acceleration", acceleration)
+
+    def getForceFeedbackSamplingPeriod(self) -> int:
+        """0: the stand-in measures no force, so nobody has enabled that."""
+        return 0
+
+    def getTorqueFeedbackSamplingPeriod(self) -> int:
+        """0: the stand-in measures no torque, so nobody has enabled that."""
+        return 0
 
     def getTargetPosition(self) -> float:
         """The commanded position in radians."""

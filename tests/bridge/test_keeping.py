@@ -331,7 +331,7 @@ def test_slow_devices_are_read_for_the_ring_no_more_than_100_us_per_call(
     bridge.keep("a look")
     assert slow.drive(robot, bridge, range(200, 260)) == 15
     ((*_, reason),) = recording.rows(STRETCHES)
-    why = "of auto_publish() one call in 4, because reading the devices takes 390 us"
+    why = "one call of auto_publish() in 4, because reading the devices takes 390 us"
     assert reason == f"a look; {why}"
     assert recording.rows("SELECT level, message FROM log") == [("info", f"ring buffer: {why}")]
     (kept,) = kept_numbers(recording)

@@ -44,7 +44,7 @@ class WebotsServer:
         self.heard: list[str] = []
         self.mode = "pause"
         self._streams, self._manner = streams, manner
-        self._on_order, self._announce_bytes = on_order, announce_bytes
+        self.on_order, self._announce_bytes = on_order, announce_bytes
         self._console: list[str] = []
         self._listeners: list[ServerConnection] = []
         self._lock = threading.Lock()
@@ -124,7 +124,7 @@ class WebotsServer:
         word = text.partition(":")[0]
         if word not in (*_MODES, "reset", "reload", "load"):
             return self.log("stderr", f"ERROR: Streaming server: Unsupported message: {text}")
-        self._on_order(text)
+        self.on_order(text)
         self.mode = _MODES.get(word, self.mode)
         if word in ("pause", "step"):
             client.send("paused by client")

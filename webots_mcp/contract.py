@@ -20,6 +20,7 @@ SCHEMA_VERSION: Final = 7  # PRAGMA user_version of a database that this version
 DATABASE_NAME: Final = "webots.db"
 CAMERA_FOLDER: Final = "camera"
 SCREENSHOT_FOLDER: Final = "screenshots"
+KEPT_FRAME: Final = "kept"  # the kind of a picture that belongs to the kept stretch it lies in
 DATA_DIR_VARIABLE: Final = "WEBOTS_MCP_DATA_DIR"
 STRICT_VARIABLE: Final = "WEBOTS_MCP_STRICT"
 THROTTLE_VARIABLE: Final = "WEBOTS_MCP_THROTTLE_INTERVAL"

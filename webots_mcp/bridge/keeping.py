@@ -3,18 +3,22 @@
 What the throttle drops goes into the ring. `keep` writes the ring to the table `kept_state`, in
 order and some rows with each call of the loop; for some seconds more each throttled call follows.
 Together with the recorded rows that is every call of a kept stretch, of which the table
-`kept_stretch` tells begin, end and reason.
+`kept_stretch` tells begin, end and reason. Small frames of the cameras that the controller names
+are held and kept with them, one file with each call.
 """
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from typing import Final
 
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.encoding import encode
+from webots_mcp.bridge.frames import MOST_FRAMES, CameraFrames, Frame
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.ring import Ring, RingRow
 from webots_mcp.bridge.run import Run
@@ -65,16 +69,24 @@ class Keeper:
         last_s: Seconds of simulation time before a moment that are kept; 0 keeps nothing.
 
     Attributes:
+        frames: Takes and holds small frames of cameras.
         fills: Each throttled call has to be added.
         busy: `go_on` has to be called with each round of the loop.
     """
 
     def __init__(
-        self, clock: Clock, recorder: Recorder, journal: Journal, throttle: Throttle, last_s: float
+        self,
+        clock: Clock,
+        recorder: Recorder,
+        journal: Journal,
+        album: Album,
+        throttle: Throttle,
+        last_s: float,
     ) -> None:
         self._clock = clock
         self._recorder = recorder
         self._journal = journal
+        self._album = album
         self._throttle = throttle
         self._last_s = last_s
         self._ring = Ring(last_s)
@@ -86,6 +98,8 @@ class Keeper:
         self._going_on = False
         self._asked: deque[str] = deque(maxlen=_MOST_REASONS)
         self._unwritten: deque[tuple[Run, RingRow]] = deque()
+        self._unwritten_frames: deque[tuple[Stretch, Frame]] = deque()
+        self.frames = CameraFrames(journal, last_s)
         self.enabled = last_s > 0
         self.fills = self.enabled and throttle.interval > 1
         self.busy = False
@@ -109,6 +123,19 @@ class Keeper:
         else:
             self._ring.add(row)
 
+    def take_frames(self, *, at_once: bool) -> None:
+        """Take a small frame of each camera whose time has come, or at once of each."""
+        if self._clock.run is not self._run:
+            self._begin_run()
+        now_s, stretch = self._clock.sim_time_s, self._stretch
+        if stretch is not None and now_s > stretch.end_s:
+            self._end_stretch(stretch.end_s)
+        for frame in self.frames.take(now_s, at_once=at_once):
+            if self._going_on and stretch is not None:
+                self._keep_frame(stretch, frame)
+            else:
+                self.frames.hold(frame)
+
     def leave_out(self, why: str) -> None:
         """A call is neither recorded nor held; a stretch with it says why."""
         if self._clock.run is not self._run:
@@ -129,7 +156,7 @@ class Keeper:
         self._write_some()
         if self._stretch is not None and self._clock.sim_time_s >= self._stretch.end_s:
             self._end_stretch(self._stretch.end_s)
-        self.busy = bool(self._going_on or self._unwritten or self._asked)
+        self.busy = bool(self._going_on or self._unwritten or self._unwritten_frames or self._asked)
 
     # -- keeping -------------------------------------------------------------------------------
 
@@ -155,6 +182,8 @@ class Keeper:
         if self._left_out is not None and self._left_out[0] >= start_s:
             stretch.gaps = stretch.gaps or self._left_out[1]
         self._unwritten.extend((self._run, row) for row in rows)
+        for frame in self.frames.release(start_s):
+            self._keep_frame(stretch, frame)
         self._going_on = self.busy = True
         self._record(stretch)
         return True
@@ -168,7 +197,7 @@ class Keeper:
 
     def write_all(self) -> None:
         """Write what is kept now: the loop is about to stand still, or to end."""
-        while self._unwritten:
+        while self._unwritten or self._unwritten_frames:
             self._write_some()
 
     def close(self) -> None:
@@ -196,6 +225,7 @@ class Keeper:
         self._run, self._stretch, self._kept_s = self._clock.run, None, 0.0
         self._left_out = None
         self._ring.begin(self._run.started_sim_time_s)
+        self.frames.release(math.inf)
 
     def _end_stretch(self, at_s: float) -> None:
         """It stays known: one that follows before its ring could have begun goes on with it."""
@@ -218,7 +248,28 @@ class Keeper:
         }
         self._recorder.record("kept stretch", stretch.run, values)
 
+    def _keep_frame(self, stretch: Stretch, frame: Frame) -> None:
+        if len(self._unwritten_frames) < 2 * MOST_FRAMES:
+            self._unwritten_frames.append((stretch, frame))
+        else:  # more cameras than can be written
+            self.frames.missed += 1
+
     def _write_some(self) -> None:
+        self._write_rows()
+        if self._unwritten_frames:
+            self._write_frame(*self._unwritten_frames[0])
+
+    def _write_frame(self, stretch: Stretch, frame: Frame) -> None:
+        """One file: to compress and write it takes about a millisecond."""
+        try:
+            self._album.add_kept(stretch.run, stretch.uuid, frame)
+        except OSError as error:
+            self.frames.missed += 1
+            self._recorder.errors.failed("keep_camera", error)
+        finally:
+            self._unwritten_frames.popleft()
+
+    def _write_rows(self) -> None:
         """Rows of one run, in one transaction. They are forgotten after it: twice does no harm."""
         rows = list[RingRow]()
         room = _CHARACTERS_AT_ONCE

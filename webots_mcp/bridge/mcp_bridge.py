@@ -34,6 +34,7 @@ from webots_mcp.contract import (
     find_log_level,
     resolve_database,
 )
+from webots_mcp.errors import CommandRefusedError
 from webots_mcp.parameter import declare
 
 if TYPE_CHECKING:
@@ -239,6 +240,31 @@ class MCPBridge:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("keep", error)
 
+    def keep_camera(self, camera: Any, frames_per_s: float = 5.0) -> None:
+        """Hold small frames of a camera with the last seconds, and keep them where those are kept.
+
+            bridge.keep_camera(camera)
+
+        With `publish` the camera's newest image is taken so often, scaled down to 160 pixels at
+        most (each n-th of a row, each n-th row), and held in memory: of all cameras the last 78
+        frames, up to 8 MB. One is taken at the very step of a breakpoint's hit. In a kept stretch
+        they become PNG files, one with each call (about a millisecond), that stay as long as the
+        stretch. A frame that the camera could not give is counted in `stats()`, and told in the
+        log where that happens again. Nothing is taken where `keep_last_s` is 0.
+
+        Args:
+            camera: A Webots `Camera`; it may be enabled later.
+            frames_per_s: So many per second of simulation time, up to 100, and none without a new
+                image; named again, a camera is looked at as often as was said last.
+        """
+        try:
+            keeper = self._session.context.keeper
+            if not keeper.enabled:
+                raise CommandRefusedError(keeper.why_not)
+            keeper.frames.watch(camera, frames_per_s)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._errors.failed("keep_camera", error)
+
     # -- beside the state ----------------------------------------------------------------------
 
     def log(self, message: object, level: str | int = "info") -> None:
@@ -424,6 +450,7 @@ class MCPBridge:
             publish_mean_us=self._publisher.cost.mean_us,
             publish_max_us=self._publisher.cost.max_us,
             ring_interval=self._publisher.devices.ring_interval,
+            frames_missed=self._session.context.keeper.frames.missed,
             failures=self._errors.failures,
             last_error=self._errors.last_error,
         )

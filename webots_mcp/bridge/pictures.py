@@ -8,12 +8,16 @@ import time
 import zlib
 from collections import deque
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.contract import CAMERA_FOLDER, make_folder
+from webots_mcp.bridge.run import Run
+from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME, make_folder
 from webots_mcp.errors import CommandRefusedError
+
+if TYPE_CHECKING:
+    from webots_mcp.bridge.frames import Frame
 
 _PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n"
 _PNG_TAIL: Final = b"IEND\xaeB`\x82"
@@ -35,14 +39,9 @@ class Album:
             CommandRefusedError: The camera is disabled or has no image yet.
             OSError: The file cannot be written.
         """
-        device, width, height = str(camera.getName()), camera.getWidth(), camera.getHeight()
-        if camera.getSamplingPeriod() <= 0:
-            raise CommandRefusedError(f"camera {device!r} is disabled: call its enable() first")
-        try:
-            image = camera.getImage()
-        except ValueError as error:
-            raise CommandRefusedError(f"camera {device!r} has no image yet") from error
-        name = f"{_file_name(self._robot_name)}.{_file_name(device)}"
+        image, width, height = image_of(camera)
+        device = str(camera.getName())
+        name = self._name_of(device)
         kept = self._kept_of(name)
         path = f"{CAMERA_FOLDER}/{name}.{_next_number(kept):06d}.png"
         size = self._write(path, encode_png(image, width, height))
@@ -52,6 +51,19 @@ class Album:
         while len(kept) > max(1, max_frames):
             self._forget(kept.popleft())
         return path
+
+    def add_kept(self, run: Run, stretch_uuid: str, frame: Frame) -> None:
+        """Write a small frame of a kept stretch; it stays as long as the stretch.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
+        number = f"{stretch_uuid[:8]}-{round(1000 * frame.sim_time_s):06d}"
+        path = f"{CAMERA_FOLDER}/{self._name_of(frame.device)}.{KEPT_FRAME}-{number}.png"
+        size = self._write(path, encode_png(frame.bgra, frame.width, frame.height))
+        times = (frame.sim_time_s, frame.wall_time_s)
+        row = (*times, KEPT_FRAME, frame.device, path, frame.width, frame.height, size)
+        self._recorder.record("image", run, row)
 
     def make_room(self, path: str) -> Path:
         """The file that a picture is to be written to: its folder exists, it does not."""
@@ -67,10 +79,11 @@ class Album:
         self._recorder.record("image", clock.run, row)
         return {"path": path, "width": width, "height": height, "bytes": size}
 
-    @property
-    def _robot_name(self) -> str:
+    def _name_of(self, device: str) -> str:
+        """What the files of a camera begin with."""
         registration = self._recorder.session.registration
-        return registration.robot_name if registration else "robot"
+        robot = registration.robot_name if registration else "robot"
+        return f"{_file_name(robot)}.{_file_name(device)}"
 
     def _kept_of(self, name: str) -> deque[str]:
         """The frames of a device that are there, oldest first; the folder is listed once."""
@@ -95,6 +108,24 @@ class Album:
     def _forget(self, path: str) -> None:
         (self._data_dir / path).unlink(missing_ok=True)
         self._recorder.record("image forgotten", None, (path,))
+
+
+def image_of(camera: Any) -> tuple[bytes, int, int]:
+    """A camera's newest image (4 bytes a pixel: blue, green, red, alpha), width and height.
+
+    Raises:
+        CommandRefusedError: The camera is disabled or has no image yet.
+    """
+    device, width, height = str(camera.getName()), camera.getWidth(), camera.getHeight()
+    if camera.getSamplingPeriod() <= 0:
+        raise CommandRefusedError(f"camera {device!r} is disabled: call its enable() first")
+    try:
+        image = camera.getImage()
+    except ValueError as error:
+        raise CommandRefusedError(f"camera {device!r} has no image yet") from error
+    if not image:
+        raise CommandRefusedError(f"camera {device!r} has no image yet")
+    return image, width, height
 
 
 def encode_png(bgra: bytes, width: int, height: int) -> bytes:

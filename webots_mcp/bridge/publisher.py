@@ -50,6 +50,8 @@ class Publisher:
             self._record(state)
         elif keeper.fills:
             keeper.add(state)
+        if keeper.frames.cameras:
+            self._look_at_cameras(at_once=bool(hit))
         if hit:
             breakpoints.act(hit, state)
         if keeper.busy:
@@ -74,8 +76,16 @@ class Publisher:
             self._record(self._read(extra, include_time))
         elif keeper.fills:
             keeper.leave_out(self.devices.why)
+        if keeper.frames.cameras:
+            self._look_at_cameras(at_once=False)
         if keeper.busy:
             keeper.go_on()
+
+    def _look_at_cameras(self, *, at_once: bool) -> None:
+        """What the cameras see is held with the states; at a hit whatever the time."""
+        keeper = self._keeper
+        if at_once or keeper.frames.is_due(self._clock.sim_time_s):
+            keeper.take_frames(at_once=at_once)
 
     def _read(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
         state: dict[Any, Any] = self.devices.read()

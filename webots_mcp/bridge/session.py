@@ -70,13 +70,14 @@ class Session:
         parameters = Parameters(clock, recorder, journal, start_values, self._set_parameter)
         self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters)
         pause = Pause(simulation, journal, heartbeat, self.runs.look_after_step)
-        keeper = Keeper(clock, recorder, journal, throttle, keep_last_s)
+        album = Album(recorder, clock, data_dir)
+        keeper = Keeper(clock, recorder, journal, album, throttle, keep_last_s)
         self.context = Context(
             simulation=simulation,
             clock=clock,
             recorder=recorder,
             journal=journal,
-            album=Album(recorder, clock, data_dir),
+            album=album,
             heartbeat=heartbeat,
             throttle=throttle,
             reloads=reloads,

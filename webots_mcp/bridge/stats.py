@@ -10,6 +10,7 @@ class BridgeStats(NamedTuple):
 
     Attributes:
         ring_interval: One call of `auto_publish` in this many is held in the ring buffer.
+        frames_missed: Camera frames that could not be taken for it, or not be written.
     """
 
     rows_written: int
@@ -21,6 +22,7 @@ class BridgeStats(NamedTuple):
     publish_mean_us: float
     publish_max_us: float
     ring_interval: int
+    frames_missed: int
     failures: int
     last_error: str | None
 

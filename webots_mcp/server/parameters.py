@@ -37,7 +37,7 @@ def _as_seconds(value: float) -> float:
 # validator stand before it: behind it pydantic does not know JSON Schema's words.
 Id = Annotated[int, Field(ge=1), AfterValidator(_as_id)]
 _Place = Annotated[int, Field(ge=0), AfterValidator(_as_id)]
-_Seconds = Annotated[float, AfterValidator(_as_seconds)]
+Seconds = Annotated[float, AfterValidator(_as_seconds)]
 _Duration = Annotated[float, Field(gt=0), AfterValidator(_as_seconds)]
 RobotName = Annotated[
     Annotated[str, Field(max_length=LONGEST_NAME)] | None,
@@ -49,8 +49,8 @@ LastS = Annotated[
     _Duration | None,
     Field(description="The last simulated seconds."),
 ]
-StartS = Annotated[_Seconds | None, Field(description="From this simulation time.")]
-EndS = Annotated[_Seconds | None, Field(description="Before this simulation time.")]
+StartS = Annotated[Seconds | None, Field(description="From this simulation time.")]
+EndS = Annotated[Seconds | None, Field(description="Before this simulation time.")]
 TimeoutS = Annotated[
     float,
     Field(ge=0.1, le=MAX_WAIT_S, description="Longest wait, wall seconds."),
@@ -60,7 +60,7 @@ Cursor = Annotated[_Place | None, Field(description=_CURSOR)]
 TextCursor = Annotated[str, Field(max_length=2000, description=_CURSOR)]
 # A number is as good; one type that holds both is shorter than two.
 _WallTime = Annotated[float | str | None, WithJsonSchema({"type": "string"})]
-Since = Annotated[_WallTime, Field(description="From this wall time: ISO 8601, Unix seconds.")]
+Since = Annotated[_WallTime, Field(description="From this wall time, ISO 8601 or Unix.")]
 Until = Annotated[_WallTime, Field(description="Before this wall time.")]
 Names = Annotated[
     list[str],
@@ -73,6 +73,11 @@ Names = Annotated[
 AnyNames = Annotated[
     list[str] | None,
     Field(max_length=50, description="Only these; '*' is any text."),
+]
+# Of a parameter. A whole number is a number as well, and stays one.
+Value = Annotated[
+    float | int | bool | str,
+    WithJsonSchema({"anyOf": [{"type": "number"}, {"type": "boolean"}, {"type": "string"}]}),
 ]
 MaxPoints = Annotated[
     int | None,

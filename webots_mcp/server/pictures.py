@@ -3,16 +3,49 @@
 from __future__ import annotations
 
 import io
+import math
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from mcp.server.mcpserver import Image
 
 from webots_mcp.store.images import opened
 
+if TYPE_CHECKING:
+    from PIL.Image import Image as Picture
+
 LONGEST_SIDE_PX: Final = 1000
 MAX_SENT_BYTES: Final = 4_000_000  # more than such a picture has pixels: something else is in it
 _JPEG_QUALITY: Final = 85
+_GAP_PX: Final = 4
+
+
+def load_sheet(files: Sequence[Path]) -> Image:
+    """Pictures beside each other, from left to right and from top to bottom, as one.
+
+    Raises:
+        InvalidInputError: A file holds no complete picture, or is too large.
+    """
+    from PIL import Image as Pictures
+
+    columns = math.ceil(math.sqrt(len(files)))
+    side_px = LONGEST_SIDE_PX // columns - _GAP_PX
+    parts = [_thumbnail(file, side_px) for file in files]
+    width, height = (max(part.size[i] for part in parts) + _GAP_PX for i in (0, 1))
+    sheet = Pictures.new("RGB", (columns * width, math.ceil(len(parts) / columns) * height))
+    for number, part in enumerate(parts):
+        sheet.paste(part, (number % columns * width, number // columns * height))
+    png = io.BytesIO()
+    sheet.save(png, "PNG")
+    return Image(data=png.getvalue(), format="png")
+
+
+def _thumbnail(file: Path, side_px: int) -> Picture:
+    with opened(file) as picture:
+        scaled = picture.convert("RGB")
+    scaled.thumbnail((side_px, side_px))
+    return scaled
 
 
 def load_picture(file: Path) -> tuple[Image, str]:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
+from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.store.rows import columns_of
 
@@ -42,12 +43,16 @@ class StoredImage:
 
 _SHOWN_PATH: Final = 100
 _COLUMNS: Final = columns_of(StoredImage)
-_NEWEST: Final = (
-    f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND kind = :kind "
-    "AND (:device IS NULL OR device = :device) ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+_OF_CAMERA: Final = f"kind IN ('camera', '{KEPT_FRAME}')"
+_NEWEST_FIRST: Final = "sim_time_s DESC"
+_NEAREST_FIRST: Final = "abs(sim_time_s - :at_s)"
+_FRAMES: Final = (
+    f"SELECT {_COLUMNS} FROM image WHERE run_id = :run_id AND {_OF_CAMERA} "
+    "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
+    "ORDER BY {order}, id DESC LIMIT :count"
 )
 _CAMERAS: Final = (
-    "SELECT run_id, group_concat(DISTINCT device) FROM image WHERE kind = 'camera' AND run_id IN "
+    f"SELECT run_id, group_concat(DISTINCT device) FROM image WHERE {_OF_CAMERA} AND run_id IN "
     "(SELECT id FROM run WHERE robot_id = ?) GROUP BY run_id ORDER BY run_id DESC"
 )
 
@@ -107,13 +112,31 @@ def _require_at_most(limit: int, of: str, found: int) -> None:
         raise ValueError(f"it has {found:,} {of}, {limit:,} is the limit")
 
 
-def newest_camera_image(
-    connection: sqlite3.Connection, run_id: int, device: str | None = None
-) -> StoredImage | None:
-    """The latest camera frame of a run, of one camera or of any."""
-    values = {"run_id": run_id, "kind": "camera", "device": device}
-    row = connection.execute(_NEWEST, values).fetchone()
-    return StoredImage(*row) if row else None
+def camera_frames(
+    connection: sqlite3.Connection,
+    run_id: int,
+    device: str | None = None,
+    *,
+    at_s: float | None = None,
+    count: int = 1,
+) -> list[StoredImage]:
+    """Frames of one camera in a run, those of kept stretches too, in order of time.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        device: Of this camera; None is the one that has the frame that is looked for.
+        at_s: The frames nearest to this simulation time; None is the newest.
+        count: So many, of one kind.
+    """
+    order = _NEWEST_FIRST if at_s is None else _NEAREST_FIRST
+    values = {"run_id": run_id, "device": device, "kind": None, "at_s": at_s, "count": 1}
+    query = _FRAMES.format(order=order)
+    found = connection.execute(query, values).fetchall()
+    if found and count > 1:
+        of = {"device": found[0][5], "kind": found[0][4], "count": count}
+        found = connection.execute(query, values | of).fetchall()
+    return sorted((StoredImage(*row) for row in found), key=lambda each: each.sim_time_s)
 
 
 def cameras(connection: sqlite3.Connection, robot_id: int) -> dict[int, str]:

@@ -83,8 +83,7 @@ async def webots_world_reset(
     force: Annotated[
         bool,
         Field(
-            description="Press Webots' own keys instead (macOS only), where the controller no "
-            "longer answers."
+            description="Press Webots' own keys (macOS), where the controller no longer answers."
         ),
     ] = False,
     robot: RobotName = None,

@@ -13,7 +13,7 @@ from webots_mcp.naming import nearest_first
 from webots_mcp.parameter import MOST_PARAMETERS
 from webots_mcp.server.budget import fitting, seconds, without_empty
 from webots_mcp.server.declaring import ACTS, READS, tool
-from webots_mcp.server.parameters import RobotName, RunId, TimeoutS
+from webots_mcp.server.parameters import RobotName, RunId, TimeoutS, Value
 from webots_mcp.server.results import CommandAnswer, ParametersAnswer
 from webots_mcp.server.shortening import DETAIL_BUDGET, WHOLE, shorten
 from webots_mcp.server.tuning import SET_WAIT_S, When, set_parameters
@@ -27,7 +27,7 @@ _NONE: Final = (
 )
 
 Values = Annotated[
-    dict[str, float | int | bool | str],
+    dict[str, Value],
     Field(min_length=1, max_length=MOST_PARAMETERS, description='{"kp": 3.0, "gait": "trot"}'),
 ]
 

@@ -8,47 +8,77 @@ from anyio import to_thread
 from mcp.server.mcpserver import Context, Image
 from pydantic import Field
 
+from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.server.budget import some
+from webots_mcp.server.budget import seconds, some
 from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.parameters import RobotName, RunId, TimeoutS
-from webots_mcp.server.pictures import load_picture
+from webots_mcp.server.parameters import RobotName, RunId, Seconds, TimeoutS
+from webots_mcp.server.pictures import load_picture, load_sheet
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.shortening import compact_json
-from webots_mcp.store.images import cameras, inside, newest_camera_image
+from webots_mcp.store.images import StoredImage, camera_frames, cameras, inside
+from webots_mcp.store.reading.kept import kept_stretches
+from webots_mcp.store.reading.ranges import just_after
 from webots_mcp.store.recording import Recording, View
 
 _WAIT_S: Final = 15.0
 _MOST_RUNS: Final = 5
+_MOST_FRAMES: Final = 16
 
 
 @tool("Get the camera picture", READS)
 def webots_get_camera(
     recording: Recording,
-    camera: Annotated[
-        str, Field(max_length=200, description="Camera device; '' is whichever saved last.")
-    ] = "",
+    camera: Annotated[str, Field(max_length=200, description="Device; '' is any.")] = "",
+    at_s: Annotated[Seconds | None, Field(description="Nearest to this simulation time.")] = None,
+    frames: Annotated[
+        int, Field(ge=1, le=_MOST_FRAMES, description="So many, in one picture.")
+    ] = 1,
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> list[str | Image]:
-    """The newest camera frame that the controller saved, as a picture, with its age."""
+    """The newest camera frame, or those kept around a hit, as a picture with time and age."""
     with recording.view(robot, run_id) as view:
         run = view.require_run()
-        image = newest_camera_image(view.connection, run.id, camera or None)
-        if image is None:
+        found = camera_frames(view.connection, run.id, camera or None, at_s=at_s, count=frames)
+        if not found:
             return [_no_frame(view, camera)]
-        picture, note = load_picture(image.file(recording.data_dir))
-        caption = view.header() | {
-            "camera": image.device,
-            "picture_sim_time_s": round(image.sim_time_s, 4),
-            "picture_age_s": view.age_s(image.wall_time_s),
-            "width_px": image.width,
-            "height_px": image.height,
-            "file": str(recording.data_dir / image.path),
-            "note": note,
-        }
-        return [_caption(caption), picture]
+        if len(found) > 1:
+            picture, shown = _sheet(recording, found)
+        else:
+            picture, shown = _single(recording, view, found[0])
+        return [_caption(view.header() | _told_of(view, found) | shown), picture]
+
+
+def _told_of(view: View, found: list[StoredImage]) -> dict[str, Any]:
+    """The camera, and the stretch that its frames are kept with."""
+    first, last = found[0], found[-1]
+    if first.kind != KEPT_FRAME:
+        return {"camera": first.device}
+    within = (first.run_id, first.sim_time_s, just_after(last.sim_time_s))
+    reasons = [each.reason for each in kept_stretches(view.connection, *within)]
+    return {"camera": first.device, "kept": "; ".join(reasons)}
+
+
+def _single(recording: Recording, view: View, image: StoredImage) -> tuple[Image, dict[str, Any]]:
+    picture, note = load_picture(image.file(recording.data_dir))
+    return picture, {
+        "picture_sim_time_s": seconds(image.sim_time_s),
+        "picture_age_s": view.age_s(image.wall_time_s),
+        "width_px": image.width,
+        "height_px": image.height,
+        "file": str(recording.data_dir / image.path),
+        "note": note,
+    }
+
+
+def _sheet(recording: Recording, found: list[StoredImage]) -> tuple[Image, dict[str, Any]]:
+    picture = load_sheet([image.file(recording.data_dir) for image in found])
+    return picture, {
+        "pictures_sim_time_s": [seconds(image.sim_time_s) for image in found],
+        "note": "row by row, from left to right",
+    }
 
 
 @tool("Take a screenshot", ACTS)
@@ -61,7 +91,7 @@ async def webots_take_screenshot(
 ) -> list[str | Image]:
     """A picture of the simulation's main view, now; needs a Supervisor.
 
-    The picture is scaled to at most 1,000 pixels; the caption names the original file.
+    Scaled to at most 1,000 pixels; the caption names the original file.
     """
     dispatcher = Dispatcher(recording, ctx.report_progress)
     answer = await dispatcher.ask(robot, "screenshot", timeout_s, {"quality": quality})

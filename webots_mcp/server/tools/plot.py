@@ -39,7 +39,7 @@ def webots_plot(
     scope: Scope,
     kind: Annotated[
         PlotKind,
-        Field(description="Signals over time, or the way of the robot seen from above."),
+        Field(description="trajectory: the way, seen from above."),
     ] = "signals",
     signals: AnyNames = None,
     run_ids: RunIds = None,

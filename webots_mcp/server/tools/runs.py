@@ -38,6 +38,7 @@ from webots_mcp.server.parameters import (
     RunIds,
     ShownLimit,
     TrialSetId,
+    Value,
 )
 from webots_mcp.server.results import Table
 from webots_mcp.server.shortening import DETAIL_BUDGET, WHOLE, shorten
@@ -89,7 +90,7 @@ def webots_list_runs(
     limit: Limit = 20,
     cursor: Cursor = None,
     parameters: Annotated[
-        dict[str, float | int | bool | str] | None,
+        dict[str, Value] | None,
         Field(
             max_length=20,
             description='Only runs in which they had these values at some time: {"kp": 3.0}.',

@@ -42,9 +42,7 @@ PagePath = Annotated[
     Field(max_length=1000, description="Dotted path, as sensors.lidar."),
 ]
 Offset = Annotated[int, Field(ge=0, description="First item or character at the path.")]
-PageSize = Annotated[
-    int, Field(ge=1, le=2000, description="How many items or characters at the path.")
-]
+PageSize = Annotated[int, Field(ge=1, le=2000, description="So many of them.")]
 
 
 @tool("Get the robot's state", READS)

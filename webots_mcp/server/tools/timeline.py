@@ -37,7 +37,7 @@ def webots_get_timeline(
     """Changes, commands, log lines, pictures, gaps, begin and end of runs in one order, paged.
 
     A log of what was noted, from the start of the run on. To search for what went wrong, also what
-    nobody noted (stuck, jumps, silent sensors): webots_find_events.
+    nobody noted: webots_find_events.
     """
     if "threshold" in (kinds or ()):
         raise InvalidInputError("a threshold has no place here: ask webots_find_events(above)")

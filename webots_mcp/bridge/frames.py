@@ -1,0 +1,151 @@
+"""Small camera frames of the last seconds: taken now and then, held in bounded memory."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from typing import Any, Final, NamedTuple
+
+from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.pictures import image_of
+from webots_mcp.bridge.text import describe
+
+LONGEST_SIDE_PX: Final = 160
+MOST_FRAMES: Final = 78  # of all cameras together: 8 MB, were they square
+_MOST_FRAMES_PER_S: Final = 100.0
+_EARLY_S: Final = 1e-9  # steps add up to a little less
+_METHODS: Final = ("getName", "getSamplingPeriod", "getWidth", "getHeight", "getImage")
+
+
+class Frame(NamedTuple):
+    """What a camera saw last at some moment, scaled down.
+
+    Attributes:
+        bgra: Four bytes a pixel, rows from the top left.
+    """
+
+    device: str
+    sim_time_s: float
+    wall_time_s: float
+    width: int
+    height: int
+    bgra: bytes
+
+
+class _Camera:
+    """A camera that is looked at now and then.
+
+    Attributes:
+        due_s: Simulation time of its next frame.
+        missed: Frames that it could not give.
+    """
+
+    def __init__(self, device: Any, interval_s: float) -> None:
+        self.device = device
+        self.name = str(device.getName())
+        self.interval_s = interval_s
+        self.due_s = self.taken_s = -math.inf
+        self.missed = 0
+
+    def frame(self, now_s: float) -> Frame:
+        """Its newest image, scaled down; the next one is due when there is another."""
+        self.taken_s = now_s
+        period_s = self.device.getSamplingPeriod() / 1000
+        self.due_s = now_s + max(self.interval_s, period_s) - _EARLY_S
+        scaled = scale_down(*image_of(self.device))
+        return Frame(self.name, now_s, time.time(), *scaled)
+
+
+class CameraFrames:
+    """Takes frames of cameras, and holds those of the last seconds of a run.
+
+    Args:
+        last_s: So many seconds of simulation time are held, and 78 frames at most.
+
+    Attributes:
+        cameras: Those that are looked at.
+        missed: Frames that could not be taken or written.
+    """
+
+    def __init__(self, journal: Journal, last_s: float) -> None:
+        self._journal = journal
+        self._last_s = last_s
+        self._held: deque[Frame] = deque(maxlen=MOST_FRAMES)
+        self._looked_s = self._due_s = -math.inf
+        self.cameras: dict[str, _Camera] = {}
+        self.missed = 0
+
+    def watch(self, device: Any, frames_per_s: float) -> None:
+        """Take so many frames of a camera per second of simulation time.
+
+        Raises:
+            TypeError: It has no pictures.
+            ValueError: The number is out of bounds.
+        """
+        lacking = [name for name in _METHODS if not callable(getattr(device, name, None))]
+        if lacking:
+            kind = type(device).__name__
+            raise TypeError(f"a Camera is needed, and {kind} has no {', '.join(lacking)}")
+        if not 0 < frames_per_s <= _MOST_FRAMES_PER_S:
+            most = f"{_MOST_FRAMES_PER_S:g}"
+            raise ValueError(f"frames_per_s is above 0 and up to {most}, not {frames_per_s!r}")
+        camera = _Camera(device, 1 / frames_per_s)
+        self.cameras[camera.name] = camera
+        self._due_s = -math.inf
+
+    def is_due(self, now_s: float) -> bool:
+        """Whether a camera has to be looked at: its time has come, or time went back."""
+        return not self._looked_s <= now_s < self._due_s
+
+    def take(self, now_s: float, *, at_once: bool) -> list[Frame]:
+        """The frames that are due; `at_once` one of each camera."""
+        again = now_s < self._looked_s  # a new run
+        due = [
+            each
+            for each in self.cameras.values()
+            if again or now_s >= each.due_s or (at_once and now_s > each.taken_s)
+        ]
+        frames = [frame for each in due if (frame := self._frame_of(each, now_s)) is not None]
+        self._looked_s = now_s
+        self._due_s = min((each.due_s for each in self.cameras.values()), default=math.inf)
+        return frames
+
+    def hold(self, frame: Frame) -> None:
+        """Hold the newest frame; those that are too old go."""
+        while self._held and self._held[0].sim_time_s < frame.sim_time_s - self._last_s:
+            self._held.popleft()
+        self._held.append(frame)
+
+    def release(self, start_s: float) -> list[Frame]:
+        """Those that were taken since; none is held any more."""
+        frames = [frame for frame in self._held if frame.sim_time_s >= start_s - _EARLY_S]
+        self._held.clear()
+        return frames
+
+    def _frame_of(self, camera: _Camera, now_s: float) -> Frame | None:
+        """None where there is none; the second time in a row of one camera is told."""
+        try:
+            return camera.frame(now_s)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            camera.missed += 1
+            self.missed += 1
+            if camera.missed == 2:  # the first one may come before the camera's first image
+                self._journal.log("warning", "bridge", f"keep_camera: {describe(error)}")
+            return None
+
+
+def scale_down(bgra: bytes, width: int, height: int) -> tuple[int, int, bytes]:
+    """Width, height and pixels of an image of which the longer side has up to 160: each n-th.
+
+    Raises:
+        ValueError: The image does not have 4 * width * height bytes.
+    """
+    if len(bgra) != 4 * width * height:
+        raise ValueError(f"{len(bgra)} bytes are no image of {width} x {height} pixels")
+    step = math.ceil(max(width, height) / LONGEST_SIDE_PX)
+    if step <= 1:
+        return width, height, bgra
+    pixels = memoryview(bgra).cast("I")
+    rows = [pixels[i : i + width : step].tobytes() for i in range(0, len(pixels), width * step)]
+    return math.ceil(width / step), len(rows), b"".join(rows)

@@ -125,6 +125,11 @@ class RecordedRobot:
         span = {"start_sim_time_s": start_s, "end_sim_time_s": end_s}
         return insert(self.connection, "kept_stretch", values | span | {"reason": reason})
 
+    def kept_state(self, sim_time_s: float, data: object) -> int:
+        """A call of `publish` that only a stretch has."""
+        values = self._stamped(sim_time_s) | {"data": json.dumps(data)}
+        return insert(self.connection, "kept_state", values)
+
     def image(self, sim_time_s: float, path: str, **changes: Any) -> int:
         values = self._stamped(sim_time_s) | {
             "kind": "camera",

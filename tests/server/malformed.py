@@ -28,7 +28,7 @@ from webots_mcp.store.rollup.rolling import roll
 ROWS: Final = 60
 JSON_COLUMNS: Final = {
     ("robot", "devices"), ("session", "versions"), ("session", "actions"), ("state", "data"),
-    ("state", "odd"), ("event", "data"), ("command", "params"), ("command", "result"),
+    ("state", "odd"), ("kept_state", "data"), ("kept_state", "odd"), ("event", "data"), ("command", "params"), ("command", "result"),
     ("trial_set", "plan"), ("trial_set", "former_values"), ("trial", "parameters"),
 }  # fmt: skip
 _BLOB: Final = b"\x00\xff\x01"
@@ -55,6 +55,7 @@ READING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_get_sensors", {}),
     ("webots_get_full_state", {}),
     ("webots_get_camera", {}),
+    ("webots_get_camera", {"at_s": 1.0}),
     ("webots_get_logs", {}),
     ("webots_monitor", {"lookback_s": 3600}),
     ("webots_list_commands", {}),
@@ -151,6 +152,8 @@ def _fill(robot: RecordedRobot, folder: Path) -> None:
             robot.event(step * 0.1, "change", "mode", {"from": "turn", "to": mode})
     Image.new("RGB", (32, 24)).save(folder / "eye.png")
     robot.image(2.0, "eye.png")
+    robot.kept(1.0, 2.0, "a look")
+    robot.kept_state(1.05, {"pose": [0.1, 0.0, 0.1], "mode": "turn", "front": 0.9})
     now = time.time()
     insert(robot.connection, "breakpoint", {
         "robot_id": robot.id, "condition": "front < 0.5", "action": "log", "hits": 1,

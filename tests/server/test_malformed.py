@@ -21,7 +21,8 @@ pytestmark = pytest.mark.anyio
 # all there are.
 TRIED = (b"\x00\xff\x01", '{"x": ', "[1, 2]", '{"x": "\\ud800"}')
 TABLES = ("robot", "session", "run", "state", "event", "command", "log", "image", "signal",
-          "rollup", "change", "breakpoint", "trial_set", "trial")  # fmt: skip
+          "rollup", "change", "breakpoint", "trial_set", "trial",
+          "kept_stretch", "kept_state")  # fmt: skip
 
 
 @pytest.fixture(scope="module")

@@ -119,7 +119,7 @@ class CameraFrames:
 
     def release(self, start_s: float) -> list[Frame]:
         """Those that were taken since; none is held any more."""
-        frames = [frame for frame in self._held if frame.sim_time_s >= start_s - _EARLY_S]
+        frames = [frame for frame in self._held if frame.sim_time_s >= start_s]
         self._held.clear()
         return frames
 

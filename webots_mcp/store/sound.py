@@ -26,10 +26,11 @@ _SHOWN: Final = 5
 
 _OBJECTS: Final = frozenset(
     {"robot.devices", "session.versions", "session.actions", "state.data", "state.odd",
+     "kept_state.data", "kept_state.odd",
      "event.data", "command.params", "trial_set.plan", "trial_set.former_values",
      "trial.parameters"}
 )  # fmt: skip
-_OF_TEXTS: Final = frozenset({"robot.devices", "session.actions", "state.odd"})
+_OF_TEXTS: Final = frozenset({"robot.devices", "session.actions", "state.odd", "kept_state.odd"})
 _VALUES: Final = frozenset(
     {"command.result", "parameter.default_value", "parameter.choices", "parameter.next_value",
      "parameter_value.value"}
@@ -42,7 +43,8 @@ _REFERENCES: Final = {
 }
 _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
                   "signal", "rollup", "coarse_rollup", "change", "watermark",
-                  "parameter", "parameter_value", "breakpoint", "trial_set", "trial")  # fmt: skip
+                  "parameter", "parameter_value", "breakpoint", "trial_set", "trial",
+                  "kept_stretch", "kept_state")  # fmt: skip
 # What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
 # be stored, a run that is not there.
 _UNSTORABLE: Final = (

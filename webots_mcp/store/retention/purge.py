@@ -17,12 +17,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.connection import LONGEST_WRITE_S, ShortWrites, Step, is_busy
+from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.images import inside
 from webots_mcp.store.retention.planning import OLD_COMMANDS, ROLLED, Plan, plan
 from webots_mcp.store.retention.planning import Step as Going
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
-from webots_mcp.store.retention.usage import TABLES, first_id
+from webots_mcp.store.retention.usage import TABLES, first_id, rows_of
 from webots_mcp.store.rollup.rolling import roll, watermark
 
 BATCH_ROWS: Final = 500
@@ -34,7 +35,7 @@ RESTS: Final = 9  # the lock is held for a tenth of the time at most
 _FREE_RUN: Final = f"NOT EXISTS (SELECT 1 FROM run WHERE id = :run_id AND {KEPT})"
 _IN_TIME: Final = (
     "SELECT id, run_id FROM {table} NOT INDEXED WHERE id > :after AND id <= :bound "
-    "AND run_id IN (SELECT value FROM json_each(:runs)) ORDER BY id LIMIT :limit"
+    "AND run_id IN (SELECT value FROM json_each(:runs)) {own} ORDER BY id LIMIT :limit"
 )
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
 _IN_RUN: Final = "SELECT run_id, signal_id, {third} FROM {table} WHERE run_id = ? LIMIT ?"
@@ -84,12 +85,19 @@ _STEPS: Final = {
     )
     for table in ("state", "kept_state", "log", "event")
 }
+# Frames whose kept stretch is gone.
+_LEFT_FRAMES: Final = (
+    f"SELECT id, run_id FROM image i WHERE kind = '{KEPT_FRAME}' AND id > ? AND NOT EXISTS ("
+    "SELECT 1 FROM kept_stretch k WHERE k.run_id = i.run_id "
+    "AND i.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s) ORDER BY id LIMIT ?"
+)
 _SESSION: Final = "SELECT session_id FROM run WHERE id = ?"
 _FORGET_SESSION: Final = (
     "DELETE FROM session WHERE id = ? AND ended_wall_time_s IS NOT NULL "
     "AND NOT EXISTS (SELECT 1 FROM run WHERE session_id = session.id)"
 )
 _PATH: Final = "SELECT path FROM image WHERE id = ?"
+_PATHS: Final = "SELECT path FROM image WHERE run_id = ?"
 _IN_USE: Final = "SELECT 1 FROM image WHERE path = ? LIMIT 1"
 _MOST_FAILURES: Final = 200
 
@@ -172,6 +180,8 @@ def purge(
     for tables in ((*TABLES, "command"), ROLLED, ("run",)):
         steps = {name: [step for step in wanted.steps if step.table == name] for name in tables}
         yield from work.in_turn([work.carry_out(name, its) for name, its in steps.items() if its])
+        if steps.get("kept_state"):
+            yield from work.forget_frames()
     yield from work.give_back()
 
 
@@ -226,6 +236,16 @@ class _Purge:
                     keys = keys[self._delete_some(table, keys) :]
                 yield self.purged
 
+    def forget_frames(self) -> Iterator[Purged]:
+        """Delete the frames of kept stretches that are gone, with their files."""
+        after = 0
+        while found := self._connection.execute(_LEFT_FRAMES, (after, BATCH_ROWS)).fetchall():
+            after = found[-1][0]
+            keys = [{"id": row_id, "run_id": run_id} for row_id, run_id in found]
+            while keys:
+                keys = keys[self._delete_some("image", keys) :]
+                yield self.purged
+
     def _in_time(self, table: str, steps: Sequence[Going]) -> Iterator[list[dict[str, Any]]]:
         """Keys in the order in which the rows were recorded, so that whole pages become free."""
         left: dict[int, int] = {step.owner_id: step.rows for step in steps}
@@ -239,7 +259,7 @@ class _Purge:
                 "runs": f"[{','.join(map(str, left))}]",
                 "limit": BATCH_ROWS,
             }
-            found = self._connection.execute(_IN_TIME.format(table=table), values).fetchall()
+            found = self._connection.execute(rows_of(_IN_TIME, table), values).fetchall()
             if not found:
                 return  # another has deleted them
             after = found[-1][0]
@@ -303,16 +323,24 @@ class _Purge:
 
     def _delete(self, table: str, key: dict[str, Any]) -> int:
         """How many rows; none of a run that was marked since the plan."""
-        path = self._first(_PATH, key["id"]) if table == "image" else None
+        paths = self._pictures_of(table, key)
         session = self._first(_SESSION, key["id"]) if table == "run" else None
         deleted = self._connection.execute(_DELETE[table], key).rowcount
         if not deleted:
             return 0
         if session is not None:
             self._connection.execute(_FORGET_SESSION, (session,))
-        if path and not self._first(_IN_USE, path):
-            self._delete_file(path)
+        for path in paths:
+            if not self._first(_IN_USE, path):
+                self._delete_file(path)
         return deleted
+
+    def _pictures_of(self, table: str, key: dict[str, Any]) -> list[str]:
+        """The paths of what goes with a row: the picture, or those that a run still has."""
+        query = {"image": _PATH, "run": _PATHS}.get(table)
+        if query is None:
+            return []
+        return [path for (path,) in self._connection.execute(query, (key["id"],)) if path]
 
     def _delete_file(self, path: str) -> None:
         """Before the commit: a row that comes back without its file is found again."""

@@ -8,10 +8,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.store.retention.pages import INDEX_BYTES, disk_shares
 from webots_mcp.store.retention.policy import KEPT
 
 TABLES: Final = ("state", "kept_state", "log", "event", "image")
+# The frames of a kept stretch count with its states, and go with them.
+_OWN: Final = {"image": f"AND kind <> '{KEPT_FRAME}'"}
 
 _RUNS: Final = (
     f"SELECT id, robot_id, rows, started_wall_time_s, last_wall_time_s, {KEPT}, "
@@ -19,37 +22,43 @@ _RUNS: Final = (
     " AS is_current FROM run WHERE typeof(started_wall_time_s) IN ('real', 'integer') "
     "AND typeof(last_wall_time_s) IN ('real', 'integer') ORDER BY started_wall_time_s, id"
 )
-_ROWS_BY_RUN: Final = "SELECT run_id, count(*) FROM {table} GROUP BY run_id"
+_ROWS_BY_RUN: Final = "SELECT run_id, count(*) FROM {table} WHERE 1 {own} GROUP BY run_id"
 _ROWS: Final = "SELECT count(*) FROM {table} WHERE run_id = ?"
 # Rows of a run in the order of its simulation time are in the order of their ids.
 _NTH_ID: Final = (
-    "SELECT id FROM {table} WHERE run_id = ? ORDER BY sim_time_s, id LIMIT 1 OFFSET ? - 1"
+    "SELECT id FROM {table} WHERE run_id = ? {own} ORDER BY sim_time_s, id LIMIT 1 OFFSET ? - 1"
 )
-_FIRST_TIME: Final = "SELECT min(sim_time_s) FROM {table} WHERE run_id = ?"
+_FIRST_TIME: Final = "SELECT min(sim_time_s) FROM {table} WHERE run_id = ? {own}"
 # Any text and any blob is greater than any number.
-_LAST_TIME: Final = "SELECT max(sim_time_s) FROM {table} WHERE run_id = ? AND sim_time_s <= 9e999"
+_LAST_TIME: Final = (
+    "SELECT max(sim_time_s) FROM {table} WHERE run_id = ? AND sim_time_s <= 9e999 {own}"
+)
 _WALL_AT: Final = (
     "SELECT wall_time_s FROM {table} WHERE run_id = ? AND sim_time_s <= ? "
-    "AND wall_time_s <= 9e999 ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+    "AND wall_time_s <= 9e999 {own} ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
-_ROWS_UP_TO: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s <= ?"
-_ROWS_BELOW: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND id < ?"
+_ROWS_UP_TO: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND sim_time_s <= ? {own}"
+_ROWS_BELOW: Final = "SELECT count(*) FROM {table} WHERE run_id = ? AND id < ? {own}"
 _OF_RUNS: Final = "run_id IN (SELECT value FROM json_each(:runs))"
 # In the order of their ids: only what goes is looked at, and what lies in between.
 _OLDEST: Final = (
     "SELECT run_id, count(*), max(id) FROM (SELECT run_id, id FROM {table} NOT INDEXED "
-    f"WHERE id >= :first AND {_OF_RUNS} ORDER BY id LIMIT :rows) GROUP BY run_id"
+    f"WHERE id >= :first AND {_OF_RUNS} {{own}} ORDER BY id LIMIT :rows) GROUP BY run_id"
 )
 _NTH_NEWEST: Final = (
-    f"SELECT id FROM {{table}} NOT INDEXED WHERE {_OF_RUNS} "
+    f"SELECT id FROM {{table}} NOT INDEXED WHERE {_OF_RUNS} {{own}} "
     "ORDER BY id DESC LIMIT 1 OFFSET :rows - 1"
 )
 _ID_RANGE: Final = "SELECT coalesce(min(id), 0), coalesce(max(id), -1) FROM {table}"
 _WINDOW: Final = (
     "SELECT run_id, {payload} FROM {table} NOT INDEXED WHERE id >= ? ORDER BY id LIMIT ?"
 )
+_FILE_BYTES: Final = "iif(bytes BETWEEN 0 AND 1e12, bytes, 0)"
 _PICTURES: Final = (
-    "SELECT run_id, avg(iif(bytes BETWEEN 0 AND 1e12, bytes, 0)) FROM image GROUP BY run_id"
+    f"SELECT run_id, avg({_FILE_BYTES}) FROM image WHERE kind <> '{KEPT_FRAME}' GROUP BY run_id"
+)
+_FRAMES: Final = (
+    f"SELECT run_id, sum({_FILE_BYTES}) FROM image WHERE kind = '{KEPT_FRAME}' GROUP BY run_id"
 )
 _COLUMNS: Final = "SELECT name, type, pk FROM pragma_table_info(?)"
 _WINDOWS: Final = 32
@@ -90,6 +99,11 @@ class Oldest(NamedTuple):
     bound: float
 
 
+def rows_of(query: str, table: str) -> str:
+    """A query about the rows of a table that a limit of their own holds for."""
+    return query.format(table=table, own=_OWN.get(table, ""))
+
+
 def read_runs(connection: sqlite3.Connection) -> list[Run]:
     """All runs in the order in which they began.
 
@@ -100,10 +114,18 @@ def read_runs(connection: sqlite3.Connection) -> list[Run]:
 
 def holdings(connection: sqlite3.Connection, table: str, runs: Sequence[Run]) -> list[Holding]:
     """What these runs have in a table; those that have nothing are left out."""
-    rows: dict[int, int] = dict(connection.execute(_ROWS_BY_RUN.format(table=table)).fetchall())
+    rows: dict[int, int] = dict(connection.execute(rows_of(_ROWS_BY_RUN, table)).fetchall())
     row_bytes, usual = _row_bytes(connection, table)
+    beside: dict[int, int] = {}
+    if table == "kept_state":
+        beside = dict(connection.execute(_FRAMES).fetchall())
     return [
-        Holding(run, table, rows[run.id], row_bytes.get(run.id, usual))
+        Holding(
+            run,
+            table,
+            rows[run.id],
+            row_bytes.get(run.id, usual) + beside.get(run.id, 0) / rows[run.id],
+        )
         for run in runs
         if run.id in rows
     ]
@@ -132,13 +154,13 @@ def count_rows(connection: sqlite3.Connection, table: str, run_id: int) -> int:
 
 def rows_below(connection: sqlite3.Connection, holding: Holding, row_id: float) -> int:
     """How many of the rows have smaller ids."""
-    query = _ROWS_BELOW.format(table=holding.table)
+    query = rows_of(_ROWS_BELOW, holding.table)
     return int(connection.execute(query, (holding.run.id, row_id)).fetchone()[0])
 
 
 def nth_id(connection: sqlite3.Connection, holding: Holding, number: int) -> int:
     """The id of the row of that number, from 1, counted from the oldest."""
-    query = _NTH_ID.format(table=holding.table)
+    query = rows_of(_NTH_ID, holding.table)
     return int(connection.execute(query, (holding.run.id, number)).fetchone()[0])
 
 
@@ -150,7 +172,7 @@ def oldest(connection: sqlite3.Connection, held: Sequence[Holding], rows: int) -
         "first": first_id(connection, table, [holding.run.id for holding in held]),
         "rows": rows,
     }
-    found = connection.execute(_OLDEST.format(table=table), values).fetchall()
+    found = connection.execute(rows_of(_OLDEST, table), values).fetchall()
     return {run_id: Oldest(count, bound) for run_id, count, bound in found}
 
 
@@ -158,7 +180,7 @@ def first_id(connection: sqlite3.Connection, table: str, run_ids: Sequence[int])
     """An id that no row of these runs is below; what kept stretches took over came later."""
     if table == "kept_state":
         return 0
-    query = _NTH_ID.format(table=table)
+    query = rows_of(_NTH_ID, table)
     found = (connection.execute(query, (run_id, 1)).fetchone() for run_id in run_ids)
     return min((row[0] for row in found if row is not None), default=0)
 
@@ -168,7 +190,7 @@ def nth_newest_id(connection: sqlite3.Connection, held: Sequence[Holding], numbe
     if number == 0:
         return float("inf")
     values = {"runs": _as_json(held), "rows": number}
-    row = connection.execute(_NTH_NEWEST.format(table=held[0].table), values).fetchone()
+    row = connection.execute(rows_of(_NTH_NEWEST, held[0].table), values).fetchone()
     return row[0] if row else 0
 
 
@@ -177,7 +199,7 @@ def rows_before(connection: sqlite3.Connection, holding: Holding, wall_time_s: f
     table, run_id = holding.table, holding.run.id
 
     def is_older(time_s: float) -> bool:
-        query = _WALL_AT.format(table=table)
+        query = rows_of(_WALL_AT, table)
         row = connection.execute(query, (run_id, time_s)).fetchone()
         return row is not None and row[0] < wall_time_s
 
@@ -191,7 +213,7 @@ def rows_before(connection: sqlite3.Connection, holding: Holding, wall_time_s: f
     for _ in range(_BISECTIONS):
         middle_s = (older_s + younger_s) / 2
         older_s, younger_s = (middle_s, younger_s) if is_older(middle_s) else (older_s, middle_s)
-    query = _ROWS_UP_TO.format(table=table)
+    query = rows_of(_ROWS_UP_TO, table)
     return int(connection.execute(query, (run_id, older_s)).fetchone()[0])
 
 
@@ -242,6 +264,6 @@ def _bounds(
     connection: sqlite3.Connection, table: str, run_id: int
 ) -> tuple[float, float] | tuple[None, None]:
     """Simulation times of the run's first and last row in a table; None where no row has one."""
-    first = connection.execute(_FIRST_TIME.format(table=table), (run_id,)).fetchone()[0]
-    last = connection.execute(_LAST_TIME.format(table=table), (run_id,)).fetchone()[0]
+    first = connection.execute(rows_of(_FIRST_TIME, table), (run_id,)).fetchone()[0]
+    last = connection.execute(rows_of(_LAST_TIME, table), (run_id,)).fetchone()[0]
     return (None, None) if last is None else (first, last)

@@ -28,7 +28,8 @@ from webots_mcp.store.rollup.rolling import roll
 ROWS: Final = 60
 JSON_COLUMNS: Final = {
     ("robot", "devices"), ("session", "versions"), ("session", "actions"), ("state", "data"),
-    ("state", "odd"), ("kept_state", "data"), ("kept_state", "odd"), ("event", "data"), ("command", "params"), ("command", "result"),
+    ("state", "odd"), ("kept_state", "data"), ("kept_state", "odd"), ("event", "data"),
+    ("command", "params"), ("command", "result"),
     ("trial_set", "plan"), ("trial_set", "former_values"), ("trial", "parameters"),
 }  # fmt: skip
 _BLOB: Final = b"\x00\xff\x01"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import io
 import json
 import os
 import sqlite3
@@ -407,6 +409,47 @@ async def test_a_small_picture_in_a_long_file_is_encoded_anew(
     async with connect() as client:
         result = await client.call_tool("webots_get_camera", {})
     assert len(pictures_of(result)[0].data) < 10_000
+
+
+async def test_the_frames_around_a_hit_are_shown_by_time_one_or_many(
+    connect: Connect, recorded: Recorded, file: Path
+) -> None:
+    robot = recorded.robot()
+    for second in range(10):
+        Image.new("RGB", (16, 12), (second * 20, 0, 0)).save(file.parent / f"{second}.png")
+        robot.image(second, f"{second}.png", kind="kept" if 3 <= second <= 7 else "camera")
+    robot.kept(2.5, 7.5, "breakpoint 1: n == 5")
+    async with connect() as client:
+
+        async def shown(**arguments: Any) -> tuple[dict[str, Any], Image.Image]:
+            result = await client.call_tool("webots_get_camera", arguments)
+            picture = Image.open(io.BytesIO(base64.b64decode(pictures_of(result)[0].data)))
+            return json.loads(text_of(result)), picture.convert("RGB")
+
+        newest, _ = await shown()
+        near, picture = await shown(at_s=5.2)
+        several, sheet = await shown(at_s=5.0, frames=4)
+        missing, _ = await shown(at_s=2.4, frames=16)
+    assert newest["picture_sim_time_s"] == 9.0 and "kept" not in newest
+    assert (near["picture_sim_time_s"], near["kept"]) == (5.0, "breakpoint 1: n == 5")
+    assert picture.getpixel((8, 6)) == (100, 0, 0)
+    assert several["pictures_sim_time_s"] == [4.0, 5.0, 6.0, 7.0]
+    reds = [sheet.getpixel((x, y)) for y in (6, 22) for x in (8, 28)]
+    assert reds == [(20 * second, 0, 0) for second in (4, 5, 6, 7)]
+    assert missing["pictures_sim_time_s"] == [0.0, 1.0, 2.0, 8.0, 9.0]
+
+
+async def test_a_kept_stretch_says_that_it_has_camera_frames(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    for second in range(10):
+        robot.state(second, {"n": second})
+        robot.image(second, f"{second}.png", kind="kept")
+    robot.kept(2.0, 6.0, "a look")
+    async with connect() as client:
+        (event,) = (await ask(client, "webots_find_events", kinds=["kept"]))["events"]["rows"]
+    assert "'frames': 5" in str(event)
 
 
 async def test_a_controller_that_saves_no_frames_is_told_how_to(

@@ -51,6 +51,10 @@ _FRAMES: Final = (
     "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
     "ORDER BY {order}, id DESC LIMIT :count"
 )
+_KEPT_FRAMES: Final = (
+    f"SELECT count(*) FROM image WHERE run_id = ? AND kind = '{KEPT_FRAME}' "
+    "AND sim_time_s BETWEEN ? AND ?"
+)
 _CAMERAS: Final = (
     f"SELECT run_id, group_concat(DISTINCT device) FROM image WHERE {_OF_CAMERA} AND run_id IN "
     "(SELECT id FROM run WHERE robot_id = ?) GROUP BY run_id ORDER BY run_id DESC"
@@ -137,6 +141,13 @@ def camera_frames(
         of = {"device": found[0][5], "kind": found[0][4], "count": count}
         found = connection.execute(query, values | of).fetchall()
     return sorted((StoredImage(*row) for row in found), key=lambda each: each.sim_time_s)
+
+
+def count_kept_frames(
+    connection: sqlite3.Connection, run_id: int, start_s: float, end_s: float
+) -> int:
+    """How many camera frames a kept stretch has, from its start to its end."""
+    return int(connection.execute(_KEPT_FRAMES, (run_id, start_s, end_s)).fetchone()[0])
 
 
 def cameras(connection: sqlite3.Connection, robot_id: int) -> dict[int, str]:

@@ -150,6 +150,7 @@ def main() -> None:
     bridge.register_command("set_speed", rover.set_speed)
     bridge.register_command("turn_to", rover.turn_to)
     bridge.on_reload(lambda: bridge.log("the world was reset or reloaded"))
+    bridge.keep_camera(rover.camera)  # a breakpoint that keeps has pictures of what led there
     next_picture_s, mode = 1.0, rover.mode
 
     while robot.step(rover.time_step) != -1:

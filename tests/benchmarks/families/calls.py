@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
@@ -13,6 +14,8 @@ from tests.benchmarks.states import make_states
 from tests.benchmarks.table import Line, Target, duration
 from tests.benchmarks.ways import BridgeWay, JsonFiles, RawSqlite, Way
 from webots_mcp import MCPBridge
+from webots_mcp.bridge.frames import scale_down
+from webots_mcp.bridge.pictures import encode_png
 from webots_mcp.contract import KEEP_LAST_S
 from webots_mcp.standin import InProcessSupervisor
 
@@ -140,6 +143,71 @@ def _reading(
         started_s = time.process_time()
         for _ in range(calls):
             bridge.auto_publish()
+        return [(time.process_time() - started_s) / calls]
+
+    return run_block
+
+
+@benchmark("frames", "publish(), what small camera frames (keep_camera) add to a call")
+def measure_frames(bench: Bench) -> Iterable[Line]:
+    """Processor time, with steps of 8 ms: one call in 25 takes a frame."""
+    for width, height in ((160, 120), (640, 480)):
+        camera = _Camera(width, height)
+        pair = {
+            name: _filming(bench.place(f"{name} {width}"), of, _calls(bench, 1000))
+            for name, of in (("camera", camera), ("none", None))
+        }
+        taken = _take_turns(bench, pair)
+        filmed, plain = taken["camera"].mean, taken["none"].mean
+        beside, added_us = f"without camera {duration(plain)}", 1e6 * (filmed - plain)
+        yield Line(
+            f"mean, {width} x {height}", duration(filmed), beside, added_us, "us", Target(15.0)
+        )
+        yield _cost_of_writing(*scale_down(camera.getImage(), width, height), _calls(bench, 50))
+
+
+def _cost_of_writing(width: int, height: int, bgra: bytes, calls: int) -> Line:
+    started_s = time.process_time()
+    for _ in range(calls):
+        encode_png(bgra, width, height)
+    taken_s = (time.process_time() - started_s) / calls
+    return Line("mean, a frame as PNG, when kept", duration(taken_s), "noise", 1e3 * taken_s, "ms")
+
+
+class _Camera:
+    """Copies its image with each call, as that of Webots does; noise, which packs worst."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self._size = width, height
+        self._image = bytearray(os.urandom(4 * width * height))
+
+    def getName(self) -> str:
+        return "camera"
+
+    def getSamplingPeriod(self) -> int:
+        return 8
+
+    def getWidth(self) -> int:
+        return self._size[0]
+
+    def getHeight(self) -> int:
+        return self._size[1]
+
+    def getImage(self) -> bytes:
+        return bytes(self._image)
+
+
+def _filming(folder: Path, camera: _Camera | None, calls: int) -> Callable[[], list[float]]:
+    robot, state = Rover(), make_states(1)[0]
+    bridge = MCPBridge(robot, data_dir=folder, throttle_interval=1_000_000_000)
+    if camera is not None:
+        bridge.keep_camera(camera)
+
+    def run_block() -> list[float]:
+        started_s = time.process_time()
+        for _ in range(calls):
+            robot.step(8)
+            bridge.publish(state)
         return [(time.process_time() - started_s) / calls]
 
     return run_block

@@ -8,6 +8,7 @@ from typing import Final
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.search import Search
+from webots_mcp.store.images import count_kept_frames
 from webots_mcp.store.reading.kept import kept_stretches
 
 
@@ -19,7 +20,10 @@ def kept_events(search: Search) -> Iterator[Event]:
         ongoing = each.end_s > search.ended_s
         end_s = max(each.start_s, min(each.end_s, search.ended_s))
         place = (segment.run_id, each.start_s, end_s, each.wall_time_s)
-        yield Event("kept", *place, None, {"reason": each.reason}, ongoing=ongoing)
+        details: dict[str, object] = {"reason": each.reason}
+        if frames := count_kept_frames(search.connection, segment.run_id, each.start_s, each.end_s):
+            details["frames"] = frames  # of cameras
+        yield Event("kept", *place, None, details, ongoing=ongoing)
 
 
 KEPT: Final = EventKind(

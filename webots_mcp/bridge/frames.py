@@ -98,7 +98,7 @@ class CameraFrames:
         """Whether a camera has to be looked at: its time has come, or time went back."""
         return not self._looked_s <= now_s < self._due_s
 
-    def take(self, now_s: float, *, at_once: bool) -> list[Frame]:
+    def look(self, now_s: float, *, at_once: bool) -> list[Frame]:
         """The frames that are due; `at_once` one of each camera."""
         again = now_s < self._looked_s  # a new run
         due = [
@@ -111,13 +111,13 @@ class CameraFrames:
         self._due_s = min((each.due_s for each in self.cameras.values()), default=math.inf)
         return frames
 
-    def hold(self, frame: Frame) -> None:
+    def add(self, frame: Frame) -> None:
         """Hold the newest frame; those that are too old go."""
         while self._held and self._held[0].sim_time_s < frame.sim_time_s - self._last_s:
             self._held.popleft()
         self._held.append(frame)
 
-    def release(self, start_s: float) -> list[Frame]:
+    def take(self, start_s: float) -> list[Frame]:
         """Those that were taken since; none is held any more."""
         frames = [frame for frame in self._held if frame.sim_time_s >= start_s]
         self._held.clear()

@@ -123,18 +123,18 @@ class Keeper:
         else:
             self._ring.add(row)
 
-    def take_frames(self, *, at_once: bool) -> None:
+    def look_at_cameras(self, *, at_once: bool) -> None:
         """Take a small frame of each camera whose time has come, or at once of each."""
         if self._clock.run is not self._run:
             self._begin_run()
         now_s, stretch = self._clock.sim_time_s, self._stretch
         if stretch is not None and now_s > stretch.end_s:
             self._end_stretch(stretch.end_s)
-        for frame in self.frames.take(now_s, at_once=at_once):
+        for frame in self.frames.look(now_s, at_once=at_once):
             if self._going_on and stretch is not None:
                 self._keep_frame(stretch, frame)
             else:
-                self.frames.hold(frame)
+                self.frames.add(frame)
 
     def leave_out(self, why: str) -> None:
         """A call is neither recorded nor held; a stretch with it says why."""
@@ -182,7 +182,7 @@ class Keeper:
         if self._left_out is not None and self._left_out[0] >= start_s:
             stretch.gaps = stretch.gaps or self._left_out[1]
         self._unwritten.extend((self._run, row) for row in rows)
-        for frame in self.frames.release(start_s):
+        for frame in self.frames.take(start_s):
             self._keep_frame(stretch, frame)
         self._going_on = self.busy = True
         self._record(stretch)
@@ -225,7 +225,7 @@ class Keeper:
         self._run, self._stretch, self._kept_s = self._clock.run, None, 0.0
         self._left_out = None
         self._ring.begin(self._run.started_sim_time_s)
-        self.frames.release(math.inf)
+        self.frames.take(math.inf)
 
     def _end_stretch(self, at_s: float) -> None:
         """It stays known: one that follows before its ring could have begun goes on with it."""

@@ -85,7 +85,7 @@ class Publisher:
         """What the cameras see is held with the states; at a hit whatever the time."""
         keeper = self._keeper
         if at_once or keeper.frames.is_due(self._clock.sim_time_s):
-            keeper.take_frames(at_once=at_once)
+            keeper.look_at_cameras(at_once=at_once)
 
     def _read(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
         state: dict[Any, Any] = self.devices.read()

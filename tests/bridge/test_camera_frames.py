@@ -264,7 +264,7 @@ class Broken:
         (None, "has no image yet"),
         (b"", "has no image yet"),
         (ValueError("NULL pointer access"), "has no image yet"),
-        (bytes(7), "7 bytes are no image of 40 x 30 pixels"),
+        (bytes(7), "7 bytes are not an image of 40 x 30 pixels"),
         (OSError("gone"), "gone"),
     ],
     ids=repr,
@@ -294,7 +294,7 @@ def test_a_camera_without_an_image_costs_its_frames_and_nothing_else(
         ("camera", float("nan"), "not nan"),
     ],
 )
-def test_what_is_no_camera_is_said_once_and_raises_nothing(
+def test_what_is_not_a_camera_is_said_once_and_raises_nothing(
     robot: InProcessSupervisor,
     make: Make,
     capfd: pytest.CaptureFixture[str],

@@ -61,7 +61,7 @@ class CameraFrames:
     """Takes frames of cameras, and holds those of the last seconds of a run.
 
     Args:
-        last_s: So many seconds of simulation time are held, and 78 frames at most.
+        last_s: Seconds of simulation time that are held, in 78 frames at most.
 
     Attributes:
         cameras: Those that are looked at.
@@ -77,7 +77,7 @@ class CameraFrames:
         self.missed = 0
 
     def watch(self, device: Any, frames_per_s: float) -> None:
-        """Take so many frames of a camera per second of simulation time.
+        """Take this many frames of a camera per second of simulation time.
 
         Raises:
             TypeError: It has no pictures.
@@ -142,7 +142,7 @@ def scale_down(bgra: bytes, width: int, height: int) -> tuple[int, int, bytes]:
         ValueError: The image does not have 4 * width * height bytes.
     """
     if len(bgra) != 4 * width * height:
-        raise ValueError(f"{len(bgra)} bytes are no image of {width} x {height} pixels")
+        raise ValueError(f"{len(bgra)} bytes are not an image of {width} x {height} pixels")
     step = math.ceil(max(width, height) / LONGEST_SIDE_PX)
     if step <= 1:
         return width, height, bgra

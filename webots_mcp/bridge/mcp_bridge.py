@@ -245,7 +245,7 @@ class MCPBridge:
 
             bridge.keep_camera(camera)
 
-        With `publish` the camera's newest image is taken so often, scaled down to 160 pixels at
+        With `publish` the camera's newest image is taken at that rate, scaled down to 160 pixels at
         most (each n-th of a row, each n-th row), and held in memory: of all cameras the last 78
         frames, up to 8 MB. One is taken at the very step of a breakpoint's hit. In a kept stretch
         they become PNG files, one with each call (about a millisecond), that stay as long as the
@@ -254,8 +254,8 @@ class MCPBridge:
 
         Args:
             camera: A Webots `Camera`; it may be enabled later.
-            frames_per_s: So many per second of simulation time, up to 100, and none without a new
-                image; named again, a camera is looked at as often as was said last.
+            frames_per_s: Frames per second of simulation time, up to 100, but not more than the
+                camera takes pictures. A later call for the same camera changes it.
         """
         try:
             keeper = self._session.context.keeper

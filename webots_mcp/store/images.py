@@ -131,7 +131,7 @@ def camera_frames(
         run_id: The run.
         device: Of this camera; None is the one that has the frame that is looked for.
         at_s: The frames nearest to this simulation time; None is the newest.
-        count: So many, of one kind.
+        count: The most to return, of one kind.
     """
     order = _NEWEST_FIRST if at_s is None else _NEAREST_FIRST
     values = {"run_id": run_id, "device": device, "kind": None, "at_s": at_s, "count": 1}

@@ -33,7 +33,7 @@ def webots_get_camera(
     camera: Annotated[str, Field(max_length=200, description="Device; '' is any.")] = "",
     at_s: Annotated[Seconds | None, Field(description="Nearest to this simulation time.")] = None,
     frames: Annotated[
-        int, Field(ge=1, le=_MOST_FRAMES, description="So many, in one picture.")
+        int, Field(ge=1, le=_MOST_FRAMES, description="This many, in one picture.")
     ] = 1,
     robot: RobotName = None,
     run_id: RunId = None,

@@ -84,7 +84,10 @@ KEEP_AFTER_S: Final = 2.0  # after it
 LOOPING: Final = ("step", "run")  # actions that let the loop come round; one is under way at most
 Pace = Literal["fast", "real_time"]  # of a `run` command
 Then = Literal["pause", "go_on", "as_before"]  # what it does at its end
-RunEnd = Literal["condition held", "time over", "run ended", "interrupted", "condition failed"]
+RunEnd = Literal[
+    "condition held", "time over", "pruned", "run ended", "interrupted", "condition failed"
+]
+ENDED_BY: Final = "the controller ended by"  # an exception, as it is logged
 MAX_RUN_S: Final = 1e6  # of simulation time, of one `run` command
 
 COMMAND_TIME_TO_LIVE_S: Final = 10.0

@@ -71,6 +71,7 @@ def test_send_pause_step_and_resume(
     assert "reason is a text that says why" in capsys.readouterr().err
     assert main(["send", *where, "break_down"]) == 2
     assert "the gear is gone" in capsys.readouterr().err
+    assert set(Recording(file).rows("SELECT requested_by FROM command")) == {"cli"}
 
 
 @pytest.mark.parametrize(

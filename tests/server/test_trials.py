@@ -146,9 +146,32 @@ async def test_a_grid_is_tried_and_ranked_and_the_parameters_are_set_back(
         assert [row["run_id"] for row in runs] == sorted(best["runs"], reverse=True)
         assert runs[-1]["label"] == "trial 2 of set 1: kp 4.0, gait trot"
         assert (await ask(client, "webots_get_robot_state"))["status"] == "paused"
+        asked_by = "SELECT DISTINCT requested_by FROM command ORDER BY 1"
+        told = await ask(client, "webots_query_sql", sql=asked_by)
+        assert [row["requested_by"] for row in rows_of(told["result"])] == ["mcp", "trials"]
         set_by = "SELECT DISTINCT set_by FROM robot_parameter WHERE run_id = 2 AND name = 'kp'"
         told = await ask(client, "webots_query_sql", sql=set_by)
         assert rows_of(told["result"]) == [{"set_by": "trial"}]
+
+
+async def test_a_trial_in_which_prune_holds_ends_there_and_ranks_below_those_with_a_score(
+    connect: Connect, tunable: TunableDriver
+) -> None:
+    async with connect() as client:
+        answer = await trials(
+            client, parameters={"kp": [1.0, 5.0]}, repeats=2, prune="distance > 0.2 for 0.05"
+        )
+        assert (answer["state"], answer["over"], answer["pruned"]) == ("done", 4, 2)
+        assert "failed" not in answer
+        good, pruned = rows_of(answer["ranked"])
+        assert (good["kp"], good["scored"], pruned["kp"], pruned["scored"]) == (1.0, 2, 5.0, 0)
+        ended = "SELECT DISTINCT status, ended_by, error FROM trial WHERE score IS NULL"
+        (told,) = rows_of((await ask(client, "webots_query_sql", sql=ended))["result"])
+        assert (told["status"], told["ended_by"]) == ("pruned", "prune")
+        assert told["error"].startswith("'distance > 0.2 for 0.05' held at 0.")
+        asked = {"score": "last(distance)", "for_s": 1, "parameters": {"kp": [1.0]}}
+        said = await fail(client, "webots_run_trials", prune="distanc > 2", **asked)
+        assert "there is distance" in said
 
 
 async def test_without_repeats_one_set_is_tried_twice_to_measure_the_noise(
@@ -246,7 +269,9 @@ async def test_what_cannot_be_tried_is_refused_before_anything_is_done(
         assert "up to 100, not 101" in await refused(parameters={"kp": [1, 101]})
         assert "one of 'trot', 'walk'" in await refused(parameters=[{"gait": "hop"}])
         assert "given twice" in await refused(parameters=[{"kp": 1}, {"kp": 1.0}])
-        assert "array of values" in await refused(parameters={"kp": []})
+        assert "kp must be a list of values" in await refused(parameters={"kp": []})
+        for wrong in ({"kp": 2}, [1.0], [], {}, 3, {"kp": [1.0], "gait": "trot"}):
+            assert "parameters must be sets, [{" in await refused(parameters=wrong)
         assert "more than 10000" in await refused(parameters={"kp": [0.01 * n for n in range(101)],
                                                               "gait": ["trot"] * 101})  # fmt: skip
         assert "there is distance" in await refused(score="last(distanc)")

@@ -19,6 +19,7 @@ import pytest
 from tests.processes.stopping import stop_between_writes
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.liveness import process_identity
+from webots_mcp.trials.simulators import Simulator
 
 Write = Callable[[str], Path]
 
@@ -82,6 +83,27 @@ def test_a_simulator_ends_with_its_runner(tmp_path: Path, deaf: bool) -> None:
     wait_until(lambda: is_gone(pid))
     simulator = int((tmp_path / "simulator.txt").read_text())
     wait_until(lambda: is_gone(simulator))
+
+
+@pytest.mark.parametrize("deaf", [False, True])
+def test_a_simulator_whose_keeper_is_killed_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deaf: bool
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "simulator.py").write_text(SIMULATOR.format(deaf=deaf))
+    simulator, told = (
+        Simulator([sys.executable, "simulator.py"], tmp_path, {}),
+        Path("simulator.txt"),
+    )
+    simulator.start()
+    wait_until(lambda: told.exists() and told.read_text() != "")
+    os.kill(simulator.pid, signal.SIGKILL)
+
+    if sys.platform == "linux" and not deaf:  # by itself
+        wait_until(lambda: is_gone(int(told.read_text())))
+    wait_until(lambda: simulator.is_over)
+    simulator.end()
+    assert is_gone(int(told.read_text()))
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_the_example_tries_five_speeds_three_times() -> None:
         ('score = "last(x)"\n[grid]\nspeed = [1.0]', "give for_s, until or both"),
         ('for_s = 1\n[grid]\nspeed = [1.0]', "score is missing"),
         ('score = "last(x)"\nfor_s = 1', "give a .grid., as in speed"),
-        ('score = "last(x)"\nfor_s = 1\n[grid]\nspeed = 1.0', "must be an array of values"),
+        ('score = "last(x)"\nfor_s = 1\n[grid]\nspeed = 1.0', "must be a list of values"),
         ('score = "last(x"\nfor_s = 1\n[grid]\nspeed = [1.0]', "column 5: '(' was never closed"),
         ('score = "x"\nfor_s = 1\n[grid]\nspeed = [1.0]', "a signal has a value in each state"),
         ('score = "last(x)"\nfor_s = -1\n[grid]\nspeed = [1.0]', "for_s=-1 must be a number"),

@@ -30,11 +30,13 @@ class Control:
 
     Attributes:
         handlers: The controller's own actions.
+        why_ended: What commands that were under way are told when the process ends.
     """
 
     def __init__(self, context: Context) -> None:
         self._context = context
         self.handlers = Handlers(context.recorder, context.pause)
+        self.why_ended = "the controller ended"
         self._under_way: dict[Command, Progress] = {}
         self._reported = False
         self._next_poll_s = 0.0
@@ -43,7 +45,7 @@ class Control:
     def report_end(self, *, extern: bool) -> None:
         """The process is about to end: say what no successor will say."""
         for under_way in [c for c in self._under_way if c.action in LOOPING]:
-            self._end(under_way, ControllerEndedError("the controller ended"))
+            self._end(under_way, ControllerEndedError(self.why_ended))
         command = self._context.reloads.requested_by
         if command is not None and extern and not self._reported:
             self._reported = True

@@ -24,6 +24,7 @@ class Goal(NamedTuple):
 
     Attributes:
         until: Run until it holds; None for no condition.
+        prune: Where it holds before, going on would tell nothing; None for no condition.
         for_s: Run for so much simulation time; None for no limit.
         reset: Reset the world first; the time counts from there.
         pace: The simulation mode to run in; None for the one that it ran in last.
@@ -32,6 +33,7 @@ class Goal(NamedTuple):
     """
 
     until: Condition | None
+    prune: Condition | None
     for_s: float | None
     reset: bool
     pace: Pace | None
@@ -45,23 +47,30 @@ def read_goal(params: dict[str, Any]) -> Goal:
     Raises:
         InvalidInputError: One of them is wrong, or both `until` and `for_s` are missing.
     """
-    from webots_mcp.conditions import parse_condition  # only here: most controllers need none
-
-    until, for_s, parameters = params.get("until"), params.get("for_s"), params.get("parameters")
+    for_s, parameters = params.get("for_s"), params.get("parameters")
+    until, prune = _condition("until", params), _condition("prune", params)
     if until is None and for_s is None:
         raise InvalidInputError("give until (a condition), for_s (simulated seconds), or both")
-    if until is not None and not isinstance(until, str):
-        raise InvalidInputError(f"until is a condition, such as 'front_m < 0.1', not {until!r:.80}")
     if parameters is not None and not isinstance(parameters, dict):
         raise InvalidInputError(f"parameters are names and values, not {parameters!r:.80}")
     return Goal(
-        until=None if until is None else parse_condition(until),
+        until=until,
+        prune=prune,
         for_s=None if for_s is None else _seconds(for_s),
         reset=_one_of("reset", params.get("reset", False), (False, True)),
         pace=_one_of("pace", params.get("pace"), (None, *get_args(Pace))),
         parameters=cast("dict[str, object]", parameters or {}),
         then=_one_of("then", params.get("then", "pause"), get_args(Then)),
     )
+
+
+def _condition(name: str, params: dict[str, Any]) -> Condition | None:
+    from webots_mcp.conditions import parse_condition  # only here: most controllers need none
+
+    text = params.get(name)
+    if text is not None and not isinstance(text, str):
+        raise InvalidInputError(f"{name} is a condition, such as 'front_m < 0.1', not {text!r:.80}")
+    return None if text is None else parse_condition(text)
 
 
 def _seconds(value: object) -> float:
@@ -114,7 +123,11 @@ class _Watched:
         self.goal = goal
         self.finish = finish
         self.finished = False
-        self.evaluator: Evaluator | None = goal.until and goal.until.evaluator(plain)
+        self.evaluators: list[tuple[RunEnd, Evaluator]] = []
+        if goal.until is not None:
+            self.evaluators.append(("condition held", goal.until.evaluator(plain)))
+        if goal.prune is not None:
+            self.evaluators.append(("pruned", goal.prune.evaluator(plain)))
         self.former, self.run = clock.run, None if goal.reset else clock.run
         self.since_s = (clock.sim_time_s, time.monotonic())
         self.published_s = -math.inf
@@ -255,15 +268,14 @@ class Watch:
             watched.finish()
 
     def _judge(self, watched: _Watched, state: Any) -> Reached | None:
-        evaluator = watched.evaluator
-        if evaluator is None:
-            return self._judge_time(watched)
+        held: Reached | None = None
         try:
-            if evaluator.holds(state, self._clock.sim_time_s):
-                return self._reached("condition held", values=evaluator.values(state))
+            for end, evaluator in watched.evaluators:  # each of them takes in every state
+                if evaluator.holds(state, self._clock.sim_time_s):
+                    held = held or self._reached(end, values=evaluator.values(state))
         except Exception as error:  # noqa: BLE001  (whatever an object of the user's does)
             return self._reached("condition failed", describe(error))
-        return self._judge_time(watched)
+        return held or self._judge_time(watched)
 
     def _judge_time(self, watched: _Watched) -> Reached | None:
         for_s, (since_s, _) = watched.goal.for_s, watched.since_s

@@ -23,6 +23,7 @@ from webots_mcp.bridge.stats import BridgeStats
 from webots_mcp.bridge.text import describe
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import (
+    ENDED_BY,
     KEEP_LAST_S,
     KEEP_LAST_VARIABLE,
     LOG_LEVELS,
@@ -499,7 +500,9 @@ class MCPBridge:
 
     def _keep_before_end(self, error: BaseException) -> None:
         if not self._closed:
-            self.keep(f"the controller ended by {describe(error)}")
+            why = f"{ENDED_BY} {describe(error)}"
+            self._session.control.why_ended = why
+            self.keep(why)
 
     def _leave_to_parent(self) -> None:
         """In a forked child: leave the session to the parent; what is published here is dropped."""
@@ -513,7 +516,7 @@ class MCPBridge:
         if isinstance(error, BaseException):
             self._keep_before_end(error)
         if isinstance(error, Exception):
-            self.log(f"the controller ended by {describe(error)}", "error")
+            self.log(f"{ENDED_BY} {describe(error)}", "error")
             self.close("crashed")
         self.close()
 

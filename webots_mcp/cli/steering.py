@@ -189,7 +189,7 @@ def writable(arguments: argparse.Namespace) -> Recording:
     from webots_mcp.contract import resolve_database
     from webots_mcp.store.recording import Recording
 
-    return Recording(*resolve_database(arguments.database, arguments.data_dir))
+    return Recording(*resolve_database(arguments.database, arguments.data_dir), asker="cli")
 
 
 def _conclude(answer: CommandAnswer | RunAnswer, arguments: argparse.Namespace) -> None:

@@ -112,7 +112,7 @@ class Dispatcher:
                 action,
                 params,
                 time_to_live_s=timeout_s + _OUTLIVES_WAITING_S,
-                requested_by="mcp",
+                requested_by=self._recording.asker,
             )
 
     async def _watch(self, command_id: int, timeout_s: float) -> Command:
@@ -145,8 +145,8 @@ class Dispatcher:
             queue = CommandQueue(connection)
             goes_on = queue.leave(command.id, "the asker went away")
             if goes_on and command.action == RUN:
-                params = {"command_id": command.id}
-                queue.enqueue(command.robot_id, "cancel_run", params, requested_by="mcp")
+                params, asker = {"command_id": command.id}, self._recording.asker
+                queue.enqueue(command.robot_id, "cancel_run", params, requested_by=asker)
 
     def _take_back(self, command_id: int, why: str) -> Command:
         with self._recording.writer() as connection:

@@ -75,6 +75,8 @@ def begin_set(
     """
     sets = combinations(dict(parameters)) if isinstance(parameters, Mapping) else parameters
     require_possible(recording, robot, asked.get("until"), asked.get("for_s"), reset=True)
+    if asked.get("prune") is not None:
+        require_possible(recording, robot, asked["prune"], None, reset=True)
     checked = _checked(recording, robot, sets)
     with recording.reader() as connection:
         view = find_target(connection, robot, ACTION)

@@ -45,8 +45,9 @@ _LOOK_EVERY_S: Final = 0.02
 _SETTLE_EVERY_S: Final = 1.0
 _PATIENCE_S: Final = 5.0  # with a command that takes a round of the loop
 _END_PATIENCE_S: Final = 2.0  # the same where the server ends
+_ASKER: Final = "trials"
 _SET_PARAMETERS: Final = "set_parameters"
-_ENDS: Final = {"condition held": "until", "time over": "for_s"}
+_ENDS: Final = {"condition held": "until", "time over": "for_s", "pruned": "prune"}
 _RUN_OF: Final = (
     "SELECT min(id) FROM run WHERE session_id = ? AND started_wall_time_s >= "
     "(SELECT claimed_wall_time_s FROM command WHERE id = ?)"
@@ -156,7 +157,7 @@ class TrialWorker(threading.Thread):
                 view.robot.id,
                 ACTION,
                 self._asked(json.loads(former) | trial.values),
-                requested_by="mcp",
+                requested_by=_ASKER,
                 idempotency_key=_key(begun),
             )
 
@@ -164,6 +165,7 @@ class TrialWorker(threading.Thread):
         """What runs a trial; a reset would leave a parameter as the trial before had it."""
         asked = {
             "until": self._plan.until,
+            "prune": self._plan.prune,
             "for_s": self._plan.for_s,
             "reset": True,
             "pace": "fast",
@@ -218,7 +220,7 @@ class TrialWorker(threading.Thread):
             queue = CommandQueue(connection)
             if not queue.cancel(command.id, "its trial was ended"):
                 params = {"command_id": command.id}
-                queue.enqueue(command.robot_id, "cancel_run", params, requested_by="mcp")
+                queue.enqueue(command.robot_id, "cancel_run", params, requested_by=_ASKER)
 
     # -- what came of it -----------------------------------------------------------------------
 
@@ -266,6 +268,9 @@ class TrialWorker(threading.Thread):
     ) -> Result:
         end_s = told["sim_time_s"]
         ended = (_ENDS[told["ended"]], end_s)
+        if told["ended"] == "pruned":
+            why = f"{self._plan.prune!r} held at {end_s:.3f} s"
+            return Result(run_id, None, why, *ended, pruned=True)
         try:
             scored = score_run(connection, run_id, self._plan.score, end_s=end_s)
         except InvalidInputError as error:
@@ -323,7 +328,7 @@ class TrialWorker(threading.Thread):
             return None
         params = {"values": former, "when": "now", "by": "trial"}
         return CommandQueue(connection).enqueue(
-            noted.robot_id, _SET_PARAMETERS, params, requested_by="mcp"
+            noted.robot_id, _SET_PARAMETERS, params, requested_by=_ASKER
         )
 
 

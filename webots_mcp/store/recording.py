@@ -126,12 +126,14 @@ class Recording:
 
     Attributes:
         limits: Those of how much is kept that the asker would like to hold.
+        asker: By whom commands are requested: `mcp` or `cli`.
     """
 
     database: Database
     data_dir: Path
     read_only: bool = False
     limits: Asked = field(default_factory=dict[str, Any])
+    asker: str = "mcp"
     _migrating: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     @contextmanager

@@ -163,7 +163,7 @@ def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> Worl
     if len(given := [_WRITTEN[name] for name in _WRITTEN if name in found]) != 1:
         raise InvalidInputError(_HOW_MANY + (f", not {' and '.join(given)}" if given else ""))
     if _GRID in found:
-        found = found | {"parameters": combinations(found[_GRID])}
+        found = found | {"parameters": combinations(found[_GRID], "[grid] ")}
     found = {name: value for name, value in found.items() if name != _GRID}
     for name in _REQUIRED:
         if name not in found:
@@ -174,15 +174,19 @@ def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> Worl
     return WorldPlan(**found, search=search)
 
 
-def combinations(grid: dict[str, Any]) -> list[dict[str, Any]]:
+def combinations(grid: dict[str, Any], where: str = "") -> list[dict[str, Any]]:
     """Every combination of the values of a grid.
+
+    Args:
+        grid: Lists of values by parameter.
+        where: It stands, for what an error says.
 
     Raises:
         InvalidInputError: One has no list of values, or there are too many.
     """
     for name, values in grid.items():
         if not isinstance(values, list) or not values:
-            raise InvalidInputError(f"[grid] {name} must be an array of values, such as [1.0, 2.0]")
+            raise InvalidInputError(f"{where}{name} must be a list of values, such as [1.0, 2.0]")
     if math.prod(len(values) for values in grid.values()) > MOST_TRIALS:
         raise InvalidInputError(f"the grid has more than {MOST_TRIALS} combinations")
     return [dict(zip(grid, each, strict=True)) for each in itertools.product(*grid.values())]

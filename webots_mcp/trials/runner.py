@@ -7,6 +7,7 @@ that had come to its end from its recording, and runs any other again.
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sqlite3
 import threading
@@ -24,6 +25,7 @@ from webots_mcp.adoption import adopt
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
     DATABASE_NAME,
+    ENDED_BY,
     PARAMETERS_VARIABLE,
     make_folder,
 )
@@ -33,6 +35,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.settlement import settle
 from webots_mcp.store.leases import Job
+from webots_mcp.store.logs import LogFilter, newest_lines
 from webots_mcp.store.merging import merge
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.questions.score import score_run
@@ -48,6 +51,7 @@ from webots_mcp.store.trials import (
     take_up,
     trials_of,
 )
+from webots_mcp.store.window import Window
 from webots_mcp.trials.plan import Plan, WorldPlan
 from webots_mcp.trials.simulators import Simulator, end_left_over
 from webots_mcp.trials.watching import End, Watch
@@ -294,8 +298,16 @@ def _concluded(
         end = end or watch.look(connection)  # what waited beside the database is in it now
         if end is not None:
             return _scored(connection, plan, trial, watch, end)
+        why = _ending_line(connection, watch.run_id) or why
     reached = "nothing" if watch.reached_s is None else f"{watch.reached_s:.3f} s"
     return Result(watch.run_id, None, f"never reached its end, but {reached}: {why}")
+
+
+def _ending_line(connection: sqlite3.Connection, run_id: int | None) -> str | None:
+    """By which exception the controller ended, where it did."""
+    wanted = LogFilter(run_id, Window(-math.inf, math.inf), ENDED_BY, "error")
+    found = newest_lines(connection, wanted, 1) if run_id is not None else []
+    return found[0].message if found else None
 
 
 def _scored(

@@ -9,7 +9,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -19,6 +19,7 @@ from webots_mcp.trials import keeper
 from webots_mcp.webots.installations import find_webots
 
 CONSOLE: Final = "simulator.log"
+_HARD: Final = signal.SIGTERM if sys.platform == "win32" else signal.SIGKILL
 
 
 def stand_in(world: str) -> list[str]:
@@ -89,8 +90,10 @@ class Simulator:
         try:
             self._process.wait(2 * keeper.GRACE_S)
         except subprocess.TimeoutExpired:
-            _signal(self.pid, hard=True)
+            _signal(self.pid, _HARD)
             self._process.wait()
+        if os.name == "posix":  # a keeper that was killed leaves the rest of its process group
+            _end(self.pid, lambda: _signal(self.pid, 0))
 
     def last_line(self) -> str:
         """What it printed last; empty if nothing."""
@@ -103,18 +106,27 @@ def end_left_over(pid: int, process: str | None, started_wall_time_s: float) -> 
     seen = (pid, process, started_wall_time_s)
     if not process_alive(*seen):
         return
-    _signal(pid, hard=False)
+    _end(pid, lambda: process_alive(*seen))
+
+
+def _end(pid: int, is_there: Callable[[], bool]) -> None:
+    """End a process with its group, the hard way if need be."""
+    if not _signal(pid, signal.SIGTERM):
+        return
     until_s = time.monotonic() + keeper.GRACE_S
-    while process_alive(*seen):
+    while is_there():
         if time.monotonic() > until_s:
-            _signal(pid, hard=True)
+            _signal(pid, _HARD)
         time.sleep(0.02)
 
 
-def _signal(pid: int, *, hard: bool) -> None:
-    """To all of its session: Webots is a script that starts the program."""
-    with contextlib.suppress(ProcessLookupError):
+def _signal(pid: int, number: int) -> bool:
+    """To all of its session, as Webots is a script that starts the program; False if none is."""
+    try:
         if sys.platform == "win32":
             os.kill(pid, signal.SIGTERM)
         else:
-            os.killpg(pid, signal.SIGKILL if hard else signal.SIGTERM)
+            os.killpg(pid, number)
+    except ProcessLookupError:
+        return False
+    return True

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, cast
 
 import anyio
 from anyio import to_thread
 from mcp.server.mcpserver import Context
-from pydantic import Field, WithJsonSchema
+from pydantic import BeforeValidator, Field, WithJsonSchema
 
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError
@@ -27,9 +27,27 @@ _LOOK_EVERY_S: Final = 0.05
 _REPORT_EVERY_S: Final = 1.0
 
 _Value = float | int | bool | str
+
+
+def _require_sets(given: Any) -> Any:
+    """See that it is sets of values or a grid, in words that say how to write them.
+
+    Raises:
+        ValueError: It is neither.
+    """
+    kind = list if isinstance(given, dict) else dict
+    inner = cast("list[Any]", [*given.values()] if isinstance(given, dict) else given)
+    if given is None or (
+        isinstance(inner, list) and inner and all(isinstance(each, kind) for each in inner)
+    ):
+        return given
+    raise ValueError('be sets, [{"kp": 1.0}, {"kp": 2.0}], or a grid, {"kp": [1.0, 2.0]}')
+
+
 # What a value may be is the parameter's to say, and would take as much room as all else.
 Tried = Annotated[
     list[dict[str, _Value]] | dict[str, list[_Value]] | None,
+    BeforeValidator(_require_sets),
     WithJsonSchema({"anyOf": [{"type": "array"}, {"type": "object"}]}),
 ]
 
@@ -39,7 +57,7 @@ async def webots_run_trials(
     recording: Recording,
     ctx: Context[Any],
     parameters: Annotated[
-        Tried, Field(description='Sets to try, [{"kp": 1.0}], or a grid, {"kp": [1.0, 2.0]}.')
+        Tried, Field(description='Sets, [{"kp": 1.0}], or a grid, {"kp": [1.0, 2.0]}.')
     ] = None,
     score: Annotated[
         str | None,
@@ -51,22 +69,22 @@ async def webots_run_trials(
     ] = None,
     best: Annotated[Best, Field(description="Which score.")] = "highest",
     for_s: Annotated[
-        float | None, Field(gt=0, le=MAX_RUN_S, description="Simulated seconds of a trial.")
+        float | None, Field(gt=0, le=MAX_RUN_S, description="Simulated seconds each.")
     ] = None,
-    until: Annotated[
-        str | None, Field(max_length=500, description="Or when this condition holds.")
+    until: Annotated[str | None, Field(max_length=500, description="Or when this holds.")] = None,
+    prune: Annotated[
+        str | None, Field(max_length=500, description="Or, unscored, when this holds.")
     ] = None,
     repeats: Annotated[int, Field(ge=1, le=1000, description="Of each set.")] = 1,
     trial_timeout_s: Annotated[float, Field(gt=0, description="Wall seconds.")] = _TRIAL_S,
     trial_set: TrialSetId = None,
-    cancel: Annotated[bool, Field(description="Stop that set after its current trial.")] = False,
+    cancel: Annotated[bool, Field(description="Stop it after this trial.")] = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> TrialsAnswer:
     """Which parameters are best? Each trial resets the world, sets them, runs fast, is scored.
 
-    After timeout_s they go on: trial_set alone waits on, or goes on with what stopped. At the end
-    the parameters are set back.
+    After timeout_s they go on: trial_set alone waits on, or resumes. At the end they are set back.
     """
     given = parameters is not None or score is not None
     if (trial_set is None) != given:
@@ -78,7 +96,7 @@ async def webots_run_trials(
         if cancel:
             raise InvalidInputError("cancel needs trial_set: which one is to stop?")
         asked = {"score": score, "best": best, "for_s": for_s, "until": until, "repeats": repeats}
-        asked |= {"timeout_s": trial_timeout_s}
+        asked |= {"timeout_s": trial_timeout_s, "prune": prune}
         number = await to_thread.run_sync(
             lambda: trial_sets.begin_set(recording, parameters, robot, **asked)
         )

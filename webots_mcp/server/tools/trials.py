@@ -35,13 +35,17 @@ def _require_sets(given: Any) -> Any:
     Raises:
         ValueError: It is neither.
     """
-    kind = list if isinstance(given, dict) else dict
-    inner = cast("list[Any]", [*given.values()] if isinstance(given, dict) else given)
-    if given is None or (
-        isinstance(inner, list) and inner and all(isinstance(each, kind) for each in inner)
-    ):
+    if given is None or _is_tried(given):
         return given
     raise ValueError('be sets, [{"kp": 1.0}, {"kp": 2.0}], or a grid, {"kp": [1.0, 2.0]}')
+
+
+def _is_tried(given: object) -> bool:
+    if isinstance(given, dict):
+        lists = cast("dict[str, object]", given).values()
+        return bool(lists) and all(isinstance(each, list) for each in lists)
+    sets = cast("list[object]", given) if isinstance(given, list) else []
+    return bool(sets) and all(isinstance(each, dict) for each in sets)
 
 
 # What a value may be is the parameter's to say, and would take as much room as all else.

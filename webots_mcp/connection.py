@@ -90,17 +90,7 @@ def connect(
         ForkedProcessError: The process that this one was forked from has the file open.
         sqlite3.Error: The file is no database, or is locked for longer than 5 s.
     """
-    if sqlite3.sqlite_version_info < OLDEST_SQLITE:
-        raise DatabaseError(
-            f"SQLite {sqlite3.sqlite_version} of this Python is too old, 3.38 is needed: "
-            "use a Python that was built with a newer one"
-        )
-    if isinstance(database, Path) and is_inherited(database):
-        raise ForkedProcessError(
-            f"{database} is open in the process that this one was forked from, and would be "
-            "destroyed if both wrote to it: start this one anew instead, as subprocess does, or "
-            'multiprocessing after set_start_method("spawn")'
-        )
+    _require_usable(database)
     address = database.uri if isinstance(database, MemoryDatabase) else _file_uri(database, create)
     timeout_s = OPENING_TIMEOUT_MS / 1000 if patient else 0
     try:
@@ -119,6 +109,20 @@ def connect(
             return _open_frozen(database)
         raise
     return connection
+
+
+def _require_usable(database: Database) -> None:
+    if sqlite3.sqlite_version_info < OLDEST_SQLITE:
+        raise DatabaseError(
+            f"SQLite {sqlite3.sqlite_version} of this Python is too old, 3.38 is needed: "
+            "use a Python that was built with a newer one"
+        )
+    if isinstance(database, Path) and is_inherited(database):
+        raise ForkedProcessError(
+            f"{database} is open in the process that this one was forked from, and would be "
+            "destroyed if both wrote to it: start this one anew instead, as subprocess does, or "
+            'multiprocessing after set_start_method("spawn")'
+        )
 
 
 def _open(address: str, timeout_s: float, kind: type[sqlite3.Connection]) -> sqlite3.Connection:

@@ -19,8 +19,8 @@ from webots_mcp.cli.command import (
     question,
     reading,
 )
-from webots_mcp.cli.history import RUN, SIMULATION_TIMES, print_json
-from webots_mcp.cli.tables import print_notes, print_table
+from webots_mcp.cli.ranges import RUN, SIMULATION_TIMES
+from webots_mcp.cli.tables import print_json, print_notes, print_table
 from webots_mcp.contract import LOG_LEVELS
 
 if TYPE_CHECKING:

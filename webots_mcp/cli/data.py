@@ -22,10 +22,10 @@ from webots_mcp.cli.command import (
     past_wrong_values,
     reading,
 )
-from webots_mcp.cli.history import RANGE, print_json, range_of
 from webots_mcp.cli.limits import LIMITS, limits_of
 from webots_mcp.cli.progress import shown_progress
-from webots_mcp.cli.tables import print_notes, print_table
+from webots_mcp.cli.ranges import RANGE, range_of
+from webots_mcp.cli.tables import print_json, print_notes, print_table
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
-import sqlite3
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, fields, is_dataclass
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.cli.command import (
     DATA_DIR,
@@ -23,48 +20,17 @@ from webots_mcp.cli.command import (
     reading,
     settings_of,
 )
-from webots_mcp.cli.tables import print_notes, print_table
+from webots_mcp.cli.comparison import print_comparison
+from webots_mcp.cli.ranges import RANGE, range_of, scope_of
+from webots_mcp.cli.tables import print_json, print_notes, print_table
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from webots_mcp.plotting import Picture
-    from webots_mcp.store.analysis.spread import Spread
     from webots_mcp.store.detection.event import EventOptions
     from webots_mcp.store.detection.verdict import Verdicts
-    from webots_mcp.store.questions.compare import Comparison
     from webots_mcp.store.questions.series import RunHistory
     from webots_mcp.store.questions.trends import RunTrends, StateTrend
-    from webots_mcp.store.reading.ranges import Scope, TimeRange
-
-_MOST_NAMED: Final = 20
-RUN: Final = argument(
-    "--run", type=int, dest="run_id", metavar="ID", help="that run instead of the newest one"
-)
-SIMULATION_TIMES: Final[tuple[Argument, ...]] = (
-    argument(
-        "--last",
-        type=float,
-        dest="last_s",
-        metavar="S",
-        help="the last S seconds of simulation time",
-    ),
-    argument(
-        "--start", type=float, dest="start_s", metavar="S", help="from this simulation time on"
-    ),
-    argument(
-        "--end",
-        type=float,
-        dest="end_s",
-        metavar="S",
-        help="up to, not including, this simulation time",
-    ),
-)
-TIMES: Final[tuple[Argument, ...]] = (
-    *SIMULATION_TIMES,
-    argument("--since", metavar="TIME", help="from this wall time on (ISO 8601 or Unix seconds)"),
-    argument("--until", metavar="TIME", help="up to, not including, this wall time"),
-)
-RANGE: Final = (ROBOT, RUN, *TIMES)
 
 
 def _id_or_signal(text: str) -> int | str:
@@ -232,7 +198,7 @@ def plot(arguments: argparse.Namespace) -> None:
             connection,
             "trajectory" if arguments.trajectory else "signals",
             [*arguments.signals, *behind_runs],
-            scope=_scope_of(arguments),
+            scope=scope_of(arguments),
             run_ids=run_ids,
             trial_set=arguments.trial_set,
             width_px=arguments.width_px,
@@ -286,21 +252,7 @@ def compare(arguments: argparse.Namespace) -> None:
             found = compare_code(connection, robot=arguments.robot, **wanted)
     if arguments.json:
         return print_json(found)
-    _print_comparison(found)
-
-
-def range_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> TimeRange:
-    """What the arguments of `RANGE` mean in the recording."""
-    from webots_mcp.store.reading.ranges import find_range
-
-    return find_range(connection, _scope_of(arguments))
-
-
-def _scope_of(arguments: argparse.Namespace) -> Scope:
-    """What the arguments of `RANGE` ask for."""
-    from webots_mcp.store.reading.ranges import Scope
-
-    return Scope(**{each.name: getattr(arguments, each.name) for each in fields(Scope)})
+    print_comparison(found)
 
 
 def _options(arguments: argparse.Namespace) -> EventOptions:
@@ -319,24 +271,6 @@ def _options(arguments: argparse.Namespace) -> EventOptions:
         position=both_of(arguments.position),
         mode=arguments.mode,
     )
-
-
-def print_json(found: Any) -> None:
-    """Print the answer of a question, a dataclass, as one object."""
-    assert is_dataclass(found)
-    assert not isinstance(found, type)
-    print(json.dumps(_with_names(asdict(found)), ensure_ascii=False))
-
-
-def _with_names(value: Any) -> Any:
-    """The fields of named tuples by their names; JSON by itself knows them as lists."""
-    if hasattr(value, "_asdict"):
-        value = value._asdict()
-    if isinstance(value, dict):
-        return {name: _with_names(each) for name, each in cast("dict[Any, Any]", value).items()}
-    if isinstance(value, (list, tuple)):
-        return [_with_names(each) for each in cast("Sequence[Any]", value)]
-    return value
 
 
 def _clock(wall_time_s: float) -> str:
@@ -395,91 +329,3 @@ def _times(state: StateTrend) -> str:
 
 def _spelled(value: object) -> object:
     return "null" if value is None else value
-
-
-def _print_comparison(found: Comparison) -> None:
-    groups = [
-        [
-            group.name,
-            ", ".join(str(run.run_id) for run in group.runs),
-            group.total_duration_s,
-            _each(run.end_reason or "going on" for run in group.runs),
-            _each((run.controller_sha256 or "")[:8] for run in group.runs) or None,
-            {name: ", ".join(map(str, each)) for name, each in group.parameters.items()} or None,
-        ]
-        for group in found.groups
-    ]
-    print_table(("", "runs", "total_duration_s", "ended by", "code", "parameters"), groups)
-    names: Sequence[str] = [group.name for group in found.groups]
-    print(f"\nThe first {found.compared_s:.3f} s of each run:")
-    verdicts = [f"{name} differs" for name in names[1:]]
-    print_table(
-        ["", *names, *verdicts],
-        [
-            [
-                each.name,
-                *map(_spelled_spread, each.spread),
-                *map(_verdict, each.different[1:], each.runs_wanted[1:]),
-            ]
-            for each in found.measures
-        ],
-    )
-    if found.differences:
-        _print_differences(found, verdicts)
-    unknown = [f"not known: {figures}: {why}" for figures, why in found.not_known.items()]
-    print_notes([*found.notes, *unknown, *_only_in(found)])
-
-
-def _each(texts: Iterable[str]) -> str:
-    """Each text once."""
-    return ", ".join(dict.fromkeys(filter(None, texts)))
-
-
-def _only_in(found: Comparison) -> list[str]:
-    """The signals that some groups lack, by the groups that have them."""
-    names_by_groups: dict[str, list[str]] = {}
-    for name, groups in found.only_in.items():
-        names_by_groups.setdefault(" and ".join(groups), []).append(name)
-    return [f"only in {groups}: {_listed(names)}" for groups, names in names_by_groups.items()]
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return ", ".join(names[:_MOST_NAMED]) + more
-
-
-def _print_differences(found: Comparison, verdicts: Sequence[str]) -> None:
-    names = [group.name for group in found.groups]
-    print("\nSignals, what differs most first:")
-    columns = [f"mean {name}" for name in names] + [f"effect {name}" for name in names[1:]]
-    columns += [f"deviation {name}" for name in names[1:]]
-    print_table(
-        ["signal", *columns, *verdicts],
-        [
-            [
-                each.name,
-                *map(_spelled_spread, each.mean),
-                *each.effect[1:],
-                *(
-                    None if ratio is None else f"x {ratio:.3g}"
-                    for ratio in each.deviation_ratio[1:]
-                ),
-                *map(_verdict, each.different[1:]),
-            ]
-            for each in found.differences
-        ],
-    )
-
-
-def _spelled_spread(spread: Spread | None) -> str | None:
-    """The median, and the range of several runs."""
-    if spread is None:
-        return None
-    several = "" if spread.low == spread.high else f" ({spread.low:.4g} to {spread.high:.4g})"
-    return f"{spread.median:.4g}{several}"
-
-
-def _verdict(different: bool | None, runs_wanted: int | None = None) -> str:
-    if runs_wanted is not None:
-        return f"not known yet: {runs_wanted} runs of each would tell"
-    return {True: "yes", False: "no", None: "not known"}[different]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from dataclasses import asdict, is_dataclass
 from typing import Any, Final, TextIO, cast
 
 from webots_mcp.cli.wording import as_typed
@@ -54,3 +55,21 @@ def print_notes(notes: Sequence[str], file: TextIO | None = None) -> None:
     """What there is to know about an answer, below it; on stdout, or in that file."""
     for note in notes:
         print(f"note: {text_of(as_typed(note))}", file=file)
+
+
+def print_json(found: Any) -> None:
+    """Print the answer of a question, a dataclass, as one object."""
+    assert is_dataclass(found)
+    assert not isinstance(found, type)
+    print(json.dumps(_with_names(asdict(found)), ensure_ascii=False))
+
+
+def _with_names(value: Any) -> Any:
+    """The fields of named tuples by their names; JSON by itself knows them as lists."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    if isinstance(value, dict):
+        return {name: _with_names(each) for name, each in cast("dict[Any, Any]", value).items()}
+    if isinstance(value, (list, tuple)):
+        return [_with_names(each) for each in cast("Sequence[Any]", value)]
+    return value

@@ -17,7 +17,7 @@ from webots_mcp.cli.command import (
     reading,
     settings_of,
 )
-from webots_mcp.cli.history import RUN
+from webots_mcp.cli.ranges import RUN
 from webots_mcp.cli.tables import print_table
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 

@@ -188,28 +188,18 @@ def _compare(
     options: EventOptions,
     deadline_s: float,
 ) -> Comparison:
-    parts = {
-        name: [_part(connection, run_id, options) for run_id in run_ids]
-        for name, run_ids in groups.items()
-    }
-    every = [part for found in parts.values() for part in found]
-    durations_s = {part.segment.run_id: part.segment.end_s - part.segment.start_s for part in every}
+    parts = [[_part(connection, run_id, options) for run_id in found] for found in groups.values()]
+    segments = [part.segment for found in parts for part in found]
+    durations_s = {segment.run_id: segment.end_s - segment.start_s for segment in segments}
     compared_s = min(durations_s.values())
-    parts = {name: [each.cut(compared_s) for each in found] for name, found in parts.items()}
-    known = {name: signal for part in reversed(every) for name, signal in part.known.items()}
-    is_alone = len(every) == 1
-    numbers = [each for each in resolve_signals(known, names) if each.is_number and not is_alone]
+    cut = [[each.cut(compared_s) for each in found] for found in parts]
     deadline = Deadline(deadline_s)
-    summaries = [
-        [_summarise(connection, part, numbers, deadline) for part in found]
-        for found in parts.values()
-    ]
-    differences = [difference_of(signal, summaries, 2 * len(numbers)) for signal in numbers]
+    differences = _differences(connection, cut, names, deadline)
     shared = sorted((each for each in differences if all(each.count)), key=size_of, reverse=True)
     told = _groups(connection, groups)
-    outcomes = outcomes_of(connection, list(parts.values()), options, deadline)
-    cut = [part for found in parts.values() for part in found]
-    notes = _notes(told) + _cut_notes(durations_s, compared_s) + sampling_notes(connection, cut)
+    outcomes = outcomes_of(connection, cut, options, deadline)
+    notes = _notes(told) + _cut_notes(durations_s, compared_s)
+    notes += sampling_notes(connection, [part for found in cut for part in found])
     if deadline.passed:
         notes.append(f"the time of {deadline_s:g} s was over: not all rows were looked at")
     return Comparison(
@@ -222,6 +212,23 @@ def _compare(
         only_in=only_in(differences, list(groups)),
         notes=tuple(notes),
     )
+
+
+def _differences(
+    connection: sqlite3.Connection,
+    groups: Sequence[Sequence[RunPart]],
+    names: Sequence[str],
+    deadline: Deadline,
+) -> list[Difference]:
+    """The numbers of those names, group beside group; none where a run stands alone."""
+    parts = [part for group in groups for part in group]
+    known = {name: signal for part in reversed(parts) for name, signal in part.known.items()}
+    found = resolve_signals(known, names)
+    numbers = [each for each in found if each.is_number and len(parts) > 1]
+    summaries = [
+        [_summarise(connection, part, numbers, deadline) for part in group] for group in groups
+    ]
+    return [difference_of(signal, summaries, 2 * len(numbers)) for signal in numbers]
 
 
 def _notes(groups: Sequence[Group]) -> list[str]:

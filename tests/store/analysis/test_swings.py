@@ -53,6 +53,18 @@ def test_more_time_never_finds_less(course: str) -> None:
         assert len(swings_of(times[part], values[part])) == 1, (start_s, end_s)
 
 
+@pytest.mark.parametrize("phase", np.arange(0.25, 2 * np.pi, 0.5))
+@pytest.mark.parametrize("at_end", [False, True])
+def test_a_swing_that_reaches_an_end_of_the_range_is_told_up_to_there(
+    phase: float, at_end: bool
+) -> None:
+    times = np.arange(0, 30, 0.1)
+    values = np.sin(2 * np.pi * times / 2.0 + phase) * (times < 10)
+    (swing,) = swings_of(times, values[::-1] if at_end else values)
+    from_end_s = float(times[-1]) - swing.end_s if at_end else swing.start_s
+    assert from_end_s <= 0.75  # of a period of 2 s: less than a half swing is left out
+
+
 def zigzag(rng: np.random.Generator, times: Array) -> Array:
     """Straight pieces of 2 to 8 s, as the heading of a robot that turns."""
     places = np.cumsum(rng.uniform(2, 8, 60))

@@ -23,9 +23,16 @@ else:
 
     np = _AtFirstUse()
 
-__all__ = ["Array", "Flags", "Indexes", "inner", "np"]
+__all__ = ["Array", "Flags", "Indexes", "inner", "median", "np"]
 
 
 def inner(one: Array, other: Array) -> float:
     """The sum of products, without the threads of `@`, which wait for each other actively."""
     return float(np.einsum("i,i->", one, other))
+
+
+def median(values: Array) -> float:
+    """That of at least one finite value; for few of them in a fifth of the time of numpy's."""
+    below, above = (len(values) - 1) // 2, len(values) // 2
+    ordered = np.partition(values, (below, above))
+    return float(ordered[below] + ordered[above]) / 2

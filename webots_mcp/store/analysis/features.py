@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, inner, np
+from webots_mcp.store.analysis.arrays import Array, Indexes, inner, np
 
 TIME_BINS: Final = 8
 SPIKE_SCORE: Final = 8.0  # 3.5 is the usual; here thousands of values are looked at at once
@@ -62,17 +62,18 @@ def find_spikes(times: Array, values: Array) -> list[Spike]:
     sizes = np.abs(values[1:-1] - (values[:-2] + values[2:]) / 2)
     mad = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
     limit = SPIKE_SCORE * (mad / 0.6745 if mad > 0 else 1.2533 * float(sizes.mean()))
-    rows: list[int] = (np.flatnonzero(sizes > limit) + 1).tolist()
-    found = [row for row in rows if _stands_alone(values, row, float(sizes[row - 1]) / 2)]
-    if len(found) > max(3, MOST_SPIKES_SHARE * len(values)):
+    rows = np.flatnonzero(sizes > limit) + 1
+    rows = rows[_apart_around(values, rows) < sizes[rows - 1] / 2]
+    if len(rows) > max(3, MOST_SPIKES_SHARE * len(values)):
         return []
-    return [Spike(float(times[row]), float(values[row])) for row in found]
+    return [Spike(*pair) for pair in zip(times[rows].tolist(), values[rows].tolist(), strict=True)]
 
 
-def _stands_alone(values: Array, row: int, limit: float) -> bool:
-    """Whether the neighbours agree with each other, and each with the one beyond it."""
-    near = np.concatenate((values[max(0, row - 2) : row], values[row + 1 : row + 3]))
-    return bool(np.all(np.abs(np.diff(near)) < limit))
+def _apart_around(values: Array, rows: Indexes) -> Array:
+    """How far the neighbours are apart from each other, or one of them from the one beyond it."""
+    first, last = np.maximum(rows - 2, 0), np.minimum(rows + 2, len(values) - 1)
+    near = values[np.stack((first, rows - 1, rows + 1, last))]
+    return np.asarray(np.abs(np.diff(near, axis=0)).max(axis=0), np.float64)
 
 
 def flat_since(times: Array, values: Array) -> float | None:

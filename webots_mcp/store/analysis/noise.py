@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.arrays import Array, median, np
 
 _ORDER: Final = 4
 # The fourth difference of independent noise has sqrt(1 + 16 + 36 + 16 + 1) = sqrt(70) times its
@@ -24,21 +24,31 @@ def noise_of(values: Array) -> float:
     Biometrika 73, 1986, of which this is the robust form with a higher order). 0 for fewer than
     12 values.
     """
-    if len(values) < LEAST_ROWS:
-        return 0.0
-    return float(np.median(np.abs(np.diff(values, _ORDER)))) / _GAIN
+    return Roughness(values).noise()
 
 
-def local_noise(values: Array) -> Array:
-    """The noise about each of the values, the least of those in the stretches around it."""
-    blocks = len(values) // _BLOCK_ROWS
-    if blocks < 2:
-        return np.full(len(values), noise_of(values))
-    sizes: Array = np.abs(np.diff(np.pad(values, (0, _ORDER), mode="edge"), _ORDER))
-    parts: Array = np.reshape(sizes[: blocks * _BLOCK_ROWS], (blocks, _BLOCK_ROWS))
-    padded: Array = np.pad(np.median(parts, axis=1) / _GAIN, 1, mode="edge")
-    least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
-    return least[np.minimum(np.arange(len(values)) // _BLOCK_ROWS, blocks - 1)]
+class Roughness:
+    """The fourth differences of values, for the noise of many parts of them."""
+
+    def __init__(self, values: Array) -> None:
+        self._count = len(values)
+        self._sizes: Array = np.abs(np.diff(values, _ORDER))
+
+    def noise(self, start: int = 0, end: int | None = None) -> float:
+        """As `noise_of` the values [start, end)."""
+        last = (self._count if end is None else end) - _ORDER
+        sizes = self._sizes[start : max(start, last)]
+        return median(sizes) / _GAIN if len(sizes) >= LEAST_ROWS - _ORDER else 0.0
+
+    def local_noise(self) -> Array:
+        """The noise about each of the values, the least of those in the stretches around it."""
+        blocks = len(self._sizes) // _BLOCK_ROWS
+        if blocks < 2:
+            return np.full(self._count, self.noise())
+        parts: Array = np.reshape(self._sizes[: blocks * _BLOCK_ROWS], (blocks, _BLOCK_ROWS))
+        padded: Array = np.pad(np.median(parts, axis=1) / _GAIN, 1, mode="edge")
+        least = np.minimum(np.minimum(padded[:-2], padded[1:-1]), padded[2:])
+        return least[np.minimum(np.arange(self._count) // _BLOCK_ROWS, blocks - 1)]
 
 
 def smooth(values: Array, rows: int) -> tuple[Array, float]:

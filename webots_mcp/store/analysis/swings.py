@@ -12,11 +12,11 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.noise import local_noise, noise_of
+from webots_mcp.store.analysis.arrays import Array, inner, median, np
+from webots_mcp.store.analysis.noise import Roughness
 from webots_mcp.store.analysis.rhythm import gap_borders
 from webots_mcp.store.analysis.sines import TRIED_PERIODS, fit_sines, parabolas
 from webots_mcp.store.analysis.swings_on_bends import likely_swings, swings_on_bends
@@ -35,6 +35,7 @@ MOST_IRREGULAR: Final = 0.25  # coefficient of variation of the half periods
 MOST_VARIED: Final = 0.4  # and of how far the half swings reach
 LEAST_EXPLAINED: Final = (0.85, 0.70)  # of the variance by a sine, for 6 half swings and for 10
 PERIODS_FITTED: Final = 2.5  # at once: over more, a swing may change a little
+FEW_COLUMNS: Final = 8  # are added up faster one after the other than row by row
 PIECES_TRIED: Final = 16  # with each period; the whole with the best of them
 LEAST_TRIED: Final = 0.5  # explained of these pieces; less is not looked at further
 NOISE_BENDS: Final = 10.0  # deviations of the noise, over the root of the rows; it makes hardly 7
@@ -155,9 +156,10 @@ def _in_stretch(
     """Swings in a stretch in which rows come evenly."""
     if len(times) <= SHORTEST_PERIOD_ROWS or not np.ptp(values):
         return []
-    interval_s = float(np.median(np.diff(times)))
-    noise = local_noise(values)
+    whole = _Stretch(times, values)
+    interval_s = whole.interval_s
     rounding = len(values) * float(np.spacing(np.abs(values).max()))
+    noise = np.maximum(whole.roughness.local_noise(), rounding)
     found: list[Swing] = []
     rows = SHORTEST_PERIOD_ROWS
     while rows * interval_s <= longest_period_s * SCALE_RATIO and rows < len(values):
@@ -169,10 +171,11 @@ def _in_stretch(
         if max(band.max(), -band.min()) > rounding:
             for crossings in _regular(moments, band, rows * interval_s, least_half_swings):
                 if not any(_is_same(crossings, each) for each in found):
-                    found += _fitted(times, values, crossings, interval_s)
+                    found += _fitted(whole, crossings)
         if _bends(slow, round(rows / step), of_means):
-            for swing in _on_bends(moments, means, rows / step, least_half_swings, found):
-                if _stands_out(times, values, swing, interval_s):
+            course = moments, means, of_means
+            for swing in _on_bends(*course, rows / step, least_half_swings, found):
+                if _stands_out(whole, swing):
                     found.append(swing)
         rows *= SCALE_RATIO
     return _connected(_best([each for each in found if each.period_s <= longest_period_s]))
@@ -218,16 +221,21 @@ def _is_same(crossings: _Crossings, swing: Swing) -> bool:
 
 def _means(values: Array, step: int) -> Array:
     """Of so many values each; a rest at the end that is less is left out."""
-    whole = len(values) // step * step
-    return np.add.reduceat(values[:whole], np.arange(0, whole, step)) / step if step > 1 else values
+    if step == 1:
+        return values
+    count = len(values) // step
+    parts: Array = np.reshape(values[: count * step], (count, step))
+    if step < FEW_COLUMNS:
+        return np.asarray(sum(parts[:, at] for at in range(step)) / step, np.float64)
+    return np.einsum("ij->i", parts) / step
 
 
 def _on_bends(
-    moments: Array, means: Array, period: float, least: int, found: list[Swing]
+    moments: Array, means: Array, noise: Array, period: float, least: int, found: list[Swing]
 ) -> Iterator[Swing]:
     """Swings on a course that bends, where they were not found without."""
     interval_s = float(moments[-1] - moments[0]) / (len(moments) - 1)
-    for start, end, rows in likely_swings(means, period):
+    for start, end, rows in likely_swings(means, noise, period):
         ends_s = float(moments[start]), float(moments[end - 1])
         if not any(_covers(each, *ends_s, rows * interval_s) for each in found):
             for bent in swings_on_bends(means, start, end, rows, least):
@@ -264,37 +272,53 @@ def _moving_mean(values: Array, rows: int) -> Array:
     reach = min(rows // 2, len(values) - 1)
     if reach < 1:
         return values
-    window = 2 * reach + 1
-    sums: Array = np.empty(len(values) + window)
     for _ in range(2):
-        sums[0] = 0.0
-        sums[1 : reach + 1] = 2 * values[0] - values[reach:0:-1]
-        sums[reach + 1 : -reach] = values
-        sums[-reach:] = 2 * values[-1] - values[-2 : -reach - 2 : -1]
-        np.cumsum(sums, out=sums)
-        values = sums[window:] - sums[:-window]
-        values /= window
+        before = 2 * values[0] - values[reach:0:-1]
+        after = 2 * values[-1] - values[-2 : -reach - 2 : -1]
+        values = _sums(np.concatenate((before, values, after)), 2 * reach + 1)
+        values /= 2 * reach + 1
     return values
+
+
+def _sums(values: Array, rows: int) -> Array:
+    """Of so many values that follow each other; put together of sums of half as many."""
+    if rows == 1:
+        return values
+    halves = _sums(values, rows // 2)
+    sums = halves[: len(halves) - rows // 2] + halves[rows // 2 :]
+    return sums[:-1] + values[rows - 1 :] if rows % 2 else sums
 
 
 def _regular(times: Array, band: Array, period_s: float, least: int) -> Iterator[_Crossings]:
     """Stretches of at least so many half swings of about that period that reach equally far.
 
-    Between two rows the band is taken to be straight.
+    Between two rows the band is taken to be straight. At both ends it is 0, because values go on
+    point-mirrored there: a stretch that reaches an end is tried with that half swing and without.
     """
     above = band >= 0
+    above[0], above[-1] = above[1], above[-2]
     before = np.flatnonzero(above[1:] != above[:-1])
     share = band[before] / (band[before] - band[before + 1])
-    moments = times[before] + share * (times[before + 1] - times[before])
+    crossed = times[before] + share * (times[before + 1] - times[before])
+    moments = np.concatenate((times[:1], crossed, times[-1:]))
+    rows = np.concatenate(([0], before + 1, [len(band)]))
     halves = np.diff(moments)
     for first, last in _fitting(halves, period_s, least):
-        rows = before[first : last + 1] + 1
-        reaches = np.maximum.reduceat(np.abs(band[rows[0] : rows[-1]]), rows[:-1] - rows[0])
-        for start, end in pairwise(_uneven(reaches.tolist())):
-            if end - start >= least:
-                part = slice(first + start, first + end)
-                ends = slice(part.start, part.stop + 1)
-                yield _Crossings(moments[ends], halves[part], reaches[start:end])
+        borders = rows[first : last + 1]
+        sizes = np.abs(band[borders[0] : borders[-1]])
+        reaches = np.maximum.reduceat(sizes, borders[:-1] - borders[0])
+        for even in pairwise(_uneven(reaches.tolist())):
+            for start, end in _without_ends(first + even[0], first + even[1], len(halves)):
+                if end - start >= least:
+                    of_part = reaches[start - first : end - first]
+                    yield _Crossings(moments[start : end + 1], halves[start:end], of_part)
+
+
+def _without_ends(start: int, end: int, count: int) -> Iterator[tuple[int, int]]:
+    """Some of so many half swings, and the same without the first one of all, or the last one."""
+    starts = (0, 1) if start == 0 else (start,)
+    ends = (count, count - 1) if end == count else (end,)
+    return product(starts, ends)
 
 
 def _fitting(halves: Array, period_s: float, least: int) -> list[tuple[int, int]]:
@@ -322,45 +346,66 @@ def _uneven(reaches: list[float]) -> list[int]:
     return [*places, len(reaches)]
 
 
-def _fitted(
-    times: Array, values: Array, crossings: _Crossings, interval_s: float
-) -> Iterator[Swing]:
+class _Stretch:
+    """Rows that come evenly, and what is asked of many parts of them."""
+
+    def __init__(self, times: Array, values: Array) -> None:
+        self.times, self.values = times, values
+        self.interval_s = float(np.median(np.diff(times)))
+        self.roughness = Roughness(values)
+        steps: Array = np.abs(np.diff(values))
+        self._steps = np.where(steps > SAME_NUMBER * np.abs(values).max(), steps, np.inf)
+
+    def rows_of(self, start_s: float, end_s: float) -> slice:
+        """The rows between two moments, with one before and one after."""
+        start, end = np.searchsorted(self.times, [start_s, end_s])
+        return slice(max(0, int(start) - 1), min(len(self.times), int(end) + 1))
+
+    def is_resolved(self, amplitude: float, rows: slice) -> bool:
+        """Whether it is more than the smallest step between two values, which most often shows.
+
+        Most often two rows that follow each other show one that is as small.
+        """
+        if amplitude > self._steps[rows.start : rows.stop - 1].min(initial=np.inf):
+            return True
+        return amplitude > _resolution(self.values[rows])
+
+    def least_amplitude(self, period_s: float, half_swings: int, rows: slice) -> float:
+        """How high so many half swings have to be, to rise above the noise."""
+        noise = self.roughness.noise(rows.start, rows.stop)
+        of_means = noise / (period_s / self.interval_s * half_swings / 2) ** 0.5
+        return min(NOISE_AMPLITUDES * noise, MEAN_AMPLITUDES * of_means)
+
+
+def _fitted(whole: _Stretch, crossings: _Crossings) -> Iterator[Swing]:
     """The swing of such a stretch, if a sine explains it."""
     count = len(crossings.halves)
     if _varies(crossings.halves) > MOST_IRREGULAR or _varies(crossings.reaches) > MOST_VARIED:
         return
     start_s, end_s = float(crossings.moments[0]), float(crossings.moments[-1])
     period_s = 2 * (end_s - start_s) / count
-    start, end = np.searchsorted(times, [start_s, end_s])
-    rows = slice(max(0, int(start) - 1), min(len(times), int(end) + 1))
+    rows = whole.rows_of(start_s, end_s)
     farthest = REACHES * float(crossings.reaches.mean())
-    resolution = _resolution(values[rows])  # first: rounded courses have most candidates by far
-    if farthest <= resolution:
+    if farthest < whole.least_amplitude(period_s, count, rows):
         return
-    if farthest < _least_amplitude(noise_of(values[rows]), period_s, interval_s, count):
+    if not whole.is_resolved(farthest, rows):
         return
-    explained, period_s, amplitude = _best_sine(times[rows], values[rows], period_s, interval_s)
-    swing = Swing(start_s, end_s, count, period_s, amplitude, explained)
-    if explained >= _least_explained(count) and _stands_out(times, values, swing, interval_s):
+    parts = whole.times[rows], whole.values[rows]
+    swing = Swing(start_s, end_s, count, *_best_sine(*parts, period_s, whole.interval_s))
+    if swing.explained >= _least_explained(count) and _stands_out(whole, swing):
         yield swing
 
 
-def _stands_out(times: Array, values: Array, swing: Swing, interval_s: float) -> bool:
+def _stands_out(whole: _Stretch, swing: Swing) -> bool:
     """Whether neither noise, nor rounding, nor a random walk makes such a swing."""
-    start, end = np.searchsorted(times, [swing.start_s, swing.end_s])
-    rows = slice(max(0, int(start) - 1), min(len(times), int(end) + 1))
-    count = swing.half_swings
-    least = _least_amplitude(noise_of(values[rows]), swing.period_s, interval_s, count)
-    if swing.amplitude < least or swing.amplitude <= _resolution(values[rows]):
+    rows, count = whole.rows_of(swing.start_s, swing.end_s), swing.half_swings
+    if swing.amplitude < whole.least_amplitude(swing.period_s, count, rows):
         return False
-    walked = _walked(values[_surroundings(rows, len(values))], swing.period_s / interval_s)
+    if not whole.is_resolved(swing.amplitude, rows):
+        return False
+    surroundings = whole.values[_surroundings(rows, len(whole.values))]
+    walked = _walked(surroundings, swing.period_s / whole.interval_s)
     return not _is_as_of_walk(swing.amplitude, count, walked)
-
-
-def _least_amplitude(noise: float, period_s: float, interval_s: float, half_swings: int) -> float:
-    """How high so many half swings have to be, to rise above the noise."""
-    of_means = noise / (period_s / interval_s * half_swings / 2) ** 0.5
-    return min(NOISE_AMPLITUDES * noise, MEAN_AMPLITUDES * of_means)
 
 
 def _resolution(values: Array) -> float:
@@ -376,7 +421,8 @@ def _resolution(values: Array) -> float:
 
 def _varies(sizes: Array) -> float:
     """The coefficient of variation."""
-    return float(sizes.std() / sizes.mean())
+    mean = float(sizes.sum()) / len(sizes)
+    return math.sqrt(inner(sizes - mean, sizes - mean) / len(sizes)) / mean
 
 
 def _least_explained(half_swings: int) -> float:
@@ -426,7 +472,7 @@ def _is_as_of_walk(amplitude: float, half_swings: int, walked: float) -> bool:
 def _best_sine(
     times: Array, values: Array, period_s: float, interval_s: float
 ) -> tuple[float, float, float]:
-    """Share of the variance, period and amplitude of the best sine of about that period.
+    """Period, amplitude and share of the variance of the best sine of about that period.
 
     Sines and parabolas of least squares, in pieces of two to three periods.
     """
@@ -435,7 +481,7 @@ def _best_sine(
     pieces = max(1, round((times[-1] - times[0]) / (PERIODS_FITTED * period_s)))
     rows = len(values) // pieces
     if rows < SHORTEST_PERIOD_ROWS:
-        return 0.0, period_s, 0.0
+        return period_s, 0.0, 0.0
     shape = pieces, rows
     moments: Array = np.reshape(times[: pieces * rows], shape)
     parts: Array = np.reshape(values[: pieces * rows], shape)
@@ -445,9 +491,9 @@ def _best_sine(
     tried = fit_sines(moments[some], parts[some], periods, basis[some]).explained
     best = int(np.argmax(tried))
     if tried[best] < LEAST_TRIED:
-        return float(tried[best]), period_s, 0.0
+        return period_s, 0.0, float(tried[best])
     fit = fit_sines(moments, parts, periods[best : best + 1], basis)
-    return float(fit.explained[0]), float(periods[best]), float(np.median(fit.amplitudes))
+    return float(periods[best]), median(fit.amplitudes[:, 0]), float(fit.explained[0])
 
 
 def _best(found: list[Swing]) -> list[Swing]:

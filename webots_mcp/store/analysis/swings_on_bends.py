@@ -14,6 +14,9 @@ from webots_mcp.store.analysis.sines import TRIED_PERIODS, Fit, fit_sines
 LOOKED_AT: Final = 2.2  # periods at once, of second differences; they reach over 0.4 more
 LAG: Final = 0.2  # of the period: over it differences are taken
 CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 times its own
+# Mean magnitude of these differences, in deviations of the noise: of noise alone it is
+# (12 / pi)**0.5 = 1.95, and where a sine explains as much of it as is LIKELY it is 3.1.
+LEAST_LOUD: Final = 2.4
 LIKELY: Final = 0.6  # of such clipped differences is explained by a sine ...
 MOST_LIKELY: Final = 0.8  # ... and so much somewhere in the stretch
 SEMITONES: Final = range(-4, 5)  # of the band's period; a band reaches from -3 to 3
@@ -48,29 +51,38 @@ class BentSwing:
     explained: float
 
 
-def likely_swings(values: Array, period: float) -> Iterator[tuple[int, int, float]]:
+def likely_swings(values: Array, noise: Array, period: float) -> Iterator[tuple[int, int, float]]:
     """Where rows [start, end) seem to swing with about that period, and with which one.
 
     Looked at are second differences over a fifth of the period: there a course of straight pieces
-    is 0 but about its bends, and what stands out from the median at bends is cut off.
+    is 0 but about its bends, and what stands out from the median at bends is cut off. Where they
+    are hardly larger than the noise about each value makes them, a sine explains little of them.
     """
     lag, hop, rows = (max(1, round(share * period)) for share in (LAG, 0.5, LOOKED_AT))
     bends = values[2 * lag :] - 2 * values[lag:-lag] + values[: -2 * lag]
     if len(bends) < rows:
         return
-    windows = np.lib.stride_tricks.sliding_window_view(bends, rows)[::hop]
+    sizes = np.einsum("ij->i", _windows(np.abs(bends), rows, hop))
+    loud = np.flatnonzero(sizes > LEAST_LOUD * rows * noise[lag + rows // 2 :: hop][: len(sizes)])
+    windows = _windows(bends, rows, hop)[loud]
     limits = CLIPPED * np.partition(np.abs(windows), rows // 2, axis=1)[:, rows // 2, None]
     clipped: Array = np.minimum(np.maximum(windows, -limits), limits)
     squares: Array = np.einsum("ij,ij->i", clipped, clipped)
     periods = period * 2 ** (np.array(SEMITONES) / 12)
     best = _explained(clipped, periods[1::3]).max(axis=1)
-    likely = np.flatnonzero((best > LIKELY * squares) & (squares > 0))
+    likely = loud[(best > LIKELY * squares) & (squares > 0)]
     reach = rows + 2 * lag
     for part in _followed(likely, int((reach + HIDDEN * period) / hop)):
-        if np.any(best[part] > MOST_LIKELY * squares[part]):
-            place = int(np.argmax(_explained(clipped[part], periods).sum(axis=0)))
+        seen = np.searchsorted(loud, part)
+        if np.any(best[seen] > MOST_LIKELY * squares[seen]):
+            place = int(np.argmax(_explained(clipped[seen], periods).sum(axis=0)))
             if 0 < place < len(periods) - 1:  # else another band sees it better
                 yield int(part[0]) * hop, int(part[-1]) * hop + reach, float(periods[place])
+
+
+def _windows(values: Array, rows: int, hop: int) -> Array:
+    """So many values each, from one to the next so many on."""
+    return np.lib.stride_tricks.sliding_window_view(values, rows)[::hop]
 
 
 def _explained(windows: Array, periods: Array) -> Array:
@@ -102,7 +114,7 @@ def swings_on_bends(
     start, end = max(0, start - 2 * hop), min(len(values), end + 2 * hop)
     if end - start < rows:
         return
-    pieces = np.lib.stride_tricks.sliding_window_view(values[start:end], rows)[::hop]
+    pieces = _windows(values[start:end], rows, hop)
     touching = int((rows + HIDDEN * period) / hop)
     for part, fitted in _fitted(pieces, period, noise_of(values[start:end]), touching):
         first, last = start + int(part[0]) * hop, start + int(part[-1]) * hop + rows

@@ -65,6 +65,16 @@ def test_a_swing_that_reaches_an_end_of_the_range_is_told_up_to_there(
     assert from_end_s <= 0.75  # of a period of 2 s: less than a half swing is left out
 
 
+@pytest.mark.parametrize("period_s", [2.013, 2.031, 2.057, 2.079])
+def test_the_period_of_a_swing_without_noise_is_told_within_a_fifth_of_a_percent(
+    period_s: float,
+) -> None:
+    times = np.arange(0, 120, 0.032)
+    inside = (times > START_S) & (times < START_S + 8.6 * period_s)
+    (swing,) = swings_of(times, np.sin(2 * np.pi * (times - START_S) / period_s) * inside)
+    assert swing.period_s == pytest.approx(period_s, rel=0.002)
+
+
 def zigzag(rng: np.random.Generator, times: Array) -> Array:
     """Straight pieces of 2 to 8 s, as the heading of a robot that turns."""
     places = np.cumsum(rng.uniform(2, 8, 60))

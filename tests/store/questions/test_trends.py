@@ -117,7 +117,7 @@ def test_what_swung_and_rests_is_said_to_have_swung(empty: sqlite3.Connection) -
     record(empty, rows=1000, interval_s=0.1, swing=swing)
     trend = one(empty, "swing")
     assert trend.shape == "resting"
-    says = "swung by 0.301 every 1.99 s from 70.043 to 81.957 s; flat at 0 since 82 s"
+    says = "swung by 0.3 every 2 s from 70.043 to 81.957 s; flat at 0 since 82 s"
     assert trend.says == says
 
 

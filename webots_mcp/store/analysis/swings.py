@@ -492,8 +492,19 @@ def _best_sine(
     best = int(np.argmax(tried))
     if tried[best] < LEAST_TRIED:
         return period_s, 0.0, float(tried[best])
-    fit = fit_sines(moments, parts, periods[best : best + 1], basis)
-    return float(periods[best]), median(fit.amplitudes[:, 0]), float(fit.explained[0])
+    periods = periods[best : best + 1] + _vertex(tried, best) * (periods[1] - periods[0])
+    fit = fit_sines(moments, parts, periods, basis)
+    return float(periods[0]), median(fit.amplitudes[:, 0]), float(fit.explained[0])
+
+
+def _vertex(heights: Array, highest: int) -> float:
+    """How far from the highest one that of the parabola through it and its neighbours lies."""
+    if not 0 < highest < len(heights) - 1:
+        return 0.0
+    before, most, after = heights[highest - 1 : highest + 2].tolist()
+    return (
+        (after - before) / (4 * most - 2 * before - 2 * after) if 2 * most > before + after else 0.0
+    )
 
 
 def _best(found: list[Swing]) -> list[Swing]:

@@ -7,6 +7,7 @@ import sqlite3
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.recordings.rover import start_run
@@ -176,3 +177,45 @@ def test_a_freeze_that_is_too_short_to_count_is_told_as_what_came_nearest(
     nearest = ask(empty, "flat").verdicts.absent["flat"]
     assert nearest.startswith("front stayed at ")
     assert nearest.endswith(" for 14.9 s from 45 s")
+
+
+def noisy(seed: int) -> Callable[[float], float]:
+    """A force with noise, the same at each time again."""
+    noise = np.random.default_rng(seed).normal(3.3, 0.05, 2000).tolist()
+    return lambda time_s: noise[round(10 * time_s)]
+
+
+def test_a_noisy_sensor_that_freezes_is_flat_long_before_one_that_rests_by_nature(
+    empty: sqlite3.Connection,
+) -> None:
+    force = noisy(1)
+    record(empty, lambda t: {"gripForceN": force(t) if t < 100.2 else 3.3, "x": t})
+    (flat,) = ask(empty, "flat").events
+    assert (flat.name, flat.start_s, flat.end_s) == ("gripForceN", 100.2, 119.9)
+    assert flat.details["value"] == 3.3
+
+
+def held(time_s: float, measured: float, value: float) -> float:
+    """What is measured, but for ten seconds in which it is that value."""
+    return measured if not 50 < time_s < 60 else value
+
+
+RESTS_BY_NATURE: dict[str, Callable[[float, float], dict[str, Any]]] = {
+    "nothing to feel": lambda t, n: {"force": held(t, n, 0.0)},
+    "saturates at times": lambda t, n: {"force": min(n, 3.32)},
+    "saturates": lambda t, n: {"force": held(t, n, 3.6)},
+    "quantised": lambda t, n: {"force": round(n, 1)},
+    "smooth": lambda t, n: {"force": held(t, math.sin(t), 0.3)},
+    "comes back to it": lambda t, n: {"force": n if int(t / 10) % 2 else 3.3},
+    "with a robot at rest": lambda t, n: {"accel": held(t, n, 3.3), "pose": [held(t, t, 50), 0]},
+    "commanded": lambda t, n: {"wheel_speed": held(t, n, 3.3), "x": t},
+}
+
+
+@pytest.mark.parametrize("state", RESTS_BY_NATURE.values(), ids=RESTS_BY_NATURE)
+def test_what_rests_by_nature_for_less_than_20_s_is_not_flat(
+    empty: sqlite3.Connection, state: Callable[[float, float], dict[str, Any]]
+) -> None:
+    force = noisy(2)
+    record(empty, lambda t: state(t, force(t)))
+    assert ask(empty, "flat").events == ()

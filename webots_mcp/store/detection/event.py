@@ -100,7 +100,8 @@ class EventOptions:
         thresholds: For the kind "threshold".
         where: For the kind "condition"; see docs/conditions.md.
         silent_s: Without a value for so long, though it mostly has one.
-        flat_s: Exactly the same number for so long, though it mostly changes.
+        flat_s: Exactly the same number for so long, though it mostly changes; for a signal that
+            is noisy otherwise 0.15 of that are enough.
         jump_score: How many times larger than the usual step (modified z-score) a jump is.
         jump_m: A position jumps by at least so much between two rows.
         oscillation_turns: Turning points in a row.

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.analysis.frozen import FEWEST_ROWS, is_noisy, may_be_measured
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
@@ -13,6 +15,7 @@ from webots_mcp.store.reading.intervals import MOSTLY, Flat, Span
 from webots_mcp.store.signals.registry import Signal
 
 LEAST_CHANGES: Final = 10  # of who mostly changes
+FROZEN_SHARE: Final = 0.15  # of `flat_s`: who is noisy otherwise counts from so long on
 
 # Whether it changed in most rows of a stretch of 10 s that the run has rollups of.
 _LIVELY: Final = (
@@ -22,22 +25,80 @@ _LIVELY: Final = (
 
 
 def flat_events(search: Search) -> Iterator[Event]:
-    """Of a long segment only rests that fill a stretch of the rollups."""
+    """Of a long segment only rests that fill a stretch of the rollups.
+
+    One of a signal that is noisy otherwise counts much sooner, unless others rest at that time.
+    """
     least_s = max(search.options.flat_s, search.view.shortest_rest_s)
     signals = search.required_quantities()
+    if (shortest_s := search.view.shortest_rest_s) and search.only is None:
+        why = f"noisy signals that freeze for less than {shortest_s:g} s: ask for less time"
+        search.not_searched("flat", why)
+    resting: dict[str, list[Span]] = {}
+    sooner: list[tuple[Signal, Span]] = []
     for index, signal in enumerate(signals):
         here = search.view.summary(signal)
         if here.changes >= here.present - 1:
             continue
         if search.is_over("flat", signals[index:]):
-            return
+            break
         spans = search.view.spans(signal, Flat())
+        if _changes_otherwise(search, here, spans):
+            resting[signal.name] = spans
         flat = [span for span in spans if _length_s(span) >= least_s]
         if flat and (_changes_otherwise(search, here, flat) or _is_lively(search, signal)):
             for span in flat:
                 yield search.event("flat", span.start_s, span.end_s, signal.name, value=span.key)
-        elif spans and not flat and not search.view.shortest_rest_s:
-            _note_longest(search, signal, here, max(spans, key=_length_s))
+        elif spans and not flat:
+            frozen = _frozen(search, signal, spans)
+            sooner += [(signal, span) for span in frozen]
+            if not frozen and not search.view.shortest_rest_s:
+                _note_longest(search, signal, here, max(spans, key=_length_s))
+    for signal, span in sooner:
+        if not _rests_with_others(signal, span, resting):
+            yield search.event("flat", span.start_s, span.end_s, signal.name, value=span.key)
+        else:
+            _note_longest(search, signal, search.view.summary(signal), span)
+
+
+def _frozen(search: Search, signal: Signal, spans: Sequence[Span]) -> list[Span]:
+    """Of the rests of a signal those that noise never makes, if it is noisy but for them."""
+    moved_with = (search.motion.commanded, search.motion.speed, *search.motion.wheels)
+    times, values = search.view.sample([signal]).numbers(signal.name)
+    if signal in moved_with or not len(times):
+        return []
+    least_s = max(
+        FROZEN_SHARE * search.options.flat_s, FEWEST_ROWS * float(np.median(np.diff(times)))
+    )
+    held = [span for span in spans if _length_s(span) >= least_s]
+    outside = np.ones(len(times), np.bool_)
+    for span in held:
+        outside &= (times < span.start_s) | (times > span.end_s)
+    keys = [span.key for span in held]
+    others = values[outside]
+    if not is_noisy(others):
+        return []
+    return [
+        span
+        for span in held
+        if keys.count(span.key) == 1  # what it comes back to is a value by nature
+        and isinstance(span.key, (int, float))
+        and may_be_measured(others, span.key)
+    ]
+
+
+def _rests_with_others(signal: Signal, span: Span, resting: dict[str, list[Span]]) -> bool:
+    """Whether something else holds one value for most of that time: then the robot rests.
+
+    What never changes is no sign of that; and the items of an array freeze together.
+    """
+    branch = signal.name.partition(".")[0]
+    return any(
+        min(span.end_s, other.end_s) - max(span.start_s, other.start_s) > MOSTLY * _length_s(span)
+        for name, others in resting.items()
+        if name.partition(".")[0] != branch
+        for other in others
+    )
 
 
 def _note_longest(search: Search, signal: Signal, here: Summary, span: Span) -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import collections
 import ctypes
 import itertools
 import json
 import math
 import sqlite3
-import sys
 import tracemalloc
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from decimal import Decimal
 from typing import Any
 
@@ -20,145 +18,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tests.bridge.conftest import Recording
+from tests.bridge.monsters import (
+    MANY,
+    MONSTERS,
+    Endless,
+    EndlessDict,
+    EndlessList,
+    Hidden,
+    Lazy,
+    Shy,
+    circle,
+    shared_dicts,
+)
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import cleaning, encoding
 from webots_mcp.bridge.changes import Changes
 from webots_mcp.bridge.cleaning import MAX_NAMED
 from webots_mcp.bridge.encoding import MAX_ROW_BYTES, Encoded
 
-MANY = 200_000
 POSE = [1.5, 2.5, 0.25]
 MOST_LOOKED_AT = 20_000
-
-
-def circle() -> list[Any]:
-    round_and_round: list[Any] = []
-    round_and_round.append(round_and_round)
-    return round_and_round
-
-
-def shared_lists() -> list[Any]:
-    node: list[Any] = [1.5]
-    for _ in range(60):
-        node = [node, node]
-    return node
-
-
-def shared_dicts() -> dict[str, Any]:
-    node: dict[str, Any] = {"x": 1.5}
-    for _ in range(60):
-        node = {"left": node, "right": node}
-    return node
-
-
-def family(depth: int = 10, parent: Any = None) -> dict[str, Any]:
-    """A tree whose nodes know their parents."""
-    node: dict[str, Any] = {"parent": parent, "name": "joint", "children": []}
-    if depth:
-        node["children"] = [family(depth - 1, node) for _ in range(2)]
-    return node
-
-
-class Lazy:
-    """Each has two of its kind inside, made when it is asked."""
-
-    asked = 0
-
-    def tolist(self) -> list[Lazy]:
-        Lazy.asked += 1
-        return [Lazy(), Lazy()]
-
-
-class Hidden:
-    """Shown in a few characters, where a test fails."""
-
-    def __init__(self, make: Callable[[], Any]) -> None:
-        self.make = make
-
-    def tolist(self) -> Any:
-        return self.make()
-
-
-class Shy(Lazy):
-    """It is a number to nobody, whatever it is added to."""
-
-    def __radd__(self, other: float) -> float:
-        return other
-
-
-class Endless(Sequence[int]):
-    """It says that it has three items, and never comes to an end."""
-
-    asked = 0
-
-    def __len__(self) -> int:
-        return 3
-
-    def __getitem__(self, index: Any) -> Any:
-        Endless.asked += 1
-        return index
-
-    def __iter__(self) -> Iterator[int]:
-        while True:
-            yield self[0]
-
-
-class EndlessList(list[int]):
-    asked = 0
-
-    def __iter__(self) -> Iterator[int]:
-        while True:
-            EndlessList.asked += 1
-            yield 0
-
-
-class EndlessDict(dict[str, int]):
-    asked = 0
-
-    def items(self) -> Any:
-        while True:
-            EndlessDict.asked += 1
-            yield f"key {EndlessDict.asked}", 0
-
-
-MONSTERS: dict[str, Callable[[], Any]] = {
-    "a circle": circle,
-    "shared lists": shared_lists,
-    "shared dicts": shared_dicts,
-    "links to parents": family,
-    "a lazy tree": Lazy,
-    "lazy trees among numbers": lambda: [0.5, *(Shy() for _ in range(100))],
-    "no end": Endless,
-    "a list without end": lambda: EndlessList([1, 2, 3]),
-    "a dict without end": lambda: EndlessDict(a=1, b=2),
-    "many keys": lambda: dict.fromkeys(map(str, range(MANY)), 0.5),
-    "many ordered keys": lambda: collections.OrderedDict.fromkeys(range(MANY), 0.5),
-    "many numbers": lambda: [0.5] * MANY,
-    "many texts": lambda: ["x" * 1000] * MANY,
-    "many rows": lambda: [[0.5] * 1000] * 200,
-    "a set": lambda: set(range(MANY)),
-    "a range": lambda: range(10**12),
-    "a long text": lambda: "x" * 50_000_000,
-    "a long text that is escaped": lambda: "\1" * 10_000_000,
-    "a long text beyond ASCII": lambda: "\U0001f916" * 10_000_000,
-    "a long key": lambda: {"x" * 50_000_000: 1},
-    "long keys": lambda: {f"{i}" * 1000: math.nan for i in range(3000)},
-    "bytes": lambda: b"x" * 200_000_000,
-    "a view": lambda: memoryview(bytearray(200_000_000)),
-    "an array": lambda: np.zeros(MANY),
-    "an array of objects": lambda: np.array([circle() for _ in range(1000)], dtype=object),
-    "a C array": lambda: (ctypes.c_double * MANY)(),
-    "nothing but gaps": lambda: {f"key {i}": math.nan for i in range(3900)},
-    "gaps of many kinds": lambda: [math.nan, math.inf] * 9000,
-    "a chain": lambda: chain(100_000),
-}
-
-
-def chain(length: int) -> list[Any]:
-    node: list[Any] = []
-    for _ in range(length):
-        node = [node]
-    return node
 
 
 def is_valid(text: str) -> bool:
@@ -282,94 +161,6 @@ def test_a_state_of_plain_values_is_looked_at_once_and_never_copied(
     assert json.loads(encoding.encode(state).text) == {**state, "p": 1.5}
 
 
-class Touched(ctypes.Structure):
-    _fields_ = (
-        ("id", ctypes.c_int),
-        ("position", ctypes.c_double * 3),
-        ("size_on_image", ctypes.c_int * 2),
-        ("colors", ctypes.POINTER(ctypes.c_double)),
-        ("_model", ctypes.c_char_p),
-    )
-
-
-@pytest.mark.usefixtures("encoder")
-def test_what_ctypes_holds_is_recorded_as_numbers(bridge: MCPBridge, recording: Recording) -> None:
-    class Derived(Touched):
-        _fields_ = (("flag", ctypes.c_bool),)
-
-    seen = Derived(7, (1.0, 2.0, 3.0), (64, 48))
-    seen.flag = True
-    bridge.publish(
-        {
-            "position": seen.position,
-            "matrix": ((ctypes.c_float * 2) * 2)((1, 2), (3, 4)),
-            "force": ctypes.c_double(0.5),
-            "name": (ctypes.c_char * 4)(*b"abc"),
-            "wide": (ctypes.c_wchar * 3)(*"abc"),
-            "empty": (ctypes.c_double * 0)(),
-            "seen": [seen],
-        }
-    )
-    (state,) = recording.states()
-    assert state == {
-        "position": [1.0, 2.0, 3.0],
-        "matrix": [[1.0, 2.0], [3.0, 4.0]],
-        "force": 0.5,
-        "name": "YWJjAA==",
-        "wide": "abc",
-        "empty": [],
-        "seen": [
-            {
-                "id": 7,
-                "position": [1.0, 2.0, 3.0],
-                "size_on_image": [64, 48],
-                "colors": None,
-                "_model": None,
-                "flag": True,
-            }
-        ],
-    }
-    (odd,) = recording.rows("SELECT odd FROM state")
-    assert json.loads(odd) == {
-        "name": "bytes",
-        "seen.0.colors": "null pointer",
-        "seen.0._model": "pointer of unknown length",
-    }
-
-
-NOWHERE = 8  # an address that ends the process when it is followed
-
-
-@pytest.mark.usefixtures("encoder")
-@pytest.mark.parametrize(
-    "pointer",
-    [
-        ctypes.cast(NOWHERE, ctypes.POINTER(ctypes.c_double)),
-        ctypes.cast(NOWHERE, ctypes.c_char_p),
-        ctypes.cast(NOWHERE, ctypes.c_wchar_p),
-        ctypes.c_void_p(NOWHERE),
-        ctypes.byref(ctypes.c_double()),
-        ctypes.cast(NOWHERE, ctypes.POINTER(Touched)),
-    ],
-    ids=lambda pointer: type(pointer).__name__,
-)
-def test_a_pointer_is_named_and_never_followed(pointer: Any) -> None:
-    text, odd, _ = encoding.encode({"touch": pointer, "pose": POSE})
-    assert json.loads(text) == {"touch": None, "pose": POSE}
-    assert odd == {"touch": "pointer of unknown length"}
-
-
-def test_an_array_of_c_strings_is_not_read_through() -> None:
-    names = (ctypes.c_char_p * 2)()
-    ctypes.cast(names, ctypes.POINTER(ctypes.c_void_p))[0] = NOWHERE
-    assert json.loads(encoding.encode({"names": names}).text) == {"names": [None, None]}
-
-
-def test_a_null_pointer_is_named() -> None:
-    null = ctypes.POINTER(ctypes.c_double)()
-    assert encoding.encode({"touch": null}) == ('{"touch":null}', {"touch": "null pointer"}, 0)
-
-
 class LidarPoint:
     """As in Webots: nothing but attributes."""
 
@@ -383,12 +174,6 @@ def test_the_points_of_a_lidar_are_recorded_as_numbers() -> None:
     point = {"x": 0.5, "y": 1.5, "z": 2.5, "layer": 1, "time": 0.032}
     assert json.loads(text) == {"cloud": [point, point]}
     assert odd == {}
-
-
-def test_ctypes_is_not_imported_for_a_state_without_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delitem(sys.modules, "ctypes")
-    assert encoding.encode({"handle": object()}).odd == {"handle": "type object"}
-    assert "ctypes" not in sys.modules
 
 
 LEAVES: st.SearchStrategy[Any] = (

@@ -19,9 +19,11 @@ import pytest
 
 from tests.store.json_folder.test_import import Peer
 from webots_mcp.cli import main
+from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.retention import DEFAULT, Limit
 from webots_mcp.store.retention.notation import limit_text, parse_limit, size_text
+from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
 
 Say = Callable[..., str]
 
@@ -127,6 +129,32 @@ def test_import_makes_a_recording_where_there_is_none(
     assert query(data_dir / "webots.db", "SELECT robot, end_reason FROM robot_run") == [
         ("rover", "finished")
     ]
+
+
+def test_import_takes_in_another_recording_with_its_trials_once(
+    database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with closing(connect(database, "writer")) as connection:
+        connection.execute("UPDATE session SET ended_wall_time_s = 1.0")
+        set_id = create_trial_set(connection, '{"score": "duration"}', [{"kp": 1.0}])
+        finish_trial(connection, trials_of(connection, set_id)[0], Result(2, 4.5, None))
+    new = tmp_path / "new" / "webots.db"
+    for _ in range(2):
+        assert main(["import", str(database), "--data-dir", str(new.parent)]) == 0
+        assert capsys.readouterr().out == f"of {database} there are here: run 1 to 2\n"
+        assert query(new, "SELECT status, score, run_id FROM trial") == [("done", 4.5, 2)]
+        assert query(new, "SELECT count(*) FROM run") == [(2,)]
+    said = complaint(capsys, "import", str(new), "--database", str(new))
+    assert "is the recording itself" in said
+
+
+def test_what_is_no_recording_is_not_imported(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "other.db"
+    file.write_text("notes")
+    assert str(file) in complaint(capsys, "import", str(file), "--data-dir", str(tmp_path / "new"))
+    assert not (tmp_path / "new").exists()
 
 
 @pytest.mark.parametrize("log", [None, "[99:00:00] b\n"])

@@ -22,11 +22,11 @@ def score(text: str, **counts: int | str) -> Scored:
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        ("mean(abs(error))", 2.0),
+        ("mean(abs(error))", 2.5),
         ("min(x) + max(x) * 10 - first(x) / 4", 29.25),
         ("last(error)", 0.0),
         ("-last(x)", -2.0),
-        ("mean(bumper)", 0.5),
+        ("mean(bumper)", 0.75),
         ("max(min(x, error))", 3.0),
         ("max(first(x), last(x), 1)", 2.0),
         ("min(min(x), 5)", -1.0),
@@ -61,6 +61,22 @@ def test_a_run_that_does_not_give_a_score_has_none_and_not_0(text: str, why: str
 
     assert scored.value is None
     assert why in str(scored.why)
+
+
+def test_a_mean_is_that_over_time_however_many_states_tell_of_a_stretch() -> None:
+    seldom = [0.05 * n for n in range(201)]
+    often = [9 + 0.001 * n for n in range(500)]  # the greatest values, as at a breakpoint
+    states = [(t, {"x": t * t, "n": 1}) for t in sorted({*seldom, *often})]
+
+    mean = parse_score("mean(x)").of(states, Facts(10.0, {})).value
+
+    assert mean == pytest.approx(100 / 3, rel=0.01)  # of t * t from 0 to 10
+    assert parse_score("mean(n)").of(states, Facts(10.0, {})).value == 1
+
+
+def test_a_mean_of_states_of_one_moment_is_that_of_the_states() -> None:
+    states = [(2.0, {"x": 1.0}), (2.0, {"x": 4.0})]
+    assert parse_score("mean(x)").of(states, Facts(0.0, {})).value == 2.5
 
 
 def test_a_run_without_a_state_has_no_mean_and_no_time_of_anything() -> None:

@@ -25,6 +25,7 @@ from webots_mcp.store.trials import (
     fetch_trial_set,
     find_trial_set,
     finish_trial,
+    lay_down,
     take_up,
     trials_of,
 )
@@ -157,6 +158,50 @@ def test_what_goes_on_or_is_purged_is_refused(
         merge(target, tmp_path / "here", source)
 
     assert counts(target) == before
+
+
+def trials_in_both(target: sqlite3.Connection, source: Path, folder: Path) -> list[int]:
+    """Ids here of a set of three trials that was merged while the last one was still to come."""
+    with closing(connect(source, "writer")) as connection:
+        asked = [{"kp": 1.0}, {"kp": 2.0}, {"kp": 3.0}]
+        set_id = create_trial_set(connection, '{"score": "duration"}', asked)
+        finish_trial(connection, trials_of(connection, set_id)[0], Result(1, 1.5, None))
+    merge(target, folder, source)
+    with closing(connect(source, "writer")) as connection:
+        finish_trial(connection, trials_of(connection, set_id)[1], Result(2, 4.5, None))
+    found = find_trial_set(target)
+    assert found is not None
+    return [each.id for each in trials_of(target, found)]
+
+
+def test_a_trial_that_waits_here_and_was_run_there_takes_the_result(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    ids = trials_in_both(target, source, tmp_path / "here")
+    with closing(connect(source, "writer")) as connection:
+        (uuid,) = connection.execute("SELECT uuid FROM run WHERE id = 2").fetchone()
+    for _ in range(2):
+        runs = merge(target, tmp_path / "here", source)
+        first, second, third = trials_of(target, 1)
+        assert [each.id for each in (first, second, third)] == ids
+        assert (first.status, first.score) == ("done", 1.5)
+        assert (second.status, second.score, second.run_id) == ("done", 4.5, runs[uuid])
+        assert third.status == "waiting"
+
+
+def test_what_was_tried_here_or_is_about_to_be_stays_what_it_is_here(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    trials_in_both(target, source, tmp_path / "here")
+    lease = take_up(target, 1)
+    merge(target, tmp_path / "here", source)
+    second = trials_of(target, 1)[1]
+    assert second.status == "waiting"
+
+    finish_trial(target, second, Result(None, 7.0, None))
+    lay_down(target, 1, lease)
+    merge(target, tmp_path / "here", source)
+    assert trials_of(target, 1)[1].score == 7.0
 
 
 def test_trial_sets_come_with_their_runs_once_and_without_who_worked_on_them(

@@ -77,29 +77,44 @@ def export(arguments: argparse.Namespace) -> None:
 
 @command(
     "import", DATA_DIR, DATABASE,
-    argument("folder", metavar="FOLDER", help="holds status.json, logs/, camera/, ..."),
+    argument("source", metavar="SOURCE",
+             help="a folder with status.json, logs/, camera/, ...; or a recording, a webots.db"),
     argument("--robot", default="imported", metavar="NAME",
              help="the name to record under, which no robot may have yet (imported)"),
 )  # fmt: skip
 def import_(arguments: argparse.Namespace) -> None:
-    """Import the data folder of a bridge that writes JSON files, as one finished run.
+    """Import another recording, or the data folder of a bridge that writes JSON files.
 
-    Taken are status.json, logs/controller.log, camera/*.png, screenshots/*.png and commands.json.
-    All of it is imported or, if a file is damaged, nothing. Such a folder has no simulation times:
-    they are counted in seconds of wall time from its earliest entry.
+    A recording that is over comes with all of its runs and trial sets; what is there already is
+    left as it is, so that it may be imported again.
+
+    Of such a folder status.json, logs/controller.log, camera/*.png, screenshots/*.png and
+    commands.json become one finished run; if a file is damaged, nothing does. It has no simulation
+    times: they are counted in seconds of wall time from its earliest entry.
     """
     from webots_mcp.store.json_folder import import_folder, read_folder
 
-    read_folder(Path(arguments.folder))  # first: no database is made for what cannot be imported
+    if (source := Path(arguments.source)).is_file():
+        return _import_recording(arguments, source)
+    read_folder(source)  # first: no database is made for what cannot be imported
     with _writable(arguments, create=True) as (recording, connection):
         with shown_progress("importing") as progress:
-            made = import_folder(
-                connection, Path(arguments.folder), recording.data_dir, arguments.robot, progress
-            )
+            made = import_folder(connection, source, recording.data_dir, arguments.robot, progress)
         print(
             f"run {made.run_id} of robot {made.robot!r}: states {made.states}, log lines "
             f"{made.lines}, pictures {made.pictures}, commands {made.commands}"
         )
+
+
+def _import_recording(arguments: argparse.Namespace, source: Path) -> None:
+    from webots_mcp.store.merging import merge, settled
+
+    settled(source)  # first: no database is made for what is no recording
+    with _writable(arguments, create=True) as (recording, connection):
+        if isinstance(recording.database, Path) and source.samefile(recording.database):
+            raise InvalidInputError(f"{source} is the recording itself: choose another file")
+        runs = merge(connection, recording.data_dir, source)
+    print(f"of {source} there are here: run {_ranges(list(runs.values())) or 'none'}")
 
 
 @command(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import statistics
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol, TypeAlias
 
@@ -14,7 +13,6 @@ Number: TypeAlias = "int | float"
 REDUCTIONS: Final[dict[str, Callable[[Sequence[Number]], Number]]] = {
     "min": min,
     "max": max,
-    "mean": statistics.fmean,
     "first": lambda numbers: numbers[0],
     "last": lambda numbers: numbers[-1],
 }
@@ -33,7 +31,7 @@ class Aggregate(Protocol):
 
 
 class Reduced:
-    """The mean, an extreme, or the first or last of a number's values."""
+    """An extreme, or the first or last of a number's values."""
 
     def __init__(self, compiled: Compiler, reduce: Callable[[Sequence[Number]], Number]) -> None:
         self._compiled = compiled
@@ -49,6 +47,37 @@ class Reduced:
     def value(self) -> Number | None:
         """Flags count as 1 and 0."""
         return self._reduce(self._numbers) if self._numbers else None
+
+
+class Mean:
+    """The mean over time: each value counts for as long as it holds, up to the next state.
+
+    So a stretch with more states than others does not count more.
+    """
+
+    def __init__(self, compiled: Compiler) -> None:
+        self._compiled = compiled
+        self._newest: tuple[float, Number] | None = None
+        self._area = self._time_s = self._sum = 0.0
+        self._count = 0
+
+    def update(self, state: State, sim_time_s: float) -> None:
+        """While the number has no value, the time does not count."""
+        if self._newest is not None:
+            since_s, held = self._newest
+            self._area += held * (sim_time_s - since_s)
+            self._time_s += sim_time_s - since_s
+        number = _root(self._compiled, state, sim_time_s)
+        self._newest = None if number is None else (sim_time_s, number)
+        if number is not None:
+            self._sum += number
+            self._count += 1
+
+    def value(self) -> float | None:
+        """Where no time has passed, the states count alike."""
+        if self._time_s > 0:
+            return self._area / self._time_s
+        return self._sum / self._count if self._count else None
 
 
 class TimeHeld:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, TypeAlias
 
-from webots_mcp.conditions.aggregates import REDUCTIONS, Aggregate, Number, Reduced, TimeHeld
+from webots_mcp.conditions.aggregates import REDUCTIONS, Aggregate, Mean, Number, Reduced, TimeHeld
 from webots_mcp.conditions.compiling import ARITHMETIC, OF_NUMBERS, Compiler
 from webots_mcp.conditions.condition import parse
 from webots_mcp.conditions.nodes import Nodes, function_of, is_signal
@@ -18,7 +18,7 @@ from webots_mcp.errors import ConditionFailedError, UnknownSignalError
 from webots_mcp.naming import nearest_first
 
 _DURATION: Final = "duration"
-FUNCTIONS: Final = (*REDUCTIONS, "abs", "time", "count")
+FUNCTIONS: Final = (*REDUCTIONS, "mean", "abs", "time", "count")
 _MOST_OFFERED: Final = 3
 _MISPLACED_FOR: Final = "`for` belongs to a condition, as in time(x < 1 for 2)"
 
@@ -171,6 +171,8 @@ class _Compiler(Nodes):
             return self._count(node)
         if name == "time":
             return self._aggregate(node, TimeHeld(self._part(self._condition_in(node))))
+        if name == "mean":
+            return self._aggregate(node, Mean(self._part(self._only(node), number=True)))
         if name in REDUCTIONS and (len(node.args) == 1 or name not in OF_NUMBERS):
             return self._aggregate(
                 node, Reduced(self._part(self._only(node), number=True), REDUCTIONS[name])

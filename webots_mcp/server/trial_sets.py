@@ -46,6 +46,8 @@ from webots_mcp.trials.plan import Plan, combinations
 
 CANCELLED: Final = "it was cancelled"
 _TABLE_BUDGET: Final = 5_400
+_GOES_ON: Final = "the command 'webots-mcp trials PLAN' goes on with it"
+_FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
 _LONGEST_WHY: Final = 120
 _FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
 _MOST_NAMED_RUNS: Final = 5
@@ -108,11 +110,17 @@ def require_ours(recording: Recording, set_id: int) -> None:
         InvalidInputError: It is one, or there is no such set.
     """
     with recording.reader() as connection:
-        if fetch_trial_set(connection, set_id).robot_id is None:
+        found = fetch_trial_set(connection, set_id)
+        if found.robot_id is None:
+            why = f"was begun from a shell: {_GOES_ON}" if _is_of_shell(found) else _FROM_ELSEWHERE
             raise InvalidInputError(
-                f"trial set {set_id} was begun from a shell: the command 'webots-mcp trials PLAN' "
-                f"goes on with it; webots_get_trials(trial_set={set_id}) tells of it"
+                f"trial set {set_id} {why}; webots_get_trials(trial_set={set_id}) tells of it"
             )
+
+
+def _is_of_shell(found: TrialSet) -> bool:
+    """Only a plan file names a world."""
+    return "world" in json.loads(found.plan)
 
 
 def go_on(recording: Recording, set_id: int) -> None:
@@ -199,7 +207,7 @@ def _state(found: TrialSet, left: int, *, at_work: bool) -> tuple[str, str | Non
     if not left:
         return "done", None
     if found.robot_id is None:
-        return "left", "the same command, 'webots-mcp trials PLAN', goes on with it"
+        return "left", _GOES_ON if _is_of_shell(found) else _FROM_ELSEWHERE
     return why, f"{again} goes on with the {left} that are left"
 
 

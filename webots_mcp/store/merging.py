@@ -9,15 +9,20 @@ from __future__ import annotations
 import os
 import shutil
 import sqlite3
+import time
 from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from webots_mcp.adoption import adopt
 from webots_mcp.connection import transaction
 from webots_mcp.contract import make_folder
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.settlement import settle
 from webots_mcp.store.images import inside
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.trials import fetch_trial_set, is_at_work
 
 _SESSIONS: Final = "SELECT id, uuid, robot_id FROM source.session ORDER BY id"
 _UNFIT: Final = (
@@ -35,6 +40,16 @@ _SET_BY: Final = (
 _TRIALS: Final = (
     "SELECT t.id, t.uuid, n.id FROM source.trial t LEFT JOIN source.run r ON r.id = t.run_id "
     "LEFT JOIN main.run n ON n.uuid = r.uuid WHERE t.trial_set_id = ? ORDER BY t.id"
+)
+# A trial that waits here and is over there: the set was gone on with in a copy of the recording.
+_RESULT: Final = ", ".join(
+    ("status", "score", "ended_by", "ended_sim_time_s", "error", "started_wall_time_s",
+     "finished_wall_time_s")
+)  # fmt: skip
+_TAKE_RESULT: Final = (
+    f"UPDATE main.trial SET ({_RESULT}, run_id, pid, process) = (SELECT {_RESULT}, ?, NULL, NULL "
+    "FROM source.trial WHERE id = ?) WHERE uuid = ? AND finished_wall_time_s IS NULL "
+    "AND (SELECT finished_wall_time_s FROM source.trial WHERE id = ?) IS NOT NULL"
 )
 _RUNS: Final = (
     "SELECT n.uuid, n.id FROM source.run r JOIN main.run n ON n.uuid = r.uuid ORDER BY r.id"
@@ -67,6 +82,19 @@ def merge(connection: sqlite3.Connection, data_dir: Path, source: Path) -> dict[
         with transaction(connection):
             _take_in_trials(connection)
         return dict(connection.execute(_RUNS).fetchall())
+
+
+def settled(database: Path) -> Recording:
+    """A recording with all that waited beside it, and its sessions ended that are over.
+
+    Raises:
+        DatabaseError: There is none, or it is none of ours.
+    """
+    recording = Recording(database, database.parent)
+    with recording.writer() as connection:
+        adopt(connection, database)
+        settle(connection, time.time())
+    return recording
 
 
 @contextmanager
@@ -115,6 +143,8 @@ def _take_in_trials(connection: sqlite3.Connection) -> None:
     """Trial sets and trials that are not there, each with its run as it is called here.
 
     Nobody works on them here: their simulators and the parameters of their controllers are gone.
+    Trials of a set that is here as well keep their results; those that wait take the ones from
+    there, unless a process is about to run them.
     """
     gone: dict[str, Any] = dict.fromkeys(
         ("host", "pid", "process", "robot_id", "session_id", "former_values")
@@ -127,6 +157,8 @@ def _take_in_trials(connection: sqlite3.Connection) -> None:
             if _id_of(connection, "trial", trial_uuid) is None:
                 own = {"trial_set_id": here, "run_id": run_id, "pid": None, "process": None}
                 _insert(connection, "trial", "id = ?", trial_id, own)
+            elif not is_at_work(connection, fetch_trial_set(connection, here)):
+                connection.execute(_TAKE_RESULT, (run_id, trial_id, trial_uuid, trial_id))
 
 
 def _robot(connection: sqlite3.Connection, robot_id: int) -> int:

@@ -21,7 +21,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.adoption import adopt
 from webots_mcp.contract import (
     DATA_DIR_VARIABLE,
     DATABASE_NAME,
@@ -33,10 +32,9 @@ from webots_mcp.errors import (
     ConditionFailedError,
     NoDatabaseError,
 )
-from webots_mcp.settlement import settle
 from webots_mcp.store.leases import Job
 from webots_mcp.store.logs import LogFilter, newest_lines
-from webots_mcp.store.merging import merge
+from webots_mcp.store.merging import merge, settled
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.questions.score import score_run
 from webots_mcp.store.recording import Recording
@@ -328,11 +326,7 @@ def _scored(
 
 def _settled(folder: Path) -> Recording | None:
     """The recording of a trial whose processes are gone, with all that waited beside it."""
-    recording = Recording(folder / DATABASE_NAME, folder)
     try:
-        with recording.writer() as connection:
-            adopt(connection, folder / DATABASE_NAME)
-            settle(connection, time.time())
+        return settled(folder / DATABASE_NAME)
     except NoDatabaseError:
         return None
-    return recording

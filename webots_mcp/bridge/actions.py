@@ -105,7 +105,7 @@ def step(context: Context, command: Command) -> Progress:
 
 @_built_in
 def run(context: Context, command: Command) -> Progress:
-    """Let the loop run until a condition holds or a time is over; then pause, unless told else."""
+    """Let the loop run until a condition holds or a time is over; then act on `then`."""
     goal = read_goal(command.params)
     context.watch.require_free()
     return _run_until(context, command, goal)

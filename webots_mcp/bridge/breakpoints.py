@@ -247,7 +247,7 @@ class Breakpoints:
     # -- what is wrong with one ----------------------------------------------------------------
 
     def _disarm(self, each: Breakpoint, why: str) -> None:
-        """A condition that fails would fail with every state: it is told once, and off."""
+        """A condition that fails would fail with every state: it is reported and turned off."""
         self.armed.remove(each)
         if each.id is not None:
             self._disable(each.id, why)

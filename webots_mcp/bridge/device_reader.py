@@ -52,7 +52,7 @@ class DeviceReader:
         self._errors.failed(f"auto_publish of the device {name!r}", error)
 
     def _count(self, duration_us: float) -> None:
-        """The median of the last ones decides; a single slow one is no reason to tell."""
+        """The median of the last ones decides; a single slow one is not reported."""
         self._durations_us.append(duration_us)
         usual_us = statistics.median(self._durations_us)
         interval = max(1, math.ceil(usual_us / MOST_READING_US))

@@ -79,7 +79,7 @@ def _devices(robot: Any) -> dict[str, Any]:
 
 
 def _instance() -> str:
-    """Which Webots this is: host and port, as Webots tells them; else who started this process."""
+    """Which Webots this is: host and port, as Webots gives them; else who started this process."""
     folder = os.environ.get("WEBOTS_INSTANCE_PATH", "").rstrip("/\\")
     url = os.environ.get("WEBOTS_CONTROLLER_URL", "")
     if folder and not _is_extern():

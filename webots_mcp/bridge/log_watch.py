@@ -35,7 +35,7 @@ class LogWatch:
         self._seen: _Log | None = None
 
     def is_whole(self) -> bool:
-        """Whether nothing was cut off since the last look, as far as can be told.
+        """Whether nothing was cut off since the last look, as far as can be known.
 
         One that is empty now tells nothing: the next look does, after something was written.
         """

@@ -211,7 +211,7 @@ class Parameters:
         self._record_next(dict.fromkeys(waiting))
 
     def _standing(self) -> Iterable[tuple[Kind, bool, Values]]:
-        """What a database has to be told that knows nothing of this session: kind, of the run?"""
+        """What a database that knows nothing of this session must be given: kind, of the run?"""
         held = tuple(self._held.values())
         for each in held:
             yield "parameter", False, _described(each.declaration)

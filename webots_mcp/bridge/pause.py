@@ -137,7 +137,7 @@ class Pause:
 
     @contextmanager
     def awaiting_step(self) -> Generator[None]:
-        """While something is to come with the end of a step: it is told before the loop goes on."""
+        """While the end of a step is to bring something: it comes before the loop goes on."""
         self._awaiting_step = True
         self._guard_steps()
         try:
@@ -172,7 +172,7 @@ class Pause:
         self._guard_steps()
 
     def _guard_steps(self) -> None:
-        """Outside of a pause the steps of user code are only told: they show that it lives."""
+        """Outside a pause the steps of user code are only noted: they show that it is alive."""
         asked = self._ask_before_steps is not None or self._companion is not None
         needed = self.active or self.in_user_code or self._awaiting_step or asked
         self._simulation.guard_steps(self._on_step if needed else None)

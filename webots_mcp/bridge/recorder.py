@@ -139,7 +139,7 @@ class Recorder:
     # -- the session ---------------------------------------------------------------------------
 
     def beat(self, loop: LoopStatus) -> None:
-        """Say that the loop is alive. Skipped while rows wait: a late heartbeat tells nothing."""
+        """Say that the loop is alive. Skipped while rows wait: a late heartbeat has no worth."""
         self._locked(lambda: self._beat(loop))
 
     def _beat(self, loop: LoopStatus) -> None:

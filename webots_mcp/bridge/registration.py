@@ -130,7 +130,7 @@ def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: i
 def _is_living(
     session: tuple[int, int, str | None, str, float], identity: Identity, now_s: float
 ) -> bool:
-    """On this host the process tells; on another only a recent heartbeat does."""
+    """On this host the process shows it; on another only a recent heartbeat does."""
     session_id, pid, process, host, last_seen_s = session
     if host != identity.host:
         return now_s - last_seen_s < REMOTE_SILENCE_S

@@ -8,7 +8,7 @@ from webots_mcp.bridge.error_report import ErrorReport
 
 
 class RowCounts:
-    """Counts what was written and what was dropped; that is warned of and told as an event.
+    """Counts what was written and what was dropped; drops are warned of and recorded as an event.
 
     Attributes:
         written: Rows that the database took.

@@ -11,7 +11,7 @@ from webots_mcp.bridge.reloads import Reloads
 
 
 class Runs:
-    """Enters each run as it begins, and tells the controller's code of it."""
+    """Enters each run as it begins, and calls the controller's callbacks."""
 
     def __init__(
         self,

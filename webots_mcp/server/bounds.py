@@ -28,7 +28,7 @@ def range_in(view: View, scope: Scope) -> TimeRange:
 
 
 def newest_runs(found: TimeRange) -> TimeRange:
-    """The range within its newest few runs; a note tells of earlier ones."""
+    """The range within its newest few runs; a note names earlier ones."""
     earlier = len(found.segments) - MOST_RUNS
     if earlier <= 0:
         return found

@@ -53,7 +53,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Declaration:
-    """A function that is a tool, and what a client is told of it beside name and parameters.
+    """A function that is a tool, and what a client learns of it beside name and parameters.
 
     Attributes:
         function: Its first parameter is the recording, the others are the client's; in place of
@@ -150,7 +150,7 @@ def _require_over_a_value(error: Exception) -> None:
 def _answer_error(
     tool: str, error: Exception, empty: Callable[[str], Any] | None, unsound: Unsound | None
 ) -> Any:
-    """Our errors tell the model what to do; of a defect the server's log has the rest.
+    """Our errors tell the model what to do; the server's log has the rest of a defect.
 
     What is missing may be so for rows that were left out: they are named beside each of our errors.
     """

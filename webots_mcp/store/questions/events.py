@@ -39,7 +39,7 @@ _ROW_AT: Final = (
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Events of one kind that were found and are not told: how many, and when they began."""
+    """Events of one kind that were found and left out: how many, and when they began."""
 
     count: int
     first_s: float
@@ -185,7 +185,7 @@ def search_events(
 
 
 def _is_left(place: Place, borders: dict[str, Place | None] | None) -> bool:
-    """Whether no page before has told of the event at that place."""
+    """Whether no earlier page has shown the event at that place."""
     if borders is None:
         return True
     border = borders.get(place[3])

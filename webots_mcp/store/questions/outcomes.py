@@ -220,7 +220,7 @@ def _outcome(
 
 
 def _distance(connection: sqlite3.Connection, part: RunPart, deadline: Deadline) -> float | None:
-    """Of a long run from samples, which cut corners a little; its newest rows tell its noise."""
+    """Of a long run from samples, which cut corners a little; its newest rows show its noise."""
     position = part.motion.position
     if position is None:
         return None

@@ -205,7 +205,7 @@ def annotate_run(
 
 
 def pace(duration_s: float, wall_s: float) -> float | None:
-    """The real-time factor; None for less than a second of wall time, which tells nothing."""
+    """The real-time factor; None where the wall time is too short: under a second."""
     return duration_s / wall_s if wall_s >= 1 else None
 
 
@@ -221,7 +221,7 @@ def _info(
     gone: dict[int, str],
     parameters: dict[str, Value | str],
 ) -> RunInfo:
-    """One run; `gone` tells of sessions that look open how they ended."""
+    """One run; `gone` says how sessions ended that still look open."""
     *what, started_wall_s, last_wall_s, started_s, last_s = row
     named = dict(zip(_WHAT, what, strict=True))
     named["end_reason"] = named["end_reason"] or gone.get(named["session_id"])

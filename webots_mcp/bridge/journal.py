@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Final
 
 from webots_mcp.bridge.clock import Clock
@@ -15,6 +16,7 @@ _MOST_LOGGER_CHARACTERS: Final = 200
 _NOT_LOST: Final = ("nan", "inf", "-inf", "bytes", "surrogate")
 _CUT: Final = ("text[", "key[", "dict cut")
 _MOST_LOST_PATHS: Final = 20
+_LEVELS: Final = {"stdout": "info", "stderr": "warning"}
 
 
 class Journal:
@@ -41,6 +43,13 @@ class Journal:
         name = None if logger is None else storable(cut(logger, _MOST_LOGGER_CHARACTERS))
         row = (self._clock.sim_time_s, time.time(), level, source, text, name)
         self._recorder.record("log", self._clock.run, row)
+
+    def output(self, stream: str, lines: Sequence[str]) -> None:
+        """Record what was printed on `stdout` or `stderr`."""
+        level, clock, now = _LEVELS[stream], self._clock, time.time()
+        texts = [storable(cut(line, MOST_LOG_CHARACTERS)) for line in lines]
+        rows = [(clock.sim_time_s, now, level, "controller", text, stream) for text in texts]
+        self._recorder.record_together("log", clock.run, rows)
 
     def event(
         self, kind: str, data: dict[str, object] | None = None, name: str | None = None

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.bridge import open_bridges
 from webots_mcp.bridge.attachment import Attachment
+from webots_mcp.bridge.capture import Capture
 from webots_mcp.bridge.commands import Command
 from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport
@@ -76,6 +77,10 @@ class MCPBridge:
             crash or a hit, and cost a throttled call some microseconds, one of `auto_publish` up to
             100 us on average for reading devices (see `stats().ring_interval`). 0 holds nothing;
             the environment variable `WEBOTS_MCP_KEEP_LAST_S` overrides it.
+        capture_output: What the process prints on stdout and stderr is recorded too, as log lines
+            of the logger `stdout` or `stderr`, up to 500 a second of each; it appears where it
+            did before. C code and child processes count as well; a child that is to outlive the
+            controller needs a stdout of its own.
         database: A file, `":memory:"`, or a `MemoryDatabase` shared with a server; None for
             `webots.db` in the data folder.
 
@@ -91,6 +96,7 @@ class MCPBridge:
         throttle_interval: int = 5,
         *,
         keep_last_s: float = KEEP_LAST_S,
+        capture_output: bool = False,
         database: str | os.PathLike[str] | MemoryDatabase | None = None,
     ) -> None:
         keep_last_s = _seconds(os.environ.get(KEEP_LAST_VARIABLE) or keep_last_s)
@@ -109,6 +115,9 @@ class MCPBridge:
         self._session = Session(simulation, *where, throttle, keep_last_s, self._errors)
         self._publisher = self._session.publisher
         self._session.begin()
+        self._capture = Capture(self._session.context.journal.output)
+        if capture_output:
+            self._capture.begin()
         self._attachment: Attachment | None = None
         open_bridges.enter(robot, OpenBridge(self, self.close, self._leave_to_parent))
         atexit.register(self._close_at_exit)
@@ -478,6 +487,7 @@ class MCPBridge:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("close", error)
         open_bridges.leave(self.robot)
+        self._capture.close()
         self._session.close(reason)
         self._closed = True  # last: an interrupted call is made up for at the exit
         atexit.unregister(self._close_at_exit)
@@ -508,6 +518,7 @@ class MCPBridge:
         """In a forked child: leave the session to the parent; what is published here is dropped."""
         self._closed = True
         self.detach()
+        self._capture.abandon()
         self._session.context.recorder.abandon()
 
     def _close_at_exit(self) -> None:

@@ -193,7 +193,8 @@ def test_a_reset_counts_the_time_from_zero_and_asks_the_first_state_after_it(
 @pytest.mark.parametrize(
     ("then", "mode_before", "mode_after"),
     [
-        ("go_on", "real_time", "fast"),
+        ("go_on", "real_time", "real_time"),
+        ("go_on", "fast", "fast"),
         ("as_before", "real_time", "real_time"),
         ("as_before", "fast", "fast"),
     ],
@@ -211,6 +212,17 @@ def test_at_the_end_it_goes_on_or_is_as_it_was(
     assert result["sim_time_s"] == pytest.approx(10 * STEP_S)
     assert 10 in [state["n"] for state in recording.states()]
     assert recording.rows("SELECT count(*) FROM event WHERE kind = 'pause'") == [0]
+
+
+def test_what_was_paused_goes_on_at_the_pace_that_it_had_before(
+    rounds: Rounds, recording: Recording
+) -> None:
+    robot = rounds.robot
+    robot.simulationSetMode(robot.SIMULATION_MODE_REAL_TIME)
+    recording.send("pause")
+    sent = recording.send("run", until="n >= 10", pace="fast", then="go_on")
+    rounds.drive(12)
+    assert recording.fate(sent)[1]["mode"] == "real_time"
 
 
 def test_as_before_pauses_what_was_paused(rounds: Rounds, recording: Recording) -> None:

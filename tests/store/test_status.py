@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
+import time
+from contextlib import closing
+from pathlib import Path
 
 import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot
+from webots_mcp import MCPBridge
+from webots_mcp.connection import connect
+from webots_mcp.entries import waiting_paths
+from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.queue import CommandQueue
 from webots_mcp.store.recording import look
 from webots_mcp.store.runs import current_run
@@ -199,6 +207,49 @@ def test_an_ended_session_tells_how_it_ended(
     status = status_of(robot, after_s=7)
     assert status.text == "stopped 7.0 s ago"
     assert said in (status.why or "")
+
+
+@pytest.mark.parametrize("managed", [True, False])
+def test_a_controller_that_an_exception_ended_names_it(tmp_path: Path, managed: bool) -> None:
+    loop = "with bridge:\n    {}['speed']" if managed else "{}['speed']"
+    program = (
+        "import sys\n"
+        "from webots_mcp import MCPBridge\n"
+        "from webots_mcp.standin import InProcessSupervisor\n"
+        "bridge = MCPBridge(InProcessSupervisor('rover'), database=sys.argv[1])\n"
+        f"bridge.publish({{'n': 1}})\n{loop}\n"
+    )
+    file = tmp_path / "webots.db"
+    command = [sys.executable, "-c", program, str(file)]
+    subprocess.run(command, stderr=subprocess.DEVNULL, check=False)
+    with closing(connect(file, "reader")) as connection:
+        status = judge(connection, newest_session(connection, 1), None, time.time())
+    assert "its controller ended by KeyError: 'speed'" in (status.why or "")
+
+
+def test_where_the_database_takes_no_rows_it_says_in_which_file_they_wait_and_since_when(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "webots.db"
+    with MCPBridge(InProcessSupervisor("rover"), database=file, throttle_interval=1) as bridge:
+        writer = bridge._session.context.recorder.session.connection  # pyright: ignore[reportPrivateUsage]
+        assert writer is not None
+        (pages,) = writer.execute("PRAGMA page_count").fetchone()
+        writer.execute(f"PRAGMA max_page_count={pages}")
+        began_s = time.time()
+        while not bridge.stats().rows_waiting:
+            bridge.publish({"padding": "x" * 1000})
+        (waiting,) = waiting_paths(file)
+        os.utime(waiting, (began_s + 30, began_s + 30))
+        with closing(connect(file, "writer")) as connection:
+            connection.execute("UPDATE session SET last_seen_monotonic_s = NULL")
+            session = newest_session(connection, 1)
+            going, gone = (judge(connection, session, None, began_s + s) for s in (30.5, 60))
+    assert going.text == "running"
+    assert f"waits in {waiting.name} beside it, for 30 s now" in (going.why or "")
+    assert gone.text == "stopped 30 s ago"
+    assert waiting.name in (gone.why or "")
+    assert "database or disk is full" in capfd.readouterr().err
 
 
 def test_a_process_that_is_gone_is_not_running_even_with_a_fresh_heartbeat(

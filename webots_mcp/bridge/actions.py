@@ -280,9 +280,9 @@ def _finish_of(context: Context, command: Command, then: Then) -> Callable[[], N
     was_paused, mode_before = pause.active, pause.running_mode
 
     def finish() -> None:
-        if then == "as_before" and not was_paused:
+        if then == "go_on" or (then == "as_before" and not was_paused):
             simulation.set_mode(mode_before)
-        elif then != "go_on":
+        else:
             pause.begin(command_id=command.id)
 
     return finish

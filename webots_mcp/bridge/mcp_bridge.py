@@ -497,7 +497,7 @@ class MCPBridge:
 
     def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
         if error is not None:
-            self._keep_before_end(error)
+            self._tell_end(error)
         self.close("crashed" if error is not None else None)
 
     # -- inside --------------------------------------------------------------------------------
@@ -508,11 +508,15 @@ class MCPBridge:
             self.close()
         return command
 
-    def _keep_before_end(self, error: BaseException) -> None:
-        if not self._closed:
-            why = f"{ENDED_BY} {describe(error)}"
-            self._session.control.why_ended = why
-            self.keep(why)
+    def _tell_end(self, error: BaseException) -> None:
+        """Keep what came before an exception; one that is no interrupt is logged as well."""
+        if self._closed:
+            return
+        why = f"{ENDED_BY} {describe(error)}"
+        self._session.control.why_ended = why
+        self.keep(why)
+        if isinstance(error, Exception):
+            self.log(why, "error")
 
     def _leave_to_parent(self) -> None:
         """In a forked child: leave the session to the parent; what is published here is dropped."""
@@ -525,11 +529,8 @@ class MCPBridge:
         """The interpreter keeps the exception that ends it; at a prompt it keeps others too."""
         error = None if hasattr(sys, "ps1") else getattr(sys, "last_value", None)
         if isinstance(error, BaseException):
-            self._keep_before_end(error)
-        if isinstance(error, Exception):
-            self.log(f"{ENDED_BY} {describe(error)}", "error")
-            self.close("crashed")
-        self.close()
+            self._tell_end(error)
+        self.close("crashed" if isinstance(error, Exception) else None)
 
 
 def _seconds(given: float | str) -> float:

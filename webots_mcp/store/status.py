@@ -5,12 +5,13 @@ from __future__ import annotations
 import sqlite3
 from typing import Final, NamedTuple
 
-from webots_mcp.contract import BUILT_IN_ACTIONS, HEARTBEAT_INTERVAL_S, PAUSED
+from webots_mcp.contract import BUILT_IN_ACTIONS, ENDED_BY, HEARTBEAT_INTERVAL_S, PAUSED
 from webots_mcp.settlement import EXTERN
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.runs import Run
 from webots_mcp.store.sessions import Session, companions, left_holding
 from webots_mcp.store.states import newest_state, recent_interval_s
+from webots_mcp.store.waiting import find_backlog
 
 NEVER_SEEN: Final = "never seen"
 RUNNING: Final = "running"
@@ -46,6 +47,12 @@ _ENDED: Final = {
     "crashed": "its controller process is gone without having finished (killed or crashed)",
     "replaced": "a newer session took its place",
 }
+_ENDED_BY: Final = (
+    "SELECT message FROM log WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
+    "AND level = 'error' AND source = 'controller' AND message GLOB ? "
+    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_MOST_ERROR_CHARACTERS: Final = 300
 _RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
 _BREAKPOINT_AT: Final = (
     "SELECT CASE WHEN json_valid(data) THEN json_extract(data, '$.condition') END, sim_time_s "
@@ -60,6 +67,10 @@ _SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
     "breakpoint, another controller looping, or an extern controller missing; from inside the "
     "simulation these look alike"
+)
+_WAITING: Final = (
+    "the database takes no rows: what its controller records waits in {0} beside it, for {1:.0f} s "
+    "now (is the disk full, or does another program hold a lock?); what is shown here is older"
 )
 _STARTED: Final = "its controller has just started; simulation time has not moved yet"
 _NOT_STARTED: Final = (
@@ -99,7 +110,7 @@ def judge(
         return Status(NEVER_SEEN)
     moved_s = _moved_wall_time_s(connection, session, run)
     if not session.is_alive(now_s):
-        return _stopped(session, moved_s, now_s, _why_ended(session))
+        return _stopped(session, moved_s, now_s, _why_ended(connection, session))
     if holder := find_holder(connection, session, now_s):
         here = holder is session
         why = _breakpoint_at(connection, session) if here else _held_elsewhere(connection, holder)
@@ -108,6 +119,12 @@ def judge(
     if fresh and _hold_since_beat(connection, session) == "resume":
         return Status(RUNNING)
     still_moving_s = _still_moving_s(connection, run)
+    if not fresh and (backlog := find_backlog(connection, session)) is not None:
+        moved_s = max(moved_s or 0.0, backlog.newest_wall_time_s)
+        why = _WAITING.format(backlog.file_name, max(now_s - backlog.oldest_wall_time_s, 0.0))
+        if session.age_s(moved_s, now_s) <= still_moving_s:
+            return Status(RUNNING, why)
+        return _stopped(session, moved_s, now_s, why)
     if moved_s is None and session.age_s(session.started_wall_time_s, now_s) <= still_moving_s:
         return Status(STARTING, _STARTED)
     if moved_s is not None and session.age_s(moved_s, now_s) <= still_moving_s:
@@ -146,10 +163,18 @@ def _why_unpublished(
     return _UNPUBLISHED.format(unpublished_s)
 
 
-def _why_ended(session: Session) -> str | None:
+def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:
     if session.end_reason == "reload" and session.extern:
         return _RELOADED_EXTERN
+    if session.end_reason == "crashed" and (error := ended_by(connection, session.id)):
+        return f"its controller ended by {error}"
     return _ENDED.get(session.end_reason or "crashed")
+
+
+def ended_by(connection: sqlite3.Connection, session_id: int) -> str | None:
+    """The exception that ended a controller, as its bridge logged it; None where it had no time."""
+    found = connection.execute(_ENDED_BY, (session_id, f"{ENDED_BY} *")).fetchone()
+    return found[0].removeprefix(f"{ENDED_BY} ")[:_MOST_ERROR_CHARACTERS] if found else None
 
 
 def _why_standing(

@@ -91,7 +91,7 @@ async def webots_take_screenshot(
 ) -> list[str | Image]:
     """A picture of the simulation's main view, now; needs a Supervisor.
 
-    Scaled to at most 1,000 pixels; the caption names the original file.
+    Scaled to 1,000 pixels; the caption names the original file.
     """
     dispatcher = Dispatcher(recording, ctx.report_progress)
     answer = await dispatcher.ask(robot, "screenshot", timeout_s, {"quality": quality})

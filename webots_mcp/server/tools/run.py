@@ -45,7 +45,7 @@ async def webots_run(
         dict[str, Any] | None,
         Field(description="Set these first, all or none; see webots_get_parameters."),
     ] = None,
-    then: Annotated[Then, Field(description="At that very step.")] = "pause",
+    then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
     picture: Annotated[bool, Field(description="A screenshot of the end, too.")] = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,

@@ -23,7 +23,7 @@ ALLOWED = {
     "schema": {"connection", "contract", "errors"},
     "liveness": set[str](),
     "notice": set[str](),
-    "naming": set[str](),
+    "naming": {"units"},
     "units": set[str](),
     "conditions": {"conditions", "errors", "naming", "units"},
     "parameter": {"errors", "naming"},

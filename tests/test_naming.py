@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from webots_mcp.naming import find_position
+from webots_mcp.naming import find_mode, find_position
 
 
 def numbers(*branches: str) -> set[str]:
@@ -20,3 +20,37 @@ def test_what_is_no_place_or_the_place_of_something_else_is_not_taken(branch: st
 def test_a_nested_position_is_taken_before_other_branches() -> None:
     found = find_position(numbers("base", "odometry.position"))
     assert found == ("odometry.position.x", "odometry.position.y")
+
+
+@pytest.mark.parametrize(
+    ("x", "y"),
+    [
+        ("Lage.xMm", "Lage.yMm"),
+        ("robotPose.posX", "robotPose.posY"),
+        ("currentPosition.x", "currentPosition.y"),
+        ("currentPosition.0", "currentPosition.1"),
+        ("robot.pose_m.0", "robot.pose_m.1"),
+        ("posX", "posY"),
+        ("x_pos", "y_pos"),
+        ("robot_x", "robot_y"),
+        ("XMm", "YMm"),
+    ],
+)
+def test_a_position_is_found_however_its_words_are_joined(x: str, y: str) -> None:
+    others = {"targetPose.x", "targetPose.y", "ballX", "ballY", "gyro.0", "gyro.1", "max", "y2"}
+    assert find_position({x, y, *others}) == (x, y)
+    assert find_position(others) is None
+
+
+def test_a_branch_that_is_called_a_place_is_taken_before_others_in_camel_case_too() -> None:
+    assert find_position(numbers("base", "currentPosition")) == (
+        "currentPosition.x",
+        "currentPosition.y",
+    )
+
+
+@pytest.mark.parametrize("name", ["driveMode", "nav.currentState", "drive_mode", "robotTask"])
+def test_a_mode_is_found_by_the_last_word_of_its_name(name: str) -> None:
+    others = {"lastAction", "next_state", "previousMode", "modest", "text"}
+    assert find_mode({name, *others}) == name
+    assert find_mode(others) is None

@@ -24,6 +24,8 @@ from webots_mcp.units import metres_in, unit_in
         ("speed.m_s", "m/s"),
         ("yawRateDegPerS", "deg/s"),
         ("headingDeg", "deg"),
+        ("Lage.xMm", "mm"),
+        ("Lage.XMm", "mm"),
         ("heading_degrees", "deg"),
         ("deg_heading", "deg"),
         ("battery_v", "V"),

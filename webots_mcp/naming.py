@@ -9,6 +9,8 @@ import math
 from collections.abc import Collection, Iterable
 from typing import Any, Final, TypeAlias
 
+from webots_mcp.units import METRES, words_of
+
 Value: TypeAlias = "int | float | str | None"  # a bool is an int
 
 LONGEST_SPREAD_ARRAY: Final = 16  # a longer one is reduced: nobody asks for lidar.117
@@ -26,6 +28,9 @@ _ELSEWHERE: Final = frozenset((
     "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel",
     "reference", "setpoint", "target", "waypoint",
 ))  # fmt: skip
+# Words beside an x that leave it the robot's own, as in robot_x and currentPosX.
+_OWN: Final = frozenset((*_BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self"))
+_PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
 _LENGTHS: Final = ("m", "cm", "mm")  # units that a place is published in
 _AXES: Final = (("0", "1"), ("x", "y"), *((f"x_{unit}", f"y_{unit}") for unit in _LENGTHS))
 _MODES: Final = ("mode", "behaviour", "behavior", "action", "task", "phase")
@@ -99,24 +104,58 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
 
     It is what is called `pose`, `position`, `pos`, `gps`, `odometry`, `odom` or `location` (in
     this order), or `x` and `y` at the top, or else the first branch by name that has an x and y:
-    one that ends in such a name before others, and none of what is elsewhere (`goal`, `ball`) or
-    no place (`velocity`). The views robot_now and robot_trajectory have the same rule, row by row.
+    one with such a word in its name before others (`currentPosition.x`, `posX`, `robotPose.0`), and
+    none of what is elsewhere (`goal`, `ball`) or no place (`velocity`). The views robot_now and
+    robot_trajectory have the same rule, row by row, but for names in camelCase and for a `pos_x`.
     """
-    branches = {name[:-2] for name in numeric if name.endswith(".x")}
-    others = sorted(filter(_may_be_own_place, branches), key=_place_first)
-    pairs = (*USUAL_POSITIONS, *((f"{branch}.x", f"{branch}.y") for branch in others))
-    return next((pair for pair in pairs if pair[0] in numeric and pair[1] in numeric), None)
+    for x, y in USUAL_POSITIONS:
+        if x in numeric and y in numeric:
+            return x, y
+    places = {place: name for name in numeric if (place := _place_of(name)) is not None}
+    pairs = [
+        (branch, (name, places[branch, key, "y"]))
+        for (branch, key, axis), name in places.items()
+        if axis == "x" and (branch, key, "y") in places
+    ]
+    return min(pairs, key=_place_first, default=("", None))[1]
+
+
+def _place_of(name: str) -> tuple[str, str, str] | None:
+    """The branch of an x or y, the rest of its name and which of them it is; None of all else."""
+    branch, _, last = name.rpartition(".")
+    words = _branch_words(branch)
+    if not _ELSEWHERE.isdisjoint(words):
+        return None
+    if last in ("0", "1"):
+        is_place = not set(_BRANCHES).isdisjoint(words_of(branch.rpartition(".")[2]))
+        return (branch, "", "xy"[int(last)]) if is_place else None
+    parts = words_of(last)
+    axes = [word for word in parts if word in ("x", "y")]
+    rest = [word for word in parts if word not in ("x", "y")]
+    if len(axes) != 1 or not _OWN.issuperset(rest) or not (branch or rest):
+        return None
+    return branch, "_".join(rest), axes[0]
+
+
+def _branch_words(branch: str) -> list[str]:
+    return [word for part in branch.split(".") for word in words_of(part)]
 
 
 def find_mode(texts: Collection[str]) -> str | None:
     """The name of what a robot is doing, among those of its texts; None without any.
 
     It is `mode`, `behaviour`, `behavior`, `action`, `task` or `phase` (in this order), or else the
-    shortest name that ends in one of them, as `nav.mode` does; then the same of `state` and
-    `status`. The views robot_now and robot_trajectory have the same rule, row by row.
+    shortest name that ends in one of these words, as `nav.mode` and `driveMode` do; then the same
+    of `state` and `status`. What was or shall be (`lastAction`, `next_state`) is none. The views
+    robot_now and robot_trajectory have the same rule, row by row, for whole parts of a name.
     """
+    last_words = {name: words_of(name.rpartition(".")[2]) for name in texts}
     for words in (_MODES, _STATES):
-        ending = [name for name in texts if name.rpartition(".")[2].lower() in words]
+        ending = [
+            name
+            for name, (*before, last) in last_words.items()
+            if last in words and _PAST_OR_FUTURE.isdisjoint(before)
+        ]
         if ending:
             return next((word for word in words if word in texts), min(ending, key=_shortest))
     return None
@@ -126,12 +165,9 @@ def _shortest(name: str) -> tuple[int, str]:
     return len(name), name
 
 
-def _may_be_own_place(branch: str) -> bool:
-    return _ELSEWHERE.isdisjoint(branch.lower().replace("_", ".").split("."))
-
-
-def _place_first(branch: str) -> tuple[bool, str]:
-    return branch.rpartition(".")[2] not in _BRANCHES, branch
+def _place_first(pair: tuple[str, tuple[str, str]]) -> tuple[bool, tuple[str, str]]:
+    named = {*_branch_words(pair[0].rpartition(".")[2]), *words_of(pair[1][0].rpartition(".")[2])}
+    return named.isdisjoint(_BRANCHES), pair[1]
 
 
 def listed(names: Collection[str], most: int = 10) -> str:

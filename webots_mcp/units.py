@@ -27,7 +27,7 @@ _UNITS: Final = {
 _LONGEST_UNIT: Final = 3  # words: m_per_s
 _ANGLES: Final = ("yaw", "heading", "theta", "bearing", "roll", "pitch")
 _ANGLES_IF_UNIT: Final = (*_ANGLES, "course")  # a course without a unit may be of anything
-_HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])")
+_HUMP: Final = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 _KEPT: Final = 4096  # names whose units are remembered
 
 
@@ -53,7 +53,7 @@ def angle_unit(name: str) -> Literal["rad", "deg"] | None:
     parts = name.split(".")
     if parts[-1].isdigit():
         parts.pop()
-    words = [word for part in parts[-2:] for word in _words(part)]
+    words = [word for part in parts[-2:] for word in words_of(part)]
     units = (*_DEGREES, *_RADIANS)
     after, before = words[-1:], words[-2:-1]
     if after and after[0] in units:
@@ -65,13 +65,15 @@ def angle_unit(name: str) -> Literal["rad", "deg"] | None:
     return "deg" if unit and unit[0] in _DEGREES else "rad"
 
 
-def _words(part: str) -> Sequence[str]:
-    return _HUMP.sub("_", part).lower().split("_")
+@lru_cache(maxsize=_KEPT)
+def words_of(part: str) -> Sequence[str]:
+    """The words of one part of a dotted name, in lower case: of `posX` and `pos_x` pos and x."""
+    return tuple(_HUMP.sub("_", part).lower().split("_"))
 
 
 def _unit_of(part: str) -> str | None:
     """That of one part of a dotted name; a single letter is one only after an underscore."""
-    words = _words(part)
+    words = words_of(part)
     for count in range(min(_LONGEST_UNIT, len(words)), 0, -1):
         unit = "_".join(words[-count:])
         if unit in _UNITS and (len(unit) > 1 or part.lower().endswith(f"_{unit}")):

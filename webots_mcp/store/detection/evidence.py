@@ -68,7 +68,8 @@ def weigh(
     against += ["it turned in place"] if _mostly(turning) else []
     against += [f"it went to and fro within {reach_m:.2g} m"] if _mostly(swaying) else []
     if not should_move.any() and not against:
-        against = ["nothing that is published shows that it should have moved"]
+        modeless = "" if motion.mode else "; a signal that holds a mode can be named: mode=NAME"
+        against = [f"nothing that is published shows that it should have moved{modeless}"]
     return Evidence(should_move, [*mode_why, *told_why, *ahead_why], against)
 
 

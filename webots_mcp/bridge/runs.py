@@ -49,6 +49,7 @@ class Runs:
         self._recorder.session.run = self._clock.run
         self._reloads.happened()
         self._journal.event("reset")
+        # Before the callbacks, which may ask for values that waited for the reset.
         self._parameters.begin_run()
         self._reloads.fire()
         self._heartbeat.beat()

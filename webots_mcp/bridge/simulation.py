@@ -96,7 +96,8 @@ class Simulation:
             if hasattr(self.robot, "simulationSetMode")
             else "create it with Supervisor() instead of Robot(), and set 'supervisor' to TRUE"
         )
-        raise CommandRefusedError(f"{action} needs a Supervisor and this robot is none: {missing}")
+        refused = f"{action} needs a Supervisor and this robot is not one"
+        raise CommandRefusedError(f"{refused}: {missing}")
 
 
 def _require_robot(robot: Any) -> None:

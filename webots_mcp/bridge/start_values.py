@@ -50,7 +50,7 @@ class StartValues:
         if self._unknown_told:
             return
         self._unknown_told = True
-        unknown = [
+        unknown = [  # an object by another name may be for another robot
             name
             for name, value in self._read().items()
             if name not in declared and not isinstance(value, dict)
@@ -68,7 +68,7 @@ class StartValues:
         try:
             found = json.loads(self._text or "")
         except (ValueError, RecursionError) as error:
-            found, why = None, f"it is no JSON ({error})"
+            found, why = None, f"it is not JSON ({error})"
         else:
             why = f"it is a {type(found).__name__}"
         if not isinstance(found, dict):

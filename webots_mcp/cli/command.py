@@ -50,6 +50,7 @@ class Command(NamedTuple):
 
 
 COMMANDS: Final[list[Command]] = []
+# Not owed to a value in a row: asking past unsound rows would not help.
 _OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
 
 

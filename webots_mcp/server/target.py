@@ -100,7 +100,7 @@ def _who_may(view: View, session: Session, action: str) -> str:
     if others:
         name = robot_name(view.connection, others[0].robot_id)
         next_step = f"robot {name!r} is a Supervisor of this simulation: ask it (robot={name!r})"
-    return f"{action} needs a Supervisor and robot {view.robot.name!r} is none: {next_step}"
+    return f"{action} needs a Supervisor and robot {view.robot.name!r} is not one: {next_step}"
 
 
 def _ended_supervisors(view: View, session: Session) -> list[str]:

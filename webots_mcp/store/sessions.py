@@ -61,7 +61,7 @@ class Session:
         beat_s = self.last_seen_monotonic_s
         if beat_s is None or self.process is None or not self._is_of_this_boot():
             return now_s - self.last_seen_wall_time_s
-        return time.monotonic() - beat_s
+        return time.monotonic() - beat_s  # the wall clock may have been set meanwhile
 
     def age_s(self, wall_time_s: float, now_s: float) -> float:
         """How long ago that was, which its bridge stamped for its newest sign of life."""

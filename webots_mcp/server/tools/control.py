@@ -114,7 +114,7 @@ def _usual_wait_s(recording: Recording, command: Control, steps: int, robot: str
         return _WAIT_S
     with recording.reader() as connection:
         run = find_target(connection, robot, command).run
-        step_ms = (run.basic_time_step_ms if run else None) or 32.0
+        step_ms = (run.basic_time_step_ms if run else None) or 32.0  # Webots' default
     return min(_WAIT_S + 2 * steps * step_ms / 1000, MAX_WAIT_S)
 
 

@@ -32,7 +32,9 @@ def event_lanes(
     most = min(rows, MOST_LANES)
     drawn = tuple(kind.name for kind in drawn_kinds())
     options = EventOptions(kinds=drawn, signals=tuple(names))
-    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=(), group=False)
+    found = find_events(
+        connection, part.range, options, limit=MOST_EVENTS, around=(), group=False, exact=False
+    )
     kinds = [kind for kind in drawn if any(event.kind == kind for event in found.events)]
     lanes = [_lane(kind, found, part) for kind in kinds[:most]]
     notes = [note for note in found.notes if note not in part.notes]
@@ -78,6 +80,6 @@ def _within(interval: Interval, part: Part) -> Interval:
 def stuck_mark(connection: sqlite3.Connection, part: Part, position: tuple[str, str]) -> Lane:
     """When the robot was stuck."""
     options = EventOptions(kinds=("stuck",), signals=position, position=position)
-    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=())
+    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=(), exact=False)
     intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]
     return Lane(f"stuck over {options.stuck_s:g} s", intervals, ())

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -28,6 +28,8 @@ class Event:
         name: The signal, the action, the level or the device that it is about.
         details: What there is to say about it, by kind.
         around: Values of a few signals when it began.
+        exactly: What all rows about it tell, where it was found in samples of a long run: mostly
+            one event, which begins and ends to the row.
     """
 
     kind: str
@@ -39,6 +41,7 @@ class Event:
     details: dict[str, Any] = field(default_factory=dict[str, Any])
     ongoing: bool = False
     around: dict[str, Value] = field(default_factory=dict[str, Value])
+    exactly: Callable[[], Sequence[Event]] | None = field(default=None, repr=False, compare=False)
 
     @property
     def duration_s(self) -> float:

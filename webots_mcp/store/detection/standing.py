@@ -5,6 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -73,14 +74,48 @@ def find_standings(search: Search) -> Standings:
     tracks = _tracks(search, position, columns)
     found = _standings(search, tracks, columns)
     moved_in = MovedIn(search.connection, search.segment.run_id, search.motion, search.deadline)
-    events: list[Event] = []
-    for standing in found:
-        evidence = weigh(
-            standing.columns, search.motion, search.options, moved_in, standing.noise_m
-        )
-        events += _told(search, standing, evidence)
+    events = [event for each in found for event in _weighed(search, each, moved_in)]
     nearest = None if found else _nearest(search, tracks)
     return Standings(events, search.view.taken_notes(), nearest)
+
+
+def _weighed(search: Search, standing: Standing, moved_in: MovedIn) -> list[Event]:
+    """The events of a standstill: of one in samples, the rows about it are read if that matters."""
+
+    def weighed(standing: Standing) -> Evidence:
+        columns, noise_m = standing.columns, standing.noise_m
+        return weigh(columns, search.motion, search.options, moved_in, noise_m)
+
+    @cache
+    def exactly() -> list[Event]:
+        fine = _from_rows(search, standing)
+        return [event for each in fine for event in _told(search, each, weighed(each))]
+
+    evidence = weighed(standing)
+    if not standing.within_s:
+        return list(_told(search, standing, evidence))
+    if not _is_certain(standing, evidence, search.options.stuck_s):
+        return exactly()
+    told = list(_told(search, standing, evidence))
+
+    def exactly_of(kind: str) -> list[Event]:
+        return [event for event in exactly() if event.kind == kind]
+
+    return [replace(each, exactly=partial(exactly_of, each.kind)) for each in told]
+
+
+def _is_certain(standing: Standing, evidence: Evidence, least_s: float) -> bool:
+    """Whether samples tell how many events it is: what lasts nearly the least time may be one.
+
+    It lasts at least from the first of its samples to the last one, and not up to the next ones.
+    """
+    times, flags = standing.columns.times, evidence.should_move
+    runs = [*_runs(flags, times), *_runs(~flags, times)]
+    lengths_s = [times[end - 1] - times[start] for start, end in runs]
+    shortest_s = least_s - 2 * standing.within_s
+    return standing.end_s - standing.start_s >= least_s and not any(
+        shortest_s < length_s < least_s for length_s in lengths_s
+    )
 
 
 def _told(search: Search, standing: Standing, evidence: Evidence) -> Iterator[Event]:
@@ -143,11 +178,11 @@ def _tracks(search: Search, position: tuple[Signal, Signal], columns: Columns) -
 
 
 def _standings(search: Search, tracks: Sequence[Track], columns: Columns) -> list[Standing]:
-    """From all rows; of a long segment first from samples, then from the rows about each."""
+    """From all rows; of a long segment from samples."""
     sampled_s, stuck_s = search.view.sampled_s, search.options.stuck_s
     least_s = max(stuck_s - 2 * sampled_s, stuck_s / 2)
     found = [each for track in tracks for each in _in_track(search, track, columns, least_s)]
-    return [fine for each in found for fine in _from_rows(search, each)] if sampled_s else found
+    return [replace(each, within_s=sampled_s) for each in found] if sampled_s else found
 
 
 def _in_track(search: Search, track: Track, columns: Columns, least_s: float) -> Iterator[Standing]:
@@ -181,7 +216,7 @@ def _from_rows(search: Search, rough: Standing) -> list[Standing]:
     """What the rows about a standstill that samples show tell of it."""
     if search.deadline.passed:
         search.view.notes.append("the time was over: not exactly where they begin and end")
-        return [replace(rough, within_s=search.view.sampled_s)]
+        return [rough]
     start_s, end_s = rough.start_s - MARGIN_S, rough.end_s + MARGIN_S
     if rough.end_s - rough.start_s <= READ_WHOLE_S:
         return _about(search, rough, start_s, end_s)
@@ -189,7 +224,7 @@ def _from_rows(search: Search, rough: Standing) -> list[Standing]:
     foot = _about(search, rough, rough.end_s - READ_WHOLE_S / 2, end_s)
     first_s = head[-1].start_s if head else rough.start_s
     last_s = foot[0].end_s if foot else rough.end_s
-    return [replace(rough, start_s=first_s, end_s=last_s)]
+    return [replace(rough, start_s=first_s, end_s=last_s, within_s=0.0)]
 
 
 def _about(search: Search, rough: Standing, start_s: float, end_s: float) -> list[Standing]:
@@ -219,13 +254,19 @@ def _rows(columns: Columns, rows: slice) -> Columns:
 def _spans(standing: Standing, flags: Flags, least_s: float) -> list[tuple[int, int]]:
     """Row ranges [start, end) of at least that duration in which the flags hold."""
     times = standing.columns.times
+    spans = _runs(flags, times)
+    return [(start, end) for start, end in spans if times[end - 1] - times[start] >= least_s]
+
+
+def _runs(flags: Flags, times: Sequence[float]) -> list[tuple[int, int]]:
+    """Row ranges [start, end) in which the flags hold, but for moments."""
     edges = np.flatnonzero(np.diff(np.concatenate(([0], flags.astype(np.int8), [0])))).tolist()
     spans: list[tuple[int, int]] = []
     for start, end in zip(edges[::2], edges[1::2], strict=True):
         if spans and times[start] - times[spans[-1][1] - 1] <= BRIDGED_S:
             start = spans.pop()[0]
         spans.append((start, end))
-    return [(start, end) for start, end in spans if times[end - 1] - times[start] >= least_s]
+    return spans
 
 
 def _nearest(search: Search, tracks: Sequence[Track]) -> tuple[float, str] | None:

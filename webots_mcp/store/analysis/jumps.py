@@ -159,7 +159,9 @@ def _is_excursion(jump: Jump, following: Jump, usual: float) -> bool:
     return from_there and nearer and way_back / size >= BACK_HALF
 
 
-def find_leaps(times: Array, x: Array, y: Array, at_least_m: float) -> list[tuple[float, float]]:
+def find_leaps(
+    times: Array, x: Array, y: Array, at_least_m: float, rows: int | None = None
+) -> list[tuple[float, float]]:
     """Times and lengths of steps of a position that no driving explains.
 
     Longer than `at_least_m`, and than five times the 99th percentile of all steps; after a gap, by
@@ -168,9 +170,10 @@ def find_leaps(times: Array, x: Array, y: Array, at_least_m: float) -> list[tupl
     if len(times) < 2:
         return []
     steps = np.hypot(np.diff(x), np.diff(y))
-    place = min(len(steps) - 1, int(0.99 * len(steps)))
-    usual_m = float(np.partition(steps, place)[place])
-    limit_m = max(at_least_m, POSITION_STEPS * usual_m if len(steps) > 100 else 0.0)
+    count = len(steps) if rows is None else max(rows - 1, len(steps))
+    place = len(steps) - count + min(count - 1, int(0.99 * count))
+    usual_m = float(np.partition(steps, place)[place]) if place >= 0 else 0.0
+    limit_m = max(at_least_m, POSITION_STEPS * usual_m if count > 100 else 0.0)
     long = np.flatnonzero(steps > limit_m)
     long = long[steps[long] > limit_m * _intervals(times, long)]
     return list(zip(times[long + 1].tolist(), steps[long].tolist(), strict=True))

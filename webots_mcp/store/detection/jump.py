@@ -6,7 +6,13 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from webots_mcp.store.analysis.arrays import np
-from webots_mcp.store.analysis.jumps import Jump, are_usual, find_jumps, find_leaps
+from webots_mcp.store.analysis.jumps import (
+    POSITION_STEPS,
+    Jump,
+    are_usual,
+    find_jumps,
+    find_leaps,
+)
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.motion import in_metres
@@ -61,7 +67,7 @@ def _leaps(search: Search) -> Iterator[Event]:
     # In one of the two directions it is farther than that.
     least_steps = [_LEAST_SHARE * search.options.jump_m / metres_in(each.name) for each in position]
     leaps: dict[float, float] = {}
-    for numbers in search.view.stretches(position, LEAPS_SHARE, least_steps):
+    for numbers in search.view.stretches(position, LEAPS_SHARE, least_steps, apart=POSITION_STEPS):
         leaps |= _leaps_in(numbers, position, search.options.jump_m)
     for time_s in sorted(leaps):
         yield search.event("jump", time_s, time_s, "position", distance_m=leaps[time_s])
@@ -72,7 +78,8 @@ def _leaps_in(
 ) -> dict[float, float]:
     x, y = (in_metres(signal, numbers.values[signal.name]) for signal in position)
     known = np.isfinite(x) & np.isfinite(y)
-    return dict(find_leaps(numbers.times[known], x[known], y[known], at_least_m))
+    places = numbers.times[known], x[known], y[known]
+    return dict(find_leaps(*places, at_least_m, numbers.stretch_rows))
 
 
 def _alike(events: Sequence[Event], unit: str) -> str:

@@ -94,10 +94,13 @@ class Numbers:
 
     Attributes:
         values: Per signal one number per row; NaN where the row has none that is usable.
+        stretch_rows: How many rows the stretch has in which only these may hold a large step; None
+            where these are all of it.
     """
 
     times: Array
     values: dict[str, Array]
+    stretch_rows: int | None = None
 
     def of(self, name: str) -> tuple[Array, Array]:
         """Times and numbers of a signal, of the rows that have a usable one."""

@@ -11,6 +11,7 @@ import sqlite3
 import statistics
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final, Protocol
 
 from webots_mcp.store.analysis.arrays import Array
@@ -47,9 +48,8 @@ _OF_SIGNAL: Final = (
     "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
 )
 _COUNTS: Final = {"rows": "sum", "present": "sum", "changes": "sum"}
-_WIDTHS: Final = (  # also at its border with the bucket before
-    "SELECT bucket, max(max - min, abs(first - lag(last, 1, first) OVER (ORDER BY bucket))) "
-    f"{_OF_SIGNAL} AND first IS NOT NULL"
+_WIDTHS: Final = (
+    f"SELECT bucket, max - min, first, last {_OF_SIGNAL} AND first IS NOT NULL ORDER BY bucket"
 )
 _ROWS_IN: Final = (
     "SELECT count(*) FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
@@ -119,6 +119,7 @@ class View(Protocol):
         share: float,
         least_steps: Sequence[float] | None = None,
         outside: range = _NOTHING,
+        apart: float = 0.0,
     ) -> Iterator[Numbers]:
         """All rows in stretches, the newest first, as many as a share of the time allows.
 
@@ -130,6 +131,8 @@ class View(Protocol):
             least_steps: Of each signal: a stretch may be left out in which none of them changes by
                 more than that from one row to the next. None for all stretches.
             outside: Buckets that are not read, but for what lies across their borders.
+            apart: Only the part of a stretch is given in which one of them changes by more than
+                that, if all changes in the rest are so many times smaller; 0: the whole.
         """
         ...
 
@@ -213,6 +216,7 @@ class RowView:
         share: float,
         least_steps: Sequence[float] | None = None,
         outside: range = _NOTHING,
+        apart: float = 0.0,
     ) -> Iterator[Numbers]:
         """All rows at once."""
         yield numbers_of(self._columns, signals)
@@ -321,7 +325,7 @@ class LongView:
         self._note_late()
         self._note_purged()
         values = (self._span[0], signal.id, *self._span[1:])
-        widths = self._connection.execute(_WIDTHS, values).fetchall()
+        widths = _widths(self._connection.execute(_WIDTHS, values).fetchall())
         usual = statistics.median(size for _, size in widths) if widths else 0.0
         wide = [(size, bucket) for bucket, size in widths if size > JUMP_RANGE * usual]
         if len(wide) > JUMP_BUCKETS:
@@ -351,6 +355,7 @@ class LongView:
         share: float,
         least_steps: Sequence[float] | None = None,
         outside: range = _NOTHING,
+        apart: float = 0.0,
     ) -> Iterator[Numbers]:
         """What there is no time for is noted."""
         deadline = self._deadline.part(share)
@@ -358,7 +363,7 @@ class LongView:
         for part in _around(self._segment, outside):
             if part.start_s < first_s:
                 self._note_purged()
-            yield from self._stretches(part, first_s, deadline, signals, least_steps)
+            yield from self._stretches(part, first_s, deadline, signals, least_steps, apart)
 
     def _stretches(
         self,
@@ -367,6 +372,7 @@ class LongView:
         deadline: Deadline,
         signals: Sequence[Signal],
         least_steps: Sequence[float] | None,
+        apart: float,
     ) -> Iterator[Numbers]:
         end_of_all_s, first_s = left.end_s, max(first_s, left.start_s)
         while left.end_s > first_s:
@@ -378,30 +384,51 @@ class LongView:
                 )
                 return
             whole = replace(part, end_s=min(end_of_all_s, part.end_s + ACROSS_S))
-            if least_steps is None or not self._is_calm(whole, signals, least_steps):
+            steps = None if least_steps is None else self._largest_steps(whole, signals)
+            if steps is None or least_steps is None:
                 yield self._stretch(whole, signals, deadline)
+            elif large := _above(steps, least_steps):
+                if apart and not _above(steps, [each / apart for each in least_steps], large):
+                    yield self._part(whole, large, signals, deadline)
+                else:
+                    yield self._stretch(whole, signals, deadline)
             if part.start_s <= first_s:
                 return
             left = replace(left, end_s=part.start_s)
 
-    def _is_calm(
-        self, part: Segment, signals: Sequence[Signal], least_steps: Sequence[float]
-    ) -> bool:
-        """Whether rollups rule out that one of the signals changes by more than that at once.
+    def _largest_steps(
+        self, part: Segment, signals: Sequence[Signal]
+    ) -> list[dict[int, float]] | None:
+        """By bucket the largest step of each signal, at its borders as well; None: not known.
 
-        They do where all rows around the part are in them, each with a number.
+        It is where all rows around the part are in the rollups, each with a number.
         """
         span = range(bucket_of(part.start_s), bucket_of(part.end_s) + 1)
         ends_s = span.start * BUCKET_S, span.stop * BUCKET_S
         rows = self._connection.execute(_ROWS_IN, (part.run_id, *ends_s)).fetchone()[0]
-        for signal, least_step in zip(signals, least_steps, strict=True):
-            found = buckets(self._connection, part.run_id, signal.id or 0, span)
+        steps: list[dict[int, float]] = []
+        for signal in signals:
+            found = list(buckets(self._connection, part.run_id, signal.id or 0, span))
             whole = merge([Summary(), *(summary for _, summary in found)])
             if whole.present != rows or whole.largest_step is None:
-                return False
-            if whole.largest_step > least_step:
-                return False
-        return True
+                return None
+            own = {bucket: each.largest_step or 0.0 for bucket, each in found}
+            for (_, before), (bucket, after) in pairwise(found):
+                step = abs((after.first or 0.0) - (before.last or 0.0))
+                own[bucket] = max(own[bucket], step)
+            steps.append(own)
+        return steps
+
+    def _part(
+        self, whole: Segment, large: range, signals: Sequence[Signal], deadline: Deadline
+    ) -> Numbers:
+        """The rows of some buckets of a stretch, and of those beside them."""
+        start_s = max(whole.start_s, (large.start - 1) * BUCKET_S)
+        end_s = min(whole.end_s, (large.stop + 1) * BUCKET_S)
+        bounds = (whole.run_id, whole.start_s, whole.end_s)
+        rows = self._connection.execute(_ROWS_IN, bounds).fetchone()[0]
+        part = replace(whole, start_s=start_s, end_s=end_s)
+        return replace(self._stretch(part, signals, deadline), stretch_rows=rows)
 
     def _stretch(self, part: Segment, signals: Sequence[Signal], deadline: Deadline) -> Numbers:
         """Read with what other kinds will ask of the same rows, and kept for them."""
@@ -486,6 +513,28 @@ def _around(segment: Segment, buckets: range) -> list[Segment]:
     after = replace(segment, start_s=max(segment.start_s, end_s - ACROSS_S))
     before = replace(segment, end_s=min(segment.end_s, start_s + ACROSS_S))
     return [after, before] if segment.start_s < start_s else [after]
+
+
+def _above(
+    steps: Sequence[dict[int, float]], limits: Sequence[float], outside: range = _NOTHING
+) -> range:
+    """From the first to the last bucket in which a signal has a step above its limit."""
+    large = [
+        bucket
+        for own, limit in zip(steps, limits, strict=True)
+        for bucket, step in own.items()
+        if step > limit and bucket not in outside
+    ]
+    return range(min(large), max(large) + 1) if large else _NOTHING
+
+
+def _widths(found: Sequence[tuple[int, float, float, float]]) -> list[tuple[int, float]]:
+    """How far each bucket reaches, also at its border with the bucket before."""
+    befores = [found[0][2], *(last for *_, last in found)] if found else []
+    return [
+        (bucket, max(width, abs(first - before)))
+        for (bucket, width, first, _), before in zip(found, befores, strict=False)
+    ]
 
 
 def _bucket(wide: tuple[float, int]) -> int:

@@ -141,26 +141,44 @@ def spans_in_pieces(
 ) -> Iterator[list[Span]]:
     """The spans in a long segment, bucket by bucket; the rows of one in between are read.
 
-    Flat buckets are looked for whole; of the others only those next to one are read.
+    Flat buckets are looked for whole; of the others only those next to one are looked at, and read
+    where older rollups do not tell up to when the first value lasted, and since when the last one.
     """
     buckets = pieces.of(signal.name)
     verdicts = [condition.of_bucket(summary) for _, summary in buckets]
     for index, (bucket, summary) in enumerate(buckets):
         near_whole = "all" in verdicts[max(0, index - 1) : index + 2]
         if verdicts[index] == "all":
-            yield [_whole(_bucket_of(segment, bucket), summary, condition)]
-        elif verdicts[index] == "some" and (near_whole or not isinstance(condition, Flat)):
+            yield [_whole(segment, bucket, summary, condition)]
+        elif verdicts[index] != "some" or (condition.lasting and not near_whole):
+            yield []
+        elif condition.lasting and (rests := rests_at_ends(summary)) is not None:
+            yield rests
+        else:
             columns = read(_bucket_of(segment, bucket))
             yield list(spans_in_rows(columns.times, columns.values[signal.name], condition))
-        else:
-            yield []
 
 
-def _whole(part: Segment, summary: Summary, condition: Condition) -> Span:
+def rests_at_ends(summary: Summary) -> list[Span] | None:
+    """Where a number that changed has its first value, and where its last; None: not known."""
+    if summary.present < summary.rows:
+        return None
+    first_s, until_s = summary.first_sim_time_s, summary.first_until_sim_time_s
+    since_s, last_s = summary.last_since_sim_time_s, summary.last_sim_time_s
+    first, last = summary.first, summary.last
+    if first_s is None or until_s is None or since_s is None or last_s is None:
+        return None
+    return [
+        Span(first_s, until_s, first, first, first, from_first=True),
+        Span(since_s, last_s, last, last, last, to_last=True),
+    ]
+
+
+def _whole(segment: Segment, bucket: int, summary: Summary, condition: Condition) -> Span:
     """Of a bucket in all rows of which it held; without a value, rows are known by bucket only."""
     first_s, last_s = summary.first_sim_time_s, summary.last_sim_time_s
-    start_s = part.start_s if first_s is None else first_s
-    end_s = part.end_s if last_s is None else last_s
+    start_s = max(segment.start_s, bucket * BUCKET_S) if first_s is None else first_s
+    end_s = min(segment.end_s, (bucket + 1) * BUCKET_S) if last_s is None else last_s
     (key,) = condition.of_rows([summary.last])
     return Span(start_s, end_s, key, summary.min, summary.max, from_first=True, to_last=True)
 
@@ -187,7 +205,8 @@ def _as_one(before: Span, after: Span) -> Span:
     lows = [each for each in (before.low, after.low) if each is not None]
     highs = [each for each in (before.high, after.high) if each is not None]
     low, high = min(lows, default=None), max(highs, default=None)
-    return replace(before, end_s=after.end_s, low=low, high=high, to_last=after.to_last)
+    ends = (before.from_first, after.to_last)
+    return Span(before.start_s, after.end_s, before.key, low, high, *ends)
 
 
 def common(spans: Sequence[Span], others: Sequence[Span]) -> Iterator[Span]:

@@ -27,7 +27,7 @@ from webots_mcp.store.reading.intervals import (
     spans_in_rows,
 )
 from webots_mcp.store.reading.ranges import Segment, just_after
-from webots_mcp.store.reading.rollups import read_pieces, rows_after
+from webots_mcp.store.reading.rollups import Pieces, read_pieces, rows_after
 from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of, read_columns
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, buckets, totals
@@ -303,12 +303,27 @@ class LongView:
         if self._deadline.passed:
             self._cut()
             return []
-        pieces = read_pieces(self._connection, self._segment, [signal], self._deadline)
+        shared = condition.lasting and signal in self._changing
+        pieces = self._pieces if shared else self._pieces_of([signal])
         read = functools.partial(self._rows_of, signal)
         spans = joined(spans_in_pieces(self._segment, signal, pieces, condition, read))
         if self._deadline.passed:
             self._cut()
         return spans
+
+    def _pieces_of(self, signals: Sequence[Signal]) -> Pieces:
+        return read_pieces(self._connection, self._segment, signals, self._deadline)
+
+    @functools.cached_property
+    def _pieces(self) -> Pieces:
+        """Of all signals that rest at times, which are read together."""
+        return self._pieces_of(self._changing)
+
+    @functools.cached_property
+    def _changing(self) -> list[Signal]:
+        """Those that rest at times only."""
+        changing = {signal_id for signal_id, total in self._totals.items() if total.changes}
+        return [signal for signal in self._resting if signal.id in changing]
 
     def _rows_of(self, signal: Signal, part: Segment) -> Columns:
         """Read with the other signals that rest at times, which are likely to ask for the same."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
 
 GAP_INTERVALS: Final = 3.0  # a gap is longer than so many usual intervals
 ANOTHER_RATE: Final = 5  # so many long intervals one after the other are no gaps
@@ -60,7 +60,7 @@ def usual_interval_s(times: Sequence[float] | Array) -> float | None:
     """The median interval; those of zero, while a simulation is paused, do not count."""
     intervals: Array = np.diff(np.asarray(times, np.float64))
     moving = intervals[intervals > 0]
-    return float(np.median(moving)) if len(moving) else None
+    return median(moving) if len(moving) else None
 
 
 def gaps_in(times: Sequence[float] | Array, interval_s: float) -> tuple[Gap, ...]:

@@ -7,7 +7,7 @@ from itertools import pairwise
 from math import log, sqrt
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
 from webots_mcp.store.analysis.noise import (
     FEWEST_SMOOTHED,
     kept_alike,
@@ -95,7 +95,7 @@ def tracks_of(times: Array, x: Array, y: Array, noise_m: float | None = None) ->
 
 
 def _smoothing_rows(times: Array, noise_m: float) -> int:
-    interval_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    interval_s = median(np.diff(times)) if len(times) > 1 else 0.0
     if noise_m == 0 or interval_s <= 0:
         return 1
     wanted = _PARABOLA_GAIN * (_leg_noise(len(times), 1) * noise_m / FINEST_LEG_M) ** 2

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from webots_mcp.naming import Value
-from webots_mcp.store.analysis.arrays import Array, Indexes
+from webots_mcp.store.analysis.arrays import Array, Indexes, median
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.habits import MovedIn
@@ -90,8 +90,8 @@ def _by_command(
     stop = (speeds < options.min_commanded) & (motion.commanded is not None)
     said = f"{signal.name} {{:.3g}}"
     shown = told.mean() > TOLD_SHARE if len(told) else False
-    why = [said.format(np.median(numbers(columns, signal)[told]))] if shown else []
-    against = [said.format(np.median(numbers(columns, signal)[stop]))] if _mostly(stop) else []
+    why = [said.format(median(numbers(columns, signal)[told]))] if shown else []
+    against = [said.format(median(numbers(columns, signal)[stop]))] if _mostly(stop) else []
     return told, why, stop, against
 
 
@@ -111,7 +111,7 @@ def _by_wheels(columns: Columns, motion: Motion) -> tuple[Flags, list[str], Flag
     spot = turn & ~ahead
     unit = " rad/s" if all(wheel.unit == "rad/s" for wheel in wheels) else ""
     driving = ahead if ahead.any() else spot
-    why = [f"wheels at {np.median(fastest[driving]):.3g}{unit}"] if driving.any() else []
+    why = [f"wheels at {median(fastest[driving]):.3g}{unit}"] if driving.any() else []
     against = ["wheels rest"] if _mostly(~turn) else []
     return (ahead | spot) if motion.heading else ahead, why, spot, against
 
@@ -198,7 +198,7 @@ def turned_rad(columns: Columns, heading: Signal | None) -> float | None:
     if not len(course):
         return None
     rows = max(1, min(5, len(course) // 2))
-    return float(np.median(course[-rows:]) - np.median(course[:rows]))
+    return median(course[-rows:]) - median(course[:rows])
 
 
 def _radians(columns: Columns, angle: Signal) -> Array:

@@ -40,7 +40,7 @@ def flat_events(search: Search) -> Iterator[Event]:
         here = search.view.summary(signal)
         if here.changes >= here.present - 1:
             continue
-        if here.changes < LEAST_CHANGES and not _is_lively(search, signal):
+        if shortest_s and here.changes < LEAST_CHANGES and not _is_lively(search, signal):
             continue
         if search.is_over("flat", signals[index:]):
             break

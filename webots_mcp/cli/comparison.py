@@ -37,7 +37,7 @@ def _group_row(group: Group) -> list[object]:
         group.total_duration_s,
         _each(run.end_reason or "going on" for run in group.runs),
         _each((run.controller_sha256 or "")[:8] for run in group.runs) or None,
-        {name: ", ".join(map(str, each)) for name, each in group.parameters.items()} or None,
+        {name: "; ".join(map(str, each)) for name, each in group.parameters.items()} or None,
     ]
 
 

@@ -42,6 +42,7 @@ from webots_mcp.store.trials import (
 from webots_mcp.trials.plan import Plan, stored_plan
 
 _LOOK_EVERY_S: Final = 0.02
+_ONE_STEP_S: Final = 1e-6  # no step is shorter
 _SETTLE_EVERY_S: Final = 1.0
 _PATIENCE_S: Final = 5.0  # with a command that takes a round of the loop
 _END_PATIENCE_S: Final = 2.0  # the same where the server ends
@@ -318,18 +319,20 @@ class TrialWorker(threading.Thread):
     def _ask_back(self, connection: sqlite3.Connection, noted: TrialSet) -> Command | None:
         """The command that sets the parameters back; None where there is nothing, or nobody."""
         assert noted.robot_id is not None and noted.former_values is not None
-        if not (former := json.loads(noted.former_values)):
+        former = json.loads(noted.former_values)
+        if noted.stop_reason is None and not self._stopping.is_set():
+            action, params = ACTION, _new_run_with(former)
+        elif former:  # somebody looks at what the trial left: no reset
+            action, params = _SET_PARAMETERS, {"values": former, "when": "now", "by": "trial"}
+        else:
             return None
         try:
-            view = find_target(connection, self._robot, _SET_PARAMETERS)
+            view = find_target(connection, self._robot, action)
         except CommandRefusedError:
             return None
         if view.session is None or view.session.id != noted.session_id:
             return None
-        params = {"values": former, "when": "now", "by": "trial"}
-        return CommandQueue(connection).enqueue(
-            noted.robot_id, _SET_PARAMETERS, params, requested_by=_ASKER
-        )
+        return CommandQueue(connection).enqueue(noted.robot_id, action, params, requested_by=_ASKER)
 
 
 class TrialWorkers:
@@ -357,6 +360,12 @@ class TrialWorkers:
         """The server ends."""
         for worker in self._workers:
             worker.stop()
+
+
+def _new_run_with(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What begins another run than that of the last trial, which would else go on with it."""
+    asked = {"for_s": _ONE_STEP_S, "reset": True, "pace": "fast", "then": "pause"}
+    return {**asked, "parameters": values, "by": "trial"}
 
 
 def _key(trial: Trial) -> str:

@@ -254,6 +254,8 @@ async def test_the_full_state_says_which_seconds_were_kept_last(
         robot.kept(5.0, 12.0, "breakpoint 1: front_m < 0.1")
         robot.kept(40.0, 47.0, "error: the gear is gone")
         answer = await ask(client, "webots_get_full_state")
+        seen = await ask(client, "webots_get_robot_state")
+    assert seen["kept_at_full_rate"] == answer["recorder"]["kept_at_full_rate"]
     assert answer["recorder"]["kept_at_full_rate"] == "40.000-47.000 s: error: the gear is gone"
 
 

@@ -51,6 +51,7 @@ class StateAnswer(Answer):
 
     state: Any = Field(default=None, description="Data published by the controller.")
     shortened: str | None = Field(default=None, description="Rule by which parts were left out.")
+    kept_at_full_rate: str | None = Field(default=None, description="The run's last kept stretch.")
 
 
 class SensorsAnswer(Answer):

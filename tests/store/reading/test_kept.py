@@ -192,6 +192,16 @@ def test_an_answer_says_what_is_kept_and_why(connection: sqlite3.Connection) -> 
     assert ranges(connection)[1].notes == ()
 
 
+def test_a_range_that_is_wider_than_a_stretch_says_how_to_use_each_call(
+    connection: sqlite3.Connection,
+) -> None:
+    start_s, end_s = stretch(connection)
+    wide = resolve_range(connection, robot="throttled", start_s=start_s - 5, end_s=end_s)
+    inside = resolve_range(connection, robot="throttled", start_s=start_s + 1, end_s=end_s - 1)
+    assert any("ask for a part of it alone to use each call" in note for note in wide.notes)
+    assert not any("each call" in note for note in inside.notes)
+
+
 def test_means_and_counts_of_a_longer_range_are_not_those_of_the_stretch(
     connection: sqlite3.Connection,
 ) -> None:

@@ -58,7 +58,8 @@ def webots_get_robot_state(
             return StateAnswer(**view.header(), hint=_nothing_yet(view))
         short = shorten(view.state.value())
         hint = "webots_get_full_state(path=...) shows a part whole" if short.rule else None
-        return StateAnswer(**view.header(), state=short.value, shortened=short.rule, hint=hint)
+        told = {"state": short.value, "shortened": short.rule, "hint": hint, **_kept(view)}
+        return StateAnswer(**view.header(), **told)
 
 
 @tool("Get the sensors", READS)

@@ -286,8 +286,11 @@ def _in_simulation_time(
 def _rate_notes(connection: sqlite3.Connection, segment: Segment) -> list[str]:
     """Where more than what the throttle lets through is a row."""
     span = (segment.run_id, segment.start_s, segment.end_s)
-    hits = () if segment.full_rate else hit_notes(connection, *span)
-    return [*kept_notes(connection, *span), *hits]
+    kept = kept_notes(connection, *span)
+    if segment.full_rate:
+        return kept
+    inside = [f"{each}; ask for a part of it alone to use each call" for each in kept]
+    return [*inside, *hit_notes(connection, *span)]
 
 
 def _too_young(

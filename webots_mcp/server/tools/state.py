@@ -58,8 +58,13 @@ def webots_get_robot_state(
             return StateAnswer(**view.header(), hint=_nothing_yet(view))
         short = shorten(view.state.value())
         hint = "webots_get_full_state(path=...) shows a part whole" if short.rule else None
-        told = {"state": short.value, "shortened": short.rule, "hint": hint, **_kept(view)}
-        return StateAnswer(**view.header(), **told)
+        return StateAnswer(
+            **view.header(),
+            state=short.value,
+            shortened=short.rule,
+            kept_at_full_rate=_kept(view),
+            hint=hint,
+        )
 
 
 @tool("Get the sensors", READS)
@@ -195,7 +200,7 @@ def _recorder(view: View) -> dict[str, Any] | None:
     error = cut_text(session.last_error, _ERROR_CHARACTERS) if session.last_error else None
     return {
         "rows_recorded": view.run.rows if view.run else 0,
-        **_kept(view),
+        **({"kept_at_full_rate": kept} if (kept := _kept(view)) else {}),
         **waiting(view.connection, session),
         "rows_dropped": session.rows_dropped,
         "last_error": error,
@@ -208,13 +213,13 @@ def _recorder(view: View) -> dict[str, Any] | None:
     }
 
 
-def _kept(view: View) -> dict[str, str]:
+def _kept(view: View) -> str | None:
     """Which seconds of the run were kept last at full rate, and why."""
     newest = newest_kept(view.connection, view.run.id) if view.run else None
     if newest is None:
-        return {}
+        return None
     span = f"{newest.start_s:.3f}-{newest.end_s:.3f} s"
-    return {"kept_at_full_rate": f"{span}: {cut_text(newest.reason, _ERROR_CHARACTERS)}"}
+    return f"{span}: {cut_text(newest.reason, _ERROR_CHARACTERS)}"
 
 
 def _replaced_in(state: State, part: dict[str, Any]) -> dict[str, str] | None:

@@ -44,7 +44,10 @@ def test_an_export_is_whole_but_for_the_row_that_cannot_be_read(
     file, table = tmp_path / "webots.db", tmp_path / "rows.jsonl"
     record(file)
     with closing(sqlite3.connect(file)) as connection, connection:
-        rows = connection.execute("SELECT count(*) FROM state WHERE run_id = 2").fetchone()[0]
+        rows = sum(
+            connection.execute(f"SELECT count(*) FROM {each} WHERE run_id = 2").fetchone()[0]
+            for each in ("state", "kept_state")
+        )
         connection.execute("UPDATE state SET odd = '[1]' WHERE id = (SELECT max(id) FROM state)")
         connection.execute(
             "UPDATE state SET data = CAST(x'7b22ff' AS TEXT) "

@@ -17,6 +17,7 @@ CLIPPED: Final = 1.5  # times the median magnitude: a sine has a height of 1.4 t
 # Mean magnitude of these differences, in deviations of the noise: of noise alone it is
 # (12 / pi)**0.5 = 1.95, and where a sine explains as much of it as is LIKELY it is 3.1.
 LEAST_LOUD: Final = 2.4
+LEAST_TURNS: Final = 2  # of their sign; a sine has four, of which a bend may hide some
 LIKELY: Final = 0.6  # of such clipped differences is explained by a sine ...
 MOST_LIKELY: Final = 0.8  # ... and so much somewhere in the stretch
 SEMITONES: Final = range(-4, 5)  # of the band's period; a band reaches from -3 to 3
@@ -56,28 +57,38 @@ def likely_swings(values: Array, noise: Array, period: float) -> Iterator[tuple[
 
     Looked at are second differences over a fifth of the period: there a course of straight pieces
     is 0 but about its bends, and what stands out from the median at bends is cut off. Where they
-    are hardly larger than the noise about each value makes them, a sine explains little of them.
+    are hardly larger than the noise about each value makes them, or keep their sign, a sine
+    explains little of them.
     """
     lag, hop, rows = (max(1, round(share * period)) for share in (LAG, 0.5, LOOKED_AT))
     bends = values[2 * lag :] - 2 * values[lag:-lag] + values[: -2 * lag]
     if len(bends) < rows:
         return
     sizes = np.einsum("ij->i", _windows(np.abs(bends), rows, hop))
-    loud = np.flatnonzero(sizes > LEAST_LOUD * rows * noise[lag + rows // 2 :: hop][: len(sizes)])
-    windows = _windows(bends, rows, hop)[loud]
+    loud = sizes > LEAST_LOUD * rows * noise[lag + rows // 2 :: hop][: len(sizes)]
+    looked_at = np.flatnonzero(loud & (_turns(bends, rows, hop) >= LEAST_TURNS))
+    windows = _windows(bends, rows, hop)[looked_at]
     limits = CLIPPED * np.partition(np.abs(windows), rows // 2, axis=1)[:, rows // 2, None]
     clipped: Array = np.minimum(np.maximum(windows, -limits), limits)
     squares: Array = np.einsum("ij,ij->i", clipped, clipped)
     periods = period * 2 ** (np.array(SEMITONES) / 12)
     best = _explained(clipped, periods[1::3]).max(axis=1)
-    likely = loud[(best > LIKELY * squares) & (squares > 0)]
+    likely = looked_at[(best > LIKELY * squares) & (squares > 0)]
     reach = rows + 2 * lag
     for part in _followed(likely, int((reach + HIDDEN * period) / hop)):
-        seen = np.searchsorted(loud, part)
+        seen = np.searchsorted(looked_at, part)
         if np.any(best[seen] > MOST_LIKELY * squares[seen]):
             place = int(np.argmax(_explained(clipped[seen], periods).sum(axis=0)))
             if 0 < place < len(periods) - 1:  # else another band sees it better
                 yield int(part[0]) * hop, int(part[-1]) * hop + reach, float(periods[place])
+
+
+def _turns(values: Array, rows: int, hop: int) -> Indexes:
+    """How often the sign changes in each of the windows."""
+    above = values > 0
+    places = np.flatnonzero(above[1:] != above[:-1])
+    starts = np.arange(0, len(values) - rows + 1, hop)
+    return np.searchsorted(places, starts + rows - 1) - np.searchsorted(places, starts)
 
 
 def _windows(values: Array, rows: int, hop: int) -> Array:

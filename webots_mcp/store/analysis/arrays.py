@@ -23,7 +23,7 @@ else:
 
     np = _AtFirstUse()
 
-__all__ = ["Array", "Flags", "Indexes", "inner", "median", "np"]
+__all__ = ["Array", "Flags", "Indexes", "inner", "median", "np", "sums_of"]
 
 
 def inner(one: Array, other: Array) -> float:
@@ -36,3 +36,12 @@ def median(values: Array) -> float:
     below, above = (len(values) - 1) // 2, len(values) // 2
     ordered = np.partition(values, (below, above))
     return float(ordered[below] + ordered[above]) / 2
+
+
+def sums_of(values: Array, rows: int) -> Array:
+    """Of so many values that follow each other; put together of sums of half as many."""
+    if rows == 1:
+        return values
+    halves = sums_of(values, rows // 2)
+    sums = halves[: len(halves) - rows // 2] + halves[rows // 2 :]
+    return sums[:-1] + values[rows - 1 :] if rows % 2 else sums

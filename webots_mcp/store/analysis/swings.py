@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, inner, median, np
+from webots_mcp.store.analysis.arrays import Array, inner, median, np, sums_of
 from webots_mcp.store.analysis.noise import Roughness
 from webots_mcp.store.analysis.rhythm import gap_borders
 from webots_mcp.store.analysis.sines import TRIED_PERIODS, fit_sines, parabolas
@@ -275,18 +275,9 @@ def _moving_mean(values: Array, rows: int) -> Array:
     for _ in range(2):
         before = 2 * values[0] - values[reach:0:-1]
         after = 2 * values[-1] - values[-2 : -reach - 2 : -1]
-        values = _sums(np.concatenate((before, values, after)), 2 * reach + 1)
+        values = sums_of(np.concatenate((before, values, after)), 2 * reach + 1)
         values /= 2 * reach + 1
     return values
-
-
-def _sums(values: Array, rows: int) -> Array:
-    """Of so many values that follow each other; put together of sums of half as many."""
-    if rows == 1:
-        return values
-    halves = _sums(values, rows // 2)
-    sums = halves[: len(halves) - rows // 2] + halves[rows // 2 :]
-    return sums[:-1] + values[rows - 1 :] if rows % 2 else sums
 
 
 def _regular(times: Array, band: Array, period_s: float, least: int) -> Iterator[_Crossings]:
@@ -297,7 +288,7 @@ def _regular(times: Array, band: Array, period_s: float, least: int) -> Iterator
     """
     above = band >= 0
     above[0], above[-1] = above[1], above[-2]
-    before = np.flatnonzero(above[1:] != above[:-1])
+    (before,) = (above[1:] != above[:-1]).nonzero()
     share = band[before] / (band[before] - band[before + 1])
     crossed = times[before] + share * (times[before + 1] - times[before])
     moments = np.concatenate((times[:1], crossed, times[-1:]))

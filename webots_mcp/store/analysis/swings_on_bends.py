@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np, sums_of
 from webots_mcp.store.analysis.hinges import hinged_courses, hinges_in
 from webots_mcp.store.analysis.noise import noise_of
 from webots_mcp.store.analysis.sines import TRIED_PERIODS, Fit, fit_sines
@@ -64,47 +65,48 @@ def likely_swings(values: Array, noise: Array, period: float) -> Iterator[tuple[
     bends = values[2 * lag :] - 2 * values[lag:-lag] + values[: -2 * lag]
     if len(bends) < rows:
         return
-    sizes = np.einsum("ij->i", _windows(np.abs(bends), rows, hop))
+    sizes = sums_of(np.abs(bends), rows)[::hop]
     loud = sizes > LEAST_LOUD * rows * noise[lag + rows // 2 :: hop][: len(sizes)]
     looked_at = np.flatnonzero(loud & (_turns(bends, rows, hop) >= LEAST_TURNS))
-    windows = _windows(bends, rows, hop)[looked_at]
+    if not len(looked_at):
+        return
+    windows = bends[hop * looked_at[:, None] + np.arange(rows)]
     limits = CLIPPED * np.partition(np.abs(windows), rows // 2, axis=1)[:, rows // 2, None]
     clipped: Array = np.minimum(np.maximum(windows, -limits), limits)
     squares: Array = np.einsum("ij,ij->i", clipped, clipped)
-    periods = period * 2 ** (np.array(SEMITONES) / 12)
-    best = _explained(clipped, periods[1::3]).max(axis=1)
+    periods = [period * 2 ** (semitones / 12) for semitones in SEMITONES]
+    best = _explained(clipped, *periods[1::3]).max(axis=1)
     likely = looked_at[(best > LIKELY * squares) & (squares > 0)]
     reach = rows + 2 * lag
     for part in _followed(likely, int((reach + HIDDEN * period) / hop)):
         seen = np.searchsorted(looked_at, part)
         if np.any(best[seen] > MOST_LIKELY * squares[seen]):
-            place = int(np.argmax(_explained(clipped[seen], periods).sum(axis=0)))
+            place = int(np.argmax(_explained(clipped[seen], *periods).sum(axis=0)))
             if 0 < place < len(periods) - 1:  # else another band sees it better
-                yield int(part[0]) * hop, int(part[-1]) * hop + reach, float(periods[place])
+                yield int(part[0]) * hop, int(part[-1]) * hop + reach, periods[place]
 
 
 def _turns(values: Array, rows: int, hop: int) -> Indexes:
     """How often the sign changes in each of the windows."""
     above = values > 0
-    places = np.flatnonzero(above[1:] != above[:-1])
+    (places,) = (above[1:] != above[:-1]).nonzero()
     starts = np.arange(0, len(values) - rows + 1, hop)
     return np.searchsorted(places, starts + rows - 1) - np.searchsorted(places, starts)
 
 
-def _windows(values: Array, rows: int, hop: int) -> Array:
-    """So many values each, from one to the next so many on."""
-    return np.lib.stride_tricks.sliding_window_view(values, rows)[::hop]
-
-
-def _explained(windows: Array, periods: Array) -> Array:
+def _explained(windows: Array, *periods: float) -> Array:
     """Of the squares in each window, what a sine of each period explains."""
-    rows = windows.shape[1]
+    squares = (windows @ _waves(windows.shape[1], *periods)) ** 2
+    return np.asarray(squares[:, : len(periods)] + squares[:, len(periods) :], np.float64)
+
+
+@lru_cache(64)  # the same for all signals of a stretch
+def _waves(rows: int, *periods: float) -> Array:
+    """Cosines and sines of length 1 as columns."""
     places: Array = np.arange(rows, dtype=np.float64) - (rows - 1) / 2
-    angles: Array = 2 * np.pi * places[:, None] / periods
+    angles: Array = 2 * np.pi * places[:, None] / np.array(periods)
     waves = np.concatenate((np.cos(angles), np.sin(angles)), axis=1)
-    waves /= np.sqrt(np.einsum("ij,ij->j", waves, waves))
-    cosines, sines = np.split((windows @ waves) ** 2, 2, axis=1)
-    return np.asarray(cosines + sines, np.float64)
+    return np.asarray(waves / np.sqrt(np.einsum("ij,ij->j", waves, waves)), np.float64)
 
 
 def _followed(places: Indexes, most: int) -> list[Indexes]:
@@ -125,7 +127,7 @@ def swings_on_bends(
     start, end = max(0, start - 2 * hop), min(len(values), end + 2 * hop)
     if end - start < rows:
         return
-    pieces = _windows(values[start:end], rows, hop)
+    pieces = np.lib.stride_tricks.sliding_window_view(values[start:end], rows)[::hop]
     touching = int((rows + HIDDEN * period) / hop)
     for part, fitted in _fitted(pieces, period, noise_of(values[start:end]), touching):
         first, last = start + int(part[0]) * hop, start + int(part[-1]) * hop + rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -36,10 +37,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts = (_judged, _widened, _travelled, _compared)
     done = [told for part in parts if (told := part(chosen, options)) is not None]
     _show("")
-    print("\n\n".join(text for text, _ in done))
     failed = sum(missed for _, missed in done)
     took_s = time.monotonic() - started_s
-    print(f"\nseed {options.seed}; {failed} lines are below their goals; {took_s:.0f} s")
+    ended = f"seed {options.seed}; {failed} lines are below their goals; {took_s:.0f} s"
+    _print("\n\n".join([*(text for text, _ in done), ended]))
     return int(options.check and failed > 0)
 
 
@@ -76,6 +77,13 @@ def _compared(chosen: Sequence[str], options: argparse.Namespace) -> tuple[str, 
         return None
     pairs = measure_pairs(options.seed, say=_show)
     return render_pairs(pairs), len(pairs.missed)
+
+
+def _print(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:  # the reader of the pipe has seen enough: Python does not try again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _show(text: str) -> None:

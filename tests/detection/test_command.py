@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import pytest
 
 from tests.detection import goals
@@ -19,6 +23,15 @@ def test_a_line_is_printed_for_each_kind_and_what_is_judged_in_it(
     lines = [line.split()[:2] for line in printed.splitlines()]
     assert ["gaps", "gap"] in lines and ["swing_gap", "swing"] in lines
     assert "seed 2" in printed
+
+
+def test_who_reads_only_the_first_lines_sees_no_traceback() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "tests.detection", "--kinds", "gaps", "--cases", "1"]
+    ended = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_the_same_seed_gives_the_same_figures() -> None:

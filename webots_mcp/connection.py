@@ -33,6 +33,7 @@ Result = TypeVar("Result")
 
 OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
 OPENING_TIMEOUT_MS: Final = 5000
+_UNINTERRUPTED_MS: Final = 100
 LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write waits so long
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
 _UNWRITABLE: Final = ("readonly database", "unable to open database file")
@@ -164,12 +165,38 @@ def transaction(connection: sqlite3.Connection) -> Generator[None]:
         sqlite3.Error: Also where the lock is not to be had (`is_busy`); then nothing ran inside.
     """
     try:
-        connection.execute("BEGIN IMMEDIATE")
+        _begin(connection)
         yield
         connection.execute("COMMIT")
     except BaseException:
         roll_back(connection)
         raise
+
+
+def _begin(connection: sqlite3.Connection) -> None:
+    """Take the write lock, waiting for it in pieces: SQLite's own wait cannot be interrupted."""
+    (patience_ms,) = connection.execute("PRAGMA busy_timeout").fetchone()
+    if patience_ms <= _UNINTERRUPTED_MS:
+        connection.execute("BEGIN IMMEDIATE")
+        return
+    until_s = time.monotonic() + patience_ms / 1000
+    connection.execute(f"PRAGMA busy_timeout={_UNINTERRUPTED_MS}")
+    try:
+        while not _begun(connection, last=time.monotonic() > until_s):
+            pass
+    finally:
+        connection.execute(f"PRAGMA busy_timeout={patience_ms}")
+
+
+def _begun(connection: sqlite3.Connection, *, last: bool) -> bool:
+    """Whether the write lock is had; the last attempt raises where it is not."""
+    try:
+        connection.execute("BEGIN IMMEDIATE")
+    except sqlite3.OperationalError as error:
+        if last or not is_busy(error):
+            raise
+        return False
+    return True
 
 
 def together(connection: sqlite3.Connection, act: Callable[[], Result]) -> Result:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sqlite3
 import stat
 import sys
@@ -49,6 +50,29 @@ def test_a_transaction_beside_another_is_busy_and_runs_nothing(tmp_path: Path) -
         pytest.fail("two transactions wrote at once")
     assert is_busy(refused.value)
     assert not is_damage(refused.value)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a timer that interrupts, of POSIX")
+def test_a_signal_is_handled_while_the_lock_is_waited_for(tmp_path: Path) -> None:
+    with (
+        closing(connect(tmp_path / "x.db", "writer", create=True)) as holder,
+        closing(connect(tmp_path / "x.db", "writer")) as connection,
+    ):
+        create_schema(holder)
+        connection.execute("PRAGMA busy_timeout=2000")
+        holder.execute("BEGIN IMMEDIATE")
+
+        def release(_number: int, _frame: object) -> None:
+            holder.execute("ROLLBACK")
+
+        before = signal.signal(signal.SIGALRM, release)
+        try:
+            signal.setitimer(signal.ITIMER_REAL, 0.05)
+            with transaction(connection):
+                connection.execute(LEASE, ("a",))
+        finally:
+            signal.signal(signal.SIGALRM, before)
+        assert connection.execute("PRAGMA busy_timeout").fetchone() == (2000,)
 
 
 def test_a_short_write_ends_when_its_time_is_over_and_goes_on_where_it_ended() -> None:

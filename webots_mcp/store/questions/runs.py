@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
+from webots_mcp.connection import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.parameter import Value
 from webots_mcp.settlement import gone_sessions
@@ -200,8 +201,10 @@ def annotate_run(
             raise InvalidInputError(
                 f"the {name} has {len(text)} characters; at most {longest} are kept"
             )
-    if not connection.execute(_ANNOTATE, {"run": run_id, "label": label, "note": note}).rowcount:
-        fetch_run(connection, run_id)  # says which there are
+    values = {"run": run_id, "label": label, "note": note}
+    with transaction(connection):  # it waits for the lock, and Ctrl-C ends that
+        if not connection.execute(_ANNOTATE, values).rowcount:
+            fetch_run(connection, run_id)  # says which there are
 
 
 def pace(duration_s: float, wall_s: float) -> float | None:

@@ -96,7 +96,9 @@ def remove_breakpoint(connection: sqlite3.Connection, robot_id: int, breakpoint_
     Raises:
         InvalidInputError: The robot has none of that id.
     """
-    if connection.execute(_REMOVE, (breakpoint_id, robot_id)).fetchall():
+    with transaction(connection):
+        removed = connection.execute(_REMOVE, (breakpoint_id, robot_id)).fetchall()
+    if removed:
         return
     there = [str(number) for (number,) in connection.execute(_IDS, (robot_id,)).fetchall()]
     known = f"there are {', '.join(there)}" if there else "it has none"

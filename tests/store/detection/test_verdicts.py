@@ -37,3 +37,9 @@ def test_what_was_searched_in_some_signals_is_named_once_with_the_others(
     assert why.startswith("not in 1 of 4 signals")
     assert "(temp_c)" in why and why.endswith("; none in the rest")
     assert (told.far, told.came_near) == (["gap"], {})
+
+
+def test_of_a_short_run_it_is_said_which_swings_do_not_fit_in(empty: sqlite3.Connection) -> None:
+    (why,) = ask(empty, 76, "oscillation").gaps.values()
+    assert "run 1 is only 7.5 s long: 6 half swings with a period of more than 2.5 s" in why
+    assert why.endswith("; none in the rest")

@@ -26,11 +26,25 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             f"robot swings with: name them in signals ({listed(left, _MOST_NAMED)})",
         )
     found = _found(search, signals)
+    if not any(found.values()):
+        _note_shortness(search)
     for name, swings in found.items():
         for swing in joined_swings(swings):
             details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
             ends = (swing.start_s, swing.end_s)
             yield search.event("oscillation", *ends, name, turns=swing.half_swings, **details)
+
+
+def _note_shortness(search: Search) -> None:
+    """Which periods are too long for a run to hold as many half swings as are asked for."""
+    turns = search.options.oscillation_turns
+    longest_s = 2 * search.length_s / turns
+    if longest_s < search.options.oscillation_period_s:
+        search.not_searched(
+            "oscillation",
+            f"run {search.segment.run_id} is only {search.length_s:.3g} s long: {turns} half "
+            f"swings with a period of more than {longest_s:.2g} s do not fit in",
+        )
 
 
 def _found(search: Search, signals: Sequence[Signal]) -> dict[str, list[Swing]]:

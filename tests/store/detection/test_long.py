@@ -151,3 +151,48 @@ def test_the_position_of_a_run_is_the_one_that_it_published(empty: sqlite3.Conne
             empty, resolve_range(empty, run_id=run_id), EventOptions(kinds=("still",))
         )
         assert [round(each.start_s) for each in found.events] == [20], run_id
+
+
+@pytest.fixture
+def stopping(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
+    """A robot that stands for 30 s of each 60 s, in a run that is long."""
+    monkeypatch.setattr(rows, "RAW_ROWS", 1000)
+    recorder = Recorder(empty)
+    robot_id = recorder.robot("rover")
+    recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
+    x = 0.0
+    for step in range(6000):
+        moving = step % 600 < 300
+        x += 0.02 * moving
+        recorder.publish(step * 0.1, {"pose": [round(x, 4), 0.0], "ticks": step * moving})
+    roll(empty, 100_000)
+    return empty
+
+
+def test_standstills_of_a_long_run_that_are_told_begin_and_end_to_the_row(
+    stopping: sqlite3.Connection,
+) -> None:
+    asked, options = resolve_range(stopping), EventOptions(kinds=("still",))
+    found = find_events(stopping, asked, options, limit=3)
+    assert found.totals == {"still": 10}
+    ends = [(each.start_s, each.end_s) for each in found.events]
+    expected = [(60.0 * at + 29.9, 60.0 * at + 59.9) for at in (7, 8, 9)]
+    assert ends == [pytest.approx(each, abs=0.11) for each in expected]
+    assert all("within_s" not in each.details for each in found.events)
+    rough = find_events(stopping, asked, options, exact=False)
+    assert [each.details["within_s"] for each in rough.events] == [0.6] * 10
+
+
+def test_no_rows_are_read_for_the_ends_of_rests_that_the_rollups_tell(
+    stopping: sqlite3.Connection,
+) -> None:
+    def flat() -> list[tuple[float, float]]:
+        asked = EventOptions(kinds=("flat",), signals=("ticks",))
+        found = find_events(stopping, resolve_range(stopping), asked, group=False)
+        return [(each.start_s, each.end_s) for each in found.events]
+
+    told, few = flat(), reads(stopping, "flat")
+    stopping.execute("UPDATE rollup SET last_since_sim_time_s = NULL")  # as older versions left it
+    assert flat() == told
+    assert len(told) == 10
+    assert reads(stopping, "flat") > few

@@ -1,4 +1,4 @@
-"""Swings that are kept with coarse rollups are those that the rows show."""
+"""Swings that are stored with coarse rollups are those that the rows show."""
 
 from __future__ import annotations
 
@@ -66,16 +66,16 @@ def rows_read(connection: sqlite3.Connection, **asked: Any) -> int:
     return sum("json_extract(data" in each for each in statements)
 
 
-def test_kept_swings_are_told_as_the_rows_tell_them_and_the_rows_are_not_read(
+def test_stored_swings_are_told_as_the_rows_tell_them_and_the_rows_are_not_read(
     long: sqlite3.Connection,
 ) -> None:
-    kept, few = swings_of(long), rows_read(long)
+    stored, few = swings_of(long), rows_read(long)
     long.execute("UPDATE coarse_rollup SET swings = NULL")  # as older versions left them
     read = swings_of(long)
     assert [(round(start_s), round(end_s)) for start_s, end_s, *_ in read] == [
         (round(start_s), round(end_s)) for start_s, end_s in SWINGS_S
     ]
-    for one, other in zip(kept, read, strict=True):
+    for one, other in zip(stored, read, strict=True):
         assert one == pytest.approx(other, rel=0.02)
     assert few < rows_read(long) / 2
 
@@ -88,7 +88,7 @@ def test_swings_of_other_lengths_or_of_other_signals_are_looked_for_in_the_rows(
     assert rows_read(long, oscillation_turns=26) > rows_read(long)
 
 
-def test_kept_swings_outlast_the_rows(long: sqlite3.Connection, tmp_path: Path) -> None:
+def test_stored_swings_outlast_the_rows(long: sqlite3.Connection, tmp_path: Path) -> None:
     before = swings_of(long)
     long.execute("UPDATE run SET ended_wall_time_s = last_wall_time_s")
     prune(long, tmp_path, Retention(state=Limit(rows=4000), outlive=0), rest=False)
@@ -102,8 +102,8 @@ def test_of_rows_that_were_gone_before_500_s_were_over_no_swings_are_claimed(
     long.execute("DELETE FROM state WHERE sim_time_s < 300")
     long.execute("UPDATE run SET coarse_end = NULL")
     roll(long, 100_000)
-    kept = long.execute(
+    stored = long.execute(
         "SELECT bucket, swings IS NOT NULL FROM coarse_rollup WHERE signal_id = "
         "(SELECT id FROM signal WHERE name = 'steering') ORDER BY bucket"
     )
-    assert kept.fetchall() == [(0, 0), (1, 1)]
+    assert stored.fetchall() == [(0, 0), (1, 1)]

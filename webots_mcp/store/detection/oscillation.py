@@ -48,13 +48,13 @@ def _note_shortness(search: Search) -> None:
 
 
 def _found(search: Search, signals: Sequence[Signal]) -> dict[str, list[Swing]]:
-    """Those that are kept, and in the rows of which none are."""
+    """Those that are stored, and in the rows of which none are."""
     options = search.options
     asked = options.oscillation_turns, options.oscillation_period_s
     usual = asked == (EventOptions.oscillation_turns, EventOptions.oscillation_period_s)
-    kept, found = search.view.kept_swings(signals if usual else ())
+    stored, found = search.view.stored_swings(signals if usual else ())
     for some, outside in (
-        ([each for each in signals if each.name in found], kept),
+        ([each for each in signals if each.name in found], stored),
         ([each for each in signals if each.name not in found], range(0)),
     ):
         at_rest = [0.0] * len(some)  # without any step there is no swing

@@ -32,7 +32,7 @@ from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of,
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, buckets, totals
 from webots_mcp.store.rollup.rolling import watermark
-from webots_mcp.store.rollup.swings import ACROSS_S, STRETCH_ROWS, kept_swings
+from webots_mcp.store.rollup.swings import ACROSS_S, STRETCH_ROWS, stored_swings
 from webots_mcp.store.signals.registry import Signal
 
 READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
@@ -109,7 +109,7 @@ class View(Protocol):
         """Where a jump may be."""
         ...
 
-    def kept_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
+    def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """Swings that were found before; and of which buckets, where all of a signal's are."""
         ...
 
@@ -206,7 +206,7 @@ class RowView:
         """All of it."""
         yield Course(*self._columns.numbers(signal.name))
 
-    def kept_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
+    def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """None: all rows are there to look in."""
         return _NOTHING, {}
 
@@ -359,10 +359,10 @@ class LongView:
             usual = self._sample.numbers(signal.name)[1]
             yield Course(*self._numbers(signal, bucket), usual)
 
-    def kept_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
+    def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """Those of the coarse rollups that lie inside."""
         start, end = -(-self._segment.start_s // BUCKET_S), self._segment.end_s // BUCKET_S
-        return kept_swings(self._connection, self._segment, range(int(start), int(end)), signals)
+        return stored_swings(self._connection, self._segment, range(int(start), int(end)), signals)
 
     def stretches(
         self,

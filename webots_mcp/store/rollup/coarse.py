@@ -1,6 +1,6 @@
 """Coarse rollups, merged from those of 10 s once these are over, in steps of about a millisecond.
 
-The swings of what a robot swings with are looked for then as well, and kept with them.
+The swings of what a robot swings with are looked for then as well, and stored with them.
 
 The column `coarse_end` of a run tells up to where they are complete. It moves on here, and back
 where a row comes late into what was merged already; then that is merged again.
@@ -17,7 +17,7 @@ from webots_mcp.connection import Step
 from webots_mcp.notice import warn
 from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, COARSE_S, bucket_of
-from webots_mcp.store.rollup.swings import swings_to_keep
+from webots_mcp.store.rollup.swings import swings_to_store
 from webots_mcp.store.rollup.tables import RUN_MARK, in_short_steps, run_mark
 from webots_mcp.store.sound import MAX_SIM_TIME_S, is_over_a_value, sound_rows
 
@@ -120,7 +120,7 @@ def _merged(connection: sqlite3.Connection, run: _Run, bucket: int) -> Iterator[
     try:
         merged = _merged_parts(connection.execute(_PARTS.format(table="rollup"), values).fetchall())
         rows = {signal_id: summary.rows for signal_id, summary in merged}
-        swings = swings_to_keep(connection, run.id, run.robot_id, bucket, rows)
+        swings = swings_to_store(connection, run.id, run.robot_id, bucket, rows)
     except Exception as error:
         if not is_over_a_value(error):
             raise

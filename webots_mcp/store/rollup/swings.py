@@ -1,4 +1,4 @@
-"""Swings of what a robot swings with: found where 500 s are over, and kept with their rollups.
+"""Swings of what a robot swings with: found where 500 s are over, and stored with their rollups.
 
 They show in all rows of a signal only, for which a question about hours has no time.
 """
@@ -24,7 +24,7 @@ from webots_mcp.store.signals.registry import Signal, registered
 LONGEST_PERIOD_S: Final = 5.0
 ACROSS_S: Final = 20.0  # of the stretch beside: longer than six half swings of that period
 STRETCH_ROWS: Final = 10_000  # that are searched at once
-MOST_SIGNALS: Final = 20  # of which swings are kept
+MOST_SIGNALS: Final = 20  # of which swings are stored
 MOST_ROWS: Final = 100_000  # in 500 s: of more a maintainer had to read too much at once
 _LONGEST_S: Final = 60.0  # that it reads
 
@@ -34,7 +34,7 @@ _SWINGING: Final = re.compile(
     r"|left|right|cmd|command\w*|error)([._]|$)",
     re.IGNORECASE,
 )
-_KEPT: Final = (
+_STORED: Final = (
     "SELECT swings FROM coarse_rollup WHERE run_id = ? AND signal_id = ? "
     "AND bucket >= ? AND bucket < ? AND present > 0 ORDER BY bucket"
 )
@@ -52,10 +52,10 @@ def swings_in(numbers: Numbers, signal: Signal, half_swings: int, period_s: floa
     return find_swings(times, values, least_half_swings=half_swings, longest_period_s=period_s)
 
 
-def swings_to_keep(
+def swings_to_store(
     connection: sqlite3.Connection, run_id: int, robot_id: int, bucket: int, rows: Mapping[int, int]
 ) -> dict[int, str]:
-    """What is kept of a coarse bucket, by the ids of its signals.
+    """What is stored of a coarse bucket, by the ids of its signals.
 
     Nothing where rows of it are missing, which were purged, or where it has too many.
 
@@ -106,10 +106,10 @@ def _stretches(
         left = replace(left, end_s=reached_s)
 
 
-def kept_swings(
+def stored_swings(
     connection: sqlite3.Connection, segment: Segment, span: range, signals: Sequence[Signal]
 ) -> tuple[range, dict[str, list[Swing]]]:
-    """The swings that are kept of signals, and of which coarse buckets all of them are.
+    """The swings that are stored of signals, and of which coarse buckets all of them are.
 
     Args:
         connection: Any.
@@ -124,7 +124,7 @@ def kept_swings(
     found: dict[str, list[Swing]] = {}
     for signal in signals:
         asked = (segment.run_id, signal.id, coarse.start, coarse.stop)
-        texts = [text for (text,) in connection.execute(_KEPT, asked)]
+        texts = [text for (text,) in connection.execute(_STORED, asked)]
         if coarse and None not in texts:
             found[signal.name] = [Swing(*each) for text in texts for each in json.loads(text)]
     return range(coarse.start * COARSE_BUCKETS, coarse.stop * COARSE_BUCKETS), found

@@ -8,6 +8,7 @@ import sqlite3
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.recordings.rover import start_run
@@ -158,3 +159,15 @@ def test_what_is_rarer_is_the_disturbance_wherever_it_begins(
     found = [(each.start_s, each.end_s) for each in jumps(empty) if each.details["after"] < 100]
     assert found == [pytest.approx(each, abs=0.11) for each in low_s]
     assert len(jumps(empty)) == 3
+
+
+@pytest.mark.parametrize("rests", [True, False], ids=["rests", "noisy"])
+def test_an_excursion_is_told_with_where_it_came_from_and_to_and_back(
+    empty: sqlite3.Connection, tier: str, rests: bool
+) -> None:
+    away = {1000: 5.5, 1001: 10.8}
+    noise = np.random.default_rng(1).normal(5.0, 0.0 if rests else 0.2, 2000).tolist()
+    record(empty, lambda t: {"volt": away.get(round(10 * t), noise[round(10 * t)])})
+    (jump,) = jumps(empty)
+    told = [jump.details[each] for each in ("before", "after", "back")]
+    assert told == pytest.approx([5.0, 10.8, 5.0], abs=0.8)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
@@ -25,13 +25,16 @@ class Jump:
     """The value changed between two rows by much more than it usually does.
 
     Attributes:
+        after: Of an excursion the value that is farthest from the one before.
         back_s: When the next row or so was back where it had been; None for a jump that stayed.
+        back: The value then.
     """
 
     sim_time_s: float
     before: float
     after: float
     back_s: float | None = None
+    back: float | None = None
 
 
 def find_jumps(times: Array, values: Array, score: float, usual: Array | None = None) -> list[Jump]:
@@ -56,7 +59,7 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
     sizes = steps[_stay(backs, len(steps))] if usual is None else np.abs(np.diff(usual))
     sizes = sizes[sizes > 0]
     if len(sizes) < LEAST_STEPS:
-        return [_jump(times, values, row, float(times[back])) for row, back in backs.items()]
+        return [_excursion(times, values, row, back) for row, back in backs.items()]
     median = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
     limit = median + score * median / 0.6745
     wide = np.flatnonzero(steps > limit)
@@ -73,9 +76,17 @@ def are_usual(jumps: Sequence[Jump], rows: int) -> bool:
     return len(jumps) > max(3, MOST_JUMPS_SHARE * rows)
 
 
-def _jump(times: Array, values: Array, row: int, back_s: float | None = None) -> Jump:
+def _jump(times: Array, values: Array, row: int) -> Jump:
     """The one after that row."""
-    return Jump(float(times[row + 1]), float(values[row]), float(values[row + 1]), back_s)
+    return Jump(float(times[row + 1]), float(values[row]), float(values[row + 1]))
+
+
+def _excursion(times: Array, values: Array, row: int, back: int) -> Jump:
+    """The one after that row, from which it was back in a later one."""
+    away = values[row + 1 : back]
+    farthest = float(away[np.abs(away - values[row]).argmax()])
+    ends = float(times[back]), float(values[back])
+    return Jump(float(times[row + 1]), float(values[row]), farthest, *ends)
 
 
 def _come_back(times: Array, values: Array, steps: Array) -> dict[int, int]:
@@ -140,7 +151,10 @@ def _with_return(jumps: Sequence[Jump], usual: float) -> Iterator[Jump]:
         jump = jumps[index]
         following = jumps[index + 1] if index + 1 < len(jumps) else None
         if following is not None and _is_excursion(jump, following, usual):
-            yield replace(jump, back_s=following.sim_time_s)
+            farthest = max(jump.after, following.before, key=lambda each: abs(each - jump.before))
+            yield Jump(
+                jump.sim_time_s, jump.before, farthest, following.sim_time_s, following.after
+            )
             index += 2
         else:
             yield jump

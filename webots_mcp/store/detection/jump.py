@@ -57,6 +57,7 @@ def jump_events(search: Search) -> Iterator[Event]:
 def _jump(search: Search, signal: Signal, jump: Jump) -> Event:
     end_s = jump.sim_time_s if jump.back_s is None else jump.back_s
     details = {"before": jump.before, "after": jump.after}
+    details |= {} if jump.back is None else {"back": jump.back}
     return search.event("jump", jump.sim_time_s, end_s, signal.name, **details)
 
 

@@ -60,8 +60,7 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
     sizes = sizes[sizes > 0]
     if len(sizes) < LEAST_STEPS:
         return [_excursion(times, values, row, back) for row, back in backs.items()]
-    median = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
-    limit = median + score * median / 0.6745
+    limit = _limit(sizes, score)
     wide = np.flatnonzero(steps > limit)
     far = _step(values[wide], values[wide + 1]) > limit * _intervals(times, wide)
     alone = far & ~_in_motion(values, wide)
@@ -69,6 +68,20 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
     if len(jumps) < 2:
         return jumps
     return list(_with_return(jumps, float(np.median(values if usual is None else usual))))
+
+
+def least_jump(usual: Array, score: float) -> float:
+    """How large a step has to be at least to be a jump among such values; 0 where they rest."""
+    sizes = np.abs(np.diff(usual))
+    return _limit(sizes[sizes > 0], score)
+
+
+def _limit(sizes: Array, score: float) -> float:
+    """The modified z-score as a size; 0 of too few sizes."""
+    if len(sizes) < LEAST_STEPS:
+        return 0.0
+    median = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
+    return median + score * median / 0.6745
 
 
 def are_usual(jumps: Sequence[Jump], rows: int) -> bool:

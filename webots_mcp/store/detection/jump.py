@@ -41,7 +41,7 @@ def jump_events(search: Search) -> Iterator[Event]:
             break
         jumps = [
             jump
-            for course in search.view.courses(signal)
+            for course in search.view.courses(signal, search.options.jump_score)
             for jump in find_jumps(
                 course.times, course.numbers, search.options.jump_score, course.usual
             )

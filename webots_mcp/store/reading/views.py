@@ -8,14 +8,15 @@ from __future__ import annotations
 import functools
 import math
 import sqlite3
-import statistics
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
+from itertools import accumulate, groupby, pairwise
 from typing import Final, Protocol
 
 from webots_mcp.store.analysis.arrays import Array
-from webots_mcp.store.analysis.rhythm import GAP_INTERVALS, usual_interval_s
+from webots_mcp.store.analysis.jumps import least_jump
+from webots_mcp.store.analysis.rhythm import usual_interval_s
 from webots_mcp.store.analysis.summary import Summary, merge, summarise_numbers
 from webots_mcp.store.analysis.swings import Swing
 from webots_mcp.store.reading.deadline import Deadline
@@ -36,8 +37,8 @@ from webots_mcp.store.rollup.swings import ACROSS_S, STRETCH_ROWS, stored_swings
 from webots_mcp.store.signals.registry import Signal
 
 READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
-JUMP_BUCKETS: Final = 20  # of each signal of a long segment that are read
-JUMP_RANGE: Final = 3.0  # times the usual range of a bucket: there may be a jump in it
+JUMP_ROWS: Final = 40_000  # of each signal of a long segment that are read, about as of a short one
+BACK_INTERVALS: Final = 8  # before and after a jump: an excursion of five rows, and what rested
 SAMPLES_PER_STAY: Final = 5
 SAMPLE_ROWS: Final = 3000  # newest rows that tell the usual interval and the usual steps
 MOST_KEPT: Final = 10_000_000  # numbers of 8 bytes, of stretches that are asked for again
@@ -48,8 +49,9 @@ _OF_SIGNAL: Final = (
     "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
 )
 _COUNTS: Final = {"rows": "sum", "present": "sum", "changes": "sum"}
-_WIDTHS: Final = (
-    f"SELECT bucket, max - min, first, last {_OF_SIGNAL} AND first IS NOT NULL ORDER BY bucket"
+_STEPS: Final = (  # older rollups know no largest step; it is no larger than the whole range
+    "SELECT bucket, rows, coalesce(largest_step, max - min), first, last "
+    f"{_OF_SIGNAL} AND first IS NOT NULL ORDER BY bucket"
 )
 _ROWS_IN: Final = (
     "SELECT count(*) FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
@@ -105,7 +107,7 @@ class View(Protocol):
         """Where the condition holds in every row; across a recording gap it is taken to go on."""
         ...
 
-    def courses(self, signal: Signal) -> Iterator[Course]:
+    def courses(self, signal: Signal, score: float) -> Iterator[Course]:
         """Where a jump may be."""
         ...
 
@@ -202,7 +204,7 @@ class RowView:
         values = self._columns.values[signal.name]
         return list(spans_in_rows(self._columns.times, values, condition))
 
-    def courses(self, signal: Signal) -> Iterator[Course]:
+    def courses(self, signal: Signal, score: float) -> Iterator[Course]:
         """All of it."""
         yield Course(*self._columns.numbers(signal.name))
 
@@ -335,29 +337,29 @@ class LongView:
                 self._read[part] = kept
         return kept
 
-    def courses(self, signal: Signal) -> Iterator[Course]:
-        """The few buckets whose range is unusual, each with the rows just before and after it."""
+    def courses(self, signal: Signal, score: float) -> Iterator[Course]:
+        """The buckets with a step that may be a jump, each with the rows before and after it."""
         self._note_late()
         self._note_purged()
         values = (self._span[0], signal.id, *self._span[1:])
-        widths = _widths(self._connection.execute(_WIDTHS, values).fetchall())
-        usual = statistics.median(size for _, size in widths) if widths else 0.0
-        wide = [(size, bucket) for bucket, size in widths if size > JUMP_RANGE * usual]
-        if len(wide) > JUMP_BUCKETS:
+        steps = _steps(self._connection.execute(_STEPS, values).fetchall())
+        usual = self._sample.numbers(signal.name)[1]
+        limit = least_jump(usual, score)
+        wide = sorted((each for each in steps if each[0] > limit), reverse=True)
+        rows = list(accumulate(rows for _, _, rows in wide))
+        taken = wide[: max(1, bisect_right(rows, JUMP_ROWS))]
+        if len(taken) < len(wide):
             self.notes.append(
-                f"of {signal.name} only in the {JUMP_BUCKETS} widest of {len(wide)} "
-                "stretches of 10 s: ask for less time to see the others"
+                f"of {signal.name} only in {len(taken)} of {len(wide)} stretches of 10 s, those "
+                "with the largest steps: ask for less time to see the others"
             )
-        elif len(wide) < len(widths):
-            self.notes.append(
-                f"not in stretches of {BUCKET_S:g} s that vary as most do: ask for less time"
-            )
-        for _, bucket in sorted(sorted(wide, reverse=True)[:JUMP_BUCKETS], key=_bucket):
+        for together in _runs_of(sorted(bucket for _, bucket, _ in taken)):
             if self._deadline.passed:
                 self._cut()
                 return
-            usual = self._sample.numbers(signal.name)[1]
-            yield Course(*self._numbers(signal, bucket), usual)
+            times, numbers = self._numbers(signal, together)
+            livelier = least_jump(numbers, score) > limit
+            yield Course(times, numbers, None if livelier else usual)
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """Those of the coarse rollups that lie inside."""
@@ -472,10 +474,6 @@ class LongView:
         return read_columns(self._connection, part, self._signals, self._deadline)
 
     @functools.cached_property
-    def _join_s(self) -> float:
-        return _join_s(self._sample.times)
-
-    @functools.cached_property
     def _resting(self) -> list[Signal]:
         """Those that have the same value throughout a bucket."""
         resting = {signal_id for (signal_id,) in self._connection.execute(_RESTING, self._span)}
@@ -513,9 +511,10 @@ class LongView:
     def _cut(self) -> None:
         self.notes.append("the time was over before all was searched: ask for less time or kinds")
 
-    def _numbers(self, signal: Signal, bucket: int) -> tuple[Array, Array]:
-        start_s = max(self._segment.start_s, bucket * BUCKET_S - self._join_s)
-        end_s = min(self._segment.end_s, (bucket + 1) * BUCKET_S + self._join_s)
+    def _numbers(self, signal: Signal, buckets: range) -> tuple[Array, Array]:
+        before_s = BACK_INTERVALS * (usual_interval_s(self._sample.times) or 0.0)
+        start_s = max(self._segment.start_s, buckets.start * BUCKET_S - before_s)
+        end_s = min(self._segment.end_s, buckets.stop * BUCKET_S + before_s)
         part = replace(self._segment, start_s=start_s, end_s=end_s)
         return read_columns(self._connection, part, [signal], self._deadline).numbers(signal.name)
 
@@ -543,19 +542,17 @@ def _above(
     return range(min(large), max(large) + 1) if large else _NOTHING
 
 
-def _widths(found: Sequence[tuple[int, float, float, float]]) -> list[tuple[int, float]]:
-    """How far each bucket reaches, also at its border with the bucket before."""
-    befores = [found[0][2], *(last for *_, last in found)] if found else []
+def _steps(found: Sequence[tuple[int, int, float, float, float]]) -> list[tuple[float, int, int]]:
+    """The largest step of each bucket, also that from the bucket before; its number and rows."""
+    befores = [found[0][3], *(last for *_, last in found)] if found else []
     return [
-        (bucket, max(width, abs(first - before)))
-        for (bucket, width, first, _), before in zip(found, befores, strict=False)
+        (max(step, abs(first - before)), bucket, rows)
+        for (bucket, rows, step, first, _), before in zip(found, befores, strict=False)
     ]
 
 
-def _bucket(wide: tuple[float, int]) -> int:
-    return wide[1]
-
-
-def _join_s(times: Sequence[float]) -> float:
-    """Rows within this time of each other follow directly: there is no gap between them."""
-    return GAP_INTERVALS * (usual_interval_s(times) or 0.0)
+def _runs_of(buckets: Sequence[int]) -> Iterator[range]:
+    """Those that follow each other as one."""
+    for _, group in groupby(enumerate(buckets), lambda each: each[1] - each[0]):
+        numbers = [bucket for _, bucket in group]
+        yield range(numbers[0], numbers[-1] + 1)

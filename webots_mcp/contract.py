@@ -70,6 +70,7 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "reset": BuiltInAction(ends_steps=True),
     "reload": BuiltInAction(ends_steps=True),
     "screenshot": BuiltInAction(),
+    "take_frame": BuiltInAction(needs_supervisor=False),
     "reset_state": BuiltInAction(needs_supervisor=False, runs_user_code=True),
     "set_parameters": BuiltInAction(needs_supervisor=False),
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),

@@ -10,7 +10,7 @@ import anyio
 import pytest
 from mcp import Client
 
-from tests.server.conftest import Connect, Driver, ask, fail, pictures_of, text_of
+from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
 
 pytestmark = pytest.mark.anyio
 
@@ -74,6 +74,43 @@ async def test_a_screenshot_is_a_picture_with_a_caption(
     assert Path(caption["file"]).is_file()
     assert Path(caption["file"]).is_relative_to(file.parent)
     assert driver.is_alive()
+
+
+async def test_a_frame_is_taken_now_though_the_controller_saves_none(
+    connect: Connect, driver: Driver, file: Path
+) -> None:
+    async with connect() as client:
+        disabled = await fail(client, "webots_get_camera", camera="camera", fresh=True)
+        assert "robot.getDevice('camera').enable(time_step)" in disabled
+        driver.bridge.register_command("look", lambda _: enable(driver.robot))
+        await ask(client, "webots_send_command", action="look")
+        result = await client.call_tool("webots_get_camera", {"camera": "camera", "fresh": True})
+        lidar = await client.call_tool("webots_get_camera", {"camera": "lidar", "fresh": True})
+        recorded = await client.call_tool("webots_get_camera", {"camera": "lidar"})
+    caption = json.loads(text_of(result))
+    assert caption["result"]["camera"] == "camera"
+    assert Path(caption["file"]).is_relative_to(file.parent)
+    assert "a ring each" in json.loads(text_of(lidar))["result"]["scale"]
+    assert [len(pictures_of(each)) for each in (result, lidar, recorded)] == [1, 1, 1]
+    assert driver.is_alive()
+
+
+def enable(robot: Any) -> None:
+    """And wait for the first picture."""
+    for name in ("camera", "lidar"):
+        robot.devices[name].enable(STEP_MS)
+    robot.step(STEP_MS)
+
+
+async def test_a_frame_that_is_taken_now_is_not_one_of_the_past(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        await ask(client, "webots_get_robot_state")
+        for past in ({"at_s": 1.0}, {"frames": 2}, {"run_id": 1}):
+            assert "without at_s" in await fail(client, "webots_get_camera", fresh=True, **past)
+    async with connect(read_only=True) as client:
+        assert "--read-only" in await fail(client, "webots_get_camera", fresh=True)
 
 
 async def test_watching_reports_what_was_recorded_meanwhile(

@@ -16,6 +16,7 @@ from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.goal import Goal, read_goal
 from webots_mcp.bridge.parameters import SETTERS, Setter
 from webots_mcp.bridge.pictures import complete_png_size
+from webots_mcp.bridge.picturing import find_pictured, take_picture
 from webots_mcp.bridge.text import describe
 from webots_mcp.contract import BUILT_IN_ACTIONS, MAX_STEPS, SCREENSHOT_FOLDER, Then
 from webots_mcp.errors import (
@@ -171,6 +172,18 @@ def screenshot(context: Context, command: Command) -> Progress:
     context.simulation.robot.exportImage(str(file), quality)
     size = yield from _wait_for_picture(file)
     return context.album.add_screenshot(path, *size)
+
+
+@_built_in
+def take_frame(context: Context, command: Command) -> Progress:
+    """Take a picture of what a camera, a range finder or a lidar sees now, as it measured last."""
+    name = command.params.get("camera") or ""
+    device = find_pictured(context.simulation.robot, str(name))
+    picture, camera = take_picture(device), str(device.getName())
+    saved = context.album.add_frame(camera, picture.bgra, picture.width, picture.height)
+    when = {"sim_time_s": context.clock.sim_time_s}
+    return {"camera": camera, **saved, **when, "scale": picture.scale}
+    yield
 
 
 @_built_in

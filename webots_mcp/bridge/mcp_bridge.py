@@ -18,6 +18,7 @@ from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.handlers import Handler
 from webots_mcp.bridge.open_bridges import OpenBridge
 from webots_mcp.bridge.parameters import Parameter, V
+from webots_mcp.bridge.pictures import MOST_FRAMES
 from webots_mcp.bridge.session import Session
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.stats import BridgeStats
@@ -315,7 +316,7 @@ class MCPBridge:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("log", error)
 
-    def save_camera_frame(self, camera: Any, max_frames: int = 50) -> str | None:
+    def save_camera_frame(self, camera: Any, max_frames: int = MOST_FRAMES) -> str | None:
         """Save the camera's current image as PNG and enter it in the database.
 
         Args:

@@ -19,6 +19,8 @@ from webots_mcp.errors import CommandRefusedError
 if TYPE_CHECKING:
     from webots_mcp.bridge.frames import Frame
 
+MOST_FRAMES: Final = 50  # of a camera that are kept
+
 _PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n"
 _PNG_TAIL: Final = b"IEND\xaeB`\x82"
 
@@ -39,18 +41,27 @@ class Album:
             CommandRefusedError: The camera is disabled or has no image yet.
             OSError: The file cannot be written.
         """
-        image, width, height = image_of(camera)
-        device = str(camera.getName())
+        frame = self.add_frame(str(camera.getName()), *image_of(camera), max_frames)
+        return str(frame["path"])
+
+    def add_frame(
+        self, device: str, bgra: bytes, width: int, height: int, max_frames: int = MOST_FRAMES
+    ) -> dict[str, object]:
+        """Write a picture of a device; returns what its command answers.
+
+        Raises:
+            OSError: The file cannot be written.
+        """
         name = self._name_of(device)
         kept = self._kept_of(name)
         path = f"{CAMERA_FOLDER}/{name}.{_next_number(kept):06d}.png"
-        size = self._write(path, encode_png(image, width, height))
+        size = self._write(path, encode_png(bgra, width, height))
         row = (self._clock.sim_time_s, time.time(), "camera", device, path, width, height, size)
         self._recorder.record("image", self._clock.run, row)
         kept.append(path)
         while len(kept) > max(1, max_frames):
             self._forget(kept.popleft())
-        return path
+        return {"path": path, "width": width, "height": height, "bytes": size}
 
     def add_kept(self, run: Run, stretch_uuid: str, frame: Frame) -> None:
         """Write a small frame of a kept stretch; it stays as long as the stretch.

@@ -69,10 +69,7 @@ async def webots_world_reload(
     robot: RobotName = None,
     timeout_s: TimeoutS = _RELOAD_WAIT_S,
 ) -> CommandAnswer:
-    """Load world and code anew: webots_simulation_control("reload") by another name.
-
-    An extern controller ends, and somebody has to start it again by hand.
-    """
+    """Load world and code anew: webots_simulation_control("reload") by another name."""
     return await Dispatcher(recording, ctx.report_progress).ask(robot, "reload", timeout_s)
 
 

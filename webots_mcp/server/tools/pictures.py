@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated, Any, Final, cast
 
 from anyio import to_thread
@@ -9,7 +10,7 @@ from mcp.server.mcpserver import Context, Image
 from pydantic import Field
 
 from webots_mcp.contract import KEPT_FRAME
-from webots_mcp.errors import CommandRefusedError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.server.budget import seconds, some
 from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.dispatch import Dispatcher
@@ -28,9 +29,13 @@ _MOST_FRAMES: Final = 16
 
 
 @tool("Get the camera picture", READS)
-def webots_get_camera(
+async def webots_get_camera(
     recording: Recording,
+    ctx: Context[Any],
     camera: Annotated[str, Field(max_length=200, description="Device; '' is any.")] = "",
+    fresh: Annotated[
+        bool, Field(description="Taken now, of lidars and range finders too.")
+    ] = False,
     at_s: Annotated[Seconds | None, Field(description="Nearest to this simulation time.")] = None,
     frames: Annotated[
         int, Field(ge=1, le=_MOST_FRAMES, description="This many, in one picture.")
@@ -38,7 +43,28 @@ def webots_get_camera(
     robot: RobotName = None,
     run_id: RunId = None,
 ) -> list[str | Image]:
-    """The newest camera frame, or those kept around a hit, as a picture with time and age."""
+    """The newest camera frame, or those kept around a hit, with time and age."""
+    if not fresh:
+        past = partial(_show_recorded, recording, camera, at_s, frames, robot, run_id)
+        return await to_thread.run_sync(past)
+    if recording.read_only or at_s is not None or run_id is not None or frames != 1:
+        raise InvalidInputError(
+            "fresh=true has the controller take one frame now: without at_s, frames and run_id, "
+            "and not from a server that is --read-only"
+        )
+    dispatcher = Dispatcher(recording, ctx.report_progress)
+    answer = await dispatcher.ask(robot, "take_frame", _WAIT_S, {"camera": camera})
+    return await to_thread.run_sync(_show, recording, answer)
+
+
+def _show_recorded(
+    recording: Recording,
+    camera: str,
+    at_s: float | None,
+    frames: int,
+    robot: str | None,
+    run_id: int | None,
+) -> list[str | Image]:
     with recording.view(robot, run_id) as view:
         run = view.require_run()
         found = camera_frames(view.connection, run.id, camera or None, at_s=at_s, count=frames)
@@ -89,9 +115,9 @@ async def webots_take_screenshot(
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> list[str | Image]:
-    """A picture of the simulation's main view, now; needs a Supervisor.
+    """The simulation's main view, now, within 1,000 pixels; needs a Supervisor.
 
-    Scaled to 1,000 pixels; the caption names the original file.
+    The caption names the original file.
     """
     dispatcher = Dispatcher(recording, ctx.report_progress)
     answer = await dispatcher.ask(robot, "screenshot", timeout_s, {"quality": quality})
@@ -102,7 +128,7 @@ def _show(recording: Recording, answer: CommandAnswer) -> list[str | Image]:
     said = answer.model_dump(mode="json", exclude_none=True)
     path = cast("dict[str, Any]", answer.result or {}).get("path")
     if answer.outcome != "done" or path is None:
-        raise CommandRefusedError(f"no screenshot: {compact_json(said)}")
+        raise CommandRefusedError(f"no picture: {compact_json(said)}")
     file = inside(recording.data_dir, str(path))
     picture, note = load_picture(file)
     return [_caption(said | {"note": note, "file": str(file)}), picture]
@@ -120,7 +146,7 @@ def _no_frame(view: View, camera: str) -> str:
     hint = (
         f"no frame{of_it} in this run; there are some of {some(saved, _MOST_RUNS)}"
         if known
-        else "no camera frame was saved: call bridge.save_camera_frame(camera) in the "
-        "controller's loop now and then, with the camera enabled"
+        else "no camera frame was saved: fresh=true takes one of an enabled camera now, "
+        "bridge.save_camera_frame(camera) in the controller's loop records them"
     )
     return _caption(view.header() | {"camera": camera, "hint": hint})

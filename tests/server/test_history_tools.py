@@ -64,8 +64,8 @@ async def test_position_and_mode_can_be_named(recorded: Recorded, connect: Conne
     robot = recorded.robot()
     for step in range(200):
         x_mm = 30.0 * min(step, 100)  # it drives 3 m in 10 s, and stands
-        robot.state(step * 0.1, {"lage": {"xMm": x_mm, "yMm": 0.0}, "betriebsart": 1})
-    named = {"position": ["lage.xMm", "lage.yMm"], "mode": "betriebsart"}
+        robot.state(step * 0.1, {"rail": {"alongMm": x_mm, "acrossMm": 0.0}, "betriebsart": 1})
+    named = {"position": ["rail.alongMm", "rail.acrossMm"], "mode": "betriebsart"}
     async with connect(read_only=True) as client:
         unnamed = await ask(client, "webots_find_events", kinds=["stuck"])
         assert "position=[x, y]" in str(unnamed["verdicts"]["not_searched"])
@@ -77,7 +77,7 @@ async def test_position_and_mode_can_be_named(recorded: Recorded, connect: Conne
         medians = {each["name"]: each["median"] for each in rows_of(compared["measures"])}
         assert medians["distance_m"] == [pytest.approx(3.0, rel=0.05)]
         assert medians["share of 1"] == [1.0]
-        wrong = await fail(client, "webots_compare_runs", position=["lage.xMm"])
+        wrong = await fail(client, "webots_compare_runs", position=["rail.alongMm"])
         assert "position" in wrong
 
 

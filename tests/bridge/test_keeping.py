@@ -11,12 +11,16 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.bridge.conftest import STEP_MS, Recording, catch_up, eager
+from tests.bridge.monsters import MONSTERS, EndlessDict
 from webots_mcp import MCPBridge, MemoryDatabase
+from webots_mcp.bridge import cleaning, encoding
+from webots_mcp.bridge.encoding import copy_or_encode, encode, encode_copy
 from webots_mcp.bridge.ring import Ring, RingRow
 from webots_mcp.connection import connect
 from webots_mcp.contract import KEEP_AFTER_S, KEEP_LAST_S
@@ -407,11 +411,95 @@ def test_a_condition_that_flickers_does_not_keep_a_whole_run(
     assert "600 s of this run" in line
 
 
+class Measured(float):
+    """A float to whoever adds it up."""
+
+
+class Hailed(bytearray):
+    """Holds bytes, and adds up to a float."""
+
+    def __radd__(self, other: float) -> float:
+        return other
+
+
+def long_array(last: object) -> list[Any]:
+    return [*[0.5] * 17, last, 1.5]
+
+
+KEYS = st.one_of(
+    st.text(max_size=3),
+    st.sampled_from([1, 1.0, True, None, np.int64(1), np.float64(1), np.str_("a"), "a", "\ud800"]),
+)
+LEAVES = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**70), 2**70),
+    st.floats(),
+    st.text(st.characters(codec=None), max_size=4),
+    st.sampled_from([np.float64(2.5), np.float32(0.1), np.str_("b"), Measured(3.5), b"\0\1"]),
+    st.sampled_from([Measured(1), np.float64(7.5), Hailed(b"abc"), None, 2, "x"]).map(long_array),
+    st.builds(np.array, st.lists(st.floats(width=32), max_size=3)),
+)
+STATES = st.dictionaries(
+    KEYS,
+    st.recursive(
+        LEAVES,
+        lambda inside: (
+            st.lists(inside, max_size=4)
+            | st.tuples(inside, inside)
+            | st.frozensets(st.text(max_size=2), max_size=3)
+            | st.dictionaries(KEYS, inside, max_size=4)
+        ),
+        max_leaves=12,
+    ),
+    max_size=6,
+)
+
+
+@given(state=STATES)
+@pytest.mark.usefixtures("encoder")
+def test_any_state_that_is_held_is_kept_as_it_would_be_recorded(state: State) -> None:
+    expected = encode(state)
+    held = copy_or_encode(state)
+    state.clear()
+    assert (encode_copy(held) if isinstance(held, bytes) else held) == expected
+
+
+@pytest.mark.parametrize("make", MONSTERS.values(), ids=MONSTERS)
+def test_a_monster_that_is_held_is_kept_as_it_would_be_recorded(
+    make: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for module in (encoding, cleaning):  # a busy machine changes nothing
+        monkeypatch.setattr(module, "LONGEST_S", math.inf)
+    EndlessDict.asked = 0
+    held = copy_or_encode({"monster": make()})
+    kept = encode_copy(held) if isinstance(held, bytes) else held
+    EndlessDict.asked = 0
+    assert kept == encode({"monster": make()})
+
+
+def test_what_the_controller_changes_after_its_call_does_not_change_what_is_kept(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    state: State = {"n": 0, "pose": [0, {"x_m": 0.0}]}
+    for number in range(9):
+        robot.step(STEP_MS)
+        state["n"] = state["pose"][0] = state["pose"][1]["x_m"] = number
+        bridge.publish(state)
+    bridge.keep("a look")
+    bridge.close()
+    kept = map(json.loads, recording.rows("SELECT data FROM kept_state ORDER BY sim_time_s"))
+    assert [*kept] == [{"n": n, "pose": [n, {"x_m": n}]} for n in range(9)]
+
+
 rows = st.lists(
     st.tuples(
         st.floats(0.001, 3.0),
         st.one_of(
-            st.text(max_size=40), st.integers(0, 6000).map("x".__mul__), st.just("\U0001f916" * 900)
+            st.text(max_size=40),
+            st.binary(max_size=40),
+            st.integers(0, 6000).map("x".__mul__),
+            st.just("\U0001f916" * 900),
         ),
     ),
     max_size=60,
@@ -420,7 +508,7 @@ rows = st.lists(
 
 @given(rows=rows, most_bytes=st.integers(0, 20_000), last_s=st.floats(0.1, 10))
 def test_a_ring_never_takes_more_memory_or_time_than_it_may_and_holds_the_newest(
-    rows: list[tuple[float, str]], most_bytes: int, last_s: float
+    rows: list[tuple[float, str | bytes]], most_bytes: int, last_s: float
 ) -> None:
     ring, now_s, given_rows = Ring(last_s, most_bytes), 0.0, list[RingRow]()
     for call, (step_s, text) in enumerate(rows):

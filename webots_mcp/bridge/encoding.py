@@ -44,11 +44,13 @@ beyond 64 bits: they become the nearest float, as which SQLite reads them.
 
 from __future__ import annotations
 
+import io
 import json
+import pickle
 import time
 from collections import Counter, OrderedDict, defaultdict, deque
 from collections.abc import Callable, Iterable
-from typing import Any, Final, NamedTuple, cast
+from typing import Any, Final, NamedTuple, TypeVar, cast
 
 from webots_mcp.bridge.cleaning import (
     LONGEST_S,
@@ -85,6 +87,9 @@ _PLAIN_DICTS: Final = (OrderedDict, defaultdict, Counter)
 _short_keys: set[object] = set()
 
 
+_Taken = TypeVar("_Taken")
+
+
 class Encoded(NamedTuple):
     """JSON text, and what had to be replaced or cut in it: dotted path to kind.
 
@@ -107,9 +112,15 @@ class _NotPlainError(Exception):
 
 
 class _Converted(dict[int, object]):
-    """The plain counterpart of each object, by its id, and when the first one was asked for."""
+    """The plain counterpart of each object, by its id.
+
+    Attributes:
+        began_s: When the first one was asked for.
+        others: Whether a value was looked at whose type is not one of JSON's own.
+    """
 
     began_s: float | None = None
+    others = False
 
     def require_time(self) -> None:
         """Raise _NotPlainError where the objects have taken too long already."""
@@ -121,15 +132,20 @@ class _Converted(dict[int, object]):
 
 def encode(state: object) -> Encoded:
     """Encode a state, as fast as its content allows; the state itself is never changed."""
-    converted = _Converted()
-    try:
-        _look((state,), MAX_PLAIN_VALUES, 0, converted)
-        text = _encode_looked_at(state, converted)
-        if (len(text) if text.isascii() else len(text.encode())) <= MAX_ROW_BYTES:
-            return Encoded(text, {})
-    except Exception:  # noqa: BLE001  (something odd is inside: it is found and named below)
-        return _encode_odd(state)
-    return _encode_odd(state)
+    return _after_look(state, _encode_ordinary)
+
+
+def copy_or_encode(state: object) -> bytes | Encoded:
+    """A copy from which `encode_copy` makes the text that `encode` would, or that text itself.
+
+    To copy costs less than to encode; only dicts of plain values are copied.
+    """
+    return _after_look(state, _copy_or_encode)
+
+
+def encode_copy(copy: bytes) -> Encoded:
+    """Encode a state as it was when it was copied."""
+    return encode(pickle.loads(copy))
 
 
 def plain(value: Any) -> Any:
@@ -158,6 +174,16 @@ def text_of(value: object) -> str:
 
 
 # -- the ordinary way --------------------------------------------------------------------------
+
+
+def _after_look(state: object, take: Callable[[object, _Converted], _Taken]) -> _Taken | Encoded:
+    """Take an ordinary state in that way; the text of any other one names what is odd."""
+    converted = _Converted()
+    try:
+        _look((state,), MAX_PLAIN_VALUES, 0, converted)
+        return take(state, converted)
+    except Exception:  # noqa: BLE001  (something odd is inside: it is found and named below)
+        return _encode_odd(state)
 
 
 def _look(values: Iterable[Any], left: int, depth: int, converted: _Converted) -> int:
@@ -234,6 +260,7 @@ def _is_plain_key(key: object) -> bool:
 
 
 def _look_at_object(value: Any, left: int, depth: int, converted: _Converted) -> int:
+    converted.others = True
     if isinstance(value, float):
         return left
     if isinstance(value, int):
@@ -263,11 +290,40 @@ def _look_at_container(value: Any, left: int, depth: int, converted: _Converted)
     return _look((cast("Any", base)(value),), left, depth, converted)
 
 
+def _encode_ordinary(state: object, converted: _Converted) -> Encoded:
+    text = _encode_looked_at(state, converted)
+    if (len(text) if text.isascii() else len(text.encode())) > MAX_ROW_BYTES:
+        raise _NotPlainError
+    return Encoded(text, {})
+
+
 def _encode_looked_at(state: object, converted: dict[int, object]) -> str:
     counterpart = _Counterparts(converted) if converted else None
     if orjson is not None and (text := _encode_with_orjson(state, counterpart)) is not None:
         return text
     return _encode_plain(state) if counterpart is None else _encoder(counterpart)(state)
+
+
+def _copy_or_encode(state: object, converted: _Converted) -> bytes | Encoded:
+    if converted.others or type(state) is not dict:
+        return _encode_ordinary(state, converted)
+    file = io.BytesIO()
+    try:
+        _Copier(file, pickle.HIGHEST_PROTOCOL).dump(cast("object", state))
+    except _NotPlainError:
+        return _encode_ordinary(cast("object", state), converted)
+    return file.getvalue()
+
+
+class _Copier(pickle.Pickler):
+    """Copies dicts, lists, tuples, texts, numbers and None, not what only derives from them.
+
+    The look does not see such subclasses among keys, and in long arrays; copies could differ.
+    """
+
+    def reducer_override(self, obj: object) -> Any:
+        """Refuse whatever is of another type."""
+        raise _NotPlainError
 
 
 class _Counterparts:

@@ -6,28 +6,38 @@ import sys
 from collections import deque
 from typing import Final, NamedTuple
 
+from webots_mcp.bridge.encoding import encode_copy
+
 MAX_RING_BYTES: Final = 8_000_000
-_ROW_BYTES: Final = 400  # of a row beside its texts: a tuple, three numbers, its place
+_ROW_BYTES: Final = 400  # of a row beside its state: a tuple, three numbers, its place
 
 
 class RingRow(NamedTuple):
-    """A call of `publish`, as it would have been recorded.
+    """A call of `publish` that may be kept.
 
     Attributes:
         call: Its number in the session.
-        odd: As in the column of that name.
+        data: The text that would have been recorded, or the copy of the state that makes it.
+        odd: As in the column of that name, of a text.
     """
 
     call: int
     sim_time_s: float
     wall_time_s: float
-    text: str
+    data: str | bytes
     odd: str | None
 
     @property
     def size_bytes(self) -> int:
         """About the memory that it takes."""
-        return _ROW_BYTES + sys.getsizeof(self.text) + (sys.getsizeof(self.odd) if self.odd else 0)
+        return _ROW_BYTES + sys.getsizeof(self.data) + (sys.getsizeof(self.odd) if self.odd else 0)
+
+    def encode(self) -> RingRow:
+        """The row as it would have been recorded."""
+        if isinstance(self.data, str):
+            return self
+        encoded = encode_copy(self.data)
+        return RingRow(*self[:3], encoded.text, encoded.odd_text)
 
 
 class Ring:

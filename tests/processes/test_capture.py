@@ -31,6 +31,9 @@ def begin():
 """
 
 
+WITHOUT_POLLING = "from webots_mcp.bridge import capture\ncapture._POLLS = False\n"
+
+
 @pytest.fixture
 def run(script: Script, data_dir: Path) -> Callable[[str], subprocess.Popen[str]]:
     return lambda program: script(CAPTURED + program, data_dir)
@@ -39,11 +42,13 @@ def run(script: Script, data_dir: Path) -> Callable[[str], subprocess.Popen[str]
 Run = Callable[[str], "subprocess.Popen[str]"]
 
 
+@pytest.mark.parametrize("system", ["", WITHOUT_POLLING], ids=["this system", "as on Windows"])
 def test_prints_of_python_of_c_and_of_children_come_in_order_and_are_recorded(
-    run: Run, filed: Recording
+    run: Run, filed: Recording, system: str
 ) -> None:
     process = run(
-        """
+        system
+        + """
 bridge = begin()
 print("python")
 os.write(1, b"descriptor\\n")
@@ -174,20 +179,64 @@ while any("std" in thread.name for thread in threading.enumerate()):
 
 
 @posix
+def test_stdout_that_somebody_closed_or_led_elsewhere_is_left_alone(
+    run: Run, filed: Recording, tmp_path: Path
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    process = run(
+        f"""
+bridge = begin()
+print("before", flush=True)
+file = os.open({str(elsewhere)!r}, os.O_WRONLY | os.O_CREAT)
+os.dup2(file, 1)
+os.close(2)
+bridge.close()
+os.write(1, b"still elsewhere")
+os._exit(7)
+"""
+    )
+    assert process.communicate(timeout=30)[0] == "before\n"
+    assert process.returncode == 7
+    assert elsewhere.read_text("utf-8") == "still elsewhere"
+    assert filed.rows(LINES) == ["before"]
+
+
+@posix
+def test_capturing_again_and_again_leaves_no_descriptor_open(run: Run, filed: Recording) -> None:
+    process = run(
+        """
+begin().close()
+before = len(os.listdir("/dev/fd"))
+for n in range(3):
+    bridge = begin()
+    print(n)
+    bridge.close()
+    deadline = time.monotonic() + 10
+    while len(os.listdir("/dev/fd")) > before:
+        assert time.monotonic() < deadline
+"""
+    )
+    out, err = process.communicate(timeout=30)
+    assert (out, err) == ("0\n1\n2\n", "")
+    assert filed.rows(LINES) == ["0", "1", "2"]
+
+
+@posix
 def test_a_forked_child_prints_where_its_parent_did_before(run: Run, filed: Recording) -> None:
     process = run(
         """
+sys.stdout.reconfigure(write_through=False, line_buffering=False)
 bridge = begin()
-print("parent", flush=True)
+print("parent")  # waits in a buffer of Python's, which the child has as well
 if os.fork() == 0:
-    print("child", flush=True)
+    os.write(1, b"child\\n")
     os._exit(0)
 os.wait()
 print("parent again")
 """
     )
     out, _ = process.communicate(timeout=30)
-    assert out.splitlines() == ["parent", "child", "parent again"]
+    assert out.splitlines() == ["child", "parent", "parent again"]
     assert filed.rows(LINES) == ["parent", "parent again"]
 
 

@@ -89,6 +89,7 @@ class _Channel:
         self._recording = threading.Lock()
         self._unpassed = bytearray()
         self._place_gone = False
+        self._ended = False
         self._stream: Any = getattr(sys, name)
         self._tee: _Tee | None = None
         self._passes = _writes_to(self._stream, self._descriptor)
@@ -101,13 +102,12 @@ class _Channel:
 
     def close(self) -> None:
         """Put the old place back, pass on and record what is still here."""
+        _flush(self._stream)
+        _flush_c()
         self._put_back()
         deadline_s = time.monotonic() + _LAST_WAIT_S
-        if _POLLS:
-            while not self._pump() and self._unpassed and time.monotonic() < deadline_s:
-                _wait_for([], [self._old_place], 0.05)
-        else:
-            self._thread.join(_LAST_WAIT_S)
+        while self._has_unpassed() and time.monotonic() < deadline_s:
+            self._thread.join(0.02)
         with self._lock:
             self._lines.end()
         self._record_lines()
@@ -116,6 +116,7 @@ class _Channel:
         """In a forked child: locks and thread are the parent's, and so is what waits."""
         self._put_back()
         os.close(self._outlet)
+        os.close(self._old_place)
 
     # -- passing on ----------------------------------------------------------------------------
 
@@ -136,12 +137,22 @@ class _Channel:
                 full = len(self._unpassed) >= _MOST_UNPASSED_BYTES
                 old_place = [self._old_place] if self._unpassed else []
                 _wait_for([] if full else [self._outlet], old_place)
+        with self._lock:
+            self._ended = True
+            os.close(self._outlet)
+            os.close(self._old_place)
         self._record_lines()
+
+    def _has_unpassed(self) -> bool:
+        """Whether something that was printed has not reached the old place yet."""
+        if not _POLLS:
+            return self._thread.is_alive()
+        return not self._pump() and bool(self._unpassed)
 
     def _pump(self) -> bool:
         """Pass on what has come, as far as that needs no waiting; True when no more can come."""
         with self._lock:
-            while True:
+            while not self._ended:
                 self._pass_on()
                 if len(self._unpassed) >= _MOST_UNPASSED_BYTES:
                     return False
@@ -153,9 +164,10 @@ class _Channel:
                 self._lines.take(data)
                 if not data:
                     return not self._unpassed
+        return True
 
     def _pass_on(self) -> None:
-        while self._unpassed and _wait_for([], [self._old_place], 0):
+        while self._unpassed and (not _POLLS or _wait_for([], [self._old_place], 0)):
             try:
                 written = os.write(self._old_place, self._unpassed[:_CHUNK_BYTES])
             except BlockingIOError:
@@ -168,14 +180,13 @@ class _Channel:
             del self._unpassed[:written]
 
     def _pass_on_waiting(self) -> bool:
+        """For a system that cannot be asked; the lock must not be held by who waits for data."""
         data = os.read(self._outlet, _MOST_UNPASSED_BYTES)
         with self._lock:
             self._lines.take(data)
-            while data:
-                data = data[os.write(self._old_place, data) :]
-                if not data:
-                    return False
-        return True
+            self._unpassed += data
+            self._pass_on()
+        return not data
 
     def _record_lines(self) -> None:
         """Whoever finds nobody at it: a warning that is printed meanwhile waits for the next."""
@@ -204,9 +215,11 @@ class _Channel:
         """Unless somebody has led it elsewhere since."""
         if getattr(sys, self._name) is self._tee:
             setattr(sys, self._name, self._stream)
-        _flush(self._stream)
-        _flush_c()
-        if os.path.samestat(os.fstat(self._descriptor), self._pipe):
+        try:
+            leads_here = os.path.samestat(os.fstat(self._descriptor), self._pipe)
+        except OSError:  # somebody has closed it
+            return
+        if leads_here:
             os.dup2(self._old_place, self._descriptor)
 
 

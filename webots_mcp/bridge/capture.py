@@ -6,8 +6,9 @@ does that itself before it returns; for what C code prints a thread does it, whi
 Webots' API. So a process that is killed loses what C code printed in its last milliseconds, and
 what was not flushed, as ever.
 
-A print never waits for the recording. Where the old place takes no more, what is printed waits in
-the pipe (1 MB on Linux, 64 kB elsewhere); a print waits only when that is full too.
+Where the old place takes no more, what is printed waits in the pipe (1 MB on Linux, 64 kB
+elsewhere); a print waits for it only when that is full too. It is recorded as any log line is,
+within milliseconds also where the database is locked.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ _CHUNK_BYTES: Final = 4096  # PIPE_BUF: a pipe that takes anything takes as many
 _MOST_UNPASSED_BYTES: Final = 1 << 16
 _MOST_SELECTABLE: Final = 1024
 _LAST_WAIT_S: Final = 1.0  # at the end, for an old place that takes no more
+_PATIENCE_S: Final = 0.02  # of a print, with the thread that records just now
 _POLLS: Final = os.name == "posix"  # Windows cannot ask whether a pipe has something
 
 Record = Callable[[str, Sequence[str]], object]
@@ -87,6 +89,7 @@ class _Channel:
         self._lines = PrintedLines()
         self._lock = threading.RLock()  # of what comes out and is passed on
         self._recording = threading.Lock()
+        self._recorder: int | None = None  # the thread that has it
         self._unpassed = bytearray()
         self._place_gone = False
         self._ended = False
@@ -110,7 +113,7 @@ class _Channel:
             self._thread.join(0.02)
         with self._lock:
             self._lines.end()
-        self._record_lines()
+        self._record_lines(_PATIENCE_S)
 
     def abandon(self) -> None:
         """In a forked child: locks and thread are the parent's, and so is what waits."""
@@ -127,7 +130,7 @@ class _Channel:
                 self._lines.take(text.encode("utf-8", "replace"))
         elif _POLLS:
             self._pump()
-        self._record_lines()
+        self._record_lines(_PATIENCE_S)
 
     def _follow(self) -> None:
         """The thread: for as long as anybody has the pipe, a child of this process too."""
@@ -188,13 +191,24 @@ class _Channel:
             self._pass_on()
         return not data
 
-    def _record_lines(self) -> None:
-        """Whoever finds nobody at it: a warning that is printed meanwhile waits for the next."""
-        while self._lines.waiting and self._recording.acquire(blocking=False):
+    def _record_lines(self, patience_s: float = 0) -> None:
+        """Record what waits; what the recording itself prints comes with the next line.
+
+        Args:
+            patience_s: How long to wait for another thread that is recording just now.
+        """
+        if self._recorder == threading.get_ident():
+            return
+        while self._recording.acquire(timeout=patience_s):
             try:
-                self._record(self._name, self._lines.remove())
+                self._recorder = threading.get_ident()
+                if self._lines.waiting:
+                    self._record(self._name, self._lines.remove())
             finally:
+                self._recorder = None
                 self._recording.release()
+            if not self._lines.waiting:
+                return
 
     # -- beginning and end ---------------------------------------------------------------------
 

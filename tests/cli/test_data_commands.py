@@ -85,6 +85,24 @@ def test_export_of_parquet_can_be_read_back(say: Say, tmp_path: Path) -> None:
     assert set(parquet.read_table(file).column("mode").to_pylist()) == {"cruise"}
 
 
+def test_export_writes_the_trials_of_a_set(
+    say: Say, database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with closing(connect(database, "writer")) as connection:
+        set_id = create_trial_set(connection, "{}", [{"kp": 1.0}, {"kp": 2.0}])
+        for trial in trials_of(connection, set_id):
+            finish_trial(connection, trial, Result(None, trial.values["kp"] * 2, None))
+    file = tmp_path / "trials.csv"
+    assert say("export", "--trials", str(set_id), "-o", str(file)) == f"{file}: 2 rows\n"
+    rows = list(csv.DictReader(io.StringIO(file.read_text())))
+    assert [(row["kp"], row["score"], row["rank"]) for row in rows] == [
+        ("1.0", "2.0", "2"),
+        ("2.0", "4.0", "1"),
+    ]
+    line = ("export", "--database", str(database), "--trials", "1", "--last", "5")
+    assert "--trials or a range" in complaint(capsys, *line)
+
+
 @pytest.mark.parametrize("output", ["a.csv", "-"])
 def test_a_range_beyond_the_recording_is_noted_beside_the_table(
     database: Path, tmp_path: Path, capfdbinary: pytest.CaptureFixture[bytes], output: str

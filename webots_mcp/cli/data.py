@@ -24,7 +24,7 @@ from webots_mcp.cli.command import (
 )
 from webots_mcp.cli.limits import LIMITS, limits_of
 from webots_mcp.cli.progress import shown_progress
-from webots_mcp.cli.ranges import RANGE, range_of
+from webots_mcp.cli.ranges import RANGE, range_of, scope_of
 from webots_mcp.cli.tables import print_json, print_notes, print_table
 from webots_mcp.errors import InvalidInputError
 
@@ -42,6 +42,8 @@ if TYPE_CHECKING:
     argument("--safe-cells", action="store_true",
              help="in CSV, an apostrophe before texts that a spreadsheet would run as a formula "
              "(they begin with =, +, - or @)"),
+    argument("--trials", type=int, dest="trial_set", metavar="SET",
+             help="the trials of that set instead, one row each, with score, rank and spread"),
 )  # fmt: skip
 def export(arguments: argparse.Namespace) -> None:
     """Write recorded states as a table: one row per state, one column per value.
@@ -50,11 +52,14 @@ def export(arguments: argparse.Namespace) -> None:
     row, times, and the dotted names of what the controller published; NaN and infinity are kept.
     Parquet needs pyarrow: pip install pyarrow.
     """
+    from webots_mcp.store.export import TrialTable, export_file, format_of
     from webots_mcp.store.export import export as write
-    from webots_mcp.store.export import export_file, format_of
+    from webots_mcp.store.reading.ranges import Scope
 
     file = Path(arguments.output) if arguments.output not in (None, "-") else None
     form = arguments.format or (format_of(file) if file else "csv")
+    if arguments.trial_set is not None and scope_of(arguments) != Scope():
+        raise InvalidInputError("give --trials or a range of states, not both")
     recording = open_recording(arguments)
     if file and isinstance(recording.database, Path) and file.resolve() == recording.database:
         raise InvalidInputError(f"{file} is the recording itself: choose another file")
@@ -63,7 +68,11 @@ def export(arguments: argparse.Namespace) -> None:
 
     def run() -> None:
         with reading(arguments) as connection, shown_progress("exporting") as progress:
-            wanted, safe = range_of(connection, arguments), arguments.safe_cells
+            safe = arguments.safe_cells
+            if arguments.trial_set is not None:
+                wanted = TrialTable.of(connection, arguments.trial_set)
+            else:
+                wanted = range_of(connection, arguments)
             if file is None:
                 write(connection, wanted, form, sys.stdout.buffer, progress, safe_cells=safe)
             else:

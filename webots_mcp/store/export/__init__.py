@@ -1,4 +1,4 @@
-"""Exporting state rows as flat tables: CSV, JSON lines, Parquet; streamed, in constant memory."""
+"""Exporting states or trials as flat tables: CSV, JSON lines, Parquet; in constant memory."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from typing import BinaryIO, Final, NamedTuple
 from webots_mcp.contract import PRIVATE_FILE
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.export.parquet import write_parquet
-from webots_mcp.store.export.rows import Progress, Source
+from webots_mcp.store.export.rows import Progress, Source, Table
 from webots_mcp.store.export.text import write_csv, write_json_lines
+from webots_mcp.store.export.trials import TrialTable
 from webots_mcp.store.reading.ranges import TimeRange
 
 
 class Format(NamedTuple):
     """How rows are written, and how often they are read for it."""
 
-    write: Callable[[Source, BinaryIO], None]
+    write: Callable[[Table, BinaryIO], None]
     passes: int
 
 
@@ -32,7 +33,7 @@ FORMATS: Final = {
 
 def export(
     connection: sqlite3.Connection,
-    wanted: TimeRange,
+    wanted: TimeRange | TrialTable,
     form: str,
     sink: BinaryIO,
     progress: Progress | None = None,
@@ -46,7 +47,7 @@ def export(
 
     Args:
         connection: Any; it is never kept busy for more than an instant.
-        wanted: From `find_range`.
+        wanted: From `find_range`; or trials, which are a table as they are.
         form: One of `FORMATS`.
         sink: Takes bytes; need not be seekable.
         progress: Called now and then with the rows read so far and in all.
@@ -62,7 +63,10 @@ def export(
     chosen = FORMATS.get(form)
     if chosen is None:
         raise InvalidInputError(f"no format {form!r}: choose one of {', '.join(FORMATS)}")
-    source = Source.of(connection, wanted.segments, chosen.passes, progress)
+    if isinstance(wanted, TrialTable):
+        source = wanted
+    else:
+        source = Source.of(connection, wanted.segments, chosen.passes, progress)
     if safe_cells and form == "csv":
         write_csv(source, sink, safe_cells=True)
     else:
@@ -72,7 +76,7 @@ def export(
 
 def export_file(
     connection: sqlite3.Connection,
-    wanted: TimeRange,
+    wanted: TimeRange | TrialTable,
     form: str,
     file: Path,
     progress: Progress | None = None,

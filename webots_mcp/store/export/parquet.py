@@ -8,13 +8,12 @@ from itertools import islice
 from typing import Any, BinaryIO, Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.export.rows import HEAD, Column, ColumnKind, Row, Source, as_text
+from webots_mcp.store.export.rows import Column, ColumnKind, Row, Table, as_text
 
 _GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
-_HEAD_KINDS: Final = ("int", "int", "num", "num")
 
 
-def write_parquet(source: Source, sink: BinaryIO) -> None:
+def write_parquet(source: Table, sink: BinaryIO) -> None:
     """One column per dotted name: int64, double (NaN where a value was not a number), bool, text.
 
     A long array of numbers is a list of doubles; a column of several kinds is text.
@@ -23,13 +22,14 @@ def write_parquet(source: Source, sink: BinaryIO) -> None:
         InvalidInputError: pyarrow is not installed.
     """
     arrow, parquet = _pyarrow()
-    head = [Column(name, kind) for name, kind in zip(HEAD, _HEAD_KINDS, strict=True)]
     columns = source.columns()
     types = {
         "null": arrow.null(), "bool": arrow.bool_(), "int": arrow.int64(),
         "num": arrow.float64(), "text": arrow.string(), "numbers": arrow.list_(arrow.float64()),
     }  # fmt: skip
-    schema = arrow.schema([(column.name, types[column.kind]) for column in (*head, *columns)])
+    schema = arrow.schema(
+        [(column.name, types[column.kind]) for column in (*source.head, *columns)]
+    )
     rows = source.rows(pass_number=2)
     with parquet.ParquetWriter(sink, schema, compression="zstd") as writer:
         while group := list(islice(rows, _GROUP_ROWS)):

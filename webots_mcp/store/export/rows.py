@@ -1,13 +1,14 @@
-"""The rows of a range, flattened: one value per dotted name."""
+"""Rows to be exported, and those of a range, flattened: one value per dotted name."""
 
 from __future__ import annotations
 
 import json
 import math
 import sqlite3
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal, NamedTuple, cast
+from typing import Any, ClassVar, Final, Literal, NamedTuple, cast
 
 from webots_mcp.naming import LONGEST_SPREAD_ARRAY
 from webots_mcp.store.reading.kept import kept_parts
@@ -18,8 +19,6 @@ from webots_mcp.store.states import put_back
 Progress = Callable[[int, int], object]
 ColumnKind = Literal["null", "bool", "int", "num", "text", "numbers"]
 
-HEAD: Final = ("run_id", "state_id", "sim_time_s", "wall_time_s")
-RESERVED: Final = frozenset((*HEAD, "odd"))
 CHUNK_ROWS: Final = 2000  # read in one short transaction each: no checkpoint waits for an export
 
 _IN_SEGMENT: Final = (
@@ -52,17 +51,16 @@ _PLAIN_KINDS: Final[dict[type[object], ColumnKind]] = {
 
 
 class Row(NamedTuple):
-    """A state row.
+    """A row of a table.
 
     Attributes:
-        head: Run, id, simulation time, wall time; as `HEAD` names them. The id of a row that only a
-            kept stretch has is below 0.
+        head: What `Table.head` names. The id of a state that only a kept stretch has is below 0.
         values: By dotted name. What was not finite is so again; an array of more than 16 items
             is one value.
         odd: Path of every value that JSON could not hold, and what it was.
     """
 
-    head: tuple[int, int, float, float]
+    head: tuple[Any, ...]
     values: dict[str, Any]
     odd: dict[str, str]
 
@@ -74,14 +72,48 @@ class Column(NamedTuple):
     kind: ColumnKind
 
 
+_HEAD: Final = (
+    Column("run_id", "int"),
+    Column("state_id", "int"),
+    Column("sim_time_s", "num"),
+    Column("wall_time_s", "num"),
+)
+_RESERVED: Final = frozenset((*(column.name for column in _HEAD), "odd"))
+
+
+class Table(ABC):
+    """Rows that can be read more than once.
+
+    Attributes:
+        head: The columns that every row has.
+    """
+
+    head: ClassVar[tuple[Column, ...]]
+
+    @abstractmethod
+    def rows(self, pass_number: int = 1) -> Iterator[Row]:
+        """All of them; the second pass tells its own progress."""
+
+    def columns(self) -> list[Column]:
+        """What the rows hold, in the order in which it first appears; this reads all of them."""
+        kinds: dict[str, ColumnKind] = {}
+        for row in self.rows():
+            for name, value in row.values.items():
+                seen = _PLAIN_KINDS.get(cast("type[object]", type(value))) or _kind(value)
+                if kinds.get(name) != seen:
+                    kinds[name] = _widened(kinds.get(name, seen), seen)
+        return [Column(name, kind) for name, kind in kinds.items()]
+
+
 @dataclass(frozen=True)
-class Source:
-    """The rows that were there when the export began; they can be read more than once.
+class Source(Table):
+    """The state rows that were there when the export began; they can be read more than once.
 
     Attributes:
         passes: How often they will be read, so that progress can be told.
     """
 
+    head: ClassVar[tuple[Column, ...]] = _HEAD
     connection: sqlite3.Connection
     segments: Sequence[Segment]
     last_id: int
@@ -120,16 +152,6 @@ class Source:
                 if self.progress is not None:
                     self.progress(done, self.total * self.passes)
 
-    def columns(self) -> list[Column]:
-        """What the rows hold, in the order in which it first appears; this reads all of them."""
-        kinds: dict[str, ColumnKind] = {}
-        for row in self.rows():
-            for name, value in row.values.items():
-                seen = _PLAIN_KINDS.get(cast("type[object]", type(value))) or _kind(value)
-                if kinds.get(name) != seen:
-                    kinds[name] = _widened(kinds.get(name, seen), seen)
-        return [Column(name, kind) for name, kind in kinds.items()]
-
     def _chunks(self, segment: Segment) -> Iterator[list[Any]]:
         values: dict[str, Any] = {
             "run_id": segment.run_id, "start_s": segment.start_s, "end_s": segment.end_s,
@@ -153,7 +175,7 @@ def _row(head: tuple[int, int, float, float], data: str, odd_text: str | None) -
             put_back(state, path.split("."), _NOT_FINITE[kind])
     values: dict[str, Any] = {}
     _spread("", state.items(), values)
-    for name in RESERVED.intersection(values):
+    for name in _RESERVED.intersection(values):
         values[f"state.{name}"] = values.pop(name)
     return Row(head, values, odd)
 

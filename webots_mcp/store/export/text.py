@@ -8,14 +8,14 @@ import json
 import math
 from typing import Any, BinaryIO, Final
 
-from webots_mcp.store.export.rows import HEAD, Source, as_text
+from webots_mcp.store.export.rows import Table, as_text
 
 _SPELLED: Final = ("bool", "text", "numbers")
 _FORMULAS: Final = ("=", "+", "-", "@", "\t", "\r")
 _encode: Final = json.JSONEncoder(ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode
 
 
-def write_csv(source: Source, sink: BinaryIO, *, safe_cells: bool = False) -> None:
+def write_csv(source: Table, sink: BinaryIO, *, safe_cells: bool = False) -> None:
     r"""One line per row under a line of column names; UTF-8, lines end as in RFC 4180.
 
     What a row lacks, or is null, is empty; flags are `true` and `false`; what was not finite is
@@ -29,10 +29,10 @@ def write_csv(source: Source, sink: BinaryIO, *, safe_cells: bool = False) -> No
     columns = source.columns()
     names = [column.name for column in columns]
     # The writer itself turns numbers into text, and null into nothing.
-    spelled = [i for i, column in enumerate(columns, len(HEAD)) if column.kind in _SPELLED]
+    spelled = [i for i, column in enumerate(columns, len(source.head)) if column.kind in _SPELLED]
     text = io.TextIOWrapper(sink, "utf-8", newline="")
     writer = csv.writer(text)
-    writer.writerow(map(spell, (*HEAD, *names)))
+    writer.writerow(map(spell, (*(column.name for column in source.head), *names)))
     for row in source.rows(pass_number=2):
         cells: list[object] = [*row.head, *map(row.values.get, names)]
         for i in spelled:
@@ -51,13 +51,14 @@ def _harmless(text: str | None) -> str | None:
     return f"'{plain}" if plain and plain.startswith(_FORMULAS) else plain
 
 
-def write_json_lines(source: Source, sink: BinaryIO) -> None:
+def write_json_lines(source: Table, sink: BinaryIO) -> None:
     """One JSON object per row and line: what it holds by dotted name, null where it is not finite.
 
     `odd`, where a row has it, names the path of every value that JSON cannot hold, and what it was.
     """
+    head = [column.name for column in source.head]
     for row in source.rows():
-        line: dict[str, Any] = dict(zip(HEAD, row.head, strict=True)) | row.values
+        line: dict[str, Any] = dict(zip(head, row.head, strict=True)) | row.values
         if row.odd:
             line["odd"] = row.odd
         sink.write(_line(line))

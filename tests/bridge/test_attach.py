@@ -381,3 +381,75 @@ def test_a_locked_database_holds_no_step_up(
             assert bridge.stats().rows_waiting >= 1
         robot.step(STEP_MS)
     assert times(filed) == [0.016, 0.032, 0.048]
+
+
+# -- what else happens at a step -------------------------------------------------------------------
+
+
+def test_a_run_until_a_condition_pauses_at_the_step_at_which_the_devices_say_it(
+    robot: InProcessSupervisor, attached: MCPBridge, recording: Recording
+) -> None:
+    attached.register_command("let it be", lambda _: recording.send("resume"))
+    robot.step(STEP_MS)
+    sent = recording.send("run", until="time >= 0.09", for_s=5)
+    for _ in range(5):
+        robot.step(STEP_MS)
+    recording.send("let it be")
+    robot.step(STEP_MS)
+    result = recording.fate(sent)[1]
+    assert result["ended"] == "condition held"
+    assert result["sim_time_s"] == pytest.approx(0.096)
+
+
+def test_a_breakpoint_is_asked_of_what_the_devices_say_and_holds_the_next_step(
+    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
+) -> None:
+    enable(robot)
+    held: list[float] = []
+    with MCPBridge.attach(robot, database=database) as bridge:  # of which most are throttled
+        bridge.breakpoint("time >= 0.05")
+        bridge.register_command("look", lambda _: held.append(robot.getTime()))
+        for _ in range(4):
+            robot.step(STEP_MS)
+        assert robot.simulationGetMode() == robot.SIMULATION_MODE_PAUSE
+        recording.send("look")
+        recording.send("resume")
+        robot.step(STEP_MS)
+    assert held == [pytest.approx(0.064)]
+    assert recording.rows("SELECT sim_time_s FROM event WHERE kind = 'breakpoint'") == held
+
+
+def test_a_callback_of_a_reset_may_step(
+    robot: InProcessSupervisor, attached: MCPBridge, recording: Recording
+) -> None:
+    answers: list[int] = []
+    attached.on_reload(lambda: answers.append(robot.step(STEP_MS)))
+    for _ in range(3):
+        robot.step(STEP_MS)
+    robot.simulationReset()
+    for _ in range(3):
+        robot.step(STEP_MS)
+    assert answers == [0]
+    newest = recording.rows("SELECT sim_time_s FROM state WHERE run_id = 2 ORDER BY id")
+    assert newest[-1] == pytest.approx(0.064)
+    assert newest == sorted(newest)
+
+
+def test_an_interrupt_in_the_bridges_part_of_a_step_ends_the_loop_and_loses_nothing(
+    robot: InProcessSupervisor,
+    attached: MCPBridge,
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    robot.step(STEP_MS)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(type(robot.devices["gps"]), "getValues", interrupt)
+        robot.step(STEP_MS)
+    robot.step(STEP_MS)
+    attached.close()
+    assert times(recording) == [0.016, 0.048]
+    assert recording.rows("SELECT end_reason FROM session") == ["finished"]
+
+
+def interrupt(_: object) -> None:
+    raise KeyboardInterrupt

@@ -45,8 +45,8 @@ from webots_mcp.store.states import State, newest_state
 from webots_mcp.store.status import Status, judge, stopped_for
 
 GETTING_STARTED: Final = (
-    "Add three lines to a controller: 'from webots_mcp import MCPBridge', "
-    "'bridge = MCPBridge(robot)', and in its loop 'bridge.publish({...}); bridge.get_command()'; "
+    "Add two lines to a controller: 'from webots_mcp import MCPBridge' and, where it has made its "
+    "robot, 'bridge = MCPBridge.attach(robot)', which records what the devices say at each step; "
     "then start the simulation. 'webots-mcp demo' shows it without Webots. If controllers record "
     "elsewhere, start the server with --data-dir or --database."
 )

@@ -137,6 +137,32 @@ def test_what_there_was_no_time_for_is_told_by_time(long: sqlite3.Connection) ->
     assert find_events(long, rest, options).events[0].start_s == pytest.approx(100, abs=0.5)
 
 
+def test_standstills_take_no_time_from_kinds_that_cost_less(long: sqlite3.Connection) -> None:
+    """Once samples are read for them, the time is over."""
+    late: list[str] = []
+    options = EventOptions(kinds=("still", "stuck", "silent", "flat", "jump", "oscillation"))
+    kinds, deadline = asked_kinds(options), Deadline(6.0, lambda: 100.0 * len(late))
+    asked, ledger = resolve_range(long), Ledger()
+    detection = Detection(long, known_signals(long, asked), kinds, options, deadline, ledger)
+    long.set_trace_callback(lambda each: late.append(each) if "RECURSIVE tick" in each else None)
+    found = detection.events_touching(asked.segments[0])
+    long.set_trace_callback(None)
+    told = ledger.verdicts(kinds, found).not_searched
+    assert {kind for kind, why in told.items() if "the time was over" in why} == {"still", "stuck"}
+    assert {each.kind for each in found} == {"flat", "jump", "oscillation"}
+
+
+def test_what_a_part_of_the_work_leaves_of_its_time_is_left_for_the_rest() -> None:
+    now_s = [0.0]
+    deadline = Deadline(8.0, lambda: now_s[0])
+    with deadline.narrowed(0.25):
+        now_s[0] = 1.0
+        assert deadline.left_s == 1.0
+        now_s[0] = 2.0
+        assert deadline.passed
+    assert deadline.left_s == 6.0
+
+
 def test_the_position_of_a_run_is_the_one_that_it_published(empty: sqlite3.Connection) -> None:
     """Another run of the robot named it otherwise, after an edit."""
     recorder = Recorder(empty)

@@ -24,7 +24,7 @@ from webots_mcp.store.reading.ranges import resolve_range
 
 
 def tilted(search: Search) -> Iterator[Event]:
-    (numbers,) = search.view.stretches([search.known["tilt"]], 1.0)
+    (numbers,) = search.view.stretches([search.known["tilt"]])
     times, tilts = numbers.of("tilt")
     for time_s, tilt in zip(times.tolist(), tilts.tolist(), strict=True):
         if tilt > 1:

@@ -74,4 +74,5 @@ CONDITION: Final = EventKind(
     usual=_is_given,
     lasts=True,
     counted=False,
+    effort=4,
 )

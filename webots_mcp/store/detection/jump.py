@@ -22,7 +22,6 @@ from webots_mcp.store.signals.registry import Signal
 from webots_mcp.units import metres_in
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
-LEAPS_SHARE: Final = 0.5  # of the time that is left; what is read in it serves swings as well
 _LEAST_SHARE: Final = 0.7  # of a distance, less than the root of a half
 _ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to the same value
 
@@ -68,7 +67,7 @@ def _leaps(search: Search) -> Iterator[Event]:
     # In one of the two directions it is farther than that.
     least_steps = [_LEAST_SHARE * search.options.jump_m / metres_in(each.name) for each in position]
     leaps: dict[float, float] = {}
-    for numbers in search.view.stretches(position, LEAPS_SHARE, least_steps, apart=POSITION_STEPS):
+    for numbers in search.view.stretches(position, least_steps, apart=POSITION_STEPS):
         leaps |= _leaps_in(numbers, position, search.options.jump_m)
     for time_s in sorted(leaps):
         yield search.event("jump", time_s, time_s, "position", distance_m=leaps[time_s])
@@ -107,4 +106,5 @@ JUMP: Final = EventKind(
     drawn=1,
     reads_through=lambda search: search.motion.position or (),
     says_alike=_alike,
+    effort=2,
 )

@@ -57,6 +57,8 @@ class EventKind:
             None where each is always told by itself.
         of_arrays: What several items of one array did at once is one event.
         reads_through: Signals of which it reads all rows, also of a long segment.
+        effort: Its rank by what it costs to look for: the least is searched first. Kinds of one
+            rank find things together, and share their part of the time.
     """
 
     name: str
@@ -73,3 +75,4 @@ class EventKind:
     says_alike: Callable[[Sequence[Event], str], str] | None = None
     of_arrays: bool = False
     reads_through: Callable[[Search], Sequence[Signal]] = _nothing
+    effort: int = 0

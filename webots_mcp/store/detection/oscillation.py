@@ -58,7 +58,7 @@ def _found(search: Search, signals: Sequence[Signal]) -> dict[str, list[Swing]]:
         ([each for each in signals if each.name not in found], range(0)),
     ):
         at_rest = [0.0] * len(some)  # without any step there is no swing
-        for numbers in search.view.stretches(some, 1.0, at_rest, outside) if some else ():
+        for numbers in search.view.stretches(some, at_rest, outside) if some else ():
             for index, signal in enumerate(some):
                 if search.is_over("oscillation", some[index:]):
                     break
@@ -83,4 +83,5 @@ OSCILLATION: Final = EventKind(
     of_numbers=True,
     drawn=3,
     reads_through=_swinging,
+    effort=1,
 )

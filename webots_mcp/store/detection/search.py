@@ -148,6 +148,10 @@ class Search:
         through = [each for kind in self.kinds for each in kind.reads_through(self)]
         return view_of(self.connection, self.segment, list(needed.values()), self.deadline, through)
 
+    def open_view(self) -> None:
+        """Read what serves all kinds before they share the time."""
+        assert self.view
+
     @cached_property
     def standings(self) -> Standings:
         """The standstills, found once for all kinds that tell them; numpy is imported here."""

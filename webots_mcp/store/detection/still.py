@@ -33,7 +33,7 @@ def _least_s(options: EventOptions) -> float:
 
 
 STILL: Final = EventKind(
-    "still", "the robot stood", still_events, lasts=True, least_s=_least_s, drawn=8
+    "still", "the robot stood", still_events, lasts=True, least_s=_least_s, drawn=8, effort=3
 )
 STUCK: Final = EventKind(
     "stuck",
@@ -42,4 +42,5 @@ STUCK: Final = EventKind(
     lasts=True,
     least_s=_least_s,
     drawn=0,
+    effort=3,
 )

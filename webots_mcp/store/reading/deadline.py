@@ -25,6 +25,16 @@ class Deadline:
         """One for a part of the work: after that share of the time that is left."""
         return Deadline(share * self.left_s, self._clock)
 
+    @contextlib.contextmanager
+    def narrowed(self, share: float) -> Generator[None]:
+        """Inside, the time is over after that share of what is left, for all that hold this one."""
+        until_s = self._until_s
+        self._until_s = self._clock() + share * self.left_s
+        try:
+            yield
+        finally:
+            self._until_s = until_s
+
     @property
     def passed(self) -> bool:
         """Whether the time is over."""

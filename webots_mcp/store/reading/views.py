@@ -118,18 +118,16 @@ class View(Protocol):
     def stretches(
         self,
         signals: Sequence[Signal],
-        share: float,
         least_steps: Sequence[float] | None = None,
         outside: range = _NOTHING,
         apart: float = 0.0,
     ) -> Iterator[Numbers]:
-        """All rows in stretches, the newest first, as many as a share of the time allows.
+        """All rows in stretches, the newest first, as many as the time allows.
 
         Each reaches so far into the one after it that what lies across the border is whole in one.
 
         Args:
             signals: Which numbers.
-            share: Of the time that is left.
             least_steps: Of each signal: a stretch may be left out in which none of them changes by
                 more than that from one row to the next. None for all stretches.
             outside: Buckets that are not read, but for what lies across their borders.
@@ -215,7 +213,6 @@ class RowView:
     def stretches(
         self,
         signals: Sequence[Signal],
-        share: float,
         least_steps: Sequence[float] | None = None,
         outside: range = _NOTHING,
         apart: float = 0.0,
@@ -369,24 +366,21 @@ class LongView:
     def stretches(
         self,
         signals: Sequence[Signal],
-        share: float,
         least_steps: Sequence[float] | None = None,
         outside: range = _NOTHING,
         apart: float = 0.0,
     ) -> Iterator[Numbers]:
         """What there is no time for is noted."""
-        deadline = self._deadline.part(share)
         first_s = max(self._segment.start_s, self._purged_until_s or -math.inf)
         for part in _around(self._segment, outside):
             if part.start_s < first_s:
                 self._note_purged()
-            yield from self._stretches(part, first_s, deadline, signals, least_steps, apart)
+            yield from self._stretches(part, first_s, signals, least_steps, apart)
 
     def _stretches(
         self,
         left: Segment,
         first_s: float,
-        deadline: Deadline,
         signals: Sequence[Signal],
         least_steps: Sequence[float] | None,
         apart: float,
@@ -394,7 +388,7 @@ class LongView:
         end_of_all_s, first_s = left.end_s, max(first_s, left.start_s)
         while left.end_s > first_s:
             part = newest_part(self._connection, left, STRETCH_ROWS)
-            if deadline.passed:
+            if self._deadline.passed:
                 reached_s = left.end_s
                 self.notes.append(
                     f"not before {reached_s:.3f} s, the time was over; ask end_s={reached_s:.3f}"
@@ -403,12 +397,12 @@ class LongView:
             whole = replace(part, end_s=min(end_of_all_s, part.end_s + ACROSS_S))
             steps = None if least_steps is None else self._largest_steps(whole, signals)
             if steps is None or least_steps is None:
-                yield self._stretch(whole, signals, deadline)
+                yield self._stretch(whole, signals)
             elif large := _above(steps, least_steps):
                 if apart and not _above(steps, [each / apart for each in least_steps], large):
-                    yield self._part(whole, large, signals, deadline)
+                    yield self._part(whole, large, signals)
                 else:
-                    yield self._stretch(whole, signals, deadline)
+                    yield self._stretch(whole, signals)
             if part.start_s <= first_s:
                 return
             left = replace(left, end_s=part.start_s)
@@ -436,24 +430,22 @@ class LongView:
             steps.append(own)
         return steps
 
-    def _part(
-        self, whole: Segment, large: range, signals: Sequence[Signal], deadline: Deadline
-    ) -> Numbers:
+    def _part(self, whole: Segment, large: range, signals: Sequence[Signal]) -> Numbers:
         """The rows of some buckets of a stretch, and of those beside them."""
         start_s = max(whole.start_s, (large.start - 1) * BUCKET_S)
         end_s = min(whole.end_s, (large.stop + 1) * BUCKET_S)
         bounds = (whole.run_id, whole.start_s, whole.end_s)
         rows = self._connection.execute(_ROWS_IN, bounds).fetchone()[0]
         part = replace(whole, start_s=start_s, end_s=end_s)
-        return replace(self._stretch(part, signals, deadline), stretch_rows=rows)
+        return replace(self._stretch(part, signals), stretch_rows=rows)
 
-    def _stretch(self, part: Segment, signals: Sequence[Signal], deadline: Deadline) -> Numbers:
+    def _stretch(self, part: Segment, signals: Sequence[Signal]) -> Numbers:
         """Read with what other kinds will ask of the same rows, and kept for them."""
         kept = self._kept.get(part)
         if kept is not None and all(signal.name in kept.values for signal in signals):
             return kept
         wanted = list({each.name: each for each in (*signals, *self._through)}.values())
-        columns = read_columns(self._connection, part, wanted, deadline)
+        columns = read_columns(self._connection, part, wanted, self._deadline)
         numbers = numbers_of(columns, wanted)
         held = sum(len(each.times) * len(each.values) for each in self._kept.values())
         if not columns.cut and held < MOST_KEPT:

@@ -34,6 +34,7 @@ ALLOWED = {
     "standin": {"standin", "bundled"},
     "webots": {"connection", "contract", "errors", "liveness", "webots"},
 }
+ALLOWED["setup"] = {"contract", "errors", "setup", "webots", "__version__"}
 ENTRIES = {"bundled", "conditions", "maintenance", "naming", "parameter", "settlement", "units"}
 STDLIB = {
     *ENTRIES,

@@ -18,6 +18,7 @@ APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
 SCHEMA_VERSION: Final = 7  # PRAGMA user_version of a database that this version reads and writes
 
 DATABASE_NAME: Final = "webots.db"
+PROJECT_DATA_FOLDER: Final = "mcp_data"  # in a Webots project
 CAMERA_FOLDER: Final = "camera"
 SCREENSHOT_FOLDER: Final = "screenshots"
 KEPT_FRAME: Final = "kept"  # the kind of a picture that belongs to the kept stretch it lies in
@@ -202,11 +203,17 @@ def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
         return full_path(data_dir)
     if named := os.environ.get(DATA_DIR_VARIABLE):
         return full_path(named)
-    here = Path.cwd()
-    for folder in (here, *here.parents):
-        if (folder / "worlds").is_dir() and (folder / "controllers").is_dir():
-            return folder / "mcp_data"
+    if project := find_project(Path.cwd()):
+        return project / PROJECT_DATA_FOLDER
     return Path.home() / ".webots-mcp" / "data"
+
+
+def find_project(folder: Path) -> Path | None:
+    """The nearest folder, at or above this one, that is a Webots project."""
+    for each in (folder, *folder.parents):
+        if (each / "worlds").is_dir() and (each / "controllers").is_dir():
+            return each
+    return None
 
 
 def resolve_database(

@@ -22,6 +22,7 @@ from webots_mcp.cli import (
     history,
     looking,
     serving,
+    setting_up,
     steering,
     trials,
     tuning,
@@ -34,7 +35,18 @@ from webots_mcp.errors import WebotsMCPError
 __all__ = ["COMMANDS", "main"]
 
 # Each registered its commands at import.
-FAMILIES: Final = (serving, looking, history, contents, data, trials, tuning, steering, breakpoints)
+FAMILIES: Final = (
+    serving,
+    setting_up,
+    looking,
+    history,
+    contents,
+    data,
+    trials,
+    tuning,
+    steering,
+    breakpoints,
+)
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2
 _DESCRIPTION: Final = (

@@ -1,0 +1,195 @@
+"""`webots-mcp init` on real projects: what is written, what is said, and that nothing is lost."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests import unprivileged
+from webots_mcp.bundled import bundled
+
+CONTROLLER = "from controller import Robot\n\nrobot = Robot()\nwhile robot.step(32) != -1: pass\n"
+WRITTEN = [".mcp.json", ".cursor/mcp.json", ".vscode/mcp.json", "mcp_data/.gitignore"]
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    """One with a space and an umlaut, whose Python is this one."""
+    folder = tmp_path / "mein schönes Projekt"
+    (folder / "worlds").mkdir(parents=True)
+    (folder / "controllers" / "läufer").mkdir(parents=True)
+    (folder / "controllers" / "läufer" / "läufer.py").write_text(CONTROLLER)
+    (folder / "controllers" / "läufer" / "runtime.ini").write_text(
+        f"[python]\nCOMMAND = {sys.executable}\n", "utf-8"
+    )
+    return folder
+
+
+def run(
+    *arguments: str, cwd: Path, line: list[str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [*(line or [sys.executable]), "-m", "webots_mcp", "init", *arguments], cwd=cwd, text=True,
+        encoding="utf-8", capture_output=True, stdin=subprocess.DEVNULL, check=False,
+        env={**os.environ, "HOME": str(cwd), "PYTHONPATH": str(Path(__file__).parents[2]),
+             "PYTHONIOENCODING": "utf-8"},
+    )  # fmt: skip
+
+
+def snapshot(folder: Path) -> dict[str, tuple[bytes, int]]:
+    return {
+        str(file.relative_to(folder)): (file.read_bytes(), file.stat().st_mtime_ns)
+        for file in folder.rglob("*")
+        if file.is_file()
+    }
+
+
+def test_a_new_project_is_ready_in_one_command_and_a_second_changes_nothing(project: Path) -> None:
+    ended = run(cwd=project / "controllers" / "läufer")
+    assert ended.returncode == 0, ended.stderr
+    before = snapshot(project)
+    assert set(WRITTEN) <= set(before)
+    assert before["mcp_data/.gitignore"][0] == b"*\n"
+    assert (project / "mcp_data").stat().st_mode & 0o777 == 0o700
+    for line in (
+        "controllers/läufer/läufer.py",
+        "from webots_mcp import MCPBridge",
+        "MCPBridge.attach(robot)",
+        "läufer/runtime.ini",
+        "which has webots-mcp",
+    ):
+        assert line in ended.stdout
+    again = run(cwd=project)
+    assert again.stdout.count("unchanged: ") == len(WRITTEN)
+    assert snapshot(project) == before
+
+
+def test_the_command_that_is_written_starts_a_server(project: Path) -> None:
+    run(cwd=project)
+    entry = json.loads((project / ".mcp.json").read_text("utf-8"))["mcpServers"]["webots"]
+    ask = {"jsonrpc": "2.0", "id": 1, "method": "initialize",
+           "params": {"protocolVersion": "2025-06-18", "capabilities": {},
+                      "clientInfo": {"name": "test", "version": "1"}}}  # fmt: skip
+    ended = subprocess.run(
+        [entry["command"], *entry["args"]], input=json.dumps(ask) + "\n", text=True, timeout=60,
+        capture_output=True, check=False, cwd="/", env={"PATH": "/nowhere"},
+    )  # fmt: skip
+    assert '"serverInfo"' in ended.stdout, ended.stderr
+
+
+def test_a_dry_run_writes_nothing_and_says_what_it_would(project: Path) -> None:
+    before = snapshot(project)
+    ended = run("--dry-run", "--claude-desktop", cwd=project)
+    assert ended.stdout.count("would be written: ") == len(WRITTEN) + 1
+    assert snapshot(project) == before
+    assert not (project / "mcp_data").exists()
+
+
+def test_json_holds_it_all(project: Path) -> None:
+    found: dict[str, Any] = json.loads(run("--json", cwd=project).stdout)
+    assert found["project"] == str(project)
+    assert {each["outcome"] for each in found["files"]} == {"written"}
+    (controller,) = found["controllers"]
+    assert controller["lines"] == ["from webots_mcp import MCPBridge", "MCPBridge.attach(robot)"]
+    assert controller["python"]["executable"] == sys.executable
+
+
+def test_a_damaged_file_is_refused_and_the_others_are_written(project: Path) -> None:
+    (project / ".vscode").mkdir()
+    (project / ".vscode" / "mcp.json").write_text('{"servers": {\n  "a" 1}}')
+    ended = run(cwd=project)
+    assert ended.returncode == 2
+    assert "line 2, column 7" in ended.stdout
+    assert "mcp.json; the reasons are above" in ended.stderr
+    assert (project / ".vscode" / "mcp.json").read_text() == '{"servers": {\n  "a" 1}}'
+    assert (project / ".mcp.json").exists()
+
+
+@pytest.mark.skipif(not unprivileged.POSSIBLE, reason="permissions do not stop this user")
+def test_a_read_only_file_stays_as_it_is(project: Path) -> None:
+    (project / ".mcp.json").write_text("{}")
+    (project / ".mcp.json").chmod(0o444)
+    controller = project / "controllers" / "läufer" / "läufer.py"
+    controller.chmod(0o444)
+    nobody = unprivileged.line()
+    ended = run(cwd=project, line=nobody)
+    assert ended.returncode == 2
+    assert ".mcp.json is read-only" in ended.stdout
+    assert (project / ".mcp.json").read_text() == "{}"
+    ended = run("--patch", str(controller), "--yes", cwd=project, line=nobody)
+    assert ended.returncode == 2
+    assert "is read-only" in ended.stderr
+    assert controller.read_text() == CONTROLLER
+
+
+def test_an_empty_folder_is_no_project(tmp_path: Path) -> None:
+    ended = run(cwd=tmp_path)
+    assert ended.returncode == 2
+    assert "no Webots project at or above" in ended.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_patch_shows_a_diff_and_undo_gives_the_same_bytes(project: Path) -> None:
+    file = project / "controllers" / "läufer" / "läufer.py"
+    ended = run("--patch", str(file), "--yes", cwd=project)
+    assert ended.returncode == 0, ended.stderr
+    assert "\n+from webots_mcp import MCPBridge\n" in ended.stdout
+    assert "\n+MCPBridge.attach(robot)\n" in ended.stdout
+    assert "MCPBridge.attach(robot)" in file.read_text()
+    assert not (project / ".mcp.json").exists()
+    again = run("--patch", str(file), "--yes", cwd=project)
+    assert (again.returncode, "already patched" in again.stdout) == (0, True)
+    assert run("--undo", str(file), "--yes", cwd=project).returncode == 0
+    assert file.read_text() == CONTROLLER
+
+
+def test_without_a_yes_nothing_is_patched(project: Path) -> None:
+    file = project / "controllers" / "läufer" / "läufer.py"
+    ended = run("--patch", str(file), cwd=project)
+    assert ended.returncode == 2
+    assert "--yes writes it" in ended.stderr
+    run("--patch", str(file), "--dry-run", cwd=project)
+    assert file.read_text() == CONTROLLER
+
+
+@pytest.mark.parametrize(("answer", "patched"), [("y\n", True), ("\n", False)])
+def test_at_a_terminal_it_asks(project: Path, answer: str, patched: bool) -> None:
+    pty = pytest.importorskip("pty")
+    file = project / "controllers" / "läufer" / "läufer.py"
+    keyboard, terminal = pty.openpty()
+    os.write(keyboard, answer.encode())
+    subprocess.run(
+        [sys.executable, "-m", "webots_mcp", "init", "--patch", str(file)],
+        stdin=terminal, capture_output=True, check=False,
+    )  # fmt: skip
+    os.close(keyboard)
+    os.close(terminal)
+    assert ("MCPBridge" in file.read_text()) == patched
+
+
+def test_a_patched_controller_records_in_the_stand_in(tmp_path: Path) -> None:
+    shutil.copytree(bundled("examples") / "worlds", tmp_path / "worlds")
+    folder = tmp_path / "controllers" / "rover"
+    folder.mkdir(parents=True)
+    (folder / "rover.py").write_text(
+        "from controller import Supervisor\n\nrobot = Supervisor()\n"
+        "for _ in range(20):\n    robot.step(16)\nrobot.simulationQuit(0)\nrobot.step(16)\n"
+    )
+    assert run("--patch", str(folder / "rover.py"), "--yes", cwd=tmp_path).returncode == 0
+    ended = subprocess.run(
+        [sys.executable, "-m", "webots_mcp.standin", "worlds/arena.wbt"], cwd=tmp_path,
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (tmp_path / "mcp_data" / "webots.db").exists(), ended.stderr
+    shown = subprocess.run(
+        [sys.executable, "-m", "webots_mcp", "signals"], cwd=tmp_path, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+    assert "motors.left wheel motor" in shown.stdout, shown.stderr

@@ -1,0 +1,184 @@
+"""Which Python a controller is started with, found by Webots' rules and tried for real."""
+
+from __future__ import annotations
+
+import os
+import plistlib
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import pytest
+
+from webots_mcp.setup.interpreter import chosen, look_into, quoted, source
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """No preferences and no Webots of this machine."""
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    for name in ("XDG_CONFIG_HOME", "WEBOTS_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    return tmp_path / "home"
+
+
+@pytest.fixture
+def controller(tmp_path: Path) -> Path:
+    folder = tmp_path / "my röbot"
+    folder.mkdir()
+    (folder / "r.py").write_text("robot = 1\n")
+    return folder / "r.py"
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A Python without webots-mcp, in a folder with a space."""
+    folder = tmp_path_factory.mktemp("a bare one")
+    venv.create(folder, with_pip=False)
+    return folder / "bin" / "python"
+
+
+def runtime(controller: Path, command: str) -> None:
+    controller.with_name("runtime.ini").write_text(
+        "; mine\n[environment variables]\nCOMMAND = no\n\n[python]\n"
+        f'COMMAND = {command} \nOPTIONS = -O\n', "utf-8",
+    )  # fmt: skip
+
+
+def prefer(home: Path, version: str, command: str) -> None:
+    folder = home / ".config" / "Cyberbotics"
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"Webots-{version}.conf").write_text(
+        f"[General]\npythonCommand=wrong\n\n[%General]\nfoo=1\npythonCommand={command}\n"
+    )
+
+
+def test_without_anything_it_is_the_default_of_the_system(controller: Path) -> None:
+    assert chosen(controller, "linux").command == ("python3",)
+    assert chosen(controller, "darwin").command == ("python3",)
+    assert chosen(controller, "win32").command == ("python",)
+
+
+def test_the_preferences_go_before_it_the_newest_first(controller: Path, home: Path) -> None:
+    prefer(home, "R2023b", "/old/python")
+    prefer(home, "R2025a", "/new/python")
+    found = chosen(controller, "linux")
+    assert found.command == ("/new/python",)
+    assert found.by == "the preferences of Webots R2025a"
+
+
+def test_those_of_the_installed_version_go_before_newer_ones(
+    controller: Path, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prefer(home, "R2023b", "/old/python")
+    prefer(home, "R2025a", "/new/python")
+    installed = tmp_path / "webots"
+    (installed / "resources").mkdir(parents=True)
+    (installed / "resources" / "version.txt").write_text("R2023b\n")
+    (installed / "webots").write_text("#!/bin/sh\n")
+    monkeypatch.setenv("WEBOTS_HOME", str(installed))
+    assert chosen(controller, "linux").command == ("/old/python",)
+
+
+def test_macos_keeps_them_in_a_property_list(controller: Path, home: Path) -> None:
+    folder = home / "Library" / "Preferences"
+    folder.mkdir(parents=True)
+    file = folder / "com.cyberbotics.Webots-R2025a.plist"
+    file.write_bytes(plistlib.dumps({"General.pythonCommand": "/opt/python"}))
+    assert chosen(controller, "darwin").command == ("/opt/python",)
+    file.write_bytes(b"damaged")
+    assert chosen(controller, "darwin").command == ("python3",)
+
+
+def test_runtime_ini_goes_before_the_preferences(controller: Path, home: Path) -> None:
+    prefer(home, "R2025a", "/new/python")
+    runtime(controller, '"/my venv/bin/python"')
+    assert chosen(controller, "linux").command == ("/my venv/bin/python",)
+    assert chosen(controller, "win32").command == ("/my venv/bin/python",)
+
+
+def test_the_first_line_goes_before_both_but_on_windows(controller: Path) -> None:
+    runtime(controller, "/ini/python")
+    controller.write_text("#!/usr/bin/env python3.12\n")
+    assert chosen(controller, "linux").command == ("/usr/bin/env", "python3.12")
+    assert chosen(controller, "win32").command == ("/ini/python",)
+
+
+def test_a_python_with_the_bridge_says_its_version(controller: Path) -> None:
+    runtime(controller, sys.executable)
+    found = look_into(controller)
+    assert (found.error, found.fix) == (None, None)
+    assert found.bridge
+    assert found.executable == sys.executable
+    left = {file.name for file in controller.parent.iterdir()}
+    assert left == {"r.py", "runtime.ini"}, "nothing is left behind"
+
+
+def test_one_without_it_gets_the_line_that_mends_it_quoted(controller: Path, bare: Path) -> None:
+    runtime(controller, str(bare))
+    found = look_into(controller)
+    assert found.bridge is None
+    assert "webots_mcp" in (found.error or "")
+    line = (found.fix or "").partition("   (")[0]
+    words = subprocess.run(
+        ["sh", "-c", f"printf '%s\\n' {line}"], capture_output=True, text=True, check=True
+    ).stdout.splitlines()
+    assert words[:4] == [str(bare), "-m", "pip", "install"]
+    assert words[-2:] == ["--no-deps", source()]
+    assert "ensurepip" in (found.fix or ""), "it has no pip"
+
+
+def test_a_controllers_own_file_that_hides_the_package_is_seen(controller: Path) -> None:
+    runtime(controller, sys.executable)
+    controller.with_name("webots_mcp.py").write_text("raise RuntimeError('mine')\n")
+    assert look_into(controller).error == "RuntimeError: mine"
+
+
+def program(tmp_path: Path, text: str) -> str:
+    file = tmp_path / "fake-python"
+    file.write_text(f"#!/bin/sh\n{text}\n")
+    file.chmod(0o755)
+    return str(file)
+
+
+def test_a_program_that_fails_is_told_with_its_words(controller: Path, tmp_path: Path) -> None:
+    runtime(controller, program(tmp_path, "echo broken >&2; exit 3"))
+    found = look_into(controller)
+    assert "exit code 3, broken" in (found.error or "")
+    assert found.fix
+
+
+def test_one_that_never_ends_is_given_up(controller: Path, tmp_path: Path) -> None:
+    runtime(controller, program(tmp_path, "exec sleep 600"))
+    assert "within 0.2 s" in (look_into(controller, timeout_s=0.2).error or "")
+
+
+def test_one_that_is_missing_is_named_with_where_it_stands(controller: Path) -> None:
+    runtime(controller, "/no/such/python")
+    found = look_into(controller)
+    assert "'/no/such/python'" in (found.error or "")
+    assert "my röbot/runtime.ini" in (found.fix or "")
+
+
+def test_an_old_python_is_not_told_to_install(controller: Path, tmp_path: Path) -> None:
+    said = '{"executable": "/p", "python": "3.8.1", "error": "SyntaxError: x", "pip": true}'
+    runtime(controller, program(tmp_path, f"echo '{said}'"))
+    assert "3.8.1 is too old" in (look_into(controller).fix or "")
+
+
+def test_the_environment_of_this_shell_does_not_count(
+    controller: Path, bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link = bare.parent / "python3"
+    assert link.exists()
+    monkeypatch.setenv("VIRTUAL_ENV", str(bare.parent.parent))
+    monkeypatch.setenv("PATH", f"{bare.parent}{os.pathsep}{os.environ['PATH']}")
+    assert look_into(controller).executable != str(link)
+
+
+def test_lines_are_quoted_for_the_shell_of_the_system() -> None:
+    command = [r"C:\Program Files\python.exe", "-m", "pip"]
+    assert quoted(command, "win32").startswith(r'& "C:\Program Files\python.exe" -m pip')
+    assert quoted(["python.exe", "-m"], "win32") == "python.exe -m"
+    assert quoted(["/a b/python"], "linux") == "'/a b/python'"

@@ -1,0 +1,46 @@
+"""Which controllers of a project Webots would start."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.setup.project import controllers_of, project_of
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    for name in ("worlds", "controllers"):
+        (tmp_path / "a project" / name).mkdir(parents=True)
+    return tmp_path / "a project"
+
+
+def test_it_is_found_from_anywhere_inside(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert project_of(str(project / "worlds")) == project
+    monkeypatch.chdir(project / "controllers")
+    assert project_of(None) == project
+
+
+def test_outside_of_one_it_is_said_and_one_below_is_named(project: Path) -> None:
+    with pytest.raises(InvalidInputError, match=r"lies below: .*a project"):
+        project_of(str(project.parent))
+    with pytest.raises(InvalidInputError, match="is no folder"):
+        project_of(str(project / "gone"))
+
+
+def test_the_first_file_that_is_there_is_started(project: Path) -> None:
+    for name, files in {
+        "python": ["python.py"],
+        "compiled": ["compiled", "compiled.py"],
+        "java": ["java.jar", "java.py"],
+        "helpers": ["other.py"],
+    }.items():
+        (project / "controllers" / name).mkdir()
+        for file in files:
+            (project / "controllers" / name / file).touch()
+    found = {each.name: each.language for each in controllers_of(project, "linux")}
+    assert found == {"python": "Python", "compiled": "a program", "java": "Java"}
+    on_windows = {each.name: each.language for each in controllers_of(project, "win32")}
+    assert on_windows["compiled"] == "Python"

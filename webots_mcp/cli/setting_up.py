@@ -1,0 +1,233 @@
+"""The command that makes a Webots project ready."""
+
+from __future__ import annotations
+
+import argparse
+import difflib
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from webots_mcp.cli.command import JSON, argument, command
+from webots_mcp.cli.tables import print_notes
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+
+if TYPE_CHECKING:
+    from webots_mcp.setup.clients import Client
+    from webots_mcp.setup.files import Change
+    from webots_mcp.setup.project import Controller
+
+
+@command(
+    "init",
+    argument("project", nargs="?", metavar="PROJECT",
+             help="a folder in the project (default: the current one)"),
+    argument("--claude-desktop", action="store_true",
+             help="tell Claude Desktop too, whose file is not in the project"),
+    argument("--name", default="webots", help="what clients call the server (webots)"),
+    argument("--patch", metavar="FILE",
+             help="put the bridge's lines into this controller, and do nothing else"),
+    argument("--undo", metavar="FILE", help="take them out again"),
+    argument("--yes", action="store_true", help="patch or undo without asking"),
+    argument("--dry-run", action="store_true", help="write nothing, and say what would be written"),
+    JSON,
+)  # fmt: skip
+def init(arguments: argparse.Namespace) -> None:
+    """Make a Webots project ready: tell MCP clients of the server, look at the controllers.
+
+    The project is the nearest folder with worlds/ and controllers/. Claude Code (.mcp.json), Cursor
+    (.cursor/mcp.json) and VS Code (.vscode/mcp.json) are told of the server, by a full path;
+    other entries and comments stay. Of each controller in Python the lines that it needs are
+    shown, the Python that Webots starts it with, and what mends that where the bridge is not
+    installed there. Nothing is changed a second time.
+
+    --patch writes those lines, after a question:
+
+        webots-mcp init --patch controllers/my_robot/my_robot.py
+    """
+    if arguments.patch and arguments.undo:
+        raise InvalidInputError("--patch and --undo exclude each other")
+    if arguments.patch or arguments.undo:
+        return _change_controller(arguments)
+    _make_ready(arguments)
+
+
+def _change_controller(arguments: argparse.Namespace) -> None:
+    from webots_mcp.setup.files import Change, apply, read
+    from webots_mcp.setup.patching import AlreadyPatchedError, patch, unpatch
+
+    file, change = (arguments.patch, patch) if arguments.patch else (arguments.undo, unpatch)
+    before = read(Path(file))
+    if before is None:
+        raise InvalidInputError(f"there is no file {file}")
+    try:
+        wanted = Change(Path(file), before, change(before))
+    except AlreadyPatchedError as error:
+        return _tell_patched(arguments, file, "unchanged", note=f"already patched: {error}")
+    except InvalidInputError as error:
+        raise InvalidInputError(f"{file} is left as it is: {error}") from error
+    diff = _diff(wanted)
+    if not arguments.json:
+        print(diff)
+    if not arguments.dry_run:
+        _ask(arguments, file)
+        apply(wanted)
+    done = "would be written" if arguments.dry_run else "written"
+    _tell_patched(arguments, file, done, diff=diff)
+
+
+def _tell_patched(arguments: argparse.Namespace, file: str, outcome: str, **more: str) -> None:
+    if arguments.json:
+        return _print_json({"file": file, "outcome": outcome, **more})
+    print(f"{file}: {more.get('note', outcome)}")
+
+
+def _diff(change: Change) -> str:
+    """The lines that change, whatever the file's encoding."""
+    before, after = (
+        (content or b"").decode("utf-8", "replace").splitlines()
+        for content in (change.before, change.after)
+    )
+    names = str(change.file), f"{change.file} (new)"
+    return "\n".join(difflib.unified_diff(before, after, *names, lineterm="", n=2))
+
+
+def _ask(arguments: argparse.Namespace, file: str) -> None:
+    if arguments.yes:
+        return
+    if not sys.stdin.isatty() or arguments.json:
+        raise CommandRefusedError(f"{file} is left as it is: --yes writes it")
+    try:
+        answer = input(f"Write {file}? [y/N] ")
+    except EOFError:
+        answer = ""
+    if answer.strip().lower() not in ("y", "yes"):
+        raise CommandRefusedError(f"{file} is left as it is")
+
+
+def _print_json(found: dict[str, Any]) -> None:
+    print(json.dumps(found, ensure_ascii=False))
+
+
+def _make_ready(arguments: argparse.Namespace) -> None:
+    from webots_mcp.contract import PROJECT_DATA_FOLDER
+    from webots_mcp.setup.clients import (
+        claude_desktop,
+        clients_of,
+        passing_environment,
+        server_command,
+    )
+    from webots_mcp.setup.project import controllers_of, project_of
+
+    project = project_of(arguments.project)
+    data_dir = project / PROJECT_DATA_FOLDER
+    clients = clients_of(project) + ([claude_desktop()] if arguments.claude_desktop else [])
+    line = server_command(data_dir)
+    files = [_ignored(data_dir, dry_run=arguments.dry_run)]
+    files += [_told(client, line, arguments) for client in clients]
+    controllers = [_described(found, project) for found in controllers_of(project)]
+    note = passing_environment()
+    found = {"project": str(project), "server": line, "files": files, "controllers": controllers}
+    if arguments.json:
+        _print_json(found | ({"note": note} if note else {}))
+    else:
+        _print(found, [note] if note else [])
+    refused = [each["file"] for each in files if each["outcome"] == "refused"]
+    if refused:
+        raise CommandRefusedError(f"not written: {', '.join(refused)}; the reasons are above")
+
+
+def _ignored(data_dir: Path, *, dry_run: bool) -> dict[str, str]:
+    from webots_mcp.contract import make_folder
+    from webots_mcp.setup.clients import ignore_file
+
+    file = data_dir / ".gitignore"
+    try:
+        change = ignore_file(data_dir)
+        if change.is_needed and not dry_run:
+            make_folder(data_dir)
+        return _done(change, dry_run=dry_run)
+    except (WebotsMCPError, OSError) as error:
+        return {"file": str(file), "outcome": "refused", "note": str(error)}
+
+
+def _told(client: Client, line: list[str], arguments: argparse.Namespace) -> dict[str, str]:
+    from webots_mcp.setup.clients import plan_entry
+
+    named = {"client": client.name}
+    try:
+        entry = plan_entry(client, arguments.name, line)
+        note = {"note": entry.note} if entry.note else {}
+        return named | _done(entry.change, dry_run=arguments.dry_run) | note
+    except (WebotsMCPError, OSError) as error:
+        return {**named, "file": str(client.file), "outcome": "refused", "note": str(error)}
+
+
+def _done(change: Change, *, dry_run: bool) -> dict[str, str]:
+    from webots_mcp.setup.files import apply
+
+    if not change.is_needed:
+        return {"file": str(change.file), "outcome": "unchanged"}
+    if not dry_run:
+        apply(change)
+    return {"file": str(change.file), "outcome": "would be written" if dry_run else "written"}
+
+
+def _described(controller: Controller, project: Path) -> dict[str, Any]:
+    """A controller, the lines that it needs, and the Python that it is started with."""
+    from dataclasses import asdict
+
+    from webots_mcp.setup.interpreter import look_into
+    from webots_mcp.setup.patching import IMPORT, AlreadyPatchedError, attach_line
+
+    file = controller.file.relative_to(project)
+    told: dict[str, Any] = {"file": file.as_posix(), "language": controller.language}
+    if not controller.is_python:
+        return told
+    try:
+        told["lines"] = [IMPORT, attach_line(controller.file.read_bytes())]
+    except AlreadyPatchedError as error:
+        told["has_bridge"] = str(error)
+    except (InvalidInputError, OSError) as error:
+        told["unclear"] = str(error)
+    python = asdict(look_into(controller.file))
+    return told | {"python": {name: value for name, value in python.items() if value is not None}}
+
+
+def _print(found: dict[str, Any], notes: list[str]) -> None:
+    print(f"project {found['project']}\n")
+    for each in found["files"]:
+        note = f" ({each['note']})" if "note" in each else ""
+        print(f"  {each['outcome']}: {each['file']}{note}")
+    for each in found["controllers"]:
+        print(f"\n{each['file']}")
+        _print_controller(each)
+    if not found["controllers"]:
+        notes = [*notes, "there is no controller yet: run it again when there is"]
+    print()
+    print_notes(notes)
+
+
+def _print_controller(told: dict[str, Any]) -> None:
+    if "python" not in told:
+        print(f"  is {told['language']}: the bridge is for controllers in Python")
+        return
+    if "lines" in told:
+        print("  needs these lines, the second where the robot is made (or: --patch)\n")
+        print("".join(f"      {line}\n" for line in told["lines"]))
+    elif "unclear" in told:
+        print(f"  where the lines belong is not clear: {told['unclear']}")
+    else:
+        print(f"  {told['has_bridge']}")
+    _print_python(told["python"])
+
+
+def _print_python(python: dict[str, Any]) -> None:
+    version = f", {python['executable']}, Python {python['python']}" if "python" in python else ""
+    print(f"  is started with {python['command']!r} ({python['chosen_by']}){version}")
+    if "error" not in python:
+        print(f"  which has webots-mcp {python['bridge']}")
+        return
+    print(f"  where the bridge cannot be used: {python['error']}. This mends it:\n")
+    print(f"      {python['fix']}")

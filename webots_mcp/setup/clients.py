@@ -1,0 +1,164 @@
+"""The files in which MCP clients are told of servers, and our entry in them."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+import sysconfig
+from pathlib import Path
+from typing import Any, Final, NamedTuple, cast
+
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.setup.commented_json import CommentedJSON
+from webots_mcp.setup.files import Change, read
+
+_BOM: Final = "\ufeff"
+# Folders of environments that uv makes for one command and clears away with its cache.
+_PASSING: Final = re.compile(r"(archive|builds|environments)-v\d+")
+
+
+class Client(NamedTuple):
+    """An MCP client: its name, its file, and the member of it that holds the servers."""
+
+    name: str
+    file: Path
+    servers: str = "mcpServers"
+
+
+class Entry(NamedTuple):
+    """What is to be done in a client's file, and what there is to know about it."""
+
+    change: Change
+    note: str | None = None
+
+
+def clients_of(project: Path) -> list[Client]:
+    """Those that look into the folder of a project."""
+    return [
+        Client("Claude Code", project / ".mcp.json"),
+        Client("Cursor", project / ".cursor" / "mcp.json"),
+        Client("VS Code", project / ".vscode" / "mcp.json", "servers"),
+    ]
+
+
+def claude_desktop(platform: str = sys.platform) -> Client:
+    """Claude Desktop, whose one file is the user's."""
+    if platform == "win32":
+        folder = Path(os.environ.get("APPDATA") or Path.home() / "AppData" / "Roaming")
+    elif platform == "darwin":
+        folder = Path.home() / "Library" / "Application Support"
+    else:
+        folder = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    return Client("Claude Desktop", folder / "Claude" / "claude_desktop_config.json")
+
+
+def server_command(data_dir: Path) -> list[str]:
+    """A command that starts the server from anywhere, whatever PATH the client was given."""
+    script = Path(sysconfig.get_path("scripts")) / "webots-mcp"
+    if sys.platform == "win32":
+        script = script.with_suffix(".exe")
+    program = [str(script)] if script.is_file() else [sys.executable, "-m", "webots_mcp"]
+    return [*program, "serve", "--data-dir", str(data_dir)]
+
+
+def passing_environment() -> str | None:
+    """What to do where this Python is one that uv clears away; None where it stays."""
+    if not any(map(_PASSING.fullmatch, Path(sys.prefix).parts)):
+        return None
+    return (
+        f"this webots-mcp runs from uv's cache ({sys.prefix}), which may be cleared: install it "
+        "by 'uv tool install' and run 'webots-mcp init' again"
+    )
+
+
+def plan_entry(client: Client, name: str, command: list[str]) -> Entry:
+    """The change that makes a client know the server.
+
+    An entry of ours that can be started is left as it is, also where it differs: its options are
+    the user's. One that cannot be started any more gets the command anew and keeps its options.
+
+    Raises:
+        InvalidInputError: The file cannot be read as JSON, or the name is taken.
+        OSError: It cannot be read.
+    """
+    before = read(client.file)
+    wanted = {"command": command[0], "args": command[1:]}
+    try:
+        text = before.decode("utf-8-sig") if before is not None else ""
+        after, note = _with_entry(text if text.strip() else "{}\n", client.servers, name, wanted)
+    except (InvalidInputError, UnicodeDecodeError) as error:
+        raise InvalidInputError(f"{client.file} is left as it is: {error}") from error
+    bom = _BOM if before is not None and before.startswith(_BOM.encode()) else ""
+    unchanged = before if before is not None and note else None
+    return Entry(Change(client.file, before, unchanged or (bom + after).encode()), note)
+
+
+def _with_entry(
+    text: str, servers: str, name: str, wanted: dict[str, Any]
+) -> tuple[str, str | None]:
+    document = CommentedJSON(text)
+    known = document.value.get(servers)
+    there = cast("dict[str, Any]", known).get(name) if isinstance(known, dict) else None
+    path = (servers, name)
+    if there is None:
+        return document.with_member(path, wanted), None
+    if not _is_ours(there):
+        raise InvalidInputError(
+            f"its server {name!r} is not webots-mcp; choose another name with --name"
+        )
+    entry = cast("dict[str, Any]", there)
+    if all(entry.get(key) == value for key, value in wanted.items()):
+        return text, None
+    if _can_be_started(entry):
+        kept = " ".join(_words(entry))
+        return text, f"it has an entry {name!r} of its own, which is kept: {kept}"
+    arguments = entry.get("args", [])
+    options = arguments[arguments.index("serve") + 1 :]
+    own = wanted["args"][: wanted["args"].index("serve") + 1]
+    mended = [*own, *(options if "--data-dir" in options or "--database" in options
+                      else [*wanted["args"][len(own):], *options])]  # fmt: skip
+    text = document.with_member((*path, "args"), mended)
+    return CommentedJSON(text).with_member((*path, "command"), wanted["command"]), None
+
+
+def _is_ours(entry: Any) -> bool:
+    """Whether a server's entry starts `webots-mcp serve`, in one of the ways to do so."""
+    if not isinstance(entry, dict):
+        return False
+    words = _words(cast("dict[str, Any]", entry))
+    names = {re.split(r"[\\/]", word)[-1].removesuffix(".exe") for word in words}
+    return "serve" in words[1:] and bool(names & {"webots-mcp", "webots_mcp"})
+
+
+def _words(entry: dict[str, Any]) -> list[str]:
+    command: object = entry.get("command")
+    arguments: object = entry.get("args", [])
+    if not isinstance(command, str) or not isinstance(arguments, list):
+        return []
+    return [command, *(str(each) for each in cast("list[object]", arguments))]
+
+
+def _can_be_started(entry: dict[str, Any]) -> bool:
+    """Not by a name alone: a client that was started from the desktop has a poor PATH.
+
+    Of `uvx` and other programs that install first only the program is looked for.
+    """
+    command: str = entry["command"]
+    if Path(command).is_absolute():
+        return Path(command).is_file()
+    return command not in ("webots-mcp", "python", "python3") and bool(shutil.which(command))
+
+
+def ignore_file(data_dir: Path) -> Change:
+    """The file that keeps the recordings out of a Git repository; one that is there is kept.
+
+    Raises:
+        CommandRefusedError: The data folder is a file.
+    """
+    if data_dir.exists() and not data_dir.is_dir():
+        raise CommandRefusedError(f"{data_dir} is no folder: recordings go there; rename it")
+    file = data_dir / ".gitignore"
+    before = read(file)
+    return Change(file, before, b"*\n" if before is None else before)

@@ -201,6 +201,29 @@ os._exit(7)
     assert filed.rows(LINES) == ["before"]
 
 
+@pytest.mark.parametrize("strict", ["", "1"])
+def test_what_cannot_be_recorded_is_passed_on_all_the_same(run: Run, strict: str) -> None:
+    """More of it than the pipe holds."""
+    process = run(
+        f"""
+os.environ["WEBOTS_MCP_STRICT"] = {strict!r}
+from webots_mcp.bridge.journal import Journal
+
+def fail(*_):
+    raise OSError("no room")
+
+bridge = begin()
+Journal.output = fail
+for n in range(40):
+    os.write(1, b"x" * 99_999 + b"\\n")
+Journal.output = lambda *_: None
+"""
+    )
+    out, err = process.communicate(timeout=60)
+    assert len(out) == 4_000_000
+    assert "no room" in err
+
+
 @posix
 def test_capturing_again_and_again_leaves_no_descriptor_open(run: Run, filed: Recording) -> None:
     process = run(

@@ -135,7 +135,7 @@ class _Channel:
     def _follow(self) -> None:
         """The thread: for as long as anybody has the pipe, a child of this process too."""
         while not (self._pump() if _POLLS else self._pass_on_waiting()):
-            self._record_lines()
+            self._record_in_thread()
             if _POLLS:
                 full = len(self._unpassed) >= _MOST_UNPASSED_BYTES
                 old_place = [self._old_place] if self._unpassed else []
@@ -144,7 +144,7 @@ class _Channel:
             self._ended = True
             os.close(self._outlet)
             os.close(self._old_place)
-        self._record_lines()
+        self._record_in_thread()
 
     def _has_unpassed(self) -> bool:
         """Whether something that was printed has not reached the old place yet."""
@@ -190,6 +190,13 @@ class _Channel:
             self._unpassed += data
             self._pass_on()
         return not data
+
+    def _record_in_thread(self) -> None:
+        """Whatever becomes of the lines, what is printed has to be passed on."""
+        try:
+            self._record_lines()
+        except Exception as error:  # noqa: BLE001  (only strict mode raises)
+            warn(f"{self._name} could not be recorded: {error}")
 
     def _record_lines(self, patience_s: float = 0) -> None:
         """Record what waits; what the recording itself prints comes with the next line.

@@ -116,7 +116,7 @@ class MCPBridge:
         self._session = Session(simulation, *where, throttle, keep_last_s, self._errors)
         self._publisher = self._session.publisher
         self._session.begin()
-        self._capture = Capture(self._session.context.journal.output)
+        self._capture = Capture(self._record_output)
         if capture_output:
             self._capture.begin()
         self._attachment: Attachment | None = None
@@ -518,6 +518,12 @@ class MCPBridge:
         self.keep(why)
         if isinstance(error, Exception):
             self.log(why, "error")
+
+    def _record_output(self, stream: str, lines: Sequence[str]) -> None:
+        try:
+            self._session.context.journal.output(stream, lines)
+        except Exception as error:  # noqa: BLE001  (the robot comes first)
+            self._errors.failed("capture_output", error)
 
     def _leave_to_parent(self) -> None:
         """In a forked child: leave the session to the parent; what is published here is dropped."""

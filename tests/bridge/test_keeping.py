@@ -197,6 +197,34 @@ def test_who_pauses_or_keeps_has_the_seconds_before_at_once(
     eager(bridge)
 
 
+@pytest.mark.parametrize("sent", [("pause", {}), ("run", {"until": "n >= 405"})])
+def test_what_is_kept_is_there_while_a_command_pauses(
+    robot: Any, make: Make, recording: Recording, sent: tuple[str, State]
+) -> None:
+    bridge, seen = make(throttle_interval=1000), list[list[list[int]]]()
+    set_mode = robot.simulationSetMode
+
+    def noticed(mode: int) -> None:
+        set_mode(mode)
+        if mode == robot.SIMULATION_MODE_PAUSE:
+            seen.append(kept_numbers(recording))
+            recording.send("resume")
+
+    vars(robot)["simulationSetMode"] = noticed
+    drive(robot, bridge, range(404))
+    recording.send(sent[0], **sent[1])
+    for number in (404, 405, 406):
+        robot.step(STEP_MS)
+        bridge.publish({"n": number})
+        bridge.log("the gear is gone", "error")
+        eager(bridge)
+
+    ((kept,),) = seen
+    assert kept == list(range(kept[0], kept[-1] + 1))
+    assert kept[-1] == 405
+    assert kept[-1] - kept[0] > 300
+
+
 def test_an_error_that_any_thread_logs_keeps_and_a_warning_does_not(
     robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
 ) -> None:

@@ -145,6 +145,36 @@ async def test_a_picture_comes_beside_the_data(
         assert "webots_take_screenshot" in picture["see"]
 
 
+async def test_where_no_screenshot_comes_the_frame_of_that_step_does_and_the_answer_says_which(
+    connect: Connect, driver: Driver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: Any) -> None:
+        raise RuntimeError("nothing is rendered")
+
+    monkeypatch.setattr(driver.robot, "exportImage", refuse)
+    async with connect() as client:
+        steps = (await paused(client))["sim_time_s"] * 1000 // STEP_MS
+        without = await ask(client, "webots_run", until=f"steps >= {steps + 20}", picture=True)
+        assert "nothing is rendered" in without["picture"]["missing"]
+        camera = driver.robot.getDevice("camera")
+        camera.enable(STEP_MS)
+        driver.bridge.keep_camera(camera)
+        condition = f"steps >= {steps + 60}"
+        await ask(client, "webots_breakpoint", condition=condition, action="keep")
+        asked = {"until": condition, "picture": True}
+        result = await client.call_tool("webots_run", asked)
+        assert not result.is_error, text_of(result)
+        assert result.structured_content is not None
+        answer = result.structured_content
+        assert len(pictures_of(result)) == 1, answer["picture"]
+        picture = answer["picture"]
+        assert picture["camera"] == "camera"
+        assert picture["sim_time_s"] == answer["ran"]["to_s"]
+        assert "nothing is rendered" in picture["no_screenshot"]
+        assert "webots_get_camera" in picture["see"]
+        assert Path(picture["file"]).is_file()
+
+
 async def test_what_cannot_end_is_refused_before_anything_is_sent(
     connect: Connect, driver: Driver
 ) -> None:

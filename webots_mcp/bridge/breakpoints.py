@@ -222,7 +222,6 @@ class Breakpoints:
         pausing = [each for each in hit if each.action == "pause"]
         if pausing and self._simulation.supervisor:
             first = pausing[0]
-            self._keeper.write_all()
             self._pause.begin(breakpoint_id=first.id, condition=first.condition.text)
 
     def _tell(self, each: Breakpoint, state: Any) -> None:

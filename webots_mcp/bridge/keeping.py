@@ -201,14 +201,14 @@ class Keeper:
         return f"{MOST_KEPT_S:g} s of this run are kept at full rate: no more will be"
 
     def write_all(self) -> None:
-        """Write what is kept now: the loop is about to stand still, or to end."""
+        """Keep what was asked for and write it now: the loop is about to stand still, or to end."""
+        while self._asked:
+            self.keep(self._asked.popleft())
         while self._unwritten or self._unwritten_frames:
             self._write_some()
 
     def close(self) -> None:
         """The session ends, and with it what was to be kept of the seconds to come."""
-        while self._asked:
-            self.keep(self._asked.popleft())
         self.write_all()
         self._end_stretch(self._clock.sim_time_s)
 

@@ -40,6 +40,7 @@ class Pause:
         journal: Is told when the pause begins and ends.
         heartbeat: Tells others of it.
         stepped: Is told of each guarded step when it is over.
+        begins: Is told when the loop is about to stand still.
 
     Attributes:
         active: The loop stays where it is.
@@ -53,11 +54,13 @@ class Pause:
         journal: Journal,
         heartbeat: Heartbeat,
         stepped: Callable[[], object],
+        begins: Callable[[], object],
     ) -> None:
         self._simulation = simulation
         self._journal = journal
         self._heartbeat = heartbeat
         self._stepped = stepped
+        self._begins = begins
         self._mode_before = "real_time"
         self._user_code_depth = 0  # a handler may ask for commands itself
         self._awaiting_step = False
@@ -81,6 +84,7 @@ class Pause:
         if self.active:
             return
         self.cause = cause
+        self._begins()
         self._activate(self._simulation.mode_name)
         self._simulation.set_mode("pause")
         self._journal.event("pause", cause)

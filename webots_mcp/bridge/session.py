@@ -69,9 +69,10 @@ class Session:
         start_values = StartValues(given, self._identity.robot_name, errors)
         parameters = Parameters(clock, recorder, journal, start_values, self._set_parameter)
         self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters)
-        pause = Pause(simulation, journal, heartbeat, self.runs.look_after_step)
         album = Album(recorder, clock, data_dir)
         keeper = Keeper(clock, recorder, journal, album, throttle, keep_last_s)
+        look = self.runs.look_after_step
+        pause = Pause(simulation, journal, heartbeat, look, keeper.write_all)
         self.context = Context(
             simulation=simulation,
             clock=clock,

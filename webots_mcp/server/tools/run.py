@@ -5,22 +5,24 @@ from __future__ import annotations
 from typing import Annotated, Any, Final, cast
 
 from anyio import to_thread
-from mcp.server.mcpserver import Context
+from mcp.server.mcpserver import Context, Image
 from pydantic import Field
 
 from webots_mcp.contract import MAX_RUN_S, Pace, Then
-from webots_mcp.errors import WebotsMCPError
+from webots_mcp.errors import CommandRefusedError, WebotsMCPError
+from webots_mcp.server.budget import seconds
 from webots_mcp.server.declaring import RESTARTS, tool
 from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.history_results import RunAnswer
 from webots_mcp.server.parameters import RobotName, TimeoutS
 from webots_mcp.server.pictures import load_picture
 from webots_mcp.server.running import ACTION, require_possible
-from webots_mcp.store.images import inside
+from webots_mcp.store.images import camera_frames, inside
 from webots_mcp.store.recording import Recording
 
 _WAIT_S: Final = 60.0
 _PICTURE_WAIT_S: Final = 8.0
+_SAME_S: Final = 0.001  # times are told to the millisecond
 
 
 @tool("Run until", RESTARTS)
@@ -46,7 +48,9 @@ async def webots_run(
         Field(description="Set these first, all or none; see webots_get_parameters."),
     ] = None,
     then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
-    picture: Annotated[bool, Field(description="A screenshot of the end, too.")] = False,
+    picture: Annotated[
+        bool, Field(description="A screenshot of the end, too, or a camera frame.")
+    ] = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> RunAnswer:
@@ -74,18 +78,44 @@ async def webots_run(
 
 
 async def _add_picture(recording: Recording, dispatcher: Dispatcher, answer: RunAnswer) -> None:
-    """A screenshot beside the data; where there is none the answer says why."""
+    """A screenshot beside the data, or a camera frame of that step, or why there is neither."""
     try:
         shot = await dispatcher.ask(answer.robot, "screenshot", _PICTURE_WAIT_S, {"quality": 90})
         if shot.outcome != "done":
-            answer.picture = {"missing": shot.error or shot.hint}
-            return
+            raise CommandRefusedError(
+                shot.error or shot.hint or f"the screenshot is {shot.outcome}"
+            )
         file = inside(recording.data_dir, str(cast("dict[str, Any]", shot.result)["path"]))
+        facts: dict[str, Any] = {"file": str(file), "sim_time_s": shot.sim_time_s}
         image, note = await to_thread.run_sync(load_picture, file)
     except WebotsMCPError as error:
-        answer.picture = {"missing": str(error)}
+        await to_thread.run_sync(_add_frame, recording, answer, str(error))
         return
+    _attach(answer, image, facts, note, "webots_take_screenshot")
+
+
+def _add_frame(recording: Recording, answer: RunAnswer, why: str) -> None:
+    """What a camera saw at the step at which the run ended, where that was recorded."""
+    ran = answer.ran or {}
+    frame = None
+    if ran.get("run_id") is not None:
+        with recording.reader() as connection:
+            found = camera_frames(connection, ran["run_id"], at_s=ran["to_s"])
+        frame = next((each for each in found if abs(each.sim_time_s - ran["to_s"]) < _SAME_S), None)
+    if frame is None:
+        answer.picture = {"missing": why}
+        return
+    try:
+        image, note = load_picture(frame.file(recording.data_dir))
+    except WebotsMCPError as error:
+        answer.picture = {"missing": f"{why}; {error}"}
+        return
+    file = str(recording.data_dir / frame.path)
+    facts = {"camera": frame.device, "file": file, "sim_time_s": seconds(frame.sim_time_s)}
+    _attach(answer, image, facts | {"no_screenshot": why}, note, "webots_get_camera")
+
+
+def _attach(answer: RunAnswer, image: Image, facts: dict[str, Any], note: str, again: str) -> None:
     answer.pictures.append(image.to_image_content())
-    answer.picture = {"file": str(file), "sim_time_s": shot.sim_time_s}
-    answer.picture |= {"note": note} if note else {}
-    answer.picture["see"] = "beside this answer; if your client drops it, webots_take_screenshot"
+    answer.picture = facts | ({"note": note} if note else {})
+    answer.picture["see"] = f"beside this answer; if your client drops it, {again}"

@@ -76,7 +76,7 @@ def test_what_no_run_has_is_told_as_not_known(empty: sqlite3.Connection) -> None
 def with_names_of_its_own(time_s: float) -> dict[str, Any]:
     """In millimetres, with a mode that is a number; it stands from 10 to 16 and 28 to 34 s."""
     x, y = stuck_twice(time_s)["pose"]
-    return {"lage": {"xMm": 1000 * x, "yMm": 1000 * y}, "betriebsart": 1 if time_s < 30 else 2}
+    return {"rail": {"alongMm": 1000 * x, "acrossMm": 1000 * y}, "betriebsart": 1 if time_s < 30 else 2}
 
 
 def test_who_asks_names_the_position_and_a_mode_that_is_a_number(
@@ -85,7 +85,7 @@ def test_who_asks_names_the_position_and_a_mode_that_is_a_number(
     record(empty, "a", with_names_of_its_own)
     (why,) = (why for names, why in compare_runs(empty, [1]).not_known.items() if "stuck" in names)
     assert "position=[x, y]" in why
-    options = EventOptions(position=("lage.xMm", "lage.yMm"), mode="betriebsart")
+    options = EventOptions(position=("rail.alongMm", "rail.acrossMm"), mode="betriebsart")
     found = compare_runs(empty, [1], options=options)
     assert medians(measure(found, "distance_m")) == [pytest.approx(0.3 * 28, rel=0.05)]
     assert medians(measure(found, "stuck per min")) == [pytest.approx(3.0, abs=0.02)]

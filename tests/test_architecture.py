@@ -45,9 +45,10 @@ STDLIB = {
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["store"] = STDLIB | {"store"}
 ALLOWED["trials"] = STDLIB | {"store", "trials", "webots"}
+ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
 ALLOWED["server"] = STDLIB | {
-    "store", "plotting", "trials", "server", "webots", "__version__"
+    "store", "plotting", "diagnosis", "trials", "server", "webots", "__version__"
 }  # fmt: skip
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
 ALLOWED["pytest_plugin"] = {"contract", "standin", "testing", "MCPBridge", "MemoryDatabase"}

@@ -192,6 +192,13 @@ def full_path(path: str | os.PathLike[str]) -> Path:
         raise OSError(f"{path} cannot be followed: {error}; give the full path") from error
 
 
+class DataFolder(NamedTuple):
+    """Where the database and the pictures live, and the rule that chose it."""
+
+    path: Path
+    chosen_by: str
+
+
 def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
     """Where the database and the pictures live; the same answer for bridge and server.
 
@@ -199,13 +206,19 @@ def resolve_data_dir(data_dir: str | os.PathLike[str] | None = None) -> Path:
     above the current one that is a Webots project (it holds `worlds/` and `controllers/`); the
     environment variable `WEBOTS_MCP_DATA_DIR`; the argument.
     """
+    return choose_data_dir(data_dir).path
+
+
+def choose_data_dir(data_dir: str | os.PathLike[str] | None = None) -> DataFolder:
+    """As `resolve_data_dir`, with the rule."""
     if data_dir is not None:
-        return full_path(data_dir)
+        return DataFolder(full_path(data_dir), "it was named")
     if named := os.environ.get(DATA_DIR_VARIABLE):
-        return full_path(named)
+        return DataFolder(full_path(named), f"the environment variable {DATA_DIR_VARIABLE}")
     if project := find_project(Path.cwd()):
-        return project / PROJECT_DATA_FOLDER
-    return Path.home() / ".webots-mcp" / "data"
+        return DataFolder(project / PROJECT_DATA_FOLDER, f"the Webots project {project}")
+    default = Path.home() / ".webots-mcp" / "data"
+    return DataFolder(default, f"the default, as {Path.cwd()} is in no Webots project")
 
 
 def find_project(folder: Path) -> Path | None:

@@ -17,6 +17,7 @@ pytestmark = pytest.mark.anyio
 
 READING = {
     "webots_list_robots",
+    "webots_diagnose",
     "webots_get_world_info",
     "webots_get_robot_state",
     "webots_get_sensors",

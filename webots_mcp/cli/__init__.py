@@ -19,6 +19,7 @@ from webots_mcp.cli import (
     breakpoints,
     contents,
     data,
+    diagnosing,
     history,
     looking,
     serving,
@@ -39,6 +40,7 @@ FAMILIES: Final = (
     serving,
     setting_up,
     looking,
+    diagnosing,
     history,
     contents,
     data,
@@ -62,8 +64,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         with ending_by_signals():
             arguments = _parser().parse_args(argv)
             speak_of(arguments.arguments)
-            arguments.run(arguments)
+            code = arguments.run(arguments) or 0
             sys.stdout.flush()
+            return code
     except WebotsMCPError as error:
         return _end(EXIT_BAD_INPUT, as_typed(str(error)))
     except UnicodeEncodeError as error:  # bytes of the command line that are no text

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeVar
 
 from webots_mcp.errors import InvalidInputError, MalformedRowError, WebotsMCPError
 
@@ -42,13 +42,17 @@ class Argument(NamedTuple):
 
 
 class Command(NamedTuple):
-    """A subcommand: its name, its function (whose docstring is its help), its arguments."""
+    """A subcommand: its name, its function (whose docstring is its help), its arguments.
+
+    What the function returns is the exit code; None is 0.
+    """
 
     name: str
-    run: Callable[[argparse.Namespace], None]
+    run: Callable[[argparse.Namespace], int | None]
     arguments: tuple[Argument, ...]
 
 
+_Run = TypeVar("_Run", bound=Callable[[argparse.Namespace], int | None])
 COMMANDS: Final[list[Command]] = []
 # Not owed to a value in a row: asking past unsound rows would not help.
 _OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
@@ -73,12 +77,10 @@ def count(
     return argument(flag, type=parse, default=default, dest=dest, metavar=metavar, help=told)
 
 
-def command(
-    name: str, *arguments: Argument
-) -> Callable[[Callable[[argparse.Namespace], None]], Callable[[argparse.Namespace], None]]:
+def command(name: str, *arguments: Argument) -> Callable[[_Run], _Run]:
     """Make a function a subcommand."""
 
-    def register(run: Callable[[argparse.Namespace], None]) -> Callable[..., None]:
+    def register(run: _Run) -> _Run:
         COMMANDS.append(Command(name, run, arguments))
         return run
 

@@ -39,8 +39,13 @@ def text_of(value: Any) -> str:
     return _one_line(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
 
 
+def printable(text: str) -> str:
+    """A text in one line, with what a terminal would obey spelled out."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def _one_line(text: str) -> str:
-    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    line = printable(text)
     return line if len(line) <= _LONGEST_CELL else f"{line[: _LONGEST_CELL - 1]}…"
 
 

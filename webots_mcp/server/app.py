@@ -21,6 +21,7 @@ from webots_mcp.server.tools import (
     breakpoints,
     commands,
     control,
+    diagnosis,
     events,
     history,
     logs,
@@ -57,8 +58,8 @@ INSTRUCTIONS: Final = (
 _PAUSE_S: Final = 0.002  # between two short writes, for the robots to write theirs
 # In the order in which clients list them.
 _MODULES: Final = (
-    world, state, pictures, logs, monitor, signals, history, trends, events, timeline, runs, plot,
-    sql, control, run, trials, breakpoints, commands, parameters,
+    world, diagnosis, state, pictures, logs, monitor, signals, history, trends, events, timeline,
+    runs, plot, sql, control, run, trials, breakpoints, commands, parameters,
 )  # fmt: skip
 
 

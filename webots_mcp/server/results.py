@@ -115,6 +115,15 @@ class RobotsAnswer(Answer):
     robots: Table | None = None
 
 
+class DiagnosisAnswer(Answer):
+    """What is not well between the controllers and their asker."""
+
+    verdict: str | None = Field(default=None, description="ok, warning or wrong: the worst.")
+    not_well: list[dict[str, str]] | None = None
+    not_looked_at: dict[str, str] | None = Field(default=None, description="Why, and which.")
+    well: str | None = Field(default=None, description="Checks that found all well.")
+
+
 class LogsAnswer(Answer):
     """Log lines, oldest first."""
 

@@ -63,7 +63,8 @@ _LEFT_PAUSED: Final = (
     "robot {0!r} paused the simulation, and its controller has ended since: press play in Webots, "
     "or start that controller again and resume it there"
 )
-_SILENT: Final = (
+# From inside these look alike; `diagnosis.simulation` looks at it from outside.
+SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
     "breakpoint, another controller looping, or an extern controller missing; from inside the "
     "simulation these look alike"
@@ -190,7 +191,7 @@ def _why_standing(
     if session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S:
         return _STANDING
     left = left_holding(connection, session, now_s)
-    return _SILENT if left is None else _LEFT_PAUSED.format(robot_name(connection, left.robot_id))
+    return SILENT if left is None else _LEFT_PAUSED.format(robot_name(connection, left.robot_id))
 
 
 def _breakpoint_at(connection: sqlite3.Connection, session: Session) -> str | None:

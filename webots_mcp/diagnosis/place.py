@@ -1,0 +1,149 @@
+"""Where the recording lies: its folder, and what kind of file system that is on."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import tempfile
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from webots_mcp.contract import DATA_DIR_VARIABLE
+from webots_mcp.diagnosis.finding import Finding, Subject
+
+# Names of file systems as the operating systems have them; in none does SQLite share memory.
+_NETWORK: Final = (
+    "nfs", "nfs4", "cifs", "smb2", "smb3", "smbfs", "afpfs", "webdav", "ncpfs", "afs", "ceph",
+    "glusterfs", "lustre", "beegfs", "fuse.sshfs", "fuse.glusterfs", "fuse.s3fs", "fuse.rclone",
+)  # fmt: skip
+_SHARED_WITH_HOST: Final = ("vboxsf", "prl_fs", "fuse.vmhgfs-fuse", "vmhgfs")
+_WINDOWS_FROM_WSL: Final = ("9p", "drvfs")
+_WSL_FROM_WINDOWS: Final = ("//wsl$/", "//wsl.localhost/")
+_FULL_BYTES: Final = 50_000_000
+_LOW_BYTES: Final = 1_000_000_000
+_LOCAL: Final = (
+    f"record in a folder of this machine's own disk: {DATA_DIR_VARIABLE}, --data-dir, or "
+    "MCPBridge(robot, data_dir=...), the same for controllers and server"
+)
+
+
+class Mount(NamedTuple):
+    """A file system and where it begins, as psutil tells them."""
+
+    point: str
+    kind: str
+    is_remote: bool = False
+
+
+def data_folder(subject: Subject) -> Finding:
+    """Whether it is there, and may be written."""
+    if subject.file is None:
+        return Finding("ok", "the recording is in memory")
+    folder = subject.file.parent
+    seen = f"{folder}, chosen by: {subject.chosen_by}"
+    if not folder.exists():
+        return Finding(
+            "warning",
+            f"{seen}; it is not there yet",
+            "start a controller with an MCPBridge, which makes it; if it records elsewhere, name "
+            "that folder with --data-dir",
+        )
+    if not folder.is_dir():
+        return Finding("wrong", f"{seen}; it is a file", "name the folder with --data-dir")
+    if why := _why_unwritable(folder):
+        return Finding(
+            "wrong",
+            f"{seen}; it cannot be written: {why}",
+            "give this user the right to write there, or name another with --data-dir; a recording "
+            "that only has to be read can: webots-mcp serve --read-only",
+        )
+    return Finding("ok", seen)
+
+
+def _why_unwritable(folder: Path) -> str | None:
+    """By trying: rights alone do not tell of a file system that is mounted read-only."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return None
+    except OSError as error:
+        return error.strerror or str(error)
+
+
+def file_system(subject: Subject) -> Finding:
+    """Whether processes can share memory there, which WAL needs."""
+    if subject.file is None:
+        return Finding("ok", "the recording is in memory")
+    import psutil
+
+    mounts = [
+        Mount(part.mountpoint, part.fstype, "remote" in part.opts.split(","))
+        for part in psutil.disk_partitions(all=True)
+    ]
+    is_wsl = "microsoft" in platform.release().lower()
+    return judge_file_system(str(subject.file.parent), mounts, is_wsl=is_wsl)
+
+
+def judge_file_system(folder: str, mounts: Iterable[Mount], *, is_wsl: bool) -> Finding:
+    """Whether a recording may lie in a folder, on a machine with these file systems."""
+    path = folder.replace("\\", "/")
+    if path.lower().startswith(_WSL_FROM_WINDOWS):
+        return _across_the_border(folder, "a folder of WSL, seen from Windows")
+    if path.startswith("//"):
+        return _on_the_network(folder, "a network drive")
+    mount = _mount_of(path, mounts)
+    if mount is None:
+        return Finding("not looked at", f"the system does not tell what {folder} lies on")
+    kind = mount.kind.lower()
+    if is_wsl and kind in _WINDOWS_FROM_WSL:
+        return _across_the_border(folder, f"a drive of Windows, seen from WSL ({kind})")
+    if mount.is_remote or kind in _NETWORK:
+        return _on_the_network(folder, f"a network drive ({mount.kind} at {mount.point})")
+    if kind in (*_SHARED_WITH_HOST, *_WINDOWS_FROM_WSL):
+        seen = f"{folder} is shared with a virtual machine's host ({mount.kind} at {mount.point})"
+        return Finding("warning", f"{seen}: both at once would not see each other's locks", _LOCAL)
+    return Finding("ok", f"{mount.kind or 'of an unnamed kind'} at {mount.point}")
+
+
+def _across_the_border(folder: str, what: str) -> Finding:
+    seen = (
+        f"{folder} is {what}: SQLite cannot share memory across that border, so that controllers "
+        "and server lock each other out or damage the file"
+    )
+    return Finding("wrong", seen, f"run both on one side of it, and {_LOCAL}")
+
+
+def _on_the_network(folder: str, what: str) -> Finding:
+    seen = (
+        f"{folder} is on {what}: SQLite's log needs memory that processes share, which network "
+        "file systems do not have"
+    )
+    return Finding("wrong", seen, _LOCAL)
+
+
+def _mount_of(path: str, mounts: Iterable[Mount]) -> Mount | None:
+    """The one that begins nearest above the path."""
+    above = [mount for mount in mounts if _is_in(path, mount.point.replace("\\", "/"))]
+    return max(above, key=lambda mount: len(mount.point), default=None)
+
+
+def _is_in(path: str, point: str) -> bool:
+    if os.name == "nt" or point[1:2] == ":":
+        path, point = path.lower(), point.lower()
+    return f"{path}/".startswith(f"{point.rstrip('/')}/")
+
+
+def free_space(subject: Subject) -> Finding:
+    """Whether there is room for what will be recorded."""
+    if subject.file is None:
+        return Finding("ok", "the recording is in memory")
+    folder = next(folder for folder in subject.file.parents if folder.exists())
+    free = shutil.disk_usage(folder).free
+    seen = f"{free / 1e9:.1f} GB free"
+    fix = "make room: 'webots-mcp prune --dry-run' tells what could go"
+    if free < _FULL_BYTES:
+        return Finding("wrong", f"{seen}: the disk is full", fix)
+    return Finding(
+        "warning" if free < _LOW_BYTES else "ok", seen, fix * (free < _LOW_BYTES) or None
+    )

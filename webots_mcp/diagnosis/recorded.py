@@ -1,0 +1,218 @@
+"""What is in the recording: whether it can be read, who writes it, and what waits."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from typing import Final, NamedTuple
+
+from webots_mcp.connection import connect, is_there, journal_mode
+from webots_mcp.contract import HEARTBEAT_LATE_S, SCHEMA_VERSION
+from webots_mcp.diagnosis.finding import Finding, Subject, ago, worst
+from webots_mcp.entries import count_rows, waiting_paths
+from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
+from webots_mcp.schema import schema_version
+from webots_mcp.store.recording import View, name_of
+from webots_mcp.store.sessions import Session, fetch_session
+from webots_mcp.store.status import handler_at_work
+from webots_mcp.store.waiting import waiting
+
+_THREE_LINES: Final = (
+    "add three lines to a controller ('from webots_mcp import MCPBridge', "
+    "'bridge = MCPBridge(robot)', and in its loop 'bridge.publish({...}); bridge.get_command()') "
+    "and start the simulation; if it records elsewhere, name that folder with --data-dir"
+)
+_GET_COMMAND: Final = (
+    "call bridge.get_command() in every round of the controller's loop, or use "
+    "MCPBridge.attach(robot), which does"
+)
+_LONG_AT_WORK_S: Final = 30.0
+_NOT_POLLED_S: Final = 5.0
+_UNFINISHED: Final = (
+    "SELECT id, robot_id, action, status, session_id, created_wall_time_s, expires_wall_time_s, "
+    "coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
+    "WHERE status IN ('pending', 'claimed') ORDER BY id"
+)
+
+
+def database(subject: Subject) -> Finding:
+    """Whether there is one that can be read, and that readers and writers can share."""
+    if isinstance(subject.unread, NoDatabaseError):
+        seen = f"nothing was recorded at {name_of(subject.recording.database)} yet"
+        return Finding("warning", seen, _THREE_LINES)
+    if subject.unread is not None and not _is_about_schema(subject):
+        return Finding("wrong", str(subject.unread), "mend or move the file, or name another one")
+    if subject.file is None:
+        return Finding("ok", "in memory")
+    with closing(connect(subject.file, "reader")) as connection:
+        mode = journal_mode(connection)
+    size = subject.file.stat().st_size
+    seen = f"{subject.file}, {size / 1e6:.1f} MB"
+    if mode != "wal":
+        seen += f"; journal mode {mode} instead of wal: readers and writers block each other"
+        return Finding("wrong", seen, "record on a local disk; see the file system above")
+    return Finding("ok", seen)
+
+
+def schema(subject: Subject) -> Finding:
+    """Whether the database has the tables of this version."""
+    if subject.unread is not None and not _is_about_schema(subject):
+        return Finding("not looked at", "there is no recording that can be read")
+    if subject.file is None or not is_there(subject.file):
+        return Finding("ok", f"{SCHEMA_VERSION}")
+    with closing(connect(subject.file, "reader")) as connection:
+        version = schema_version(connection)
+    seen = f"{version}, this webots-mcp needs {SCHEMA_VERSION}"
+    if version < SCHEMA_VERSION:
+        fix = "run 'webots-mcp migrate'; a server that may write, or a controller, does it as well"
+        return Finding("wrong", seen, fix)
+    if version > SCHEMA_VERSION:
+        return Finding("wrong", seen, "upgrade webots-mcp: a newer one has written this file")
+    return Finding("ok", f"{version}")
+
+
+def _is_about_schema(subject: Subject) -> bool:
+    return isinstance(subject.unread, (SchemaTooOldError, SchemaTooNewError))
+
+
+def recording_now(subject: Subject) -> Finding:
+    """Who writes, and how old the newest is."""
+    if subject.live:
+        return Finding("ok", "; ".join(_described(view) for view in subject.live))
+    newest_s = max((view.robot.last_seen_wall_time_s for view in subject.views), default=None)
+    if newest_s is None:
+        return Finding("warning", "no robot has been recorded yet", _THREE_LINES)
+    return Finding(
+        "warning",
+        f"no controller is recording; the last one was seen {ago(subject.now_s - newest_s)}",
+        "start the simulation in Webots; if its controllers record elsewhere, name that folder "
+        "with --data-dir",
+    )
+
+
+def _described(view: View) -> str:
+    session = view.session
+    assert session is not None
+    python = session.versions.get("python")
+    return (
+        f"{view.robot.name} (process {session.pid}{f', Python {python}' if python else ''}), heard "
+        f"of {ago(session.silent_s(view.now_s))}"
+    )
+
+
+def rows(subject: Subject) -> Finding:
+    """What was recorded and is not in the database."""
+    findings = [_lost(view) for view in subject.views if view.session is not None]
+    findings += _left_waiting(subject)
+    return worst(
+        [each for each in findings if each.verdict != "ok"]
+        or [Finding("ok", "none wait or are dropped")]
+    )
+
+
+def _lost(view: View) -> Finding:
+    session = view.session
+    assert session is not None
+    told = waiting(view.connection, session) if view.robot.live else {"rows_waiting": 0}
+    name, error = view.robot.name, session.last_error
+    why = f" ({error[:200]})" if error else ""
+    if session.rows_dropped:
+        return Finding(
+            "wrong" if view.robot.live else "warning",
+            f"{session.rows_dropped} rows of {name} were dropped{why}",
+            "see free space and the folder's rights; what was dropped is lost",
+        )
+    if told["rows_waiting"]:
+        return Finding(
+            "warning",
+            f"{told['rows_waiting']} rows of {name} wait in {told['waiting_in']}{why}",
+            "free the database: a full disk, or a program that holds a lock (a sqlite3 shell?); "
+            "they are taken in with the next row",
+        )
+    return Finding("ok", name)
+
+
+def _left_waiting(subject: Subject) -> list[Finding]:
+    """Files that no living controller will empty."""
+    if subject.file is None:
+        return []
+    waiting_in = [waiting(v.connection, v.session).get("waiting_in") for v in subject.live]
+    left = [path for path in waiting_paths(subject.file) if path.name not in waiting_in]
+    return [
+        Finding(
+            "warning",
+            f"{count} rows of a controller that is gone wait in {path.name}",
+            "start 'webots-mcp serve' (not --read-only) or a controller there: it takes them in",
+        )
+        for path in left
+        if (count := count_rows(path))
+    ]
+
+
+class _Unfinished(NamedTuple):
+    """A command that is still to be answered."""
+
+    id: int
+    robot_id: int
+    action: str
+    status: str
+    session_id: int | None
+    created_s: float
+    expires_s: float
+    claimed_s: float
+
+
+def commands(subject: Subject) -> Finding:
+    """What waits for a controller, and for how long."""
+    unfinished = [_Unfinished(*row) for row in subject.opened.execute(_UNFINISHED)]
+    by_robot = {view.robot.id: view for view in subject.views}
+    findings = [_judged(each, by_robot[each.robot_id]) for each in unfinished]
+    if overdue := [each for each in findings if each.verdict != "ok"]:
+        return worst(overdue)
+    queued = sum(each.status == "pending" for each in unfinished)
+    return Finding("ok", f"{queued} queued, {len(unfinished) - queued} claimed, none overdue")
+
+
+def _judged(command: _Unfinished, view: View) -> Finding:
+    what = f"command {command.id} ({command.action}) for {view.robot.name}"
+    if command.status == "claimed":
+        return _claimed(command, view, what)
+    if command.expires_s >= view.now_s:
+        return Finding("ok", what)
+    seen = f"{what} waits since {ago(view.now_s - command.created_s)}"
+    if not view.robot.live:
+        return Finding("wrong", f"{seen}; its controller is gone", "start the controller again")
+    if view.session is not None and view.session.last_poll_wall_time_s is None:
+        return Finding("wrong", f"{seen}; its loop never calls get_command()", _GET_COMMAND)
+    why = view.status.why or view.status.text
+    return Finding("wrong", f"{seen}: {why}", "let the simulation go on, see Simulation")
+
+
+def _claimed(command: _Unfinished, view: View, what: str) -> Finding:
+    session = fetch_session(view.connection, command.session_id or 0)
+    if session is None or not session.is_alive(view.now_s):
+        seen = f"{what} was claimed by a controller that is gone: it is lost"
+        return Finding("warning", seen, "ask again; a server that may write settles it")
+    at_work_s = view.now_s - command.claimed_s
+    if at_work_s < _LONG_AT_WORK_S:
+        return Finding("ok", what)
+    inside = handler_at_work(view.connection, session, view.now_s)
+    seen = inside or f"{what} is under way since {ago(at_work_s)}"
+    return Finding("warning", seen, "wait for it, or send cancel_run; a handler must return soon")
+
+
+def get_command(subject: Subject) -> Finding:
+    """Whether the loops of the living controllers ask for commands."""
+    findings = [_polled(view, view.session) for view in subject.live if view.session]
+    return worst(findings or [Finding("ok", "no controller lives that could be asked")])
+
+
+def _polled(view: View, session: Session) -> Finding:
+    polled_s = session.last_poll_wall_time_s
+    if polled_s is None and session.age_s(session.started_wall_time_s, view.now_s) > _NOT_POLLED_S:
+        seen = f"{view.robot.name}'s loop never called get_command(): it records and obeys nothing"
+        return Finding("warning", seen, _GET_COMMAND)
+    silent_s = 0.0 if polled_s is None else session.age_s(polled_s, view.now_s)
+    if view.status.is_moving and silent_s > _NOT_POLLED_S + HEARTBEAT_LATE_S:
+        seen = f"{view.robot.name}'s loop called get_command() last {ago(silent_s)}, and goes on"
+        return Finding("warning", seen, _GET_COMMAND)
+    return Finding("ok", f"{view.robot.name}'s loop asks for commands")

@@ -1,0 +1,181 @@
+"""Why is it not running? What a status tells from inside, narrowed down from outside.
+
+A loop that is silent inside `step` looks the same whoever keeps it there. The machine tells more:
+which controller's process computes, and how many robots of the world wait for a controller that
+somebody has to start.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from webots_mcp.contract import PAUSED, host_name
+from webots_mcp.diagnosis.finding import Finding, Subject, worst
+from webots_mcp.store.recording import View
+from webots_mcp.store.sessions import Session, companions
+from webots_mcp.store.status import SILENT
+from webots_mcp.webots.stream import address_of
+
+if TYPE_CHECKING:
+    import psutil
+
+    from webots_mcp.webots.instances import Instance
+
+_WATCHED_S: Final = 0.3
+_BUSY: Final = 0.5  # of a processor; a controller that waits for its next step needs none
+_EXTERN: Final = re.compile(r'^\s*controller\s+"<extern>"', re.MULTILINE)
+_LARGEST_WORLD_BYTES: Final = 50_000_000
+_ENDED_BADLY: Final = ("crashed", "reload")
+_PRESS_PLAY: Final = "press play in Webots"
+_RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
+
+
+def simulation(subject: Subject) -> Finding:
+    """Whether time moves, and why it does not."""
+    concerned = subject.live or _last_seen(subject.views)
+    if not concerned:
+        return Finding("ok", "no robot has been recorded yet")
+    return worst([_judged(subject, view) for view in concerned])
+
+
+def _last_seen(views: list[View]) -> list[View]:
+    newest = max(views, key=lambda view: view.robot.last_seen_wall_time_s, default=None)
+    return [newest] if newest else []
+
+
+def _judged(subject: Subject, view: View) -> Finding:
+    name, status = view.robot.name, view.status
+    seen = f"{name}: {status.text}{f' ({status.why})' if status.why else ''}"
+    session = view.session
+    if session is None or not view.robot.live:
+        return _ended(view, seen)
+    if status.is_moving:
+        return Finding("warning" if status.why else "ok", seen)
+    if status.text == PAUSED:
+        return Finding("warning", seen, f"webots-mcp resume --robot {name}")
+    if status.why != SILENT:
+        return Finding("wrong", seen, "see docs/troubleshooting.md#simulation")
+    return _narrowed(subject, view, session)
+
+
+def _ended(view: View, seen: str) -> Finding:
+    if view.session is None or (view.session.end_reason or "crashed") not in _ENDED_BADLY:
+        return Finding("ok", seen)
+    fix = "see 'webots-mcp logs --level error', mend the controller and start it again"
+    return Finding("wrong", seen, fix)
+
+
+def _narrowed(subject: Subject, view: View, session: Session) -> Finding:
+    """Of the reasons that look alike from inside, the one that shows from outside."""
+    head = f"{view.robot.name}: {view.status.text}"
+    webots = _webots_of(subject, session)
+    busy = _busy_controllers(view, session, webots)
+    if busy is not None and session.pid in busy:
+        seen = f"{head}; its own process computes: its loop does not come back to step()"
+        return Finding("wrong", seen, "look for a long computation or an endless loop in it")
+    if busy:
+        others = ", ".join(f"{what} (process {pid})" for pid, what in busy.items())
+        seen = f"{head}; another controller computes and holds the step up: {others}"
+        return Finding("wrong", seen, _RELOAD)
+    if missing := _missing_externs(subject, view, webots):
+        fix = "start it: 'webots-controller --robot-name=NAME FILE', or press play if it is paused"
+        return Finding("wrong", f"{head}; {missing}", fix)
+    if busy is None:
+        return Finding("wrong", f"{head} ({view.status.why})", _PRESS_PLAY)
+    seen = (
+        f"{head}; no controller computes and none is known to be missing: most likely it was "
+        "paused by hand in Webots"
+    )
+    return Finding("wrong", seen, _PRESS_PLAY)
+
+
+def _webots_of(subject: Subject, session: Session) -> Instance | None:
+    """The Webots that a session belongs to, where it runs here."""
+    address = address_of(session.instance)
+    return next((w for w in subject.running_webots if address and w.port == address.port), None)
+
+
+def _busy_controllers(
+    view: View, session: Session, webots: Instance | None
+) -> dict[int, str] | None:
+    """Controllers of the same simulation that compute now; None where that cannot be looked at."""
+    if session.host != host_name():
+        return None
+    controllers = list(_controllers(view, session, webots))
+    times = {process: _processor_s(process) for process in controllers}
+    started_s = time.monotonic()
+    time.sleep(_WATCHED_S)
+    watched_s = time.monotonic() - started_s
+    return {
+        process.pid: _named(process)
+        for process, before_s in times.items()
+        if _processor_s(process) - before_s > _BUSY * watched_s
+    }
+
+
+def _controllers(view: View, session: Session, webots: Instance | None) -> Iterator[psutil.Process]:
+    """The processes that record in this simulation, and those that its Webots has started."""
+    import psutil
+
+    pids = {session.pid}
+    pids |= {each.pid for each in companions(view.connection, session, view.now_s)}
+    if webots is not None:
+        with suppress(psutil.Error):  # another user's: what records is known nevertheless
+            pids |= {child.pid for child in psutil.Process(webots.pid).children(recursive=True)}
+    for pid in sorted(pids):
+        try:
+            yield psutil.Process(pid)
+        except psutil.Error:  # noqa: PERF203  (it has ended meanwhile)
+            continue
+
+
+def _processor_s(process: psutil.Process) -> float:
+    import psutil
+
+    try:
+        used = process.cpu_times()
+    except psutil.Error:
+        return 0.0
+    return used.user + used.system
+
+
+def _named(process: psutil.Process) -> str:
+    """What it runs: the file of a Python controller, else the program."""
+    import psutil
+
+    try:
+        words = process.cmdline()
+        file = next((word for word in words[1:] if word.endswith(".py")), None)
+        return Path(file).name if file else process.name()
+    except psutil.Error:
+        return "a controller"
+
+
+def _missing_externs(subject: Subject, view: View, webots: Instance | None) -> str | None:
+    """That the world has more extern robots than record; by its text, so only perhaps."""
+    world = (view.run and view.run.world) or (webots and webots.world)
+    count = _externs_in(Path(world)) if world else 0
+    session = view.session
+    assert session is not None
+    alive = [session, *companions(view.connection, session, view.now_s)]
+    here = sum(each.extern for each in alive)
+    if count <= here:
+        return None
+    return (
+        f"{count} robots of {Path(str(world)).name} have the controller <extern> and {here} record "
+        "here: one that nobody has started stops the whole simulation"
+    )
+
+
+def _externs_in(world: Path) -> int:
+    try:
+        if world.stat().st_size > _LARGEST_WORLD_BYTES:
+            return 0
+        return len(_EXTERN.findall(world.read_text("utf-8", "replace")))
+    except OSError:
+        return 0

@@ -1,0 +1,55 @@
+"""The tool that says why nothing works."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from webots_mcp.diagnosis.finding import Checked, worst
+from webots_mcp.diagnosis.registry import diagnose, subject_of
+from webots_mcp.server.declaring import READS, tool
+from webots_mcp.server.results import DiagnosisAnswer
+from webots_mcp.server.shortening import cut_text
+from webots_mcp.store.recording import Recording
+
+_LONGEST_TEXT: Final = 320
+_BUDGET: Final = 5_000  # characters; the checks beyond it are told by name
+
+
+@tool("Diagnose the set-up", READS)
+def webots_diagnose(recording: Recording) -> DiagnosisAnswer:
+    """When nothing comes, or time stands still: each link from Webots and controller to here.
+
+    Checks data folder, database, who records, rows and commands that wait, why the simulation
+    stands, which Webots run, client files. `webots-mcp doctor` in a shell also starts a server.
+    """
+    checked = diagnose(subject_of(recording, "how this server was started"))
+    return DiagnosisAnswer(
+        verdict=worst([each.finding for each in checked]).verdict,
+        not_well=_not_well(checked) or None,
+        not_looked_at=_by_reason(checked) or None,
+        well=", ".join(each.check.name for each in checked if each.is_well),
+    )
+
+
+def _not_well(checked: Sequence[Checked]) -> list[dict[str, str]]:
+    """What is wrong before what might be."""
+    told: list[dict[str, str]] = []
+    room = _BUDGET
+    for verdict in ("wrong", "warning"):
+        for check, finding in checked:
+            if finding.verdict == verdict:
+                head = {"check": check.name, "verdict": verdict}
+                texts = {"seen": finding.seen, "fix": finding.fix or ""}
+                cut = {name: cut_text(text, _LONGEST_TEXT) for name, text in texts.items() if text}
+                room -= sum(map(len, cut.values()))
+                told.append(head | (cut if room > 0 else {}))
+    return told
+
+
+def _by_reason(checked: Sequence[Checked]) -> dict[str, str]:
+    names: dict[str, list[str]] = {}
+    for check, finding in checked:
+        if finding.verdict == "not looked at":
+            names.setdefault(cut_text(finding.seen, _LONGEST_TEXT), []).append(check.name)
+    return {reason: ", ".join(those) for reason, those in names.items()}

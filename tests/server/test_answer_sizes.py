@@ -25,6 +25,7 @@ MORE_SIGNALS: Final = 30  # to the 39 of the long recording
 
 DEFAULTS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_list_robots", {}),
+    ("webots_diagnose", {}),
     ("webots_get_robot_state", {}),
     ("webots_get_logs", {}),
     ("webots_list_commands", {}),

@@ -11,11 +11,7 @@ from typing import Any, Final, cast
 from webots_mcp.diagnosis.finding import Finding, Subject, worst
 
 # In a project's folder, with the member that lists the servers.
-_FILES: Final = (
-    (".mcp.json", "mcpServers"),
-    (".cursor/mcp.json", "mcpServers"),
-    (".vscode/mcp.json", "servers"),
-)
+_FILES: Final = ((".mcp.json", "mcpServers"),)
 _MAIN_OPTIONS: Final = ("--data-dir", "--database")
 _ADD: Final = (
     "write .mcp.json as in examples/.mcp.json, or run 'claude mcp add webots -- webots-mcp serve "
@@ -32,8 +28,7 @@ def clients(subject: Subject) -> Finding:
     ]
     if findings:
         return worst(findings)
-    names = ", ".join(name for name, _ in _FILES)
-    return Finding("warning", f"none of {names} is in {subject.project}", _ADD)
+    return Finding("warning", f"no .mcp.json is in {subject.project}", _ADD)
 
 
 def _file(subject: Subject, file: Path, member: str) -> Finding:
@@ -50,7 +45,7 @@ def _file(subject: Subject, file: Path, member: str) -> Finding:
 
 def _servers_in(file: Path, member: str) -> dict[str, dict[str, Any]]:
     """Raises ValueError where the file is no JSON, or has another form."""
-    data: Any = json.loads(file.read_text("utf-8"))
+    data: Any = json.loads(file.read_text("utf-8-sig"))
     servers: Any = cast("dict[str, Any]", data).get(member, {}) if isinstance(data, dict) else None
     if not isinstance(servers, dict):
         raise ValueError(f"it is no object with an object {member!r}")

@@ -117,11 +117,17 @@ class Checked(NamedTuple):
 
 def worst(findings: Sequence[Finding]) -> Finding:
     """Several findings of one check as one; what is well is left out where something is not."""
-    verdict = min((finding.verdict for finding in findings), key=_WORST_FIRST.index)
+    verdict = _WORST_FIRST[min(_WORST_FIRST.index(finding.verdict) for finding in findings)]
     told = [finding for finding in findings if verdict == "ok" or finding.verdict != "ok"]
     fixes = list(dict.fromkeys(finding.fix for finding in told if finding.fix))
     seen = "; ".join(dict.fromkeys(finding.seen for finding in told))
     return Finding(verdict, seen, "; ".join(fixes) or None)
+
+
+def last_seen_s(view: View) -> float:
+    """When a robot was heard of last, Unix time."""
+    seen_s = view.robot.last_seen_wall_time_s
+    return max(seen_s, view.session.last_seen_wall_time_s) if view.session else seen_s
 
 
 def ago(seconds: float) -> str:

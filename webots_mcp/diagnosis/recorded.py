@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 from webots_mcp.connection import connect, is_there, journal_mode
 from webots_mcp.contract import HEARTBEAT_LATE_S, SCHEMA_VERSION
-from webots_mcp.diagnosis.finding import Finding, Subject, ago, worst
+from webots_mcp.diagnosis.finding import Finding, Subject, ago, last_seen_s, worst
 from webots_mcp.entries import count_rows, waiting_paths
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.schema import schema_version
@@ -78,12 +78,12 @@ def recording_now(subject: Subject) -> Finding:
     """Who writes, and how old the newest is."""
     if subject.live:
         return Finding("ok", "; ".join(_described(view) for view in subject.live))
-    newest_s = max((view.robot.last_seen_wall_time_s for view in subject.views), default=None)
-    if newest_s is None:
+    if not subject.views:
         return Finding("warning", "no robot has been recorded yet", _THREE_LINES)
+    newest_s = max(last_seen_s(view) for view in subject.views)
     return Finding(
         "warning",
-        f"no controller is recording; the last one was seen {ago(subject.now_s - newest_s)}",
+        f"no controller is recording; the last one was heard of {ago(subject.now_s - newest_s)}",
         "start the simulation in Webots; if its controllers record elsewhere, name that folder "
         "with --data-dir",
     )

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.contract import PAUSED, host_name
-from webots_mcp.diagnosis.finding import Finding, Subject, worst
+from webots_mcp.diagnosis.finding import Finding, Subject, last_seen_s, worst
 from webots_mcp.store.recording import View
 from webots_mcp.store.sessions import Session, companions
 from webots_mcp.store.status import SILENT
@@ -44,7 +44,7 @@ def simulation(subject: Subject) -> Finding:
 
 
 def _last_seen(views: list[View]) -> list[View]:
-    newest = max(views, key=lambda view: view.robot.last_seen_wall_time_s, default=None)
+    newest = max(views, key=last_seen_s, default=None)
     return [newest] if newest else []
 
 

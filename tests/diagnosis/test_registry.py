@@ -1,0 +1,67 @@
+"""All checks together: on what is well, and what each of them leads to."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from tests.diagnosis.conftest import found
+from webots_mcp.contract import MemoryDatabase
+from webots_mcp.diagnosis.finding import PAGE, Check, Finding, Subject, worst
+from webots_mcp.diagnosis.registry import CHECKS, SERVER, diagnose, subject_of
+from webots_mcp.store.recording import Recording
+
+CHECKOUT = Path(__file__).parents[2]
+# What a machine without Webots, and a project without clients, cannot have.
+ELSEWHERE = {"Webots", "Clients", "Recording now", "Free space"}
+
+
+def test_each_check_has_its_part_of_the_page_and_each_part_its_check() -> None:
+    headings = re.findall(r"^## (.+)$", (CHECKOUT / PAGE).read_text("utf-8"), re.MULTILINE)
+    assert headings == [check.name for check in (*CHECKS, SERVER)]
+    assert CHECKS[3].page == "docs/troubleshooting.md#data-folder"
+
+
+def test_a_recording_of_a_robot_that_has_finished_is_well(bridge_recording: Path) -> None:
+    subject = subject_of(Recording(bridge_recording, bridge_recording.parent), "the test")
+    bad = [each for each in diagnose(subject) if not each.is_well]
+    assert {each.check.name for each in bad} <= ELSEWHERE, bad
+    assert "wrong" not in {each.finding.verdict for each in bad}
+
+
+def test_a_recording_in_memory_is_looked_at_as_well() -> None:
+    memory = MemoryDatabase()
+    try:
+        checked = diagnose(subject_of(Recording(memory, memory.data_dir), "the test"))
+    finally:
+        memory.close()
+    by_name = {check.name: finding for check, finding in checked}
+    assert "nothing was recorded" in by_name["Database"].seen
+    assert by_name["Rows"].verdict == "not looked at"
+
+
+def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None:
+    def fails(_: Subject) -> Finding:
+        raise PermissionError("nobody may look there")
+
+    def well(_: Subject) -> Finding:
+        return Finding("ok", "all well")
+
+    subject = subject_of(Recording(tmp_path / "webots.db", tmp_path), "the test")
+    first, second = diagnose(subject, (Check("One", fails), Check("Two", well)))
+    assert first.finding.verdict == "not looked at"
+    assert "nobody may look there" in first.finding.seen
+    assert second.is_well
+
+
+def test_of_several_findings_those_that_are_well_are_left_out() -> None:
+    several = [Finding("ok", "a"), Finding("warning", "b", "x"), Finding("wrong", "c", "x")]
+    assert worst(several) == Finding("wrong", "b; c", "x")
+    assert worst(several[:1]) == several[0]
+
+
+def test_nothing_is_made_where_nothing_is(tmp_path: Path) -> None:
+    file = tmp_path / "nowhere" / "webots.db"
+    for check in CHECKS:
+        found(file, check.name)
+    assert not file.parent.exists()

@@ -45,7 +45,7 @@ STDLIB = {
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["store"] = STDLIB | {"store"}
 ALLOWED["trials"] = STDLIB | {"store", "trials", "webots"}
-ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "webots"}
+ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
 ALLOWED["server"] = STDLIB | {
     "store", "plotting", "diagnosis", "trials", "server", "webots", "__version__"

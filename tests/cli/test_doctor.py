@@ -67,12 +67,12 @@ def test_what_a_controller_said_cannot_steer_a_terminal(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / ".mcp.json").write_text(
-        '{"mcpServers": {"\\u001b[2J": {"command": "webots-mcp-x"}}}'
+        '{"mcpServers": {"\\u001b[2J": {"command": "/x/webots-mcp", "args": ["serve"]}}}'
     )
     monkey = pytest.MonkeyPatch()
     with monkey.context() as here:
         here.chdir(tmp_path)
         main(["doctor", "--no-server", "--data-dir", str(tmp_path)])
     out = capsys.readouterr().out
-    assert "no program 'webots-mcp-x'" in out
+    assert "no program '/x/webots-mcp'" in out
     assert "\x1b" not in out

@@ -49,10 +49,10 @@ def overdue(robot: RecordedRobot) -> None:
     queue.enqueue(robot.id, "pause")
 
 
-def test_where_nothing_was_recorded_the_three_lines_are_shown(look: Look) -> None:
+def test_where_nothing_was_recorded_the_lines_that_record_are_shown(look: Look) -> None:
     database = look("Database")
     assert (database.verdict, "nothing was recorded" in database.seen) == ("warning", True)
-    assert "bridge.get_command()" in (database.fix or "")
+    assert "MCPBridge.attach(robot)" in (database.fix or "")
     assert look("Rows").verdict == look("Schema").verdict == "not looked at"
 
 

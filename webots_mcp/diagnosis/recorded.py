@@ -11,16 +11,11 @@ from webots_mcp.diagnosis.finding import Finding, Subject, ago, last_seen_s, wor
 from webots_mcp.entries import count_rows, waiting_paths
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.schema import schema_version
-from webots_mcp.store.recording import View, name_of
+from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.sessions import Session, fetch_session
 from webots_mcp.store.status import handler_at_work
 from webots_mcp.store.waiting import waiting
 
-_THREE_LINES: Final = (
-    "add three lines to a controller ('from webots_mcp import MCPBridge', "
-    "'bridge = MCPBridge(robot)', and in its loop 'bridge.publish({...}); bridge.get_command()') "
-    "and start the simulation; if it records elsewhere, name that folder with --data-dir"
-)
 _GET_COMMAND: Final = (
     "call bridge.get_command() in every round of the controller's loop, or use "
     "MCPBridge.attach(robot), which does"
@@ -38,7 +33,7 @@ def database(subject: Subject) -> Finding:
     """Whether there is one that can be read, and that readers and writers can share."""
     if isinstance(subject.unread, NoDatabaseError):
         seen = f"nothing was recorded at {name_of(subject.recording.database)} yet"
-        return Finding("warning", seen, _THREE_LINES)
+        return Finding("warning", seen, GETTING_STARTED)
     if subject.unread is not None and not _is_about_schema(subject):
         return Finding("wrong", str(subject.unread), "mend or move the file, or name another one")
     if subject.file is None:
@@ -79,7 +74,7 @@ def recording_now(subject: Subject) -> Finding:
     if subject.live:
         return Finding("ok", "; ".join(_described(view) for view in subject.live))
     if not subject.views:
-        return Finding("warning", "no robot has been recorded yet", _THREE_LINES)
+        return Finding("warning", "no robot has been recorded yet", GETTING_STARTED)
     newest_s = max(last_seen_s(view) for view in subject.views)
     return Finding(
         "warning",

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.contract import full_path
+from webots_mcp.contract import PROJECT_DATA_FOLDER, full_path
 from webots_mcp.diagnosis import (
     clients,
     machine,
@@ -74,4 +74,4 @@ def subject_of(recording: Recording, chosen_by: str) -> Subject:
 def _project(recording: Recording) -> Path:
     """The folder above `mcp_data/`, where a project's recording lies, else the current one."""
     folder = full_path(recording.data_dir)
-    return folder.parent if folder.name == "mcp_data" else Path.cwd()
+    return folder.parent if folder.name == PROJECT_DATA_FOLDER else Path.cwd()

@@ -104,15 +104,15 @@ def _with_entry(
     path = (servers, name)
     if there is None:
         return document.with_member(path, wanted), None
-    if not _is_ours(there):
+    if not is_ours(there):
         raise InvalidInputError(
             f"its server {name!r} is not webots-mcp; choose another name with --name"
         )
     entry = cast("dict[str, Any]", there)
     if all(entry.get(key) == value for key, value in wanted.items()):
         return text, None
-    if _can_be_started(entry):
-        kept = " ".join(_words(entry))
+    if can_be_started(entry):
+        kept = " ".join(words_of(entry))
         return text, f"it has an entry {name!r} of its own, which is kept: {kept}"
     arguments = entry.get("args", [])
     options = arguments[arguments.index("serve") + 1 :]
@@ -123,16 +123,17 @@ def _with_entry(
     return CommentedJSON(text).with_member((*path, "command"), wanted["command"]), None
 
 
-def _is_ours(entry: Any) -> bool:
+def is_ours(entry: Any) -> bool:
     """Whether a server's entry starts `webots-mcp serve`, in one of the ways to do so."""
     if not isinstance(entry, dict):
         return False
-    words = _words(cast("dict[str, Any]", entry))
+    words = words_of(cast("dict[str, Any]", entry))
     names = {re.split(r"[\\/]", word)[-1].removesuffix(".exe") for word in words}
     return "serve" in words[1:] and bool(names & {"webots-mcp", "webots_mcp"})
 
 
-def _words(entry: dict[str, Any]) -> list[str]:
+def words_of(entry: dict[str, Any]) -> list[str]:
+    """The command line of an entry; empty where it has none."""
     command: object = entry.get("command")
     arguments: object = entry.get("args", [])
     if not isinstance(command, str) or not isinstance(arguments, list):
@@ -140,7 +141,7 @@ def _words(entry: dict[str, Any]) -> list[str]:
     return [command, *(str(each) for each in cast("list[object]", arguments))]
 
 
-def _can_be_started(entry: dict[str, Any]) -> bool:
+def can_be_started(entry: dict[str, Any]) -> bool:
     """Not by a name alone: a client that was started from the desktop has a poor PATH.
 
     Of `uvx` and other programs that install first only the program is looked for.

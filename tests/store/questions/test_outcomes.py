@@ -76,7 +76,10 @@ def test_what_no_run_has_is_told_as_not_known(empty: sqlite3.Connection) -> None
 def with_names_of_its_own(time_s: float) -> dict[str, Any]:
     """In millimetres, with a mode that is a number; it stands from 10 to 16 and 28 to 34 s."""
     x, y = stuck_twice(time_s)["pose"]
-    return {"rail": {"alongMm": 1000 * x, "acrossMm": 1000 * y}, "betriebsart": 1 if time_s < 30 else 2}
+    return {
+        "rail": {"alongMm": 1000 * x, "acrossMm": 1000 * y},
+        "betriebsart": 1 if time_s < 30 else 2,
+    }
 
 
 def test_who_asks_names_the_position_and_a_mode_that_is_a_number(

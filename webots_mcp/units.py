@@ -71,6 +71,12 @@ def words_of(part: str) -> Sequence[str]:
     return tuple(_HUMP.sub("_", part).lower().split("_"))
 
 
+@lru_cache(maxsize=_KEPT)
+def in_snake_case(name: str) -> str:
+    """A dotted name in lower case with underscores: of `nav.targetSpeed` nav.target_speed."""
+    return ".".join("_".join(words_of(part)) for part in name.split("."))
+
+
 def _unit_of(part: str) -> str | None:
     """That of one part of a dotted name; a single letter is one only after an underscore."""
     words = words_of(part)

@@ -54,6 +54,49 @@ def test_who_only_climbs_is_said_to_have_climbed(empty: sqlite3.Connection) -> N
     assert found.verdicts.absent["still"].endswith("but climbed or sank")
 
 
+@pytest.mark.parametrize("name", ["altitude", "altitudeM", "alt_m"])
+def test_an_altitude_is_a_height(empty: sqlite3.Connection, name: str) -> None:
+    def climbs(time_s: float) -> dict[str, Any]:
+        place = {"x": max(0.0, time_s - 30), "y": 0.0, name: 0.5 * min(30.0, time_s)}
+        return {"position": place, "mode": "fly"}
+
+    found = ask(empty, climbs)
+    assert not found.events
+    assert found.verdicts.absent["stuck"].endswith("but climbed or sank")
+
+
+def test_a_slow_drift_in_much_noise_is_not_called_a_standstill(empty: sqlite3.Connection) -> None:
+    random = np.random.default_rng(7)
+
+    def drifts_then_runs_aground(time_s: float) -> dict[str, Any]:
+        x_m = 0.15 * min(200.0, time_s)
+        return {"gps": [x_m + random.normal(0, 0.3), random.normal(0, 0.3)], "mode": "drift"}
+
+    found = ask(empty, drifts_then_runs_aground, 0.5, 300.0)
+    (aground,) = found.events
+    assert aground.start_s == pytest.approx(200, abs=10)
+    speed_m_s = float(aground.details["evidence"].split()[-2])
+    assert speed_m_s == pytest.approx(0.15, rel=0.1)
+    assert "hides slow motion" in found.verdicts.not_searched["still"]
+
+
+@pytest.mark.parametrize("name", ["targetSpeed", "cmdVel", "commandedSpeed"])
+def test_a_command_is_found_in_camel_case(empty: sqlite3.Connection, name: str) -> None:
+    def pushes(time_s: float) -> dict[str, Any]:
+        return {"pose": [0.2 * min(30.0, time_s), 0.0], name: 0.2}
+
+    (stuck,) = ask(empty, pushes).events
+    assert (stuck.kind, stuck.details["commanded"]) == ("stuck", 0.2)
+
+
+def test_wheels_are_found_in_camel_case(empty: sqlite3.Connection) -> None:
+    def pushes(time_s: float) -> dict[str, Any]:
+        return {"pose": [0.2 * min(30.0, time_s), 0.0], "leftMotor": 5.0, "rightMotor": 5.0}
+
+    (stuck,) = ask(empty, pushes).events
+    assert stuck.details["evidence"] == "wheels at 5"
+
+
 def test_wheels_that_rest_speak_against_being_stuck(empty: sqlite3.Connection) -> None:
     def drives_then_waits(time_s: float) -> dict[str, Any]:
         speed = 5.0 if time_s < 30 else 0.0

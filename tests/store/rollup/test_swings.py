@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tests.recordings.rover import Recorder
+from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows, views
@@ -107,3 +107,16 @@ def test_of_rows_that_were_gone_before_500_s_were_over_no_swings_are_claimed(
         "(SELECT id FROM signal WHERE name = 'steering') ORDER BY bucket"
     )
     assert stored.fetchall() == [(0, 0), (1, 1)]
+
+
+@pytest.mark.parametrize("name", ["headingDeg", "steeringAngle", "rollDeg", "imu.pitch"])
+def test_what_swings_is_found_however_its_name_is_written(
+    empty: sqlite3.Connection, name: str
+) -> None:
+    branch, _, last = name.rpartition(".")
+    recorder = start_run(empty)
+    for step in range(300):
+        value = 5.0 * math.sin(math.pi * step * 0.1)
+        recorder.publish(step * 0.1, {branch: {last: value}} if branch else {last: value})
+    ((_, _, period_s, amplitude, _),) = swings_of(empty)
+    assert (period_s, amplitude) == pytest.approx((2.0, 5.0), rel=0.05)

@@ -13,6 +13,7 @@ from webots_mcp.store.analysis.track import Track
 WIDENED_BY: Final = 5.0  # a place is at least so many deviations of the smoothed position wide
 SETTLED_SHARE: Final = 0.2  # of the radius: within it of the place is where a standstill begins
 _NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
+UNSEEN_SLOPE: Final = 3.0  # deviations: a speed that is less may be noise alone
 _LEAST_RAMP_ROWS: Final = 4
 _MOST_RAMP_ROWS: Final = 512
 _RAMP_SHARE: Final = 0.75  # of the smoothed rows: so far a ramp is looked for at first
@@ -53,6 +54,16 @@ def find_standstills(track: Track, radius_m: float, least_s: float) -> list[Stan
         elif each:
             found.append(each)
     return found
+
+
+def shortest_seen_s(noise_m: float, interval_s: float, radius_m: float, least_s: float) -> float:
+    """How long a standstill lasts at least that is told from slow motion in spite of the noise.
+
+    The slope of a line through n positions within t seconds has a deviation of noise * sqrt(12 / n)
+    / t. Three of them are not more than the speed of who just leaves the radius in `least_s`.
+    """
+    noise = UNSEEN_SLOPE * noise_m * (12 * interval_s) ** 0.5
+    return max(least_s, (noise * least_s / radius_m) ** (2 / 3))
 
 
 def _touching(stays: Sequence[tuple[int, int]], index: int) -> tuple[int, int]:

@@ -23,6 +23,7 @@ WINDOW_S: Final = 20.0  # at once is read
 MOST_WINDOWS: Final = 12  # of each mode are read
 LEAST_MOVED_M: Final = 0.1
 LEAST_NOISE: Final = 4.0  # deviations of the position
+OVER_NOISE: Final = 20.0  # deviations of what is left of it: so far it goes while speed is measured
 EARLIER_RUNS: Final = 3
 
 _EARLIER: Final = (
@@ -114,9 +115,18 @@ def _steps(begin_s: float, end_s: float) -> Iterator[float]:
 
 
 def _usual_m_s(track: Track) -> float:
-    """The median speed over a second, where it is at least half of the highest."""
-    later = np.minimum(np.searchsorted(track.times, track.times + 1.0), len(track.times) - 1)
+    """The median speed over a second, where it is at least half of the highest.
+
+    Over more seconds where the noise of a position would pass for speed.
+    """
+    lasted_s = float(track.times[-1] - track.times[0])
+    way_m = path_length_m(track)
+    if not way_m:
+        return 0.0
+    over_s = min(OVER_NOISE * track.left_m * lasted_s / way_m, lasted_s / 2)
+    later = np.searchsorted(track.times, track.times + max(1.0, over_s))
+    later = np.minimum(later, len(track.times) - 1)
     way_m = np.hypot(track.x[later] - track.x, track.y[later] - track.y)
-    took_s = np.maximum(track.times[later] - track.times, 0.5)
+    took_s = np.maximum(track.times[later] - track.times, max(0.5, over_s))
     speeds = way_m / took_s
     return float(np.median(speeds[speeds >= speeds.max() / 2]))

@@ -16,7 +16,7 @@ from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.units import METRES, metres_in, unit_in
+from webots_mcp.units import METRES, in_snake_case, metres_in, unit_in, words_of
 
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.track import Track
@@ -99,7 +99,8 @@ def find_motion(
     wheels = tuple(
         signal
         for name, signal in own.items()
-        if signal.kind == "num" and _WHEEL.search(name) and not _NO_SPEED.search(name)
+        if signal.kind == "num" and not _is_no_wheel(name)
+        if not _NO_SPEED.search(in_snake_case(name))
         if signal.unit not in _PLACES and signal not in (commanded, speed)
     )
     position = _position(known, options.position) if options.position else _position(own, None)
@@ -109,17 +110,26 @@ def find_motion(
 
 
 def _is_no_wheel(name: str) -> bool:
-    return not _WHEEL.search(name)
+    return not _WHEEL.search(in_snake_case(name))
 
 
 def _height(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:
-    """The third of the position's numbers; that of a pose of three is where it looks."""
+    """The third of the position's numbers, or an altitude beside it or at the top.
+
+    The third of a pose of three is where it looks.
+    """
     branch, _, axis = position[0].name.rpartition(".") if position else ("", "", "")
     name = f"{branch}.{_THIRD_AXES.get(axis, '')}".removeprefix(".")
     if name == "pose.2" and "pose.3" not in known:
-        return None
-    signal = known.get(name)
-    return signal if signal and signal.kind == "num" else None
+        name = ""
+    altitudes = [each for each in known if position and _is_altitude(each, branch)]
+    signals = (known.get(each) for each in (name, *altitudes))
+    return next((each for each in signals if each and each.kind == "num"), None)
+
+
+def _is_altitude(name: str, branch: str) -> bool:
+    beside, _, last = name.rpartition(".")
+    return beside in (branch, "") and words_of(last)[0] in ("altitude", "alt")
 
 
 def _heading(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:
@@ -127,7 +137,7 @@ def _heading(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -
     angles = [name for name, signal in known.items() if signal.turn is not None]
     branch = position[0].name.rpartition(".")[0] if position else ""
     beside = [name for name in angles if name.rpartition(".")[0] == branch and branch]
-    named = [name for name in angles if _HEADING.search(name)]
+    named = [name for name in angles if _HEADING.search(in_snake_case(name))]
     found = beside or named
     return known[min(found, key=len)] if found else None
 
@@ -158,7 +168,7 @@ def _first(
 ) -> Signal | None:
     """The number with the shortest name that fits: `speed` before `arm.speed`."""
     numbers = [each for each, signal in known.items() if signal.kind == "num"]
-    fitting = [each for each in numbers if name.search(each) and wanted(each)]
+    fitting = [each for each in numbers if name.search(in_snake_case(each)) and wanted(each)]
     return known[min(fitting, key=len)] if fitting else None
 
 

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from webots_mcp.naming import NAME_POSITION
+from webots_mcp.store.analysis.arrays import median
 from webots_mcp.store.analysis.noise import noise_of
-from webots_mcp.store.analysis.standstill import find_standstills
+from webots_mcp.store.analysis.standstill import find_standstills, shortest_seen_s
 from webots_mcp.store.analysis.track import Track, tracks_of
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.evidence import Evidence, Flags, turned_rad, usual, weigh
@@ -72,11 +73,31 @@ def find_standings(search: Search) -> Standings:
         raise NotSearchableError(NAME_POSITION)
     columns = search.view.places(search.motion.evidence, search.options.stuck_s)
     tracks = _tracks(search, position, columns)
-    found = _standings(search, tracks, columns)
+    all_found = _standings(search, tracks, columns)
+    seen_s = _shortest_seen_s(search, position, tracks)
+    found = [
+        each for each in all_found if each.end_s - each.start_s >= NEARLY * seen_s - each.within_s
+    ]
     moved_in = MovedIn(search.connection, search.segment.run_id, search.motion, search.deadline)
     events = [event for each in found for event in _weighed(search, each, moved_in)]
-    nearest = None if found else _nearest(search, tracks)
-    return Standings(events, search.view.taken_notes(), nearest)
+    nearest = None if all_found else _nearest(search, tracks)
+    notes = search.view.taken_notes()
+    if seen_s > search.options.stuck_s / NEARLY:
+        notes.append(
+            f"none of less than {seen_s:.2g} s: the position's noise of {tracks[0].noise_m:.2g} m "
+            "hides slow motion"
+        )
+    return Standings(events, notes, nearest)
+
+
+def _shortest_seen_s(
+    search: Search, position: tuple[Signal, Signal], tracks: Sequence[Track]
+) -> float:
+    """How long a standstill has to last that the noise of the position does not feign."""
+    times = search.view.sample(position).moments
+    interval_s = median(np.diff(times)) if len(times) > 1 else 0.0
+    options = search.options
+    return shortest_seen_s(tracks[0].noise_m, interval_s, options.stuck_m, options.stuck_s)
 
 
 def _weighed(search: Search, standing: Standing, moved_in: MovedIn) -> list[Event]:

@@ -20,6 +20,7 @@ from webots_mcp.store.reading.rows import Numbers, numbers_of, read_columns
 from webots_mcp.store.reading.sampling import newest_part
 from webots_mcp.store.rollup.buckets import COARSE, COARSE_BUCKETS, COARSE_S, by_grain
 from webots_mcp.store.signals.registry import Signal, registered
+from webots_mcp.units import in_snake_case
 
 LONGEST_PERIOD_S: Final = 5.0
 ACROSS_S: Final = 20.0  # of the stretch beside: longer than six half swings of that period
@@ -30,7 +31,7 @@ _LONGEST_S: Final = 60.0  # that it reads
 
 # Sensors swing by nature while a robot drives.
 _SWINGING: Final = re.compile(
-    r"(^|[._])(heading|yaw|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"
+    r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"
     r"|left|right|cmd|command\w*|error)([._]|$)",
     re.IGNORECASE,
 )
@@ -42,7 +43,7 @@ _STORED: Final = (
 
 def may_swing(signal: Signal) -> bool:
     """Whether it is named like something that a robot swings with."""
-    return signal.is_number and _SWINGING.search(signal.name) is not None
+    return signal.is_number and _SWINGING.search(in_snake_case(signal.name)) is not None
 
 
 def swings_in(numbers: Numbers, signal: Signal, half_swings: int, period_s: float) -> list[Swing]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from webots_mcp.store.analysis.noise import Array
-from webots_mcp.store.analysis.swings import Swing, find_swings
+from webots_mcp.store.analysis.swings import Swing, find_swings, joined_swings
 
 START_S, PERIODS, HEIGHT = 60.0, 8, 0.2
 COURSES: dict[str, Callable[[Array], Array]] = {
@@ -51,6 +51,25 @@ def test_more_time_never_finds_less(course: str) -> None:
     for start_s, end_s in ((55, 80), (30, 120), (0, 300), (0, 600)):
         part = (times >= start_s) & (times < end_s)
         assert len(swings_of(times[part], values[part])) == 1, (start_s, end_s)
+
+
+@pytest.mark.parametrize(("before_s", "after_s"), [(3.0, 1.0), (1.0, 3.0), (4.0, 1.5)])
+def test_a_swing_of_another_period_right_after_hides_none(before_s: float, after_s: float) -> None:
+    times = np.arange(0, 200, 0.032)
+    swing = np.sin(2 * np.pi * times / np.where(times < 60, before_s, after_s))
+    noise = np.random.default_rng(7).normal(0, 0.1, len(times))
+    found = joined_swings(swings_of(times, swing + noise))
+    assert [each.period_s for each in found] == pytest.approx([before_s, after_s], rel=0.05)
+    assert [found[0].end_s, found[1].start_s] == pytest.approx([60.0, 60.0], abs=1.0)
+
+
+@pytest.mark.parametrize("limit", [1.0, 0.5, 0.01])
+def test_a_swing_that_meets_a_limit_reaches_no_farther(limit: float) -> None:
+    times = np.arange(0, 60, 0.032)
+    swing = np.clip(np.sin(2 * np.pi * times / 1.6), -limit, limit)
+    noise = np.random.default_rng(7).normal(0, limit / 100, len(times))
+    (found,) = swings_of(times, swing + noise)
+    assert found.amplitude == pytest.approx(limit, rel=0.1)
 
 
 @pytest.mark.parametrize("phase", np.arange(0.25, 2 * np.pi, 0.5))

@@ -36,6 +36,7 @@ MOST_VARIED: Final = 0.4  # and of how far the half swings reach
 LEAST_EXPLAINED: Final = (0.85, 0.70)  # of the variance by a sine, for 6 half swings and for 10
 PERIODS_FITTED: Final = 2.5  # at once: over more, a swing may change a little
 FEW_COLUMNS: Final = 8  # are added up faster one after the other than row by row
+CLIPPED_PER_PERIOD: Final = 16.0  # rows: among fewer the turning points may be missed
 PIECES_TRIED: Final = 16  # with each period; the whole with the best of them
 LEAST_TRIED: Final = 0.5  # explained of these pieces; less is not looked at further
 NOISE_BENDS: Final = 10.0  # deviations of the noise, over the root of the rows; it makes hardly 7
@@ -107,11 +108,17 @@ def joined_swings(found: Iterable[Swing]) -> list[Swing]:
     joined: list[Swing] = []
     for swing in sorted(found, key=lambda each: each.start_s):
         before = joined[-1] if joined else None
-        if before is None or swing.start_s >= before.end_s:
+        if before is None or swing.start_s >= before.end_s or _are_two(before, swing):
             joined.append(swing)
         elif swing.end_s > before.end_s:
             joined[-1] = _together(before, swing)
     return joined
+
+
+def _are_two(before: Swing, after: Swing) -> bool:
+    """Whether a swing of another period follows: the ends of both are known to half a swing."""
+    periods = _ratio(before.period_s, after.period_s)
+    return periods > ALIKE[0] and _overlap(before, after) < MOST_OVERLAP
 
 
 def _together(before: Swing, after: Swing) -> Swing:
@@ -485,7 +492,10 @@ def _best_sine(
         return period_s, 0.0, float(tried[best])
     periods = periods[best : best + 1] + _vertex(tried, best) * (periods[1] - periods[0])
     fit = fit_sines(moments, parts, periods, basis)
-    return float(periods[0]), median(fit.amplitudes[:, 0]), float(fit.explained[0])
+    amplitude = median(fit.amplitudes[:, 0])
+    if period_s >= CLIPPED_PER_PERIOD * step * interval_s:  # of a clipped one the sine is higher
+        amplitude = min(amplitude, median(np.ptp(parts, axis=1)) / 2)
+    return float(periods[0]), amplitude, float(fit.explained[0])
 
 
 def _vertex(heights: Array, highest: int) -> float:

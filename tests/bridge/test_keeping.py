@@ -6,6 +6,7 @@ import json
 import math
 import threading
 import time
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
@@ -556,3 +557,31 @@ def test_a_ring_never_takes_more_memory_or_time_than_it_may_and_holds_the_newest
         fits.insert(0, row)
     assert held == fits
     assert ring.size_bytes == 0
+
+
+STATES_TO_HOLD: dict[str, Callable[[int], State]] = {
+    "numbers": lambda n: {"lidar": [number / 7 for number in range(n, n + 200)]},
+    "one number": lambda n: {"n": n},
+    "texts": lambda n: {"said": "\U0001f916" * (n % 100), "more": [None] * (n % 50)},
+    "arrays of numpy": lambda n: {"lidar": np.arange(n, n + 50) / 7},
+}
+
+
+@pytest.mark.parametrize("make_state", STATES_TO_HOLD.values(), ids=STATES_TO_HOLD)
+def test_what_a_ring_holds_takes_no_more_memory_than_it_says(
+    make_state: Callable[[int], State],
+) -> None:
+    ring = Ring(1000, 300_000)
+    tracemalloc.start()
+    try:
+        before, _ = tracemalloc.get_traced_memory()
+        for number in range(1200):
+            held, odd = copy_or_encode(make_state(number)), None
+            if not isinstance(held, bytes):
+                held, odd = held.text, held.odd_text
+            ring.add(RingRow(number, number / 100, number + 0.5, held, odd))
+        taken, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert len(ring) > 50
+    assert taken - before <= 300_000

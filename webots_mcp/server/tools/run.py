@@ -48,9 +48,7 @@ async def webots_run(
         Field(description="Set these first, all or none; see webots_get_parameters."),
     ] = None,
     then: Annotated[Then, Field(description="At that step; go_on: at the old pace.")] = "pause",
-    picture: Annotated[
-        bool, Field(description="A screenshot of the end, too, or a camera frame.")
-    ] = False,
+    picture: Annotated[bool, Field(description="A screenshot of the end, too.")] = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> RunAnswer:

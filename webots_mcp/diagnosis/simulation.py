@@ -8,6 +8,7 @@ somebody has to start.
 from __future__ import annotations
 
 import re
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from webots_mcp.webots.instances import Instance
 
 _WATCHED_S: Final = 0.3
+_LOOKS: Final = 6
 _BUSY: Final = 0.5  # of a processor; a controller that waits for its next step needs none
 _EXTERN: Final = re.compile(r'^\s*controller\s+"<extern>"', re.MULTILINE)
 _LARGEST_WORLD_BYTES: Final = 50_000_000
@@ -106,16 +108,29 @@ def _busy_controllers(
     """Controllers of the same simulation that compute now; None where that cannot be looked at."""
     if session.host != host_name():
         return None
+    import psutil
+
     controllers = list(_controllers(view, session, webots))
-    times = {process: _processor_s(process) for process in controllers}
-    started_s = time.monotonic()
-    time.sleep(_WATCHED_S)
-    watched_s = time.monotonic() - started_s
+    before_s = {process: _processor_s(process) for process in controllers}
+    waited = set[psutil.Process]()
+    for _ in range(_LOOKS):
+        time.sleep(_WATCHED_S / _LOOKS)
+        waited |= {process for process in controllers if not _wants_processor(process)}
     return {
         process.pid: _named(process)
-        for process, before_s in times.items()
-        if _processor_s(process) - before_s > _BUSY * watched_s
+        for process in controllers
+        if process not in waited or _processor_s(process) - before_s[process] > _BUSY * _WATCHED_S
     }
+
+
+def _wants_processor(process: psutil.Process) -> bool:
+    """Whether it would go on if a processor were free; only Linux tells."""
+    import psutil
+
+    try:
+        return sys.platform == "linux" and process.status() == psutil.STATUS_RUNNING
+    except psutil.Error:
+        return False
 
 
 def _controllers(view: View, session: Session, webots: Instance | None) -> Iterator[psutil.Process]:

@@ -1,0 +1,189 @@
+"""Why time stands still: told apart by what the machine shows besides."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.diagnosis.conftest import Look, found
+from tests.recordings.rows import Recorded, RecordedRobot
+from tests.webots.conftest import (
+    StartWebots,
+    free_port,
+    start_webots,
+    wait_for_line,
+    webots,
+    world,
+    write_project,
+)
+from webots_mcp.contract import ENDED_BY
+from webots_mcp.diagnosis.finding import Finding
+from webots_mcp.liveness import process_identity
+
+WAITS = "import sys; print('ready', flush=True); sys.stdin.read()"
+COMPUTES = "print('ready', flush=True)\nwhile True: pass"
+SPINS = """
+from controller import Robot
+
+robot = Robot()
+robot.step(16)
+robot.step(16)
+while True:
+    pass
+"""
+__all__ = ["start_webots", "webots", "world"]  # fixtures
+
+Start = Callable[[str], "subprocess.Popen[str]"]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Start a process that takes a controller's place."""
+    running: list[subprocess.Popen[str]] = []
+
+    def run(program: str) -> subprocess.Popen[str]:
+        line = [sys.executable, "-c", program]
+        pipe = subprocess.PIPE
+        running.append(process := subprocess.Popen(line, stdin=pipe, stdout=pipe, text=True))
+        wait_for_line(process, "ready")
+        return process
+
+    yield run
+    for process in running:
+        process.kill()
+        process.communicate()
+
+
+def silent(
+    recorded: Recorded, process: subprocess.Popen[str], name: str = "rover", **session: object
+) -> RecordedRobot:
+    """A robot whose controller lives and was not heard of for a minute."""
+    identity = process_identity(process.pid)
+    began_s = time.time() - 60
+    return recorded.robot(name, now=began_s, pid=process.pid, process=identity, **session)
+
+
+def eventually(look: Callable[[], Finding], words: str) -> Finding:
+    """What is found as soon as it says so."""
+    until_s = time.monotonic() + 60
+    while words not in (finding := look()).seen:
+        assert time.monotonic() < until_s, finding
+    return finding
+
+
+def test_a_robot_whose_time_moves_is_well(look: Look, recorded: Recorded) -> None:
+    recorded.robot()
+    assert look("Simulation") == Finding("ok", "rover: running")
+
+
+def test_a_pause_by_command_names_what_ends_it(look: Look, recorded: Recorded) -> None:
+    recorded.robot(hold="paused")
+    found = look("Simulation")
+    assert (found.verdict, found.fix) == ("warning", "webots-mcp resume --robot rover")
+
+
+def test_where_nobody_computes_it_was_most_likely_paused_by_hand(
+    look: Look, recorded: Recorded, start: Start
+) -> None:
+    silent(recorded, start(WAITS))
+    found = look("Simulation")
+    assert found.verdict == "wrong"
+    assert "paused by hand" in found.seen
+    assert found.fix == "press play in Webots"
+
+
+def test_a_controller_that_computes_holds_itself_up(
+    look: Look, recorded: Recorded, start: Start
+) -> None:
+    silent(recorded, start(COMPUTES))
+    assert "its own process computes" in look("Simulation").seen
+
+
+def test_another_controller_that_computes_is_named(
+    look: Look, recorded: Recorded, start: Start
+) -> None:
+    busy = start(COMPUTES)
+    silent(recorded, start(WAITS))
+    silent(recorded, busy, "referee")
+    seen = look("Simulation").seen
+    assert "another controller computes and holds the step up: python" in seen
+    assert f"(process {busy.pid})" in seen
+
+
+def test_an_extern_controller_that_nobody_has_started_is_missed(
+    look: Look, recorded: Recorded, start: Start, tmp_path: Path
+) -> None:
+    world = tmp_path / "arena.wbt"
+    robots = 'Robot {\n  controller "<extern>"\n}\n'
+    world.write_text(f'#VRML_SIM R2025a utf8\n{robots * 2}Robot {{\n  controller "rover"\n}}\n')
+    silent(recorded, start(WAITS), extern=1)
+    recorded.connection.execute("UPDATE run SET world = ?", (str(world),))
+    found = look("Simulation")
+    assert "2 robots of arena.wbt have the controller <extern> and 1 record here" in found.seen
+    assert "webots-controller" in (found.fix or "")
+
+
+def test_a_controller_on_another_machine_is_told_of_as_far_as_it_is_known(
+    look: Look, recorded: Recorded
+) -> None:
+    recorded.robot(now=time.time() - 5, host="another-machine", moved_wall_time_s=None)
+    assert look("Simulation").verdict == "wrong"
+
+
+def test_an_exception_that_ended_a_controller_is_named(look: Look, recorded: Recorded) -> None:
+    robot = recorded.robot()
+    robot.log(1.0, f"{ENDED_BY} ValueError: no such wheel", "error")
+    robot.beat(ended_wall_time_s=robot.now, end_reason="crashed")
+    found = look("Simulation")
+    assert found.verdict == "wrong"
+    assert "ValueError: no such wheel" in found.seen
+    assert "webots-mcp logs" in (found.fix or "")
+
+
+def test_a_controller_that_has_finished_is_well(look: Look, recorded: Recorded) -> None:
+    robot = recorded.robot()
+    robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
+    assert look("Simulation").verdict == "ok"
+
+
+def test_a_controller_that_records_nothing_and_hangs_is_found_as_a_child_of_its_webots(
+    start_webots: StartWebots, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WEBOTS_MCP_DATA_DIR", str(tmp_path / "data"))
+    world = write_project(tmp_path / "project")
+    world.write_text(
+        world.read_text("utf-8") + 'Robot {\n  name "spinner"\n  controller "spinner"\n}\n', "utf-8"
+    )
+    folder = world.parents[1] / "controllers" / "spinner"
+    folder.mkdir()
+    (folder / "spinner.py").write_text(SPINS, "utf-8")
+    port = free_port()
+    wait_for_line(start_webots("--stdout", f"--port={port}", world), "ready")
+    file = tmp_path / "data" / "webots.db"
+    told = eventually(lambda: found(file, "Simulation"), "another controller computes")
+    assert "spinner.py (process " in told.seen
+    assert "reload the world" in (told.fix or "")
+    running = found(file, "Running Webots")
+    assert f"port {port}" in running.seen
+    assert "was started without --stream and does not obey" in running.seen
+
+
+def test_a_webots_that_obeys_is_told_with_its_world_and_mode(
+    start_webots: StartWebots, world: Path, look: Look
+) -> None:
+    port = free_port()
+    line = ("--stream", "--mode=fast", "--stdout", f"--port={port}", world)
+    wait_for_line(start_webots(*line), "ready")
+    seen = look("Running Webots").seen
+    assert f"port {port} (process " in seen
+    assert "arena.wbt, mode fast) obeys orders from outside" in seen
+
+
+def test_which_webots_there_is_tells_its_place(webots: Path, look: Look) -> None:
+    installed = look("Webots")
+    assert (installed.verdict, str(webots) in installed.seen) == ("ok", True)

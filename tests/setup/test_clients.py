@@ -114,6 +114,19 @@ def test_a_symbolic_link_is_followed_and_stays(client: Client, tmp_path: Path) -
     assert [file.name for file in real.parent.iterdir()] == ["servers.json"]
 
 
+def test_a_folder_that_links_to_nothing_makes_none_elsewhere(tmp_path: Path) -> None:
+    cursor = clients_of(tmp_path)[1]
+    cursor.file.parent.symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OSError, match="link to nothing"):
+        plan_entry(cursor, "webots", LINE)
+
+
+def test_the_same_server_by_another_name_is_not_told_twice(client: Client) -> None:
+    entry = plan(client, {"mcpServers": {"mine": {"command": LINE[0], "args": LINE[1:]}}})
+    assert not entry.change.is_needed
+    assert "'mine'" in (entry.note or "")
+
+
 def test_a_file_that_changed_meanwhile_is_not_overwritten(client: Client) -> None:
     change = plan(client, {}).change
     client.file.write_text('{"new": 1}')

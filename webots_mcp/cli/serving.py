@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 def serve(arguments: argparse.Namespace) -> None:
     """Serve a recording to an MCP client over stdin and stdout.
 
-    Starts whether or not anything was recorded yet. Connect Claude Code with:
+    Starts whether or not anything was recorded yet. 'webots-mcp init' tells clients of it; by
+    hand, Claude Code is told with:
 
         claude mcp add webots -- webots-mcp serve --data-dir /path/to/project/mcp_data
 

@@ -58,6 +58,8 @@ def _change_controller(arguments: argparse.Namespace) -> None:
     from webots_mcp.setup.patching import AlreadyPatchedError, patch, unpatch
 
     file, change = (arguments.patch, patch) if arguments.patch else (arguments.undo, unpatch)
+    if Path(file).is_dir():
+        raise InvalidInputError(f"{file} is a folder: name the controller's file in it")
     before = read(Path(file))
     if before is None:
         raise InvalidInputError(f"there is no file {file}")
@@ -203,6 +205,12 @@ def _print(found: dict[str, Any], notes: list[str]) -> None:
     for each in found["controllers"]:
         print(f"\n{each['file']}")
         _print_controller(each)
+    fixes = dict.fromkeys(
+        each["python"]["fix"] for each in found["controllers"] if "fix" in each.get("python", {})
+    )
+    if fixes:
+        print("\nWhat mends that:\n")
+        print("\n".join(f"    {fix}" for fix in fixes))
     if not found["controllers"]:
         notes = [*notes, "there is no controller yet: run it again when there is"]
     print()
@@ -229,5 +237,4 @@ def _print_python(python: dict[str, Any]) -> None:
     if "error" not in python:
         print(f"  which has webots-mcp {python['bridge']}")
         return
-    print(f"  where the bridge cannot be used: {python['error']}. This mends it:\n")
-    print(f"      {python['fix']}")
+    print(f"  where the bridge cannot be used: {python['error']}")

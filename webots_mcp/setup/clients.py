@@ -100,15 +100,18 @@ def _with_entry(
 ) -> tuple[str, str | None]:
     document = CommentedJSON(text)
     known = document.value.get(servers)
-    there = cast("dict[str, Any]", known).get(name) if isinstance(known, dict) else None
+    there = cast("dict[str, Any]", known if isinstance(known, dict) else {})
     path = (servers, name)
-    if there is None:
+    if name not in there:
+        for other, entry in there.items():
+            if entry == wanted:
+                return text, f"it has this server by the name {other!r}"
         return document.with_member(path, wanted), None
-    if not is_ours(there):
+    if not is_ours(there[name]):
         raise InvalidInputError(
             f"its server {name!r} is not webots-mcp; choose another name with --name"
         )
-    entry = cast("dict[str, Any]", there)
+    entry = cast("dict[str, Any]", there[name])
     if all(entry.get(key) == value for key, value in wanted.items()):
         return text, None
     if can_be_started(entry):

@@ -38,8 +38,9 @@ def read(file: Path) -> bytes | None:
     try:
         return file.read_bytes()
     except FileNotFoundError:
-        if file.is_symlink():
-            raise OSError(f"{file} is a symbolic link to nothing: remove it or mend it") from None
+        for each in (file, file.parent):
+            if each.is_symlink() and not each.exists():
+                raise OSError(f"{each} is a symbolic link to nothing: remove or mend it") from None
         return None
 
 

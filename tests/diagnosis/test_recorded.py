@@ -81,6 +81,17 @@ def test_a_file_that_is_no_database_is_wrong(look: Look, file: Path) -> None:
     assert "not a database" in database.seen
 
 
+def test_a_database_that_is_damaged_in_its_middle_is_wrong(
+    look: Look, file: Path, bridge_recording: Path
+) -> None:
+    content = bytearray(bridge_recording.read_bytes())
+    content[4096 * 4 : 4096 * 12] = b"garbage!" * 4096
+    file.write_bytes(content)
+    rows = look("Recording now")
+    assert (rows.verdict, "is damaged" in rows.seen) == ("wrong", True)
+    assert ".recover" in (rows.fix or "")
+
+
 def test_a_journal_that_is_no_wal_is_wrong(look: Look, file: Path, recorded: Recorded) -> None:
     recorded.close()
     with closing(sqlite3.connect(file)) as connection:

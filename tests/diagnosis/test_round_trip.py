@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 import pytest
 
 from tests.diagnosis.conftest import Look
 from tests.recordings.rows import Recorded
+from webots_mcp.store.migrate import upgrade
 
 BREAKS = "raise RuntimeError('the gear is gone')"
 
@@ -17,6 +19,16 @@ def test_a_server_that_starts_and_answers_is_well(look: Look, recorded: Recorded
     found = look("Server")
     assert found.verdict == "ok", found
     assert "tools, one answer" in found.seen
+
+
+def test_a_server_that_answers_that_it_cannot_read_the_recording_is_not_to_blame(
+    look: Look, file: Path
+) -> None:
+    upgrade(file, "0001")
+    found = look("Server")
+    assert found.verdict == "warning"
+    assert "webots-mcp migrate" in found.seen
+    assert "Schema" in (found.fix or "")
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from webots_mcp.connection import is_damage, text_of
 from webots_mcp.contract import PROJECT_DATA_FOLDER, full_path
 from webots_mcp.diagnosis import (
     clients,
@@ -39,6 +40,9 @@ CHECKS: Final = (
     Check("Running Webots", simulators.running),
     Check("Clients", clients.clients),
 )
+_RECOVER: Final = (
+    "stop what records there, save rows with 'sqlite3 FILE .recover', and move the file away"
+)
 # Starts a process of its own, which takes seconds: a server does not ask it of itself.
 SERVER: Final = Check("Server", round_trip.server)
 
@@ -63,6 +67,8 @@ def _look(check: Check, subject: Subject) -> Finding:
     except ModuleNotFoundError as error:
         return Finding("not looked at", f"the Python package {error.name!r} is missing")
     except Exception as error:  # noqa: BLE001  (it is told)
+        if is_damage(error):
+            return Finding("wrong", f"the database is damaged: {text_of(error)}", _RECOVER)
         return Finding("not looked at", f"{type(error).__name__}: {error}")
 
 

@@ -142,3 +142,12 @@ def test_a_leap_is_more_than_a_quarter_turn_the_short_way_round(angles: Array) -
     largest = max(map(abs, steps), default=0.0)
     if abs(largest - math.tau / 4) > 1e-9:
         assert leaps_in(angles, math.tau) == (largest > math.tau / 4)
+
+
+def test_a_noisy_heading_that_passes_north_has_no_spike_there() -> None:
+    times = np.arange(0.0, 60.0, 0.5)
+    noise = np.random.default_rng(7).normal(0.0, 1.0, len(times))
+    headings = 340.0 + times + noise
+    headings[36], headings[100] = 361.5, 410.0  # for one row beyond north; a spike
+    assert 1.5 in [each.value for each in find_spikes(times, headings % 360)]
+    assert [each.value for each in find_spikes(times, headings % 360, turn=360.0)] == [50.0]

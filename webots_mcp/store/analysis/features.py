@@ -48,7 +48,7 @@ def fit_line(times: Array, values: Array, mean: float) -> Line | None:
     return Line(stv / stt, min(1.0, stv / stt * (stv / svv)) if svv > 0 else 0.0)
 
 
-def find_spikes(times: Array, values: Array) -> list[Spike]:
+def find_spikes(times: Array, values: Array, turn: float | None = None) -> list[Spike]:
     """Single values that stand out from both neighbours, while those agree with each other.
 
     s = value - mean of both neighbours, judged by the modified z-score 0.6745 * s / MAD(s), and
@@ -56,9 +56,12 @@ def find_spikes(times: Array, values: Array) -> list[Spike]:
     Handle Outliers (1993). A step is no spike, because its neighbours differ, and no
     turning point, because those differ from the ones beyond them. Where more than one
     in twenty values (and more than three) stand out, none is told: that is how the signal is.
+    Of an angle, a step over the end of its scale is as large as what is left of a whole turn.
     """
     if len(values) < 5:
         return []
+    recorded = values
+    values = values if turn is None else np.unwrap(values, period=turn)
     sizes = np.abs(values[1:-1] - (values[:-2] + values[2:]) / 2)
     mad = float(np.partition(sizes, len(sizes) // 2)[len(sizes) // 2])
     limit = SPIKE_SCORE * (mad / 0.6745 if mad > 0 else 1.2533 * float(sizes.mean()))
@@ -66,7 +69,9 @@ def find_spikes(times: Array, values: Array) -> list[Spike]:
     rows = rows[_apart_around(values, rows) < sizes[rows - 1] / 2]
     if len(rows) > max(3, MOST_SPIKES_SHARE * len(values)):
         return []
-    return [Spike(*pair) for pair in zip(times[rows].tolist(), values[rows].tolist(), strict=True)]
+    return [
+        Spike(*pair) for pair in zip(times[rows].tolist(), recorded[rows].tolist(), strict=True)
+    ]
 
 
 def _apart_around(values: Array, rows: Indexes) -> Array:

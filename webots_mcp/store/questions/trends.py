@@ -175,7 +175,7 @@ def _trend_of_rows(signal: Signal, columns: Columns, kept: Columns | None) -> Tr
         return None
     summary = summarise_numbers(times, numbers, rows=len(columns.times), turn=signal.turn)
     summary = _with_kept(signal, summary, kept)
-    return judge(signal, summary, times, numbers, find_spikes(times, numbers))
+    return judge(signal, summary, times, numbers, find_spikes(times, numbers, signal.turn))
 
 
 def _trend_of_pieces(signal: Signal, pieces: Pieces, kept: Columns | None) -> Trend | None:

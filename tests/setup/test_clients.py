@@ -17,6 +17,7 @@ from webots_mcp.setup.clients import (
     clients_of,
     plan_entry,
     server_command,
+    server_hindrance,
 )
 from webots_mcp.setup.files import apply
 
@@ -147,3 +148,12 @@ def test_claude_desktop_has_its_file_where_that_system_keeps_it(
     monkeypatch.setenv("APPDATA", str(tmp_path / "roaming"))
     monkeypatch.delenv("XDG_CONFIG_HOME", raising=False)
     assert claude_desktop(platform).file == tmp_path / folder / "claude_desktop_config.json"
+
+
+def test_a_server_that_lacks_its_packages_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert server_hindrance() is None
+    monkeypatch.setitem(sys.modules, "mcp", None)
+    assert "without --no-deps" in (server_hindrance() or "")
+    monkeypatch.undo()
+    monkeypatch.setattr(sys, "prefix", "/home/me/.cache/uv/archive-v0/Ab1")
+    assert "uv tool install" in (server_hindrance() or "")

@@ -117,8 +117,8 @@ def _make_ready(arguments: argparse.Namespace) -> None:
     from webots_mcp.setup.clients import (
         claude_desktop,
         clients_of,
-        passing_environment,
         server_command,
+        server_hindrance,
     )
     from webots_mcp.setup.project import controllers_of, project_of
 
@@ -129,7 +129,7 @@ def _make_ready(arguments: argparse.Namespace) -> None:
     files = [_ignored(data_dir, dry_run=arguments.dry_run)]
     files += [_told(client, line, arguments) for client in clients]
     controllers = [_described(found, project) for found in controllers_of(project)]
-    note = passing_environment()
+    note = server_hindrance()
     found = {"project": str(project), "server": line, "files": files, "controllers": controllers}
     if arguments.json:
         _print_json(found | ({"note": note} if note else {}))

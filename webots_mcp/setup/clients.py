@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shutil
@@ -63,8 +64,13 @@ def server_command(data_dir: Path) -> list[str]:
     return [*program, "serve", "--data-dir", str(data_dir)]
 
 
-def passing_environment() -> str | None:
-    """What to do where this Python is one that uv clears away; None where it stays."""
+def server_hindrance() -> str | None:
+    """Why clients could not start this server, now or some day; None where they can."""
+    if importlib.util.find_spec("mcp") is None:
+        return (
+            f"the server cannot be started by {sys.executable}, which lacks the package mcp: "
+            "install webots-mcp without --no-deps, and run 'webots-mcp init' from there"
+        )
     if not any(map(_PASSING.fullmatch, Path(sys.prefix).parts)):
         return None
     return (

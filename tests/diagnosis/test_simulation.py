@@ -115,6 +115,15 @@ def test_another_controller_that_computes_is_named(
     assert f"(process {busy.pid})" in seen
 
 
+def test_many_that_stand_in_one_simulation_are_told_once(
+    look: Look, recorded: Recorded, start: Start
+) -> None:
+    process = start(WAITS)
+    for n in range(40):
+        silent(recorded, process, f"robot{n}")
+    assert look("Simulation").seen.count("paused by hand") == 1
+
+
 def test_an_extern_controller_that_nobody_has_started_is_missed(
     look: Look, recorded: Recorded, start: Start, tmp_path: Path
 ) -> None:

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 _WATCHED_S: Final = 0.3
 _LOOKS: Final = 6
+_MOST_WATCHED: Final = 5  # simulations, one after the other
 _BUSY: Final = 0.5  # of a processor; a controller that waits for its next step needs none
 _EXTERN: Final = re.compile(r'^\s*controller\s+"<extern>"', re.MULTILINE)
 _LARGEST_WORLD_BYTES: Final = 50_000_000
@@ -42,7 +43,19 @@ def simulation(subject: Subject) -> Finding:
     concerned = subject.live or _last_seen(subject.views)
     if not concerned:
         return Finding("ok", "no robot has been recorded yet")
-    return worst([_judged(subject, view) for view in concerned])
+    return worst([_judged(subject, view) for view in _once_each(concerned)])
+
+
+def _once_each(views: list[View]) -> list[View]:
+    """Of the robots that stand silent in the same simulation one: it is watched for them all."""
+    watched = dict[str, View]()
+    others = list[View]()
+    for view in views:
+        if view.session is not None and view.robot.live and view.status.why == SILENT:
+            watched.setdefault(view.session.instance, view)
+        else:
+            others.append(view)
+    return [*others, *list(watched.values())[:_MOST_WATCHED]]
 
 
 def _last_seen(views: list[View]) -> list[View]:

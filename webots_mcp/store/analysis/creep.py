@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.arrays import Array, Indexes, mean, np
 from webots_mcp.store.analysis.track import Track
 
 DRIFT_SHARE: Final = 0.15  # of the radius: who came farther between its first and last third moves
@@ -30,8 +31,8 @@ def _drifts(track: Track, start: int, end: int, radius_m: float) -> bool:
     third = max(1, (end - start) // 3)
     first, last = slice(start, start + third), slice(end - third, end)
     way_m = np.hypot(
-        track.raw_x[last].mean() - track.raw_x[first].mean(),
-        track.raw_y[last].mean() - track.raw_y[first].mean(),
+        mean(track.raw_x[last]) - mean(track.raw_x[first]),
+        mean(track.raw_y[last]) - mean(track.raw_y[first]),
     )
     error_m = track.noise_m * np.sqrt(2 / third)
     return bool(way_m > max(DRIFT_SHARE * radius_m, CERTAIN * error_m))
@@ -73,14 +74,14 @@ class _Line:
 
 
 def _line_through(track: Track, rows: slice) -> _Line:
-    times = track.times[rows] - track.times[rows].mean()
+    times = track.times[rows] - mean(track.times[rows])
     squares = float(times @ times)
     if squares == 0:
         return _Line(0.0, np.inf, 0.0, 0.0)
-    places = np.stack([each[rows] - each[rows].mean() for each in (track.raw_x, track.raw_y)])
+    places = np.array([each[rows] - mean(each[rows]) for each in (track.raw_x, track.raw_y)])
     speeds = places @ times / squares
-    left_m = float(np.sqrt(np.mean((places - np.outer(speeds, times)) ** 2)))
-    error_m_s = track.noise_m / float(np.sqrt(squares))
+    left_m = math.sqrt(mean((places - np.outer(speeds, times)) ** 2))
+    error_m_s = track.noise_m / math.sqrt(squares)
     return _Line(float(np.hypot(*speeds)), error_m_s, left_m, float(times[-1] - times[0]))
 
 

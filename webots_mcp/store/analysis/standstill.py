@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.analysis.arrays import mean, median, np
 from webots_mcp.store.analysis.creep import is_creep, rest_within
 from webots_mcp.store.analysis.track import Track
 
@@ -103,13 +103,13 @@ def _stays(track: Track, radius_m: float, least_s: float) -> Iterator[tuple[int,
 
 def _farthest_m(track: Track, start: int, end: int) -> float:
     x, y = track.x[start:end], track.y[start:end]
-    return float(np.hypot(x - x.mean(), y - y.mean()).max())
+    return float(np.hypot(x - mean(x), y - mean(y)).max())
 
 
 def _extended(track: Track, start: int, end: int, radius_m: float) -> int:
     """How far the positions stay within the radius of their mean, in steps that double."""
     while end < len(track.times):
-        x_m, y_m = track.x[start:end].mean(), track.y[start:end].mean()
+        x_m, y_m = mean(track.x[start:end]), mean(track.y[start:end])
         more = slice(end, 2 * end - start + 8)
         away = np.hypot(track.x[more] - x_m, track.y[more] - y_m) > radius_m
         if away.any():
@@ -126,8 +126,7 @@ def _standstill(
     around: tuple[int, int] | None = None,
 ) -> Standstill | None:
     """That of a stay; of one in which it creeps, that of the rest in it or around it, if any."""
-    place = np.median(track.x[slice(*stay)]), np.median(track.y[slice(*stay)])
-    x_m, y_m = map(float, place)
+    x_m, y_m = median(track.x[slice(*stay)]), median(track.y[slice(*stay)])
     away_m = np.hypot(track.x[slice(*stay)] - x_m, track.y[slice(*stay)] - y_m)
     settled = np.flatnonzero(away_m <= max(SETTLED_SHARE * radius_m, 3 * track.left_m))
     if len(settled) < 2:
@@ -186,7 +185,7 @@ def _end_of_ramp(track: Track, rows: slice, rest: slice) -> tuple[int, float]:
         rows: Where one may end.
         rest: Rows in which it certainly stands.
     """
-    off = np.stack([each[rows] - each[rest].mean() for each in (track.raw_x, track.raw_y)], axis=1)
+    off = np.stack([each[rows] - mean(each[rest]) for each in (track.raw_x, track.raw_y)], axis=1)
     times = track.times[rows]
     ramps = np.minimum(times[None, :] - times[:, None], 0.0)  # one a row, for each end
     squares = np.einsum("ij,ij->i", ramps, ramps)

@@ -89,7 +89,7 @@ def _by_command(
     told = speeds >= options.min_commanded
     stop = (speeds < options.min_commanded) & (motion.commanded is not None)
     said = f"{signal.name} {{:.3g}}"
-    shown = told.mean() > TOLD_SHARE if len(told) else False
+    shown = np.count_nonzero(told) > TOLD_SHARE * len(told)
     why = [said.format(median(numbers(columns, signal)[told]))] if shown else []
     against = [said.format(median(numbers(columns, signal)[stop]))] if _mostly(stop) else []
     return told, why, stop, against
@@ -211,7 +211,7 @@ def numbers(columns: Columns, signal: Signal) -> Array:
 
 
 def _mostly(flags: Flags) -> bool:
-    return len(flags) > 0 and float(flags.mean()) > MOSTLY
+    return bool(np.count_nonzero(flags) > MOSTLY * len(flags))
 
 
 def usual(values: Sequence[Value]) -> Value:

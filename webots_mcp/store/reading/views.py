@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from itertools import accumulate, groupby, pairwise
 from typing import Final, Protocol
 
-from webots_mcp.store.analysis.arrays import Array
+from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.jumps import least_jump
 from webots_mcp.store.analysis.rhythm import usual_interval_s
 from webots_mcp.store.analysis.summary import Summary, merge, summarise_numbers
@@ -339,10 +339,10 @@ class LongView:
         self._note_late()
         self._note_purged()
         values = (self._span[0], signal.id, *self._span[1:])
-        steps = _steps(self._connection.execute(_STEPS, values).fetchall())
+        found = self._connection.execute(_STEPS, values).fetchall()
         usual = self._sample.numbers(signal.name)[1]
         limit = least_jump(usual, score)
-        wide = sorted((each for each in steps if each[0] > limit), reverse=True)
+        wide = sorted(_steps_above(found, limit), reverse=True)
         rows = list(accumulate(rows for _, _, rows in wide))
         taken = wide[: max(1, bisect_right(rows, JUMP_ROWS))]
         if len(taken) < len(wide):
@@ -534,13 +534,17 @@ def _above(
     return range(min(large), max(large) + 1) if large else _NOTHING
 
 
-def _steps(found: Sequence[tuple[int, int, float, float, float]]) -> list[tuple[float, int, int]]:
+def _steps_above(
+    found: Sequence[tuple[int, int, float, float, float]], limit: float
+) -> list[tuple[float, int, int]]:
     """The largest step of each bucket, also that from the bucket before; its number and rows."""
-    befores = [found[0][3], *(last for *_, last in found)] if found else []
-    return [
-        (max(step, abs(first - before)), bucket, rows)
-        for (bucket, rows, step, first, _), before in zip(found, befores, strict=False)
-    ]
+    if not found:
+        return []
+    inside: Array = np.array([each[2] for each in found], np.float64)
+    first: Array = np.array([each[3] for each in found], np.float64)
+    last: Array = np.array([each[4] for each in found], np.float64)
+    steps: Array = np.fmax(inside, np.abs(first - np.concatenate((first[:1], last[:-1]))))
+    return [(float(steps[at]), *found[at][:2]) for at in np.flatnonzero(steps > limit).tolist()]
 
 
 def _runs_of(buckets: Sequence[int]) -> Iterator[range]:

@@ -32,6 +32,23 @@ def test_a_reset_by_the_controller_begins_a_new_run_and_ends_the_old_one(
     assert recording.rows("SELECT count(*) FROM state GROUP BY run_id") == [10, 3]
 
 
+@pytest.mark.parametrize("attached", [False, True])
+def test_like_runs_are_recorded_at_like_times_whenever_the_reset_came(
+    robot: InProcessSupervisor, recording: Recording, attached: bool
+) -> None:
+    database: MemoryDatabase = recording.database  # type: ignore[assignment]
+    make = MCPBridge.attach if attached else MCPBridge
+    with make(robot, database=database) as bridge:
+        for rounds in (12, 11, 13):
+            for number in range(rounds):
+                robot.step(STEP_MS)
+                if not attached:
+                    bridge.publish({"number": number})
+            robot.simulationReset()
+    times = recording.rows("SELECT run_id, sim_time_s FROM state ORDER BY id")
+    assert times == [(run, pytest.approx(n * 0.016)) for run in (1, 2, 3) for n in (5, 10)]
+
+
 def test_a_reset_fires_callbacks_once_and_is_detected_once(
     robot: InProcessSupervisor, bridge: MCPBridge, drive: Callable[[int], None]
 ) -> None:

@@ -8,6 +8,7 @@ from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.reloads import Reloads
+from webots_mcp.bridge.throttle import Throttle
 
 
 class Runs:
@@ -21,6 +22,7 @@ class Runs:
         heartbeat: Heartbeat,
         reloads: Reloads,
         parameters: Parameters,
+        throttle: Throttle,
     ) -> None:
         self._clock = clock
         self._recorder = recorder
@@ -28,6 +30,7 @@ class Runs:
         self._heartbeat = heartbeat
         self._reloads = reloads
         self._parameters = parameters
+        self._throttle = throttle
 
     def look(self, *, after_step: bool = False) -> None:
         """Begin a run if simulation time went back since the last look.
@@ -47,6 +50,7 @@ class Runs:
         """Simulation time went back: the old run ends with what was last known of it."""
         self._recorder.end_run("reset", self._clock.ended_sim_time_s)
         self._recorder.session.run = self._clock.run
+        self._throttle.begin_run()
         self._reloads.happened()
         self._journal.event("reset")
         # Before the callbacks, which may ask for values that waited for the reset.

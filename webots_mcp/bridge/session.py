@@ -68,7 +68,7 @@ class Session:
         given = os.environ.get(PARAMETERS_VARIABLE)
         start_values = StartValues(given, self._identity.robot_name, errors)
         parameters = Parameters(clock, recorder, journal, start_values, self._set_parameter)
-        self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters)
+        self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters, throttle)
         album = Album(recorder, clock, data_dir)
         keeper = Keeper(clock, recorder, journal, album, throttle, keep_last_s)
         look = self.runs.look_after_step

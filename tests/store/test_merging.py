@@ -223,6 +223,18 @@ def test_trial_sets_come_with_their_runs_once_and_without_who_worked_on_them(
         assert (waiting.status, waiting.run_id) == ("waiting", None)
 
 
+def test_trial_sets_come_in_the_order_in_which_they_were_begun(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    plans = [f'{{"score": "{number}"}}' for number in range(8)]
+    with closing(connect(source, "writer")) as connection:
+        for plan in plans:
+            create_trial_set(connection, plan, [{"kp": 1.0}])
+    merge(target, tmp_path / "here", source)
+    taken = target.execute("SELECT plan FROM trial_set ORDER BY id").fetchall()
+    assert taken == [(plan,) for plan in plans]
+
+
 def test_camera_frames_come_with_their_kept_stretch(
     target: sqlite3.Connection, tmp_path: Path
 ) -> None:

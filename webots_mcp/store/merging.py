@@ -37,6 +37,7 @@ _BUSY: Final = (
 _SET_BY: Final = (
     "SELECT id, command_id FROM main.parameter_value WHERE run_id = ? AND command_id IS NOT NULL"
 )
+_TRIAL_SETS: Final = "SELECT id, uuid FROM source.trial_set ORDER BY id"
 _TRIALS: Final = (
     "SELECT t.id, t.uuid, n.id FROM source.trial t LEFT JOIN source.run r ON r.id = t.run_id "
     "LEFT JOIN main.run n ON n.uuid = r.uuid WHERE t.trial_set_id = ? ORDER BY t.id"
@@ -149,7 +150,7 @@ def _take_in_trials(connection: sqlite3.Connection) -> None:
     gone: dict[str, Any] = dict.fromkeys(
         ("host", "pid", "process", "robot_id", "session_id", "former_values")
     )
-    for set_id, uuid in connection.execute("SELECT id, uuid FROM source.trial_set").fetchall():
+    for set_id, uuid in connection.execute(_TRIAL_SETS).fetchall():
         here = _id_of(connection, "trial_set", uuid)
         if here is None:
             here = _insert(connection, "trial_set", "id = ?", set_id, gone)

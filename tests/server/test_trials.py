@@ -24,9 +24,10 @@ from tests.processes.stopping import stop_between_writes
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail, pictures_of, text_of
 from tests.server.story import rows_of
+from webots_mcp import MCPBridge
 from webots_mcp.connection import connect as database
 from webots_mcp.server import create_server
-from webots_mcp.standin import Mode, Simulation
+from webots_mcp.standin import InProcessSupervisor, Mode, Simulation
 from webots_mcp.store.retention.policy import KEPT
 
 __all__ = ["data_dir", "filed", "start"]
@@ -70,10 +71,14 @@ class TunableDriver(Driver):
         self.kp = self.bridge.parameter("kp", 2.0, low=0, high=100)
         self.gait = self.bridge.parameter("gait", "trot", choices=["trot", "walk"])
         self.goes_on = threading.Event()
+        self.resets = 0
 
     def run(self) -> None:
+        before_s = 0.0
         while self.robot.step(STEP_MS) != -1:
-            distance = self.kp.value * self.robot.getTime()
+            self.resets += self.robot.getTime() < before_s
+            before_s = self.robot.getTime()
+            distance = self.kp.value * before_s
             self.bridge.publish({"distance": distance, "gait": self.gait.value})
             if self.kp.value == HANGS_AT and self.robot.getTime() > 0.1:
                 self.goes_on.wait()
@@ -256,6 +261,32 @@ async def test_trials_that_change_nothing_end(connect: Connect, tunable: Tunable
         answer = await trials(client, parameters=[{}], repeats=2)
         assert (answer["state"], answer["over"]) == ("done", 2)
         assert (await trials(client, parameters={"kp": [1.0]}))["state"] == "done"
+
+
+async def test_a_controller_that_knows_a_reset_only_by_its_time_notices_each(
+    connect: Connect, tunable: TunableDriver
+) -> None:
+    async with connect() as client:
+        for _ in range(2):
+            await trials(client, parameters={"kp": [1.0, 2.0]})
+        told = await ask(client, "webots_list_runs")
+        assert tunable.resets == told["total"] - 1
+
+
+async def test_a_trial_that_nobody_ran_because_the_controller_ended_says_why(
+    connect: Connect, file: Path
+) -> None:
+    with MCPBridge(InProcessSupervisor("silent"), throttle_interval=1, database=file) as bridge:
+        bridge.parameter("kp", 2.0, low=0, high=100)
+        bridge.publish({"distance": 1.0})
+        async with connect() as client:
+            await trials(client, parameters={"kp": [1.0]}, timeout_s=0.1)
+            bridge.close()
+            with closing(database(file, "writer")) as connection:
+                connection.execute("UPDATE command SET expires_wall_time_s = 1.0")
+            answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=30)
+            assert "no live controller" in answer["state"]
+            assert (answer["over"], answer["trials"]) == (0, 2)
 
 
 async def test_what_cannot_be_tried_is_refused_before_anything_is_done(

@@ -166,7 +166,7 @@ def test_who_was_stopped_until_another_took_over_writes_nothing_more(
     _, said = process.communicate(timeout=30)
 
     assert process.returncode == 2, said
-    assert "trial set 1 was taken over by another process" in said
+    assert "trial set 1 was taken over by another process, since this one" in said
     assert [len(each["scores"]) for each in answer["sets"]] == [2, 2]
     done = "SELECT count(*), count(DISTINCT run_id) FROM trial WHERE status = 'done'"
     assert rows(project, done) == [(4, 4)]

@@ -42,7 +42,8 @@ from webots_mcp.store.trials import (
 from webots_mcp.trials.plan import Plan, stored_plan
 
 _LOOK_EVERY_S: Final = 0.02
-_ONE_STEP_S: Final = 1e-6  # no step is shorter
+# So long that a controller that knows a reset only by its time having gone back notices the next.
+_SOME_STEPS_S: Final = 0.2
 _SETTLE_EVERY_S: Final = 1.0
 _PATIENCE_S: Final = 5.0  # with a command that takes a round of the loop
 _END_PATIENCE_S: Final = 2.0  # the same where the server ends
@@ -229,10 +230,12 @@ class TrialWorker(threading.Thread):
         """What became of a trial.
 
         Raises:
-            CommandRefusedError: Somebody else decides what the simulation does.
+            CommandRefusedError: Nobody ran it, or somebody else decides what the simulation does.
             InvalidInputError: No trial of the set can succeed.
         """
         if command.status in ("expired", "cancelled"):
+            with self._recording.reader() as connection:
+                find_target(connection, self._robot, ACTION)  # tells why nobody ran it
             raise CommandRefusedError(f"trial {trial.number} was not run: {command.error}")
         with self._recording.reader() as connection:
             run_id = connection.execute(_RUN_OF, (command.session_id, command.id)).fetchone()[0]
@@ -364,7 +367,7 @@ class TrialWorkers:
 
 def _new_run_with(values: Mapping[str, Any]) -> dict[str, Any]:
     """What begins another run than that of the last trial, which would else go on with it."""
-    asked = {"for_s": _ONE_STEP_S, "reset": True, "pace": "fast", "then": "pause"}
+    asked = {"for_s": _SOME_STEPS_S, "reset": True, "pace": "fast", "then": "pause"}
     return {**asked, "parameters": values, "by": "trial"}
 
 

@@ -34,7 +34,7 @@ _RENEW: Final = "UPDATE lease SET until_wall_time_s = ? WHERE name = ? AND holde
 _GIVE_BACK: Final = "DELETE FROM lease WHERE name = ? AND holder = ?"
 _HOLDER: Final = "SELECT holder FROM lease WHERE name = ? AND until_wall_time_s BETWEEN ? AND ?"
 _LOST: Final = (
-    "{} was taken over by another process ({}), since this one had not renewed its lease for "
+    "{} was taken over by another process{}, since this one had not renewed its lease for "
     f"{LEASE_S:g} s: it wrote nothing more"
 )
 
@@ -85,7 +85,8 @@ def still_held(connection: sqlite3.Connection, lease: Lease) -> Generator[None]:
     with transaction(connection):
         values = (time.time() + LEASE_S, lease.name, lease.holder)
         if connection.execute(_RENEW, values).rowcount == 0:
-            raise LeaseLostError(_LOST.format(lease.name, holder_of(connection, lease.name)))
+            holder = holder_of(connection, lease.name)  # None where that one is done by now
+            raise LeaseLostError(_LOST.format(lease.name, f" ({holder})" if holder else ""))
         yield
 
 

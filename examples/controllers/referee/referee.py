@@ -95,7 +95,7 @@ def main() -> None:
     touched = None
 
     while robot.step(time_step) != -1:
-        if robot.getTime() < referee.time_s:
+        if bridge.detect_reload():
             referee.start()
         bridge.publish(referee.watch())
         bridge.get_command()

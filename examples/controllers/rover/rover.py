@@ -1,8 +1,8 @@
 """A rover that wanders about the arena, records what it does and takes commands.
 
-The bridge is in six places: it is made, parameters are declared, commands are registered, and the
-loop publishes, asks for commands and now and then saves a picture. All else is an ordinary Webots
-controller.
+The bridge is in seven places: it is made, parameters are declared, commands are registered, and
+the loop asks whether the world was reset, publishes, asks for commands and now and then saves a
+picture. All else is an ordinary Webots controller.
 """
 
 from math import hypot, inf, pi
@@ -154,7 +154,7 @@ def main() -> None:
     next_picture_s, mode = 1.0, rover.mode
 
     while robot.step(rover.time_step) != -1:
-        if robot.getTime() < rover.time_s:  # a reset: the motors hold until told again
+        if bridge.detect_reload():  # a reset: the motors hold until told again
             rover.start()
             next_picture_s = 1.0
         state = rover.sense()

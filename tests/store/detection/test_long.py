@@ -152,6 +152,33 @@ def test_standstills_take_no_time_from_kinds_that_cost_less(long: sqlite3.Connec
     assert {each.kind for each in found} == {"flat", "jump", "oscillation"}
 
 
+def test_where_the_robot_stood_it_is_told_as_stuck_too_though_the_time_is_over_by_then(
+    empty: sqlite3.Connection,
+) -> None:
+    """Both are found at once: as many statements as `still` alone needs are time enough."""
+    recorder = start_run(empty)
+    for step in range(600):
+        there_m = 0.03 * (min(step, 200) + max(step - 400, 0))
+        recorder.publish(step * 0.1, {"pose": [there_m, 0.0], "commanded_m_s": 0.3})
+    statements: list[str] = []
+    empty.set_trace_callback(statements.append)
+
+    def found_kinds(kinds: tuple[str, ...], enough: float) -> list[str]:
+        statements.clear()
+        options, deadline = (
+            EventOptions(kinds=kinds),
+            Deadline(1.0, lambda: len(statements) / enough),
+        )
+        asked = resolve_range(empty)
+        known = known_signals(empty, asked)
+        detection = Detection(empty, known, asked_kinds(options), options, deadline, Ledger())
+        return [each.kind for each in detection.events_touching(asked.segments[0])]
+
+    assert found_kinds(("still",), math.inf) == ["still"]
+    assert found_kinds(("still", "stuck"), len(statements)) == ["stuck"]
+    empty.set_trace_callback(None)
+
+
 def test_what_a_part_of_the_work_leaves_of_its_time_is_left_for_the_rest() -> None:
     now_s = [0.0]
     deadline = Deadline(8.0, lambda: now_s[0])

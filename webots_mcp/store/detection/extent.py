@@ -96,13 +96,18 @@ class Detection:
         for index, effort in enumerate(efforts):
             with self.deadline.narrowed(1 / (len(efforts) - index)):
                 same = [kind for kind in search.kinds if kind.effort == effort]
-                found |= {kind.name: self._found_of(kind, search) for kind in same}
+                found |= self._found_of_rank(same, search)
         return [event for kind in search.kinds for event in found[kind.name]]
 
-    def _found_of(self, kind: EventKind, search: Search) -> list[Event]:
-        if self.deadline.passed:
+    def _found_of_rank(self, kinds: Sequence[EventKind], search: Search) -> dict[str, list[Event]]:
+        """Kinds of one rank find things together: what the first has read serves the others."""
+        if not self.deadline.passed:
+            return {kind.name: self._found_of(kind, search) for kind in kinds}
+        for kind in kinds:
             search.not_searched(kind.name, "the time was over: ask for this kind alone")
-            return []
+        return {kind.name: [] for kind in kinds}
+
+    def _found_of(self, kind: EventKind, search: Search) -> list[Event]:
         try:
             found = list(kind.find(search))
         except NotSearchableError as error:

@@ -21,9 +21,7 @@ from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, ask, fail
 from tests.store.test_queue import claim
 from webots_mcp.connection import connect as connect_database
-from webots_mcp.errors import CommandRefusedError
 from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.keyboard import press_reset
 from webots_mcp.store.queue import CommandQueue, fetch_command, list_commands
 from webots_mcp.store.recording import Recording
 
@@ -347,34 +345,6 @@ async def test_a_locked_database_is_a_clear_error(
     async with connect() as client:
         assert "stayed locked" in await fail(client, "webots_send_command", action="go")
     recorded.connection.execute("ROLLBACK")
-
-
-@pytest.mark.skipif(sys.platform == "darwin", reason="macOS has the keys")
-async def test_forcing_a_reset_is_refused_where_keys_cannot_be_sent(
-    connect: Connect, recorded: Recorded
-) -> None:
-    recorded.robot()
-    async with connect() as client:
-        text = await fail(client, "webots_world_reset", force=True)
-    assert "macOS only" in text
-    assert "Ctrl+Shift+T" in text
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs a shell script")
-@pytest.mark.parametrize(("exit_code", "refused"), [(0, False), (1, True)])
-def test_on_macos_the_reset_keys_are_sent_by_osascript(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exit_code: int, refused: bool
-) -> None:
-    program, said = tmp_path / "osascript", tmp_path / "said"
-    program.write_text(f'#!/bin/sh\necho "$@" > {said}\necho no access >&2\nexit {exit_code}\n')
-    program.chmod(0o755)
-    monkeypatch.setenv("PATH", str(tmp_path), prepend=":")
-    if refused:
-        with pytest.raises(CommandRefusedError, match="Accessibility"):
-            press_reset("darwin")
-    else:
-        press_reset("darwin")
-    assert 'keystroke "t" using {command down, shift down}' in said.read_text()
 
 
 async def test_who_is_interrupted_while_a_command_is_being_sent_leaves_none_behind(

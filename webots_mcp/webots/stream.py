@@ -40,7 +40,7 @@ _ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
     "reset": ("reset", ("reset finished",)),
     "reload": ("reload", ("delete world", "loading:", "world:", "scene load completed")),
 }
-_LATE_ANSWERS: Final = ("reset", "reload")  # may be answered to others, or much later
+RESTARTING: Final = ("reset", "reload")  # may be answered to others, or much later
 
 
 class Address(NamedTuple):
@@ -247,7 +247,7 @@ def give_order(address: Address, order: Order, timeout_s: float = ANSWER_S) -> R
         CommandRefusedError: There is no Webots to speak to.
     """
     words, answers = _ORDERS[order]
-    return _give(address, words, answers, timeout_s, late=order in _LATE_ANSWERS)
+    return _give(address, words, answers, timeout_s, late=order in RESTARTING)
 
 
 def load_world(address: Address, file_name: str, timeout_s: float = ANSWER_S) -> Reply:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
-import anyio
 from anyio import to_thread
 from mcp.server.mcpserver import Context
 from pydantic import Field
@@ -14,28 +12,29 @@ from webots_mcp.contract import MAX_STEPS
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.server.declaring import ACTS, RESTARTS, tool
 from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.keyboard import press_reset
 from webots_mcp.server.parameters import MAX_WAIT_S, RobotName, TimeoutS
 from webots_mcp.server.results import CommandAnswer
+from webots_mcp.server.routes import Attempt
 from webots_mcp.server.target import find_target
 from webots_mcp.store.recording import Recording
+from webots_mcp.webots.stream import Order
 
-Control = Literal["pause", "resume", "fast", "step", "reset", "reload"]
+Force = Annotated[bool, Field(description="Press Webots' own keys where nothing else works.")]
 
 _WAIT_S: Final = 10.0
 _RELOAD_WAIT_S: Final = 30.0
-_RESET_POLL_S: Final = 0.05
 
 
 @tool("Control the simulation", RESTARTS)
 async def webots_simulation_control(
     recording: Recording,
-    command: Annotated[Control, Field(description="reset and reload begin a new run at time 0.")],
+    command: Annotated[Order, Field(description="reset and reload begin a new run at time 0.")],
     ctx: Context[Any],
     steps: Annotated[
         Annotated[int, Field(ge=1, le=MAX_STEPS)] | None,
         Field(description="For step, by default 1: rounds of the controller's loop, then paused."),
     ] = None,
+    force: Force = False,
     robot: RobotName = None,
     timeout_s: Annotated[
         float | None,
@@ -48,9 +47,10 @@ async def webots_simulation_control(
 ) -> CommandAnswer:
     """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
 
-    Needs a controller that is a Supervisor. The whole simulation is steered, not one robot
-    alone. `reload` restarts the controllers that Webots starts, with their code as it is on
-    disk now; an extern controller ends, and somebody has to start it again by hand.
+    By a controller that is a Supervisor, else by Webots itself if it was started with --stream;
+    `route` says which. The whole simulation is steered, not one robot. `reload` restarts the
+    controllers that Webots starts, with their code as it is on disk now; an extern controller
+    ends, and somebody has to start it again by hand.
     """
     if steps is not None and command != "step":
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
@@ -59,7 +59,8 @@ async def webots_simulation_control(
     waiting_s = timeout_s or await to_thread.run_sync(
         _usual_wait_s, recording, command, steps, robot
     )
-    return await Dispatcher(recording, ctx.report_progress).ask(robot, command, waiting_s, params)
+    dispatcher = Dispatcher(recording, ctx.report_progress)
+    return await Attempt(recording, dispatcher, robot, command, params, waiting_s, force).steer()
 
 
 @tool("Reload the world", RESTARTS)
@@ -70,26 +71,21 @@ async def webots_world_reload(
     timeout_s: TimeoutS = _RELOAD_WAIT_S,
 ) -> CommandAnswer:
     """Load world and code anew: webots_simulation_control("reload") by another name."""
-    return await Dispatcher(recording, ctx.report_progress).ask(robot, "reload", timeout_s)
+    dispatcher = Dispatcher(recording, ctx.report_progress)
+    return await Attempt(recording, dispatcher, robot, "reload", {}, timeout_s).steer()
 
 
 @tool("Reset the world", RESTARTS)
 async def webots_world_reset(
     recording: Recording,
     ctx: Context[Any],
-    force: Annotated[
-        bool,
-        Field(
-            description="Press Webots' own keys (macOS), where the controller no longer answers."
-        ),
-    ] = False,
+    force: Force = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Back to time 0: webots_simulation_control("reset"), and with force for a stuck controller."""
-    if force:
-        return await _reset_by_keys(recording, robot, timeout_s)
-    return await Dispatcher(recording, ctx.report_progress).ask(robot, "reset", timeout_s)
+    dispatcher = Dispatcher(recording, ctx.report_progress)
+    return await Attempt(recording, dispatcher, robot, "reset", {}, timeout_s, force).steer()
 
 
 @tool("Reset the controller's state", ACTS)
@@ -103,7 +99,7 @@ async def webots_reset_controller_state(
     return await Dispatcher(recording, ctx.report_progress).ask(robot, "reset_state", timeout_s)
 
 
-def _usual_wait_s(recording: Recording, command: Control, steps: int, robot: str | None) -> float:
+def _usual_wait_s(recording: Recording, command: Order, steps: int, robot: str | None) -> float:
     """Long enough for steps at half of real time, and for a reload."""
     if command == "reload":
         return _RELOAD_WAIT_S
@@ -113,36 +109,3 @@ def _usual_wait_s(recording: Recording, command: Control, steps: int, robot: str
         run = find_target(connection, robot, command).run
         step_ms = (run.basic_time_step_ms if run else None) or 32.0  # Webots' default
     return min(_WAIT_S + 2 * steps * step_ms / 1000, MAX_WAIT_S)
-
-
-async def _reset_by_keys(
-    recording: Recording, robot: str | None, timeout_s: float
-) -> CommandAnswer:
-    """Press the keys, then wait for the run that a reset begins."""
-    before = await to_thread.run_sync(_current_run_id, recording, robot)
-    await to_thread.run_sync(press_reset)
-    started_s = time.monotonic()
-    while (run_id := await to_thread.run_sync(_current_run_id, recording, robot)) == before:
-        if time.monotonic() - started_s > timeout_s:
-            break
-        await anyio.sleep(_RESET_POLL_S)
-    return await to_thread.run_sync(_after_keys, recording, robot, run_id != before, started_s)
-
-
-def _current_run_id(recording: Recording, robot: str | None) -> int | None:
-    with recording.view(robot) as view:
-        return view.run.id if view.run else None
-
-
-def _after_keys(
-    recording: Recording, robot: str | None, begun: bool, started_s: float
-) -> CommandAnswer:
-    hint = "the keys were sent, but no new run has begun: look at Webots' window"
-    with recording.view(robot) as view:
-        return CommandAnswer(
-            **view.header(),
-            action="reset",
-            outcome="done" if begun else "failed",
-            waited_s=round(time.monotonic() - started_s, 3),
-            hint=None if begun else hint,
-        )

@@ -1,0 +1,351 @@
+"""Ways to steer the simulation, tried in turn: its controller, Webots' WebSocket, Webots' keys.
+
+An answer names the way that worked and what shows that it did; where none does, each says why.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+import anyio
+from anyio import to_thread
+
+from webots_mcp.contract import HEARTBEAT_LATE_S
+from webots_mcp.errors import CommandRefusedError, NoDatabaseError, NothingRecordedError
+from webots_mcp.server.dispatch import Dispatcher
+from webots_mcp.server.results import CommandAnswer
+from webots_mcp.server.target import find_target
+from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.sessions import Session
+from webots_mcp.store.status import find_holder
+from webots_mcp.webots import keyboard
+from webots_mcp.webots.instances import Instance, instance_at, instances
+from webots_mcp.webots.stream import (
+    ANSWER_S,
+    RESTARTING,
+    Address,
+    Order,
+    Reply,
+    address_of,
+    give_order,
+    no_obedience,
+)
+
+_POLL_S: Final = 0.05
+_CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # by then a loop that has just stopped is known as such
+_UNCLAIMED: Final = ("cancelled", "expired")
+_PROOF_S: Final = 3.0  # a heartbeat tells within half a second that time goes on
+_RESTART_S: Final = 5.0  # until a controller that Webots starts again has recorded
+_LEAST_S: Final = 0.1
+_NOTHING_SEEN: Final = (
+    "the recording does not show it yet: a controller that hangs, or an extern one that is "
+    "missing, stops the time of a simulation that runs"
+)
+_NO_FORCE: Final = "force=true would press Webots' own keys"
+
+
+class Moment(NamedTuple):
+    """Where the recording is: what comes after it shows what an order did."""
+
+    run_id: int | None
+    sim_time_s: float | None
+
+
+@dataclass
+class Situation:
+    """What is known before the first way is tried.
+
+    Attributes:
+        robot: The robot as it is recorded; None where none was.
+        can_command: Whether its controller can be sent a command, if only to wait for it.
+        silent: Why a command would wait now; None where the controller's loop turns.
+        instance: Where its session says that Webots listens.
+    """
+
+    robot: str | None
+    can_command: bool
+    silent: str | None
+    address: Address | None
+    before: Moment
+
+
+@dataclass
+class Attempt:
+    """One request to steer, through all ways.
+
+    Attributes:
+        tried: Why each way did not work, by its name.
+    """
+
+    recording: Recording
+    dispatcher: Dispatcher
+    robot: str | None
+    order: Order
+    params: Mapping[str, Any]
+    timeout_s: float
+    force: bool = False
+    tried: dict[str, str] = field(default_factory=dict[str, str])
+    started_s: float = field(default_factory=time.monotonic)
+
+    async def steer(self) -> CommandAnswer:
+        """Go the first way that works.
+
+        Raises:
+            InvalidInputError: There is no such robot, or several are possible.
+            CommandRefusedError: No way works; each is named with the reason.
+        """
+        situation = await self._look_around()
+        if situation.silent is None:
+            answer = await self._by_bridge(_CLAIMING_S)
+            if answer.outcome not in _UNCLAIMED:
+                return answer
+            situation = await self._look_around()
+        if situation.silent is None:
+            return await self._by_bridge()
+        self.tried["bridge"] = situation.silent
+        # The observer, a robot that only steers, will be asked here.
+        for way in (self._by_websocket, self._by_keyboard):
+            answer = await way(situation)
+            if answer is not None:
+                return answer
+        if not situation.can_command:
+            raise CommandRefusedError(_no_way(self.order, self.tried))
+        return await self._by_bridge()
+
+    async def _look_around(self) -> Situation:
+        return await to_thread.run_sync(_look_around, self.recording, self.robot, self.order)
+
+    async def _by_bridge(self, claiming_s: float = math.inf) -> CommandAnswer:
+        """Send a command to the controller, and wait for it as long as there is time.
+
+        Args:
+            claiming_s: Nobody waits for longer until its loop takes the command.
+        """
+        wait_s = min(self._left_s(), claiming_s)
+        answer = await self.dispatcher.ask(self.robot, self.order, wait_s, self.params)
+        if answer.outcome == "claimed" and answer.command_id is not None:
+            answer = await self.dispatcher.wait(answer.command_id, self._left_s())
+        answer.waited_s = self._waited_s
+        answer.route = "bridge" if answer.outcome == "done" else None
+        others = {name: why for name, why in self.tried.items() if name != "bridge"}
+        if answer.outcome != "done" and others:
+            answer.tried = others
+        return answer
+
+    @property
+    def _waited_s(self) -> float:
+        return round(time.monotonic() - self.started_s, 3)
+
+    async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:
+        try:
+            address = situation.address or await to_thread.run_sync(_only_webots)
+            reply, made = await self._give(address)
+        except CommandRefusedError as error:
+            self.tried["websocket"] = str(error)
+            return None
+        if made:
+            return await self._obeyed(situation, reply, made)
+        seen = None
+        if self.order in RESTARTING:  # of which Webots need not say anything
+            seen = await self._shown(situation, _RESTART_S)
+        if seen is None:
+            self.tried["websocket"] = no_obedience(address, reply)
+            return None
+        return await self._answered(situation, "websocket", seen)
+
+    async def _give(self, address: Address) -> tuple[Reply, int]:
+        """Once, or as many steps as are asked for; the last reply, and how many were heard."""
+        reply, made = Reply(None, is_alive=False), 0
+        while made < self._wanted and (made == 0 or self._left_s() > _LEAST_S):
+            timeout_s = min(ANSWER_S, self._left_s())
+            reply = await to_thread.run_sync(give_order, address, self.order, timeout_s)
+            if reply.heard is None:
+                break
+            made += 1
+        return reply, made
+
+    @property
+    def _wanted(self) -> int:
+        return int(self.params.get("steps", 1))
+
+    async def _obeyed(self, situation: Situation, reply: Reply, made: int) -> CommandAnswer:
+        """Webots has said so; the recording soon shows it as well, where controllers record."""
+        said = f"Webots said {reply.heard!r}" if reply.heard else "Webots obeyed"
+        if self._wanted > 1:
+            said = f"Webots made {made} of {self._wanted} basic time steps"
+        wait_s = self._left_s() if self.order in RESTARTING else _PROOF_S
+        seen = None if self.order == "pause" else await self._shown(situation, wait_s)
+        proof = f"{said}; {seen}" if seen else said
+        answer = await self._answered(situation, "websocket", proof)
+        if made < self._wanted:
+            answer.outcome = "failed"
+        elif seen is None and self.order != "pause" and situation.robot is not None:
+            answer.hint = _NOTHING_SEEN
+        return answer
+
+    async def _by_keyboard(self, situation: Situation) -> CommandAnswer | None:
+        if not self.force:
+            self.tried["keyboard"] = _NO_FORCE
+            return None
+        try:
+            pid = await to_thread.run_sync(_window_owner, situation.address)
+            await to_thread.run_sync(keyboard.press, self.order, pid)
+        except CommandRefusedError as error:
+            self.tried["keyboard"] = str(error)
+            return None
+        seen = await self._shown(situation, self.timeout_s)
+        if seen is not None:
+            return await self._answered(situation, "keyboard", seen)
+        self.tried["keyboard"] = (
+            f"{keyboard.KEYS[self.order].spoken} was sent, and nothing in the recording shows that "
+            "Webots obeyed: look at its window"
+        )
+        return None
+
+    async def _shown(self, situation: Situation, wait_s: float) -> str | None:
+        """What the recording shows of it, as soon as it does; None if nothing in that time."""
+        if situation.robot is None:
+            return None
+        until_s = time.monotonic() + min(wait_s, self._left_s())
+        while True:
+            sign = await to_thread.run_sync(self._sign, situation)
+            if sign is not None or time.monotonic() > until_s:
+                return sign
+            await anyio.sleep(_POLL_S)
+
+    def _sign(self, situation: Situation) -> str | None:
+        with self.recording.view(situation.robot) as view:
+            return _SIGNS[self.order](situation.before, view)
+
+    async def _answered(self, situation: Situation, route: str, proof: str) -> CommandAnswer:
+        header: dict[str, Any] = {}
+        if situation.robot is not None:
+            header = await to_thread.run_sync(self._header, situation.robot)
+        return CommandAnswer(
+            **header,
+            action=self.order,
+            outcome="done",
+            waited_s=self._waited_s,
+            route=route,
+            proof=proof,
+        )
+
+    def _header(self, robot: str) -> dict[str, Any]:
+        with self.recording.view(robot) as view:
+            return view.header()
+
+    def _left_s(self) -> float:
+        return max(self.timeout_s - (time.monotonic() - self.started_s), _LEAST_S)
+
+
+def _look_around(recording: Recording, robot: str | None, order: Order) -> Situation:
+    try:
+        with recording.reader() as connection:
+            try:
+                view = find_target(connection, robot, order)
+            except CommandRefusedError as error:
+                view = look(connection, robot)
+                _require_not_held_elsewhere(view, error)
+                return _situation(view, can_command=False, silent=str(error))
+            return _situation(view, can_command=True, silent=_why_silent(view))
+    except (NoDatabaseError, NothingRecordedError) as error:  # which say how to record
+        return Situation(None, False, str(error).rstrip("."), None, Moment(None, None))
+
+
+def _require_not_held_elsewhere(view: View, error: CommandRefusedError) -> None:
+    """What another robot's bridge holds, only that bridge can let go."""
+    session = view.session
+    if session is None or not session.is_alive(view.now_s):
+        return
+    holder = find_holder(view.connection, session, view.now_s)
+    if holder is not None and holder.id != session.id:
+        raise error
+
+
+def _situation(view: View, *, can_command: bool, silent: str | None) -> Situation:
+    moment = Moment(view.run.id if view.run else None, view.header()["sim_time_s"])
+    address = address_of(view.session.instance) if view.session else None
+    return Situation(view.robot.name, can_command, silent, address, moment)
+
+
+def _why_silent(view: View) -> str | None:
+    """Why a command would not be claimed soon; None where it would, or that is not known."""
+    session = view.session
+    if session is None or not session.is_alive(view.now_s):
+        return None  # it is being reloaded
+    if not session.heartbeat_is_fresh(view.now_s):
+        return view.status.why or "the controller's loop is silent"
+    if _never_asks(session, view.now_s):
+        return "the controller's loop does not call bridge.get_command()"
+    return None
+
+
+def _never_asks(session: Session, now_s: float) -> bool:
+    """Whether it turns for longer than a heartbeat may take without looking for commands."""
+    since_s = session.last_poll_wall_time_s or session.started_wall_time_s
+    return session.age_s(since_s, now_s) > 2 * HEARTBEAT_LATE_S
+
+
+def _begun(before: Moment, view: View) -> str | None:
+    if view.run is None or view.run.id == before.run_id:
+        return None
+    return f"run {view.run.id} began"
+
+
+def _moved(before: Moment, view: View) -> str | None:
+    now_s = view.header()["sim_time_s"]
+    if now_s is None or (before.sim_time_s is not None and now_s <= before.sim_time_s):
+        return _begun(before, view)
+    return f"simulation time went on to {now_s} s"
+
+
+def _standing(before: Moment, view: View) -> str | None:
+    return None if view.status.is_moving else f"status: {view.status.text}"
+
+
+_SIGNS: Final[dict[Order, Callable[[Moment, View], str | None]]] = {
+    "pause": _standing,
+    "resume": _moved,
+    "fast": _moved,
+    "step": _moved,
+    "reset": _begun,
+    "reload": _begun,
+}
+
+
+def _only_webots() -> Address:
+    """The Webots that runs here, where no session names it."""
+    return _only(instances()).address
+
+
+def _window_owner(address: Address | None) -> int | None:
+    """The process whose window gets the keys; None where the system does not tell."""
+    if address is None:
+        return _only(instances()).pid
+    found = instance_at(address.port)
+    if found is not None and found.address == address:  # another machine may use the same port
+        return found.pid
+    raise CommandRefusedError(f"no Webots of this machine listens at {address}")
+
+
+def _only(running: list[Instance]) -> Instance:
+    if len(running) == 1:
+        return running[0]
+    if not running:
+        raise CommandRefusedError("no Webots runs on this machine")
+    ports = ", ".join(str(each.port) for each in running)
+    raise CommandRefusedError(
+        f"{len(running)} Webots run (ports {ports}), and no live session tells which is meant"
+    )
+
+
+def _no_way(order: Order, tried: Mapping[str, str]) -> str:
+    told = "; ".join(f"{route}: {why}" for route, why in tried.items())
+    return (
+        f"no way to {order} the simulation works. {told}. Press {keyboard.KEYS[order].spoken} in "
+        "Webots, or start Webots with --stream, which lets it be steered without a controller"
+    )

@@ -63,7 +63,8 @@ class Situation:
         robot: The robot as it is recorded; None where none was.
         can_command: Whether its controller can be sent a command, if only to wait for it.
         silent: Why a command would wait now; None where the controller's loop turns.
-        instance: Where its session says that Webots listens.
+        address: Where its session says that Webots listens.
+        before: Where its recording was.
     """
 
     robot: str | None

@@ -432,6 +432,8 @@ async def test_the_frames_around_a_hit_are_shown_by_time_one_or_many(
         near, picture = await shown(at_s=5.2)
         several, sheet = await shown(at_s=5.0, frames=4)
         missing, _ = await shown(at_s=2.4, frames=16)
+        far, _ = await shown(at_s=-30.0)
+    assert far["hint"] == "no picture is nearer to -30 s than 30.0 s" and "hint" not in near
     assert newest["picture_sim_time_s"] == 9.0 and "kept" not in newest
     assert (near["picture_sim_time_s"], near["kept"]) == (5.0, "breakpoint 1: n == 5")
     assert picture.getpixel((8, 6)) == (100, 0, 0)

@@ -26,6 +26,7 @@ from webots_mcp.store.recording import Recording, View
 _WAIT_S: Final = 15.0
 _MOST_RUNS: Final = 5
 _MOST_FRAMES: Final = 16
+_FAR_S: Final = 1.0  # from the time that was asked for
 
 
 @tool("Get the camera picture", READS)
@@ -74,7 +75,16 @@ def _show_recorded(
             picture, shown = _sheet(recording, found)
         else:
             picture, shown = _single(recording, view, found[0])
-        return [_caption(view.header() | _told_of(view, found) | shown), picture]
+        told = _told_of(view, found) | shown | _far_off(at_s, found)
+        return [_caption(view.header() | told), picture]
+
+
+def _far_off(at_s: float | None, found: list[StoredImage]) -> dict[str, Any]:
+    """That the nearest picture is not of the time that was asked for."""
+    apart_s = 0.0 if at_s is None else min(abs(each.sim_time_s - at_s) for each in found)
+    if apart_s <= _FAR_S:
+        return {}
+    return {"hint": f"no picture is nearer to {at_s:g} s than {seconds(apart_s)} s"}
 
 
 def _told_of(view: View, found: list[StoredImage]) -> dict[str, Any]:
@@ -147,6 +157,7 @@ def _no_frame(view: View, camera: str) -> str:
         f"no frame{of_it} in this run; there are some of {some(saved, _MOST_RUNS)}"
         if known
         else "no camera frame was saved: fresh=true takes one of an enabled camera now, "
-        "bridge.save_camera_frame(camera) in the controller's loop records them"
+        "bridge.save_camera_frame(camera) in the controller's loop records them, "
+        "bridge.keep_camera(camera) those of kept stretches"
     )
     return _caption(view.header() | {"camera": camera, "hint": hint})

@@ -148,6 +148,8 @@ async def test_steering_through_a_plain_robot_is_refused_with_the_supervisor_to_
         alone = await fail(client, "webots_simulation_control", command="pause")
         recorded.robot("referee")
         beside = await fail(client, "webots_world_reset", robot="rover")
+        run = await fail(client, "webots_run", robot="rover", for_s=1)
+    assert "for conditions and parameters of 'rover', set the field 'supervisor'" in run
     assert "pause needs a Supervisor and robot 'rover' is not one: set the field" in alone
     assert "'referee' is a Supervisor of this simulation: ask it (robot='referee')" in beside
 

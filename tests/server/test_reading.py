@@ -255,6 +255,9 @@ async def test_the_full_state_says_which_seconds_were_kept_last(
         robot.kept(40.0, 47.0, "error: the gear is gone")
         answer = await ask(client, "webots_get_full_state")
         seen = await ask(client, "webots_get_robot_state")
+        robot.kept(58.0, 62.0, "pause")
+        goes_on = (await ask(client, "webots_get_robot_state"))["kept_at_full_rate"]
+    assert goes_on == "58.000 s on, until 62.000 s: pause"
     assert seen["kept_at_full_rate"] == answer["recorder"]["kept_at_full_rate"]
     assert answer["recorder"]["kept_at_full_rate"] == "40.000-47.000 s: error: the gear is gone"
 

@@ -100,6 +100,8 @@ def _who_may(view: View, session: Session, action: str) -> str:
     if others:
         name = robot_name(view.connection, others[0].robot_id)
         next_step = f"robot {name!r} is a Supervisor of this simulation: ask it (robot={name!r})"
+        if action == "run":
+            next_step += f"; for conditions and parameters of {view.robot.name!r}, {_MAKE_ONE}"
     return f"{action} needs a Supervisor and robot {view.robot.name!r} is not one: {next_step}"
 
 

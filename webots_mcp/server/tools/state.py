@@ -216,9 +216,11 @@ def _recorder(view: View) -> dict[str, Any] | None:
 def _kept(view: View) -> str | None:
     """Which seconds of the run were kept last at full rate, and why."""
     newest = newest_kept(view.connection, view.run.id) if view.run else None
-    if newest is None:
+    if newest is None or view.run is None:
         return None
     span = f"{newest.start_s:.3f}-{newest.end_s:.3f} s"
+    if newest.end_s > view.run.last_sim_time_s:
+        span = f"{newest.start_s:.3f} s on, until {newest.end_s:.3f} s"
     return f"{span}: {cut_text(newest.reason, _ERROR_CHARACTERS)}"
 
 

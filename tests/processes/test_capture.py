@@ -207,20 +207,27 @@ def test_what_cannot_be_recorded_is_passed_on_all_the_same(run: Run, strict: str
     process = run(
         f"""
 os.environ["WEBOTS_MCP_STRICT"] = {strict!r}
+import threading
 from webots_mcp.bridge.journal import Journal
 
+failed = threading.Semaphore(0)
+
 def fail(*_):
+    failed.release()
     raise OSError("no room")
 
 bridge = begin()
 Journal.output = fail
 for n in range(40):
     os.write(1, b"x" * 99_999 + b"\\n")
+assert failed.acquire(timeout=30)
+os.write(1, b"y\\n")  # the second failure begins when the first one has been told
+assert failed.acquire(timeout=30)
 Journal.output = lambda *_: None
 """
     )
-    out, err = process.communicate(timeout=60)
-    assert len(out) == 4_000_000
+    out, err = process.communicate(timeout=90)
+    assert len(out) == 4_000_002
     assert "no room" in err
 
 

@@ -179,7 +179,7 @@ def test_runs_tell_durations_speed_and_rows(reader: sqlite3.Connection) -> None:
     )
     first, second = rows(reader, sql)
     assert first == ("rover", 19.984, 20, 530, 0, "start", "reset")
-    assert second == ("rover", pytest.approx(11.968), 12, 328, 0, "reset", "finished")
+    assert second == ("rover", pytest.approx(11.968), 12, 327, 0, "reset", "finished")
 
 
 def test_commands_tell_how_long_they_waited_and_ran(recorder: Recorder) -> None:

@@ -277,7 +277,7 @@ def test_a_range_holds_its_start_and_not_its_end(reader: sqlite3.Connection) -> 
 def test_a_range_in_wall_time_goes_through_several_runs(reader: sqlite3.Connection) -> None:
     lines = json_lines(reader, since=0)
     assert {line["run_id"] for line in lines} == {1, 2}
-    assert len(lines) == 858
+    assert len(lines) == 857
 
 
 def test_rows_of_a_paused_simulation_share_their_time_and_all_come(recorder: Recorder) -> None:

@@ -16,6 +16,7 @@ from mcp import Client
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, ask, fail
 from tests.webots.conftest import (
+    CONTROLLER,
     StartWebots,
     free_port,
     start_webots,
@@ -44,17 +45,7 @@ while robot.step(16) != -1:
         while True:
             pass
 """
-PLAIN = """
-from controller import Robot
-from webots_mcp import MCPBridge
-
-robot = Robot()
-bridge = MCPBridge(robot, throttle_interval=1)
-print("ready", flush=True)
-while robot.step(16) != -1:
-    bridge.publish({"time_s": robot.getTime()})
-    bridge.get_command()
-"""
+PLAIN = CONTROLLER.replace("Supervisor", "Robot")
 
 
 async def control(client: Client, command: str, **arguments: object) -> dict[str, Any]:

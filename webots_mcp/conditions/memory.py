@@ -6,6 +6,7 @@ All of it is brought up to date with every state, whatever `and` and `or` leave 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from typing import Final, Generic, Protocol, TypeVar
@@ -32,7 +33,7 @@ class Memory(Protocol):
         ...
 
 
-class _Asking(Generic[Answer]):
+class _Asking(ABC, Generic[Answer]):
     """Asks something of every state and keeps what follows from the answers."""
 
     def __init__(self, ask: Callable[[State], Answer]) -> None:
@@ -40,9 +41,9 @@ class _Asking(Generic[Answer]):
         self._error: ConditionFailedError | None = None
         self.forget()
 
+    @abstractmethod
     def forget(self) -> None:
         """A new run has begun."""
-        raise NotImplementedError
 
     def update(self, state: State, sim_time_s: float) -> None:
         """Take in a state; why it could not be asked is raised when the result is read."""
@@ -54,8 +55,9 @@ class _Asking(Generic[Answer]):
         else:
             self._take_in(answer, sim_time_s)
 
+    @abstractmethod
     def _take_in(self, answer: Answer, sim_time_s: float) -> None:
-        raise NotImplementedError
+        """Keep what follows from an answer."""
 
     def _check(self) -> None:
         if self._error is not None:

@@ -13,7 +13,7 @@ from tests.detection.labelled import Measure
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
 from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 
 # Without a deadline that a busy machine would meet; how long it took is measured beside.
 UNHURRIED_S: Final = 300.0
@@ -102,7 +102,7 @@ def _asked(
 ) -> Answer:
     kinds = tuple({kind for measure in measures for kind in _KINDS[measure]})
     started_s = time.perf_counter()
-    time_range = resolve_range(connection, **bounds)  # pyright: ignore[reportArgumentType]
+    time_range = find_range(connection, Scope(**bounds))  # pyright: ignore[reportArgumentType]
     told = find_events(
         connection,
         time_range,

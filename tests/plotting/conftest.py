@@ -11,7 +11,7 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, record_rover
-from webots_mcp.store.reading.ranges import TimeRange, resolve_range
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.rollup.rolling import roll
 
 State = Callable[[float], dict[str, Any]]
@@ -55,4 +55,4 @@ def record() -> Iterator[Record]:
 
 
 def whole(connection: sqlite3.Connection, run_id: int = 1, **limits: Any) -> TimeRange:
-    return resolve_range(connection, run_id=run_id, **limits)
+    return find_range(connection, Scope(run_id=run_id, **limits))

@@ -10,7 +10,7 @@ from tests.recordings.rows import Recorded, RecordedRobot
 from tests.server.conftest import Connect, ask
 from tests.server.story import rows_of
 from webots_mcp.server.watching import movement
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import Recording
 
 pytestmark = pytest.mark.anyio
@@ -127,7 +127,7 @@ def test_a_movement_says_from_when_on_rows_were_not_read(
     drive(rover, *([0.01 * step, 0] for step in range(3000)))
     recorded.connection.execute("COMMIT")
     with Recording(recorded.database, tmp_path).view(None, None) as view:
-        whole = resolve_range(view.connection)
+        whole = find_range(view.connection, Scope())
         answer = movement(view, whole, 0)
     assert answer is not None
     assert answer["rows_missing_from_s"] < 1499.5

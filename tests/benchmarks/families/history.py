@@ -26,7 +26,7 @@ from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.timeline import timeline
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.signals.catalogue import list_signals
 from webots_mcp.store.window import Window
@@ -102,7 +102,7 @@ def _sizes(bench: Bench) -> list[int]:
 
 def _questions(db: sqlite3.Connection, rows: int) -> Iterator[Question]:
     whole, minute, ten = (
-        resolve_range(db, last_s=last_s) for last_s in (None, _MINUTE_S, _TEN_MINUTES_S)
+        find_range(db, Scope(last_s=last_s)) for last_s in (None, _MINUTE_S, _TEN_MINUTES_S)
     )
     numbers: dict[str, str] = dict(db.execute(_NUMBERS))
     length_s = end_s(rows)
@@ -230,7 +230,7 @@ def _lines(question: Question, rows: int, taken: dict[str, Samples]) -> Iterable
 def _stuck(db: sqlite3.Connection, rows: int) -> Iterable[Line]:
     """Of a long run the rollups tell where to look: nothing may be missed."""
     expected = max(0, math.ceil((end_s(rows) - 46) / CYCLE_S))  # each ends 46 s into its cycle
-    stuck = find_events(db, resolve_range(db), EventOptions(kinds=("stuck",)))
+    stuck = find_events(db, find_range(db, Scope()), EventOptions(kinds=("stuck",)))
     found = stuck.totals.get("stuck", 0)
     what, beside = f"stuck places, {rows:,} rows", f"in the recording {expected:,}"
     yield Line(what, f"found {found:,}", beside, abs(expected - found), "off", Target(0))

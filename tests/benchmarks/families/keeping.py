@@ -22,7 +22,7 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.schema import create_schema
 from webots_mcp.store.export import FORMATS, export_file
 from webots_mcp.store.json_folder import import_folder
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Purged, Retention, prune
 
 _ROWS: Final = 100_000
@@ -56,7 +56,7 @@ def measure_keeping(bench: Bench) -> Iterable[Line]:
 
 def _exports(bench: Bench, file: Path, rows: int) -> Iterable[Line]:
     with closing(connect(file, "reader")) as db:
-        whole = resolve_range(db)
+        whole = find_range(db, Scope())
         naive = _rate(rows, lambda: _copy_as_json_lines(db, bench.folder / "naive"))
         for form in FORMATS:
             if form == "parquet" and not importlib.util.find_spec("pyarrow"):

@@ -7,13 +7,16 @@ import sqlite3
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import Events, find_events
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 
 
 def changes(connection: sqlite3.Connection) -> Events:
     return find_events(
-        connection, resolve_range(connection, run_id=1), EventOptions(kinds=("change",)), limit=20
+        connection,
+        find_range(connection, Scope(run_id=1)),
+        EventOptions(kinds=("change",)),
+        limit=20,
     )
 
 
@@ -52,5 +55,5 @@ def test_of_a_mode_that_is_a_number_the_way_to_its_changes_is_named(
         recorder.publish(step * 0.1, {"betriebsart": step // 30})
     assert "where='changed(NAME)'" in changes(empty).verdicts.not_searched["change"]
     options = EventOptions(kinds=("condition",), where="changed(betriebsart)")
-    found = find_events(empty, resolve_range(empty, run_id=1), options)
+    found = find_events(empty, find_range(empty, Scope(run_id=1)), options)
     assert [round(each.start_s, 1) for each in found.events] == [3.0, 6.0]

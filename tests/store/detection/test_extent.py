@@ -12,7 +12,7 @@ import pytest
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 
 STOPS_S = 200.0  # the robot drives, then stands, at 300 s it drives on
@@ -44,7 +44,7 @@ def told(connection: sqlite3.Connection, kind: str, **bounds: Any) -> list[Event
     low = (Threshold("battery_v", below=5.0, for_s=2.0),)
     name = {"silent": "front_m", "flat": "heading_deg", "change": "mode"}.get(kind, "*")
     options = EventOptions(kinds=(kind,), signals=(name,), thresholds=low)
-    return list(find_events(connection, resolve_range(connection, **bounds), options).events)
+    return list(find_events(connection, find_range(connection, Scope(**bounds)), options).events)
 
 
 @pytest.mark.parametrize("kind", ["stuck", "threshold", "silent", "flat"])
@@ -81,7 +81,7 @@ def test_a_change_lasts_until_the_next_one_also_beyond_the_range(
 def test_two_limits_on_one_signal_are_two_events(standing: sqlite3.Connection) -> None:
     limits = (Threshold("battery_v", below=5.0), Threshold("battery_v", below=4.0))
     options = EventOptions(kinds=("threshold",), thresholds=limits)
-    found = find_events(standing, resolve_range(standing, start_s=250.0, end_s=255.0), options)
+    found = find_events(standing, find_range(standing, Scope(start_s=250.0, end_s=255.0)), options)
     told = [(event.details["below"], event.start_s, event.end_s) for event in found.events]
     assert sorted(told) == [(4.0, 200.0, 299.9), (5.0, 200.0, 299.9)]
 
@@ -95,7 +95,7 @@ def test_a_signal_that_few_rows_of_the_run_hold_is_not_silent_in_the_others(
         recorder.publish(round(step * 0.1, 6), {"x": step, **late})
     recorder.end_run("finished")
     roll(empty, 100_000)
-    asked = resolve_range(empty, start_s=70.0, end_s=80.0)
+    asked = find_range(empty, Scope(start_s=70.0, end_s=80.0))
     assert find_events(empty, asked, EventOptions(kinds=("silent",))).events == ()
 
 
@@ -135,7 +135,7 @@ def calls(connection: sqlite3.Connection) -> int:
             return other.execute(query, asked).fetchone()[0]
 
         connection.create_function("json_extract", -1, json_extract)
-        asked = resolve_range(connection, last_s=1.0)
+        asked = find_range(connection, Scope(last_s=1.0))
         find_events(connection, asked)
         before = sys.getprofile()
         sys.setprofile(count)

@@ -15,7 +15,7 @@ from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows, views
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 
 
@@ -32,7 +32,7 @@ def record(
 
 def jumps(connection: sqlite3.Connection, **options: Any) -> list[Event]:
     asked = EventOptions(kinds=("jump",), **options)
-    return list(find_events(connection, resolve_range(connection), asked).events)
+    return list(find_events(connection, find_range(connection, Scope()), asked).events)
 
 
 def test_what_went_on_smoothly_during_a_gap_did_not_jump(
@@ -65,7 +65,7 @@ def test_a_heading_that_goes_over_the_end_of_its_scale_does_not_jump(
 
 def test_a_signal_that_the_asker_names_is_searched_for_swings(empty: sqlite3.Connection) -> None:
     record(empty, lambda t: {"sensors": {"front": math.sin(math.pi * t)}})
-    whole = resolve_range(empty)
+    whole = find_range(empty, Scope())
     unasked = find_events(empty, whole, EventOptions(kinds=("oscillation",)))
     asked = EventOptions(kinds=("oscillation",), signals=("sensors.front",))
     assert unasked.events == ()
@@ -85,7 +85,7 @@ def test_a_jump_exactly_at_the_begin_of_a_range_is_in_it(
 ) -> None:
     record(empty, lambda t: {"temp_c": 20 + 0.01 * t + (50 if t >= 100 else 0)})
     for start_s, end_s, count in ((100.0, 150.0, 1), (50.0, 100.0, 0), (99.9, 100.0, 0)):
-        asked = resolve_range(empty, start_s=start_s, end_s=end_s)
+        asked = find_range(empty, Scope(start_s=start_s, end_s=end_s))
         assert len(find_events(empty, asked, EventOptions(kinds=("jump",))).events) == count
 
 
@@ -103,7 +103,7 @@ def test_what_of_a_long_range_is_too_much_to_be_read_for_jumps_is_told(
     monkeypatch.setattr(rows, "RAW_ROWS", 100)
     monkeypatch.setattr(views, "JUMP_ROWS", 500)
     record(empty, lambda t: {"front": 0.0 if round(10 * t) % 70 == 33 else 2 + 0.1 * math.sin(t)})
-    answer = find_events(empty, resolve_range(empty), EventOptions(kinds=("jump",)))
+    answer = find_events(empty, find_range(empty, Scope()), EventOptions(kinds=("jump",)))
     assert "only in 5 of 20 stretches of 10 s" in answer.verdicts.not_searched["jump"]
 
 
@@ -149,9 +149,9 @@ def test_which_beam_is_the_shortest_neither_jumps_nor_freezes(
 
     record(empty, scans)
     asked = EventOptions(kinds=("jump", "flat"))
-    assert find_events(empty, resolve_range(empty), asked).events == ()
+    assert find_events(empty, find_range(empty, Scope()), asked).events == ()
     asked = EventOptions(kinds=("jump", "flat"), signals=("lidar.argmin",))
-    found = find_events(empty, resolve_range(empty), asked).verdicts.not_searched
+    found = find_events(empty, find_range(empty, Scope()), asked).verdicts.not_searched
     assert all("leaps and rests by nature" in found[kind] for kind in ("jump", "flat"))
 
 

@@ -20,7 +20,7 @@ from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows, views
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals
 
@@ -48,7 +48,9 @@ def state(time_s: float) -> dict[str, Any]:
 
 
 def test_swings_and_leaps_are_searched_in_the_whole_of_a_long_run(long: sqlite3.Connection) -> None:
-    found = find_events(long, resolve_range(long), EventOptions(kinds=("jump", "oscillation")))
+    found = find_events(
+        long, find_range(long, Scope()), EventOptions(kinds=("jump", "oscillation"))
+    )
     swings = [each for each in found.events if each.kind == "oscillation"]
     assert [(round(each.start_s), round(each.end_s)) for each in swings] == [(100, 130), (343, 355)]
     (leap,) = (each for each in found.events if each.kind == "jump")
@@ -74,7 +76,7 @@ def test_leaps_are_looked_for_only_where_the_rollups_do_not_rule_them_out(
 
 def leaps(connection: sqlite3.Connection) -> list[tuple[float, Any]]:
     asked = EventOptions(kinds=("jump",), signals=("pose.*",))
-    found = find_events(connection, resolve_range(connection), asked, limit=1000, group=False)
+    found = find_events(connection, find_range(connection, Scope()), asked, limit=1000, group=False)
     return [(each.start_s, each.details["distance_m"]) for each in found.events]
 
 
@@ -116,7 +118,7 @@ def reads(connection: sqlite3.Connection, *kinds: str) -> int:
     """How many statements read values of rows."""
     statements: list[str] = []
     connection.set_trace_callback(statements.append)
-    find_events(connection, resolve_range(connection), EventOptions(kinds=kinds))
+    find_events(connection, find_range(connection, Scope()), EventOptions(kinds=kinds))
     connection.set_trace_callback(None)
     return sum(
         "json_extract(data" in each and "ORDER BY sim_time_s, row_id" in each for each in statements
@@ -125,7 +127,7 @@ def reads(connection: sqlite3.Connection, *kinds: str) -> int:
 
 def test_what_there_was_no_time_for_is_told_by_time(long: sqlite3.Connection) -> None:
     ticks = count()
-    asked = resolve_range(long)
+    asked = find_range(long, Scope())
     options, ledger = EventOptions(kinds=("oscillation",), signals=("steering",)), Ledger()
     kinds, deadline = asked_kinds(options), Deadline(9.0, lambda: next(ticks))
     detection = Detection(long, known_signals(long, asked), kinds, options, deadline, ledger)
@@ -133,7 +135,7 @@ def test_what_there_was_no_time_for_is_told_by_time(long: sqlite3.Connection) ->
     why = ledger.verdicts(kinds, found).not_searched["oscillation"]
     until_s = float(why.rpartition("ask end_s=")[2])
     assert 100 < until_s < 500
-    rest = resolve_range(long, end_s=until_s)
+    rest = find_range(long, Scope(end_s=until_s))
     assert find_events(long, rest, options).events[0].start_s == pytest.approx(100, abs=0.5)
 
 
@@ -142,7 +144,7 @@ def test_standstills_take_no_time_from_kinds_that_cost_less(long: sqlite3.Connec
     late: list[str] = []
     options = EventOptions(kinds=("still", "stuck", "silent", "flat", "jump", "oscillation"))
     kinds, deadline = asked_kinds(options), Deadline(6.0, lambda: 100.0 * len(late))
-    asked, ledger = resolve_range(long), Ledger()
+    asked, ledger = find_range(long, Scope()), Ledger()
     detection = Detection(long, known_signals(long, asked), kinds, options, deadline, ledger)
     long.set_trace_callback(lambda each: late.append(each) if "RECURSIVE tick" in each else None)
     found = detection.events_touching(asked.segments[0])
@@ -169,7 +171,7 @@ def test_where_the_robot_stood_it_is_told_as_stuck_too_though_the_time_is_over_b
             EventOptions(kinds=kinds),
             Deadline(1.0, lambda: len(statements) / enough),
         )
-        asked = resolve_range(empty)
+        asked = find_range(empty, Scope())
         known = known_signals(empty, asked)
         detection = Detection(empty, known, asked_kinds(options), options, deadline, Ledger())
         return [each.kind for each in detection.events_touching(asked.segments[0])]
@@ -204,7 +206,7 @@ def test_the_position_of_a_run_is_the_one_that_it_published(empty: sqlite3.Conne
     roll(empty, 100_000)
     for run_id in (1, 2):
         found = find_events(
-            empty, resolve_range(empty, run_id=run_id), EventOptions(kinds=("still",))
+            empty, find_range(empty, Scope(run_id=run_id)), EventOptions(kinds=("still",))
         )
         assert [round(each.start_s) for each in found.events] == [20], run_id
 
@@ -228,7 +230,7 @@ def stopping(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqli
 def test_standstills_of_a_long_run_that_are_told_begin_and_end_to_the_row(
     stopping: sqlite3.Connection,
 ) -> None:
-    asked, options = resolve_range(stopping), EventOptions(kinds=("still",))
+    asked, options = find_range(stopping, Scope()), EventOptions(kinds=("still",))
     found = find_events(stopping, asked, options, limit=3)
     assert found.totals == {"still": 10}
     ends = [(each.start_s, each.end_s) for each in found.events]
@@ -244,7 +246,7 @@ def test_no_rows_are_read_for_the_ends_of_rests_that_the_rollups_tell(
 ) -> None:
     def flat() -> list[tuple[float, float]]:
         asked = EventOptions(kinds=("flat",), signals=("ticks",))
-        found = find_events(stopping, resolve_range(stopping), asked, group=False)
+        found = find_events(stopping, find_range(stopping, Scope()), asked, group=False)
         return [(each.start_s, each.end_s) for each in found.events]
 
     told, few = flat(), reads(stopping, "flat")

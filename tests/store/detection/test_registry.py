@@ -20,7 +20,7 @@ from webots_mcp.store.detection.search import Search
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.timeline import timeline
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 
 
 def tilted(search: Search) -> Iterator[Event]:
@@ -49,7 +49,7 @@ def tilting(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlit
 def test_a_kind_that_is_entered_once_is_found_compared_told_and_drawn(
     tilting: sqlite3.Connection,
 ) -> None:
-    whole = resolve_range(tilting)
+    whole = find_range(tilting, Scope())
     assert find_events(tilting, whole).verdicts.found["tilted"] == 2
     assert timeline(tilting, whole).verdicts.found["tilted"] == 2
     (measure,) = (

@@ -15,7 +15,7 @@ from webots_mcp.errors import UnknownSignalError
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals, list_signals, resolve_signals
 
@@ -33,7 +33,9 @@ def record(connection: sqlite3.Connection, state: State, *, until_s: float = 120
 
 
 def ask(connection: sqlite3.Connection, kind: str, **bounds: Any) -> Events:
-    return find_events(connection, resolve_range(connection, **bounds), EventOptions(kinds=(kind,)))
+    return find_events(
+        connection, find_range(connection, Scope(**bounds)), EventOptions(kinds=(kind,))
+    )
 
 
 def told(events: Events) -> list[tuple[str | None, float, float]]:
@@ -60,13 +62,13 @@ def test_a_scalar_null_is_the_missing_value_of_what_comes_below_it(
     empty: sqlite3.Connection, tier: str
 ) -> None:
     record(empty, waking)
-    known = known_signals(empty, resolve_range(empty))
+    known = known_signals(empty, find_range(empty, Scope()))
     assert [s.name for s in resolve_signals(known, ["lidar"])] == [
         "lidar.count", "lidar.min", "lidar.max", "lidar.mean", "lidar.argmin",
     ]  # fmt: skip
     assert "lidar" not in [signal.name for signal in list_signals(empty).signals]
     assert told(ask(empty, "silent")) == []
-    assert trends(empty, resolve_range(empty)).runs[0].silent == ()
+    assert trends(empty, find_range(empty, Scope())).runs[0].silent == ()
 
 
 def test_a_lidar_that_dies_is_silent_once(empty: sqlite3.Connection, tier: str) -> None:
@@ -104,9 +106,9 @@ def test_a_signal_that_never_had_a_value_is_not_said_to_be_silent_for_good(
 ) -> None:
     record(empty, lambda t: {"front": None, "x": t})
     assert told(ask(empty, "silent")) == []
-    assert trends(empty, resolve_range(empty)).runs[0].silent == ("front",)
+    assert trends(empty, find_range(empty, Scope())).runs[0].silent == ("front",)
     with pytest.raises(UnknownSignalError):
-        resolve_signals(known_signals(empty, resolve_range(empty)), ["frount"])
+        resolve_signals(known_signals(empty, find_range(empty, Scope())), ["frount"])
 
 
 def test_many_silences_are_one_event(empty: sqlite3.Connection) -> None:

@@ -13,7 +13,7 @@ import pytest
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import Events, find_events
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 
 OPTIONS = EventOptions(kinds=("still", "stuck"))
@@ -32,7 +32,7 @@ def ask(
         recorder.publish(round(step * interval_s, 6), state(step * interval_s))
     connection.execute("COMMIT")
     roll(connection, 100_000)
-    return find_events(connection, resolve_range(connection), OPTIONS)
+    return find_events(connection, find_range(connection, Scope()), OPTIONS)
 
 
 def flight(time_s: float) -> dict[str, Any]:
@@ -125,7 +125,7 @@ def test_who_stands_while_rows_come_seldom_stands(empty: sqlite3.Connection) -> 
     times = [0.032 * step for step in range(1000)] + [32.0 + 0.5 * step for step in range(60)]
     for time_s in times:
         recorder.publish(time_s, {"pose": [0.2 * min(time_s, 32.0), 0.0]})
-    (still,) = find_events(empty, resolve_range(empty), OPTIONS).events
+    (still,) = find_events(empty, find_range(empty, Scope()), OPTIONS).events
     assert (still.start_s, still.end_s) == (32.0, 61.5)
 
 

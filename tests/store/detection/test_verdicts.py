@@ -9,7 +9,7 @@ from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 
 
 def ask(connection: sqlite3.Connection, rows: int, *kinds: str) -> Verdicts:
@@ -19,7 +19,9 @@ def ask(connection: sqlite3.Connection, rows: int, *kinds: str) -> Verdicts:
         time_s = row / 10
         state = {"pose": [0.2 * time_s, 0.0], "heading": 0.0, "temp_c": math.sin(time_s)}
         recorder.publish(time_s, state)
-    return find_events(connection, resolve_range(connection), EventOptions(kinds=kinds)).verdicts
+    return find_events(
+        connection, find_range(connection, Scope()), EventOptions(kinds=kinds)
+    ).verdicts
 
 
 def test_what_no_run_so_short_can_hold_was_not_searched(empty: sqlite3.Connection) -> None:

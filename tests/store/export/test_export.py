@@ -24,7 +24,7 @@ from tests.recordings.rover import Recorder, start_run
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.export import FORMATS, export, export_file, format_of
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 
 HEAD = ["run_id", "state_id", "sim_time_s", "wall_time_s"]
 
@@ -50,7 +50,7 @@ def publish(recorder: Recorder, time_s: float, state: dict[str, Any]) -> None:
 
 def exported(connection: sqlite3.Connection, form: str, **wanted: Any) -> bytes:
     sink = io.BytesIO()
-    export(connection, resolve_range(connection, **wanted), form, sink)
+    export(connection, find_range(connection, Scope(**wanted)), form, sink)
     return sink.getvalue()
 
 
@@ -226,7 +226,7 @@ def test_cells_that_a_spreadsheet_would_run_are_made_harmless_on_request(
     recorder: Recorder,
 ) -> None:
     recorder.publish(0.0, {"=name": "=1+1", "a": "@x", "b": "+x", "c": "-x", "n": -1.5, "t": "x=1"})
-    wanted = resolve_range(recorder.connection, run_id=1)
+    wanted = find_range(recorder.connection, Scope(run_id=1))
     found: list[list[str]] = []
     for safe in (False, True):
         sink = io.BytesIO()
@@ -242,7 +242,7 @@ def test_cells_that_a_spreadsheet_would_run_are_made_harmless_on_request(
 def test_an_exported_file_is_its_owners_alone(recorder: Recorder, tmp_path: Path) -> None:
     recorder.publish(0.0, {"x": 1})
     file = tmp_path / "rows.csv"
-    export_file(recorder.connection, resolve_range(recorder.connection, run_id=1), "csv", file)
+    export_file(recorder.connection, find_range(recorder.connection, Scope(run_id=1)), "csv", file)
     assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
 
@@ -289,7 +289,7 @@ def test_rows_of_a_paused_simulation_share_their_time_and_all_come(recorder: Rec
 def test_rows_that_come_during_the_export_are_left_for_the_next(recorder: Recorder) -> None:
     for i in range(3000):
         recorder.publish(float(i), {"x": i})
-    wanted = resolve_range(recorder.connection, start_s=0, end_s=1e9)
+    wanted = find_range(recorder.connection, Scope(start_s=0, end_s=1e9))
 
     def robot_goes_on(done: int, of: int) -> None:
         recorder.publish(5000.0 + done, {"late": done})
@@ -307,7 +307,7 @@ def test_progress_reaches_its_end(recorder: Recorder, form: str) -> None:
     for i in range(5000):
         recorder.publish(float(i), {"x": i})
     told: list[tuple[int, int]] = []
-    wanted = resolve_range(recorder.connection)
+    wanted = find_range(recorder.connection, Scope())
     export(
         recorder.connection, wanted, form, io.BytesIO(), lambda done, of: told.append((done, of))
     )
@@ -324,7 +324,7 @@ def test_memory_does_not_grow_with_the_recording(
     for rows in (300, 300, 1200):
         for i in range(rows):
             recorder.publish(float(i), {"text": "t" * 500})
-        wanted = resolve_range(recorder.connection)
+        wanted = find_range(recorder.connection, Scope())
         tracemalloc.start()
         with Path("/dev/null").open("wb") as sink:
             export(recorder.connection, wanted, form, sink)
@@ -339,7 +339,7 @@ def test_memory_does_not_grow_with_the_recording(
 def test_a_file_appears_when_it_is_complete(reader: sqlite3.Connection, tmp_path: Path) -> None:
     file = tmp_path / "run.csv"
     seen: list[bool] = []
-    wanted = resolve_range(reader, run_id=1)
+    wanted = find_range(reader, Scope(run_id=1))
     rows = export_file(reader, wanted, "csv", file, lambda done, of: seen.append(file.exists()))
     assert rows == 530
     assert not any(seen)
@@ -357,19 +357,19 @@ def test_an_export_that_fails_leaves_the_old_file_and_no_half_of_a_new_one(
         raise OSError("disk full")
 
     with pytest.raises(InvalidInputError, match="disk full"):
-        export_file(reader, resolve_range(reader), "csv", file, fail)
+        export_file(reader, find_range(reader, Scope()), "csv", file, fail)
     assert file.read_text() == "old"
     assert list(tmp_path.iterdir()) == [file]
 
 
 def test_a_folder_that_is_missing_is_named(reader: sqlite3.Connection, tmp_path: Path) -> None:
     with pytest.raises(InvalidInputError, match="missing"):
-        export_file(reader, resolve_range(reader), "csv", tmp_path / "missing" / "run.csv")
+        export_file(reader, find_range(reader, Scope()), "csv", tmp_path / "missing" / "run.csv")
 
 
 def test_an_unknown_format_is_told_what_there_is(reader: sqlite3.Connection) -> None:
     with pytest.raises(InvalidInputError, match="csv, jsonl, parquet"):
-        export(reader, resolve_range(reader), "xlsx", io.BytesIO())
+        export(reader, find_range(reader, Scope()), "xlsx", io.BytesIO())
 
 
 @pytest.mark.parametrize(

@@ -13,11 +13,11 @@ from tests.recordings.rover import Recorder, start_run
 from webots_mcp.errors import InvalidConditionError, InvalidInputError, UnknownSignalError
 from webots_mcp.store.detection.event import EventOptions, Threshold
 from webots_mcp.store.questions.events import Events, find_events
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 
 
 def ask(connection: sqlite3.Connection, where: str, **bounds: Any) -> Events:
-    found = resolve_range(connection, **(bounds or {"run_id": 1}))
+    found = find_range(connection, Scope(**(bounds or {"run_id": 1})))
     return find_events(connection, found, EventOptions(kinds=("condition",), where=where))
 
 
@@ -144,14 +144,14 @@ def test_a_wrong_question_is_refused_with_what_would_do(rover: sqlite3.Connectio
         ask(rover, "bmuper")
     with pytest.raises(InvalidInputError, match=r"the text 'cruise' < the number 3\? \(in run 1"):
         ask(rover, "mode < 3")
-    found = find_events(rover, resolve_range(rover), EventOptions(kinds=("condition",)))
+    found = find_events(rover, find_range(rover, Scope()), EventOptions(kinds=("condition",)))
     assert "give where" in found.verdicts.not_searched["condition"]
 
 
 def test_what_there_was_no_time_for_is_named_by_time(rover: sqlite3.Connection) -> None:
     found = find_events(
         rover,
-        resolve_range(rover, run_id=1),
+        find_range(rover, Scope(run_id=1)),
         EventOptions(kinds=("condition",), where="sensors.bumper"),
         deadline_s=0.0,
     )
@@ -174,7 +174,7 @@ def test_thresholds_are_a_short_form_of_a_condition(
     recorder = start_run(empty)
     for step, value in enumerate([*values, 1.0]):
         recorder.publish(step * 0.1, {"x": value})
-    whole = resolve_range(empty, run_id=recorder.run_id)
+    whole = find_range(empty, Scope(run_id=recorder.run_id))
     limit = Threshold("x", **{"above" if above else "below": 1.0}, for_s=for_s)
     short = find_events(empty, whole, EventOptions(kinds=("threshold",), thresholds=(limit,)))
     text = f"x {'>' if above else '<'} 1" + (f" for {for_s}" if for_s else "")

@@ -21,13 +21,13 @@ from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.signals.catalogue import known_signals
 
 
 def ask(connection: sqlite3.Connection, kind: Any, *, bounds: Any = None, **options: Any) -> Events:
     given: dict[str, Any] = bounds or {"run_id": 1}
-    found = resolve_range(connection, **given)
+    found = find_range(connection, Scope(**given))
     return find_events(connection, found, EventOptions(kinds=(kind,), **options), limit=200)
 
 
@@ -144,7 +144,7 @@ def test_runs_begin_and_end_in_wall_time(rover: sqlite3.Connection) -> None:
 
 
 def test_everything_at_once_is_in_order_and_counted(rover: sqlite3.Connection) -> None:
-    found = resolve_range(rover, run_id=1)
+    found = find_range(rover, Scope(run_id=1))
     events = find_events(rover, found, limit=200)
     walls = [event.wall_time_s for event in events.events]
     assert walls == sorted(walls)
@@ -153,7 +153,7 @@ def test_everything_at_once_is_in_order_and_counted(rover: sqlite3.Connection) -
 
 
 def test_a_limit_keeps_rare_kinds_and_says_what_is_left_out(rover: sqlite3.Connection) -> None:
-    found = resolve_range(rover, run_id=1)
+    found = find_range(rover, Scope(run_id=1))
     events = find_events(rover, found, limit=12)
     assert len(events.events) <= 12
     kinds = {event.kind for event in events.events}
@@ -182,9 +182,9 @@ def test_cursors_lead_through_all_that_was_left_out_while_more_is_recorded(
     empty: sqlite3.Connection, limit: int
 ) -> None:
     recorder = record_a_busy_run(empty)
-    whole = find_events(empty, resolve_range(empty), limit=1000).events
+    whole = find_events(empty, find_range(empty, Scope()), limit=1000).events
     found: list[Event] = []
-    page = find_events(empty, resolve_range(empty), limit=limit)
+    page = find_events(empty, find_range(empty, Scope()), limit=limit)
     while True:
         assert 0 < len(page.events) <= limit
         found += page.events
@@ -194,7 +194,7 @@ def test_cursors_lead_through_all_that_was_left_out_while_more_is_recorded(
         recorder.publish(time_s, {"lit": None, "mode": "c"})
         line = {"level": "error", "source": "controller", "message": "later"}
         recorder.insert("log", **recorder.at(time_s), **line)
-        page = find_events(empty, resolve_range(empty), limit=limit, after=page.cursor)
+        page = find_events(empty, find_range(empty, Scope()), limit=limit, after=page.cursor)
 
     def subject(event: Event) -> tuple[object, ...]:
         return event.kind, event.name, event.start_s
@@ -207,7 +207,7 @@ def test_what_happens_all_the_time_crowds_nothing_out_and_is_named_by_time(
     empty: sqlite3.Connection,
 ) -> None:
     record_a_busy_run(empty)
-    events = find_events(empty, resolve_range(empty), limit=6)
+    events = find_events(empty, find_range(empty, Scope()), limit=6)
     told = [(event.kind, event.name) for event in events.events]
     assert told.count(("log", "warning")) == 3 and told.count(("run", None)) == 1
     changes = events.left_out["change"]
@@ -217,18 +217,18 @@ def test_what_happens_all_the_time_crowds_nothing_out_and_is_named_by_time(
 
 def test_pictures_are_told_only_where_they_are_asked_for(empty: sqlite3.Connection) -> None:
     record_a_busy_run(empty)
-    assert "image" not in find_events(empty, resolve_range(empty)).totals
+    assert "image" not in find_events(empty, find_range(empty, Scope())).totals
     assert ask(empty, "image").totals == {"image": 200}
 
 
 def test_a_cursor_of_find_events_that_is_none_is_refused(rover: sqlite3.Connection) -> None:
     for wrong in ("x", "[]", "5", '{"log": 3}', '{"log": [1, 2]}', "null"):
         with pytest.raises(InvalidInputError, match="no cursor"):
-            find_events(rover, resolve_range(rover), after=wrong)
+            find_events(rover, find_range(rover, Scope()), after=wrong)
 
 
 def test_what_there_was_no_time_for_is_named(rover: sqlite3.Connection, tier: str) -> None:
-    found = resolve_range(rover, run_id=1)
+    found = find_range(rover, Scope(run_id=1))
     told = find_events(rover, found, deadline_s=0.0)
     assert not told.events and not told.verdicts.absent and not told.verdicts.found
     for kind in asked_kinds(EventOptions()):
@@ -239,7 +239,7 @@ def test_between_two_signals_the_time_is_looked_at(
     rover: sqlite3.Connection,
 ) -> None:
     ticks = count()
-    time_range = resolve_range(rover, run_id=1)
+    time_range = find_range(rover, Scope(run_id=1))
     options, ledger = EventOptions(kinds=("jump",)), Ledger()
     kinds = asked_kinds(options)
     deadline = Deadline(12.0, lambda: next(ticks))
@@ -251,7 +251,7 @@ def test_between_two_signals_the_time_is_looked_at(
 
 
 def test_a_run_that_is_only_cruising_has_no_trouble(rover: sqlite3.Connection) -> None:
-    found = resolve_range(rover, run_id=3)
+    found = find_range(rover, Scope(run_id=3))
     events = find_events(rover, found, limit=200)
     assert {event.kind for event in events.events} == {"run"}
 

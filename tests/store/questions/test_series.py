@@ -12,12 +12,12 @@ from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.questions.series import NumberColumns, query_history
 from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 
 
 def ask(connection: sqlite3.Connection, *names: str, max_points: int = 50, **bounds: Any):
-    found = resolve_range(connection, run_id=1, **bounds)
+    found = find_range(connection, Scope(run_id=1, **bounds))
     (run,) = query_history(connection, found, names, max_points=max_points).runs
     return run
 
@@ -123,20 +123,20 @@ def test_rows_and_rollups_give_the_same_whole(rover: sqlite3.Connection, tier: s
 
 
 def test_a_wall_range_gives_each_run_its_part(rover: sqlite3.Connection) -> None:
-    found = resolve_range(rover, since=1_700_000_050.0, until=1_700_000_070.0)
+    found = find_range(rover, Scope(since=1_700_000_050.0, until=1_700_000_070.0))
     answer = query_history(rover, found, ["battery_v"], max_points=20)
     assert [run.run_id for run in answer.runs] == [1, 2]
     assert sum(len(run.sim_time_s) for run in answer.runs) <= 20
 
 
 def test_a_deadline_that_passed_is_admitted(rover: sqlite3.Connection) -> None:
-    found = resolve_range(rover, run_id=1)
+    found = find_range(rover, Scope(run_id=1))
     (run,) = query_history(rover, found, ["lidar.min"], deadline_s=0.0).runs
     assert run.cut_at_s is not None
 
 
 def test_pages_hold_every_row_once(rover: sqlite3.Connection) -> None:
-    found = resolve_range(rover, run_id=1, start_s=5.0, end_s=40.0)
+    found = find_range(rover, Scope(run_id=1, start_s=5.0, end_s=40.0))
     cursor, ids, xs = 0, list[int](), list[Any]()
     while True:
         page = query_rows(rover, found, ["pose.0"], limit=99, after_id=cursor)
@@ -150,7 +150,7 @@ def test_pages_hold_every_row_once(rover: sqlite3.Connection) -> None:
 
 
 def test_absurd_questions_are_refused(rover: sqlite3.Connection) -> None:
-    found = resolve_range(rover, run_id=1)
+    found = find_range(rover, Scope(run_id=1))
     for max_points in (0, -1, 501, 10**9):
         with pytest.raises(InvalidInputError, match="max_points"):
             query_history(rover, found, ["ir"], max_points=max_points)
@@ -177,7 +177,7 @@ def test_integers_beyond_64_bits_stay_what_they_are_in_rows(empty: sqlite3.Conne
     recorder = start_run(empty)
     for step, number in enumerate(numbers):
         recorder.publish(float(step), {"ticks": number})
-    assert list(query_rows(empty, resolve_range(empty), ["ticks"]).values["ticks"]) == numbers
+    assert list(query_rows(empty, find_range(empty, Scope()), ["ticks"]).values["ticks"]) == numbers
 
 
 @pytest.mark.parametrize(("name", "turn"), [("heading_deg", 360.0), ("yaw", math.tau)])

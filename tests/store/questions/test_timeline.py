@@ -10,11 +10,11 @@ from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.questions.timeline import timeline
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 
 
 def test_the_timeline_merges_all_sources_in_order(rover: sqlite3.Connection) -> None:
-    answer = timeline(rover, resolve_range(rover, run_id=1))
+    answer = timeline(rover, find_range(rover, Scope(run_id=1)))
     told = [(event.kind, round(event.start_s, 1)) for event in answer.events]
     assert told == [
         ("run", 0.0), ("log", 10.0), ("command", 20.0), ("image", 30.0), ("change", 40.0),
@@ -26,7 +26,7 @@ def test_the_timeline_merges_all_sources_in_order(rover: sqlite3.Connection) -> 
 
 @pytest.mark.parametrize("limit", [1, 3, 7])
 def test_pages_hold_every_event_once(rover: sqlite3.Connection, limit: int) -> None:
-    span = resolve_range(rover, since=WALL_START_S, until=WALL_START_S + 1000)
+    span = find_range(rover, Scope(since=WALL_START_S, until=WALL_START_S + 1000))
     whole = timeline(rover, span).events
     found: list[Event] = []
     cursor = None
@@ -43,7 +43,7 @@ def test_pages_hold_every_event_once(rover: sqlite3.Connection, limit: int) -> N
 def test_a_cursor_that_is_none_is_refused(rover: sqlite3.Connection) -> None:
     for wrong in ("x", "[]", "5", "[1, 2]", "null"):
         with pytest.raises(InvalidInputError, match="cursor"):
-            timeline(rover, resolve_range(rover, run_id=1), after=wrong)
+            timeline(rover, find_range(rover, Scope(run_id=1)), after=wrong)
 
 
 def test_what_was_logged_after_the_last_row_is_told(empty: sqlite3.Connection) -> None:
@@ -51,7 +51,7 @@ def test_what_was_logged_after_the_last_row_is_told(empty: sqlite3.Connection) -
     recorder.publish(1.0, {"x": 1})
     recorder.insert("log", **recorder.at(1.5), level="error", source="controller", message="bye")
     empty.execute("UPDATE run SET ended_wall_time_s = 2e9, last_sim_time_s = 1.6")
-    whole = timeline(empty, resolve_range(empty)).events
+    whole = timeline(empty, find_range(empty, Scope())).events
     assert [event.kind for event in whole] == ["run", "log", "run"]
-    closed = timeline(empty, resolve_range(empty, start_s=0.5, end_s=1.2)).events
+    closed = timeline(empty, find_range(empty, Scope(start_s=0.5, end_s=1.2))).events
     assert closed == ()

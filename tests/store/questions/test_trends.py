@@ -14,14 +14,14 @@ import pytest
 from tests.recordings.rover import start_run
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, trends
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 
 Course = Callable[[float], float | None]  # from the time; None leaves the key out
 
 
 def ask(connection: sqlite3.Connection, *names: str, **bounds: Any) -> RunTrends:
-    found = resolve_range(connection, run_id=1, **bounds)
+    found = find_range(connection, Scope(run_id=1, **bounds))
     return trends(connection, found, names or ("*",)).runs[0]
 
 
@@ -89,7 +89,7 @@ def test_a_swing_faster_than_the_rollups_gets_no_period_of_an_alias(
         return math.remainder(math.pi + 0.5 * math.sin(3 * time_s), 2 * math.pi)
 
     record(empty, rows=4000, interval_s=0.1, sine=math.sin, yaw=yaw)
-    (note,) = trends(empty, resolve_range(empty, run_id=1)).notes
+    (note,) = trends(empty, find_range(empty, Scope(run_id=1))).notes
     assert "swings shorter than 80 s were not looked for" in note
     for name in ("sine", "yaw"):
         trend = one(empty, name)
@@ -243,7 +243,7 @@ def test_what_stepped_from_one_rest_to_another_is_flat_since_the_step(
         time_s = row / 10
         recorder.publish(time_s, {"x": min(time_s, 40.0) + step * (time_s >= 70.3)})
     roll(empty, 100_000)
-    (x,) = trends(empty, resolve_range(empty)).runs[0].numbers
+    (x,) = trends(empty, find_range(empty, Scope())).runs[0].numbers
     assert x.flat_since_s == 70.3
 
 

@@ -18,7 +18,7 @@ from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.timeline import timeline
 from webots_mcp.store.reading.moments import moment_of, shown_time
 from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import Scope, resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.window import window_of
 
@@ -53,14 +53,14 @@ def clock(request: pytest.FixtureRequest) -> Iterator[sqlite3.Connection]:
 
 
 def rows_of(connection: sqlite3.Connection, **bounds: Any) -> list[int]:
-    found = query_rows(connection, resolve_range(connection, **bounds), ["row"], limit=1000)
+    found = query_rows(connection, find_range(connection, Scope(**bounds)), ["row"], limit=1000)
     return [int(str(value)) for value in found.values["row"]]
 
 
 def happened(connection: sqlite3.Connection, **bounds: Any) -> list[Event]:
     options = EventOptions(kinds=("change", "log", "run"))
     return list(
-        find_events(connection, resolve_range(connection, **bounds), options, limit=9999).events
+        find_events(connection, find_range(connection, Scope(**bounds)), options, limit=9999).events
     )
 
 
@@ -97,7 +97,7 @@ def test_a_shown_time_finds_its_row_and_no_other_within_the_millisecond(
 
 def test_a_change_at_the_start_of_a_range_is_in_it(clock: sqlite3.Connection) -> None:
     shown_s = shown_time(TIMES[70])
-    whole = resolve_range(clock, start_s=shown_s, end_s=shown_s + 0.1)
+    whole = find_range(clock, Scope(start_s=shown_s, end_s=shown_s + 0.1))
     for found in (
         find_events(clock, whole, EventOptions(kinds=("change",))).events,
         timeline(clock, whole, EventOptions(kinds=("change",))).events,
@@ -121,8 +121,8 @@ def test_log_lines_are_bounded_as_rows_are() -> None:
 def test_a_range_that_begins_with_the_first_row_is_within_the_recording(
     clock: sqlite3.Connection,
 ) -> None:
-    assert resolve_range(clock, start_s=0.0).notes == ()
-    assert "begins at 0 s" in resolve_range(clock, start_s=-0.001).notes[0]
+    assert find_range(clock, Scope(start_s=0.0)).notes == ()
+    assert "begins at 0 s" in find_range(clock, Scope(start_s=-0.001)).notes[0]
 
 
 @pytest.mark.parametrize(("first", "last"), [(0, 1), (1, 2), (0, 2)])
@@ -130,7 +130,7 @@ def test_summaries_of_whole_buckets_hold_the_rows_that_are_shown_in_them(
     clock: sqlite3.Connection, first: int, last: int
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        whole = resolve_range(clock, start_s=10.0 * first, end_s=10.0 * last)
+        whole = find_range(clock, Scope(start_s=10.0 * first, end_s=10.0 * last))
         from_rows = query_history(clock, whole, ["row"], max_points=1)
         patch.setattr("webots_mcp.store.reading.rows.RAW_ROWS", 100)
         from_rollups = query_history(clock, whole, ["row"], max_points=1)

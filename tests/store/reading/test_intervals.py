@@ -15,7 +15,7 @@ from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows as columns
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 
 Spans = list[tuple[str | None, float, float]]
@@ -34,7 +34,11 @@ def record(
 
 def spans(connection: sqlite3.Connection, **options: Any) -> Spans:
     found = find_events(
-        connection, resolve_range(connection), EventOptions(**options), limit=10_000, around=()
+        connection,
+        find_range(connection, Scope()),
+        EventOptions(**options),
+        limit=10_000,
+        around=(),
     )
     return sorted((each.name, each.start_s, each.end_s) for each in found.events)
 

@@ -22,7 +22,7 @@ from webots_mcp.store.questions.events import EventOptions, find_events
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import TimeRange, resolve_range
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.states import newest_state
 
@@ -81,7 +81,7 @@ def ranges(
 ) -> list[TimeRange]:
     """Of the throttled robot, and the same of the one with all rows."""
     return [
-        resolve_range(connection, robot=robot, start_s=start_s, end_s=end_s)
+        find_range(connection, Scope(robot=robot, start_s=start_s, end_s=end_s))
         for robot in ("throttled", "every")
     ]
 
@@ -136,7 +136,7 @@ def test_calls_of_one_step_come_each_once_wherever_a_page_ends() -> None:
             for limit in range(1, 8):
                 found, cursor = list[object](), 0
                 while cursor is not None:
-                    whole = resolve_range(connection)
+                    whole = find_range(connection, Scope())
                     page = query_rows(connection, whole, ["n"], limit=limit, after_id=cursor)
                     found += page.values["n"]
                     cursor = page.cursor
@@ -168,7 +168,7 @@ def test_what_was_not_written_of_a_stretch_before_a_kill_is_not_told_as_kept(
     assert subprocess.run(line, check=False).returncode == -signal.SIGKILL
     with closing(connect(tmp_path / DATABASE_NAME, "writer")) as connection:
         for robot in ("left", "right"):
-            whole = resolve_range(connection, robot=robot)
+            whole = find_range(connection, Scope(robot=robot))
             (note,) = [note for note in whole.notes if "full rate" in note]
             (run_id,) = [segment.run_id for segment in whole.segments]
             sql = (
@@ -178,10 +178,10 @@ def test_what_was_not_written_of_a_stretch_before_a_kill_is_not_told_as_kept(
             assert 0 < rows < 300
             assert f"-{last_s:.3f} s" in note
             assert f"rows after {last_s:.3f} s are not written" in note
-            written = resolve_range(connection, robot=robot, start_s=first_s, end_s=last_s)
+            written = find_range(connection, Scope(robot=robot, start_s=first_s, end_s=last_s))
             numbers = query_rows(connection, written, ["n"], limit=1000).values["n"]
             assert numbers == list(range(int(numbers[0] or 0), int(numbers[-1] or 0) + 1))
-            rest = resolve_range(connection, robot=robot, start_s=last_s + STEP_MS / 1000)
+            rest = find_range(connection, Scope(robot=robot, start_s=last_s + STEP_MS / 1000))
             assert not rest.segments[0].full_rate
 
 
@@ -196,8 +196,8 @@ def test_a_range_that_is_wider_than_a_stretch_says_how_to_use_each_call(
     connection: sqlite3.Connection,
 ) -> None:
     start_s, end_s = stretch(connection)
-    wide = resolve_range(connection, robot="throttled", start_s=start_s - 5, end_s=end_s)
-    inside = resolve_range(connection, robot="throttled", start_s=start_s + 1, end_s=end_s - 1)
+    wide = find_range(connection, Scope(robot="throttled", start_s=start_s - 5, end_s=end_s))
+    inside = find_range(connection, Scope(robot="throttled", start_s=start_s + 1, end_s=end_s - 1))
     assert any("ask for a part of it alone to use each call" in note for note in wide.notes)
     assert not any("each call" in note for note in inside.notes)
 
@@ -266,7 +266,10 @@ def test_the_newest_state_and_the_end_of_a_crashed_run_are_those_of_its_last_cal
     assert segment.end_s > state.sim_time_s
     last = stretch(connection, 1)
     page = query_rows(
-        connection, resolve_range(connection, robot="throttled", start_s=last[0]), ["n"], limit=1000
+        connection,
+        find_range(connection, Scope(robot="throttled", start_s=last[0])),
+        ["n"],
+        limit=1000,
     )
     assert page.values["n"][-1] == LAST
     assert page.values["n"] == list(range(LAST + 1 - len(page.ids), LAST + 1))
@@ -304,7 +307,7 @@ def test_a_mean_that_leans_towards_the_hits_of_a_breakpoint_is_told(
                 robot.step(STEP_MS)
                 bridge.publish({"v": 1.0 if number % every else 10.0})
         with closing(connect(database, "writer")) as connection:
-            whole = resolve_range(connection)
+            whole = find_range(connection, Scope())
             mean = (
                 query_history(connection, whole, ["v"], max_points=1).runs[0].numbers[0].whole.mean
             )

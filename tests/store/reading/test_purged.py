@@ -12,13 +12,13 @@ from webots_mcp.store.analysis.spread import Spread
 from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.series import RunHistory, query_history
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention, prune
 from webots_mcp.store.rollup.rolling import roll
 
 
 def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:
-    wanted = resolve_range(connection, run_id=1, start_s=start_s)
+    wanted = find_range(connection, Scope(run_id=1, start_s=start_s))
     return query_history(connection, wanted, ["pose.0", "mode"], max_points=12).runs[0]
 
 
@@ -64,16 +64,16 @@ def test_a_range_that_begins_before_the_first_row_left_says_so(
     rover: sqlite3.Connection, tmp_path: Path
 ) -> None:
     keep_rows(rover, tmp_path, 1500)
-    (note,) = resolve_range(rover, run_id=1).notes
+    (note,) = find_range(rover, Scope(run_id=1)).notes
     assert "rows of run 1 before 55 s were purged" in note and "10 s summaries" in note
-    assert resolve_range(rover, run_id=1, start_s=60.0).notes == ()
-    assert "were purged" in resolve_range(rover, run_id=1, start_s=10.0, end_s=20.0).notes[0]
+    assert find_range(rover, Scope(run_id=1, start_s=60.0)).notes == ()
+    assert "were purged" in find_range(rover, Scope(run_id=1, start_s=10.0, end_s=20.0)).notes[0]
 
 
 def test_wall_time_reaches_into_what_was_purged(rover: sqlite3.Connection, tmp_path: Path) -> None:
     keep_rows(rover, tmp_path, 1500)
     start, end = WALL_START_S + 10, WALL_START_S + 40
-    found = resolve_range(rover, run_id=1, since=start, until=end)
+    found = find_range(rover, Scope(run_id=1, since=start, until=end))
     (segment,) = found.segments
     assert (segment.start_s, segment.end_s) == (
         pytest.approx(20, abs=0.2), pytest.approx(80, abs=0.2),
@@ -87,11 +87,11 @@ def test_a_run_of_which_only_rollups_are_left_is_found_by_wall_time(
     rover: sqlite3.Connection, tmp_path: Path
 ) -> None:
     keep_rows(rover, tmp_path, 900)
-    found = resolve_range(rover, since=WALL_START_S, until=WALL_START_S + 30)
+    found = find_range(rover, Scope(since=WALL_START_S, until=WALL_START_S + 30))
     assert [segment.run_id for segment in found.segments] == [1]
     assert found.segments[0].end_s == pytest.approx(60, abs=0.2)
     assert "the rows of run 1 were purged" in found.notes[0]
-    whole = resolve_range(rover, run_id=1, since=WALL_START_S - 9)
+    whole = find_range(rover, Scope(run_id=1, since=WALL_START_S - 9))
     (run,) = query_history(rover, whole, ["pose.0"]).runs
     assert run.rows == 1150
 
@@ -100,7 +100,7 @@ def test_where_rows_were_purged_events_do_not_claim_to_have_looked_at_them(
     rover: sqlite3.Connection, tmp_path: Path
 ) -> None:
     keep_rows(rover, tmp_path, 1500)
-    told = find_events(rover, resolve_range(rover, run_id=1)).verdicts.not_searched
+    told = find_events(rover, find_range(rover, Scope(run_id=1))).verdicts.not_searched
     for kind in ("still", "stuck", "jump", "oscillation"):
         assert "not before 55.000 s, whose rows were purged" in told[kind], kind
     assert "not those of less than 20 s before 55.000 s" in told["silent"]

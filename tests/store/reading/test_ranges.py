@@ -21,7 +21,7 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownRunError,
 )
-from webots_mcp.store.reading.ranges import Segment, resolve_range
+from webots_mcp.store.reading.ranges import Scope, Segment, find_range
 from webots_mcp.store.reading.wall_time import parse_wall_time
 
 IN_SEGMENT = (
@@ -37,7 +37,7 @@ def rows_in(connection: sqlite3.Connection, segment: Segment) -> list[int]:
 
 
 def test_without_bounds_a_range_is_the_whole_newest_run(rover: sqlite3.Connection) -> None:
-    found = resolve_range(rover)
+    found = find_range(rover, Scope())
     (segment,) = found.segments
     assert (found.robot, segment.run_id, segment.start_s) == ("rover", 3, 0.0)
     assert len(rows_in(rover, segment)) == 600
@@ -45,12 +45,12 @@ def test_without_bounds_a_range_is_the_whole_newest_run(rover: sqlite3.Connectio
 
 
 def test_the_end_is_not_in_the_range(rover: sqlite3.Connection) -> None:
-    (segment,) = resolve_range(rover, run_id=1, start_s=1.0, end_s=2.0).segments
+    (segment,) = find_range(rover, Scope(run_id=1, start_s=1.0, end_s=2.0)).segments
     assert len(rows_in(rover, segment)) == 10
 
 
 def test_seconds_back_hold_the_newest_row(rover: sqlite3.Connection) -> None:
-    (segment,) = resolve_range(rover, run_id=1, last_s=1.0).segments
+    (segment,) = find_range(rover, Scope(run_id=1, last_s=1.0)).segments
     assert segment.start_s == pytest.approx(118.9)
     assert len(rows_in(rover, segment)) == 11
 
@@ -67,17 +67,17 @@ def test_seconds_back_hold_the_newest_row(rover: sqlite3.Connection) -> None:
 def test_a_range_that_leaves_the_recording_says_so(
     rover: sqlite3.Connection, bounds: dict[str, Any], words: str
 ) -> None:
-    assert words in resolve_range(rover, run_id=1, **bounds).notes[0]
+    assert words in find_range(rover, Scope(run_id=1, **bounds)).notes[0]
 
 
 def test_more_seconds_back_than_a_run_has_lasted_name_the_run_before(
     rover: sqlite3.Connection,
 ) -> None:
-    asked = resolve_range(rover, run_id=2, last_s=60.0)
+    asked = find_range(rover, Scope(run_id=2, last_s=60.0))
     (told,) = asked.notes
-    assert asked.segments == resolve_range(rover, run_id=2).segments
+    assert asked.segments == find_range(rover, Scope(run_id=2)).segments
     assert "run 2 (begun by reset) has lasted for 29.9 s only" in told and "run 1" in told
-    assert "run 1" not in " ".join(resolve_range(rover, run_id=2, last_s=29.9).notes)
+    assert "run 1" not in " ".join(find_range(rover, Scope(run_id=2, last_s=29.9)).notes)
 
 
 @pytest.mark.parametrize(
@@ -98,12 +98,12 @@ def test_a_range_without_sense_is_refused_with_the_reason(
     rover: sqlite3.Connection, bounds: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(InvalidRangeError, match=words):
-        resolve_range(rover, run_id=1, **bounds)
+        find_range(rover, Scope(run_id=1, **bounds))
 
 
 def test_wall_time_reaches_across_runs(rover: sqlite3.Connection) -> None:
     start, end = WALL_START_S + 50, WALL_START_S + 65
-    found = resolve_range(rover, since=start, until=end)
+    found = find_range(rover, Scope(since=start, until=end))
     assert [segment.run_id for segment in found.segments] == [1, 2]
     first, second = found.segments
     assert first.start_s == pytest.approx(100.0)
@@ -120,7 +120,7 @@ def test_a_wall_range_holds_exactly_its_rows(
     paused: sqlite3.Connection, start: float, length: float
 ) -> None:
     walls = (WALL_START_S + start, WALL_START_S + start + length)
-    found = resolve_range(paused, since=walls[0], until=walls[1])
+    found = find_range(paused, Scope(since=walls[0], until=walls[1]))
     rows = [row for segment in found.segments for row in rows_in(paused, segment)]
     expected = paused.execute(
         "SELECT id FROM state WHERE wall_time_s >= ? AND wall_time_s < ?", walls
@@ -156,17 +156,17 @@ def test_what_was_never_recorded_is_named_as_such(
     rover: sqlite3.Connection, empty: sqlite3.Connection
 ) -> None:
     with pytest.raises(UnknownRobotError, match="rover"):
-        resolve_range(rover, robot="rovre")
+        find_range(rover, Scope(robot="rovre"))
     with pytest.raises(UnknownRunError, match="99"):
-        resolve_range(rover, run_id=99)
+        find_range(rover, Scope(run_id=99))
     with pytest.raises(NothingRecordedError):
-        resolve_range(empty)
+        find_range(empty, Scope())
     for name in ("a", "b"):
         start_run(empty, name)
     with pytest.raises(AmbiguousRobotError):
-        resolve_range(empty)
+        find_range(empty, Scope())
     with pytest.raises(NothingRecordedError, match="no state row"):
-        resolve_range(empty, robot="a")
+        find_range(empty, Scope(robot="a"))
 
 
 def test_a_wall_range_over_very_many_runs_takes_the_newest(empty: sqlite3.Connection) -> None:
@@ -176,14 +176,14 @@ def test_a_wall_range_over_very_many_runs_takes_the_newest(empty: sqlite3.Connec
     for _ in range(60):
         recorder.run(session_id, robot_id)
         recorder.publish(1.0, {"x": 1})
-    found = resolve_range(empty, since=0.0)
+    found = find_range(empty, Scope(since=0.0))
     assert [segment.run_id for segment in found.segments] == list(range(11, 61))
     assert "newest 50 runs" in found.notes[0]
 
 
 def test_a_range_within_a_recording_gap_says_what_is_missing(rover: sqlite3.Connection) -> None:
-    (note,) = resolve_range(rover, run_id=1, start_s=91.0, end_s=93.0).notes
+    (note,) = find_range(rover, Scope(run_id=1, start_s=91.0, end_s=93.0)).notes
     assert note == "no row: nothing was recorded between 89.9 and 95 s of run 1"
     start, end = WALL_START_S + 45.5, WALL_START_S + 46.5
-    found = resolve_range(rover, run_id=1, since=start, until=end)
+    found = find_range(rover, Scope(run_id=1, since=start, until=end))
     assert (found.segments, found.notes) == ((), ("no row of robot 'rover' in that wall time",))

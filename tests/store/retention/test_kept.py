@@ -13,7 +13,7 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.series import query_history
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention, plan, prune
 
 NONE = Limit(rows=0)
@@ -58,7 +58,7 @@ def test_they_stay_whole_where_all_states_go(
     start_s, end_s = connection.execute(
         "SELECT start_sim_time_s, end_sim_time_s + 0.001 FROM kept_stretch LIMIT 1"
     ).fetchone()
-    asked = resolve_range(connection, start_s=start_s, end_s=end_s)
+    asked = find_range(connection, Scope(start_s=start_s, end_s=end_s))
     (run,) = query_history(connection, asked, ["n"], max_points=500).runs
     assert run.rows == 438
     assert run.numbers[0].last == [float(n) for n in before[0]]

@@ -23,7 +23,7 @@ from webots_mcp.store.analysis.summary import Summary, merge, summarise
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.rollup.rolling import forget, roll, watermark
 from webots_mcp.store.rollup.tables import Addition, held, store
@@ -174,7 +174,7 @@ def test_a_batch_that_is_stored_in_part_is_finished_later_and_counted_once(tmp_p
         assert watermark(writer) == 0 and runs[0] == 30 and runs[2] == 0
         for _ in range(2):
             for run_id in (1, 2, 3):
-                (run,) = query_history(writer, resolve_range(writer, run_id=run_id), ["x"]).runs
+                (run,) = query_history(writer, find_range(writer, Scope(run_id=run_id)), ["x"]).runs
                 assert run.numbers[0].whole.present == 30
                 assert len(list_signals(writer, run_id=run_id).signals) == 2
             assert roll(writer).done
@@ -249,11 +249,11 @@ def test_an_integer_beyond_64_bits_stops_neither_the_rollups_nor_an_answer(
     if tier == "rollups":
         assert roll(empty, 100_000).done
     for name, present in (("hash", 200 * usable), ("x", 200), ("array.mean", 200 * usable)):
-        (run,) = query_history(empty, resolve_range(empty), [name], max_points=10).runs
+        (run,) = query_history(empty, find_range(empty, Scope()), [name], max_points=10).runs
         assert run.numbers[0].whole.present == present
     assert len(list_signals(empty).signals) == 7
-    trends(empty, resolve_range(empty))
-    query_rows(empty, resolve_range(empty), ["*"])
+    trends(empty, find_range(empty, Scope()))
+    query_rows(empty, find_range(empty, Scope()), ["*"])
 
 
 def test_a_row_that_cannot_be_stored_costs_itself_and_not_the_rollup(
@@ -318,7 +318,7 @@ def test_rows_that_are_rolled_up_during_an_answer_are_counted_once(
                 roll(writer, 300)
 
         with closing(connect(file, "reader")) as reader:
-            whole = resolve_range(reader, run_id=1)
+            whole = find_range(reader, Scope(run_id=1))
             reader.set_trace_callback(roll_in_between)
             for _ in range(4):
                 (run,) = query_history(reader, whole, ["battery_v", "mode"]).runs

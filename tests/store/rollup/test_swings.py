@@ -13,7 +13,7 @@ from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows, views
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention, prune
 from webots_mcp.store.rollup import swings
 from webots_mcp.store.rollup.rolling import roll
@@ -48,7 +48,7 @@ def state(time_s: float) -> dict[str, Any]:
 
 def swings_of(connection: sqlite3.Connection, **asked: Any) -> list[tuple[float, ...]]:
     options = EventOptions(kinds=("oscillation",), **asked)
-    found = find_events(connection, resolve_range(connection), options, deadline_s=60.0)
+    found = find_events(connection, find_range(connection, Scope()), options, deadline_s=60.0)
     assert "not before" not in found.verdicts.not_searched.get("oscillation", "")
     figures = ("period_s", "amplitude", "turns")
     return [

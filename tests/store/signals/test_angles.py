@@ -17,7 +17,7 @@ from webots_mcp.store.analysis.arrays import Array
 from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals
 
@@ -35,9 +35,9 @@ def test_the_third_item_of_a_planar_pose_is_an_angle(empty: sqlite3.Connection) 
     recorder = start_run(empty)
     for second in range(200):
         recorder.publish(float(second), turning(float(second)))
-    before = known_signals(empty, resolve_range(empty))
+    before = known_signals(empty, find_range(empty, Scope()))
     roll(empty, 100_000)
-    for known in (before, known_signals(empty, resolve_range(empty))):
+    for known in (before, known_signals(empty, find_range(empty, Scope()))):
         assert (known["pose.2"].kind, known["pose.2"].unit) == ("angle", "rad")
         assert known["arm.pose.2"].kind == "num"  # goes up to 10
         assert known["drone.pose.2"].kind == "num"  # of six items the third is z
@@ -55,7 +55,7 @@ def trend_of(connection: sqlite3.Connection, name: str, course: Callable[[float]
     for step in range(600):
         recorder.publish(step * 0.1, {name: course(step * 0.1)})
     roll(connection, 100_000)
-    return trends(connection, resolve_range(connection)).runs[0].numbers[0]
+    return trends(connection, find_range(connection, Scope())).runs[0].numbers[0]
 
 
 @pytest.mark.parametrize(("name", "turn"), [("heading", math.tau), ("heading_deg", 360.0)])

@@ -11,7 +11,7 @@ from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.naming import flatten
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
-from webots_mcp.store.reading.ranges import resolve_range
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.reading.subject import find_subject
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import catalogue, list_signals, resolve_signals
@@ -89,7 +89,7 @@ def test_whatever_a_key_is_called_it_is_a_signal(empty: sqlite3.Connection, roll
     assert {signal.name for signal in list_signals(empty).signals} == names
     for index, name in enumerate(STRANGE):
         for asked in (name, f"deep.{name}"):
-            page = query_rows(empty, resolve_range(empty), [asked], limit=2)
+            page = query_rows(empty, find_range(empty, Scope()), [asked], limit=2)
             assert page.values[asked] == [index, index + 1]
 
 
@@ -134,10 +134,10 @@ def test_a_signal_that_changes_its_kind_is_told_the_same_before_and_after_rollin
         kind = course[step * len(course) // 300]
         value = {"t": "word", "n": step // 50, "b": step % 100 < 50, "_": None}[kind]
         recorder.publish(step * 0.1, {"x": step, "value": value})
-    before = (list_signals(empty), trends(empty, resolve_range(empty)))
+    before = (list_signals(empty), trends(empty, find_range(empty, Scope())))
     while not roll(empty, 50).done:
         pass
-    assert (list_signals(empty), trends(empty, resolve_range(empty))) == before
+    assert (list_signals(empty), trends(empty, find_range(empty, Scope()))) == before
 
 
 def test_rows_not_rolled_up_yet_are_in_the_list(empty: sqlite3.Connection) -> None:

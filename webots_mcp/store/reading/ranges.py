@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from dataclasses import dataclass, replace
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 from webots_mcp.errors import InvalidRangeError, NothingRecordedError
 from webots_mcp.store.reading.coverage import coverage_notes, hit_notes, purge_notes
@@ -195,11 +195,6 @@ def find_range(
     _require_order(*walls, "since", "until")
     subject = subject or find_subject(connection, scope.robot, scope.run_id)
     return _in_wall_time(connection, subject, scope.run_id, *walls)
-
-
-def resolve_range(connection: sqlite3.Connection, **asked: Any) -> TimeRange:
-    """Find the range of a scope that is given by its attributes; see `find_range`."""
-    return find_range(connection, Scope(**asked))
 
 
 def _require_order(start_s: float, end_s: float, start_name: str, end_name: str) -> None:

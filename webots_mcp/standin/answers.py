@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from controller.wire import Message
 
 from webots_mcp.standin.arena import Body
+from webots_mcp.standin.nodes import NODE_TYPES, FieldDefinition
 from webots_mcp.standin.picture import Label
 from webots_mcp.standin.protos import shown_definitions
 from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
@@ -137,11 +138,16 @@ class SupervisorRequests:
     def on_node_get_field(self, node_id: int, name: str) -> Any:
         """Type and number of entries of a field; None if the node has no such field."""
         node = self._world.nodes[node_id]
-        definition = shown_definitions(node).get(name)
-        if definition is None:
-            return None
-        many = definition.type_name.startswith("MF")
-        return definition.type_name, len(node.fields[name]) if many else -1
+        return _described(node, name, shown_definitions(node))
+
+    def on_node_get_base_node_field(self, node_id: int, name: str) -> Any:
+        """The same of the node that a PROTO node is made of."""
+        node = self._world.nodes[node_id]
+        return _described(node, name, NODE_TYPES[node.type_name])
+
+    def on_node_get_base_node_field_names(self, node_id: int) -> list[str]:
+        """The names of all fields of what a PROTO node is made of."""
+        return [*NODE_TYPES[self._world.nodes[node_id].type_name]]
 
     def on_node_get_field_names(self, node_id: int) -> list[str]:
         """The names of all fields of a node."""
@@ -271,3 +277,11 @@ class SupervisorRequests:
             self._simulator.labels[number] = Label(text, x, y, size, rgb)
         else:
             self._simulator.labels.pop(number, None)
+
+
+def _described(node: Node, name: str, definitions: Mapping[str, FieldDefinition]) -> Any:
+    definition = definitions.get(name)
+    if definition is None:
+        return None
+    many = definition.type_name.startswith("MF")
+    return definition.type_name, len(node.fields[name]) if many else -1

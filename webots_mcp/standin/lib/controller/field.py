@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 _LENGTHS: Final = {"Vec2f": 2, "Vec3f": 3, "Color": 3, "Rotation": 4}
 _TYPES: Final[dict[str, type]] = {"Bool": bool, "Int32": int, "Float": float, "String": str}
+_READ_ONLY: Final = "Error: a field inside a PROTO node is read-only."
 _BEYOND_THE_END: Final[dict[str, Any]] = {
     **{"Bool": False, "Int32": 0, "Float": nan, "String": "", "Node": None},
     **{kind: [nan] * length for kind, length in _LENGTHS.items()},
@@ -43,13 +44,23 @@ class Field:
     _key: tuple[int, str]
     _type_name: str
     _count: int
+    _is_inner: bool
 
     def __init__(self, ref: Any) -> None:
         raise lacking("Field(...); ask a node for its fields")
 
     @classmethod
-    def _of(cls, session: Session, node_id: int, name: str, found: tuple[str, int]) -> Field:
+    def _of(
+        cls,
+        session: Session,
+        node_id: int,
+        name: str,
+        found: tuple[str, int],
+        *,
+        is_inner: bool = False,
+    ) -> Field:
         field = cls.__new__(cls)
+        field._is_inner = is_inner
         field._session, field._key = session, (node_id, name)
         field._type_name, field._count = found
         field.type = FIELD_NUMBER_OF[field._type_name]
@@ -97,10 +108,12 @@ class Field:
 
     @value.setter
     def value(self, value: Any) -> None:
-        if self._count >= 0 or not _fits(self._type_name[2:], value):
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._count >= 0 or not _fits(self._type_name[2:], value):
             say("Error: new field value has wrong type or length.")
-            return
-        self._session.set_field(self._key, None, _as_sent(value))
+        else:
+            self._session.set_field(self._key, None, _as_sent(value))
 
     def _as_given(self, value: Any) -> Any:
         from .node import node_of
@@ -193,7 +206,9 @@ class Field:
         return _BEYOND_THE_END[kind]
 
     def _set_entry(self, kind: str, index: int, value: Any) -> None:
-        if self._has_entry("set", kind, integer(index, position=2)):
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._has_entry("set", kind, integer(index, position=2)):
             self._session.set_field(self._key, index, value)
 
     def _has_entry(self, what: str, kind: str, index: int) -> bool:
@@ -293,3 +308,8 @@ def _fits(kind: str, value: Any) -> bool:
 
 field_of = Field._of  # pyright: ignore[reportPrivateUsage]
 """Makes the object for a field that the simulator has told of."""
+
+
+def inner_field_of(session: Session, node_id: int, name: str, found: tuple[str, int]) -> Field:
+    """The object for a field inside a PROTO node, which is read-only."""
+    return field_of(session, node_id, name, found, is_inner=True)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from .arguments import integer, number, numbers, text
 from .console import say
-from .field import Field, field_of
+from .field import Field, field_of, inner_field_of
 from .lacking import lacking, lacks
 from .node_types import CONSTANTS, NUMBER_OF
 from .session import Session
@@ -27,10 +27,9 @@ else:
 
 @lacks(
     "addForce addForceWithOffset addTorque disableContactPointsTracking "
-    "enableContactPointsTracking exportString getBaseNodeField "
-    "getBaseNodeFieldByIndex getCenterOfMass getContactPoints getFromProtoDef "
-    "getNumberOfBaseNodeFields getProto getProtoField getProtoFieldByIndex getStaticBalance "
-    "loadState moveViewpoint number_of_base_node_fields remove saveState "
+    "enableContactPointsTracking exportString getCenterOfMass getContactPoints getFromProtoDef "
+    "getProto getProtoField getProtoFieldByIndex getStaticBalance "
+    "loadState moveViewpoint remove saveState "
     "setVisibility"
 )
 class Node(metaclass=_NodeTypes):
@@ -135,6 +134,38 @@ class Node(metaclass=_NodeTypes):
         """A field by its place; None beyond the last."""
         names: list[str] = self._session.ask("node_get_field_names", self._id, default=[])
         return self.getField(names[index]) if 0 <= integer(index, 2) < len(names) else None
+
+    def getBaseNodeField(self, fieldName: str) -> Field | None:
+        """A field of the node that a PROTO node is made of, to be read only."""
+        if not self._is_proto("getBaseNodeField"):
+            return None
+        found = self._session.ask("node_get_base_node_field", self._id, text(fieldName))
+        return None if found is None else inner_field_of(self._session, self._id, fieldName, found)
+
+    def getNumberOfBaseNodeFields(self) -> int:
+        """How many fields the node has that a PROTO node is made of."""
+        return len(self._base_node_field_names("getNumberOfBaseNodeFields"))
+
+    @property
+    def number_of_base_node_fields(self) -> int:
+        """How many fields the node has that a PROTO node is made of."""
+        return self.getNumberOfBaseNodeFields()
+
+    def getBaseNodeFieldByIndex(self, index: int) -> Field | None:
+        """A field of what a PROTO node is made of, by its place; None beyond the last."""
+        names = self._base_node_field_names("getBaseNodeFieldByIndex")
+        has_it = 0 <= integer(index, 2) < len(names)
+        return self.getBaseNodeField(names[index]) if has_it else None
+
+    def _base_node_field_names(self, asked: str) -> list[str]:
+        if not self._is_proto(asked):
+            return []
+        return self._session.ask("node_get_base_node_field_names", self._id, default=[])
+
+    def _is_proto(self, asked: str) -> bool:
+        if not self.isProto():
+            say(f"Error: {asked}() called with a node that is no PROTO node.")
+        return self.isProto()
 
     # Places --------------------------------------------------------------------------------------
 

@@ -1,0 +1,206 @@
+"""The scene tree of a world, walked from its root.
+
+Each look at a field or at one of its entries may be a request that Webots has to answer, so a walk
+is a generator: whoever walks decides when to go on. It does not look at shapes and appearances
+unless told to.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+MOST_NODES: Final = 5000  # that one walk gives
+DEEPEST: Final = 24  # levels below the root
+
+_CHILDREN: Final = ("children",)
+# By base type: the fields in which solids, joints and devices stand. What is not here holds none.
+_FIELDS: Final[dict[str, tuple[str, ...]]] = {
+    **dict.fromkeys(("Group", "Pose", "Transform", "Billboard", "Solid", "Robot"), _CHILDREN),
+    **dict.fromkeys(("Accelerometer", "Altimeter", "Camera", "Charger", "Compass"), _CHILDREN),
+    **dict.fromkeys(("Connector", "Display", "DistanceSensor", "Emitter", "GPS"), _CHILDREN),
+    **dict.fromkeys(("Gyro", "InertialUnit", "LED", "Lidar", "LightSensor", "Pen"), _CHILDREN),
+    **dict.fromkeys(("Radar", "RangeFinder", "Receiver", "Speaker", "TouchSensor"), _CHILDREN),
+    **dict.fromkeys(("VacuumGripper", "Fluid"), _CHILDREN),
+    **dict.fromkeys(("HingeJoint", "SliderJoint"), ("device", "endPoint")),
+    "Hinge2Joint": ("device", "device2", "endPoint"),
+    "BallJoint": ("device", "device2", "device3", "endPoint"),
+    "Propeller": ("device",),
+    "Slot": ("endPoint",),
+    "Track": ("device", *_CHILDREN),
+}
+_NO_SOLIDS: Final = ("Group", "Pose", "Transform", "Billboard", "Fluid")
+SOLIDS: Final = frozenset(
+    name for name, fields in _FIELDS.items() if "children" in fields and name not in _NO_SOLIDS
+)
+"""Base types that are a Solid or one of its subclasses: they have a `name` and a velocity."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneNode:
+    """A node where it stands in the tree.
+
+    Attributes:
+        node: Webots' `Node`.
+        id: Its number; no other node of the world has it, and none ever gets it again.
+        type_name: `E-puck`, of a PROTO node; else as `base_type`.
+        base_type: `Robot`.
+        definition: Its DEF name, or "".
+        parent: The node around it; None at the top of the tree.
+        field: The field of the parent, or of the root, in which it stands.
+        index: Its place in that field; None where the field holds one node.
+        hidden: It stands inside a PROTO node: it can be looked at, and not be changed.
+    """
+
+    node: Any
+    id: int
+    type_name: str
+    base_type: str
+    definition: str
+    parent: SceneNode | None
+    field: str
+    index: int | None
+    hidden: bool
+
+    @property
+    def depth(self) -> int:
+        """How many nodes are around it."""
+        return 0 if self.parent is None else self.parent.depth + 1
+
+    @property
+    def is_solid(self) -> bool:
+        """Whether it is a Solid, a Robot or a device that is one."""
+        return self.base_type in SOLIDS
+
+    @property
+    def is_proto(self) -> bool:
+        """Whether it is an instance of a PROTO."""
+        return bool(self.node.isProto())
+
+    @property
+    def name(self) -> str:
+        """What its field `name` holds; "" where it has none."""
+        value = read_value(self.node, "name")
+        return value if isinstance(value, str) else ""
+
+
+class NodeField(NamedTuple):
+    """A field that can hold nodes.
+
+    Attributes:
+        name: Its name.
+        field: Webots' `Field`.
+        hidden: It belongs to the inside of a PROTO node.
+    """
+
+    name: str
+    field: Any
+    hidden: bool
+
+
+def walk(
+    root: Any,
+    *,
+    most: int = MOST_NODES,
+    deepest: int = DEEPEST,
+    inside: bool = True,
+    everything: bool = False,
+) -> Generator[SceneNode]:
+    """The nodes of the tree, each once, those near the root first.
+
+    Args:
+        root: The node to begin at, which is not given itself: `supervisor.getRoot()`, or another.
+        most: It ends after so many nodes.
+        deepest: It goes no more than so many levels below the root.
+        inside: It looks into PROTO nodes too, whose inside Webots lets be read.
+        everything: It gives shapes, appearances and the like as well.
+    """
+    seen: set[int] = {int(root.getId())}
+    waiting: deque[tuple[Any, SceneNode | None]] = deque([(root, None)])
+    while waiting:
+        node, around = waiting.popleft()
+        for found in _nodes_in(node, around, inside=inside, everything=everything):
+            if found.id in seen:  # a USE, or what a slot shows a second time
+                continue
+            if len(seen) > most:
+                return
+            seen.add(found.id)
+            if found.depth + 1 < deepest:
+                waiting.append((found.node, found))
+            yield found
+
+
+def _nodes_in(
+    node: Any, around: SceneNode | None, *, inside: bool, everything: bool
+) -> Iterator[SceneNode]:
+    hidden = around is not None and around.hidden
+    for name, field, is_inside in node_fields(node, inside=inside, everything=everything):
+        for index, child in _entries(field):
+            if everything or child.getBaseTypeName() in _FIELDS or name.startswith("device"):
+                yield SceneNode(
+                    child,
+                    int(child.getId()),
+                    child.getTypeName(),
+                    child.getBaseTypeName(),
+                    child.getDef(),
+                    around,
+                    name,
+                    index,
+                    hidden or is_inside,
+                )
+
+
+def node_fields(node: Any, *, inside: bool = True, everything: bool = False) -> Iterator[NodeField]:
+    """The fields of a node in which nodes can stand; of a PROTO node those inside it come last."""
+    base_type: str = node.getBaseTypeName()
+    if node.isProto() or everything:
+        yield from _all_node_fields(node)
+    elif base_type in _FIELDS:
+        for name in _FIELDS[base_type]:
+            if (field := node.getField(name)) is not None:
+                yield NodeField(name, field, False)
+    if inside and node.isProto():
+        for name in _FIELDS.get(base_type, ()):
+            if (field := find_inner_field(node, name)) is not None:
+                yield NodeField(name, field, True)
+
+
+def _all_node_fields(node: Any) -> Iterator[NodeField]:
+    for index in range(node.getNumberOfFields()):
+        field = node.getFieldByIndex(index)
+        if field is not None and field.getTypeName() in ("SFNode", "MFNode"):
+            yield NodeField(field.getName(), field, False)
+
+
+def find_inner_field(node: Any, name: str) -> Any | None:
+    """A field of the node that a PROTO node is made of, to be read only; None where it has none."""
+    # R2025a renamed what R2023b calls getProtoField.
+    look = getattr(node, "getBaseNodeField", None) or getattr(node, "getProtoField", None)
+    return None if look is None or not node.isProto() else look(name)
+
+
+def find_field(node: Any, name: str) -> Any | None:
+    """A field of a node: its own, or else one of what a PROTO node is made of."""
+    field = node.getField(name)
+    return find_inner_field(node, name) if field is None else field
+
+
+def read_value(node: Any, name: str) -> Any | None:
+    """The value of a field that holds one; None where the node has no such field."""
+    field = find_field(node, name)
+    return None if field is None or field.getCount() >= 0 else field.value
+
+
+def _entries(field: Any) -> Iterator[tuple[int | None, Any]]:
+    """The nodes in a field, with their places."""
+    if field.getTypeName() == "SFNode":
+        node = field.getSFNode()
+        if node is not None:
+            yield None, node
+        return
+    for index in range(field.getCount()):
+        node = field.getMFNode(index)
+        if node is not None:
+            yield index, node

@@ -1,5 +1,5 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 7;
+PRAGMA user_version = 8;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
@@ -311,7 +311,7 @@ CREATE TABLE coarse_rollup (
 	sum FLOAT, 
 	squares FLOAT /* sum of squared deviations from sum / count */, 
 	sines FLOAT /* angles only: sum of sines */, 
-	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, swings TEXT /* JSON: the swings of what a robot swings with, each as [begin, end, half swings, period in s, amplitude, explained share]; null where they were not looked for */ NULL, 
+	cosines FLOAT /* angles only: sum of cosines */, largest_step FLOAT /* largest difference of values that follow each other; null in those of older versions */ NULL, first_until_sim_time_s FLOAT /* up to then it had its first number; null in older versions */ NULL, last_since_sim_time_s FLOAT /* from then on it had its last number; null in older versions */ NULL, swings TEXT /* JSON: the swings of what a robot swings with, each as [begin, end, half swings, period in s, amplitude, explained share]; null where they were not looked for */ NULL, standstills TEXT /* JSON, at the signal of x: where the robot stood still, and what shows whether it should have moved; null where that was not looked for */ NULL, jumps TEXT /* JSON: the steps of a number that are much larger than it usually changes, and how it usually changes; null where they were not looked for */ NULL, 
 	PRIMARY KEY (run_id, signal_id, bucket), 
 	CONSTRAINT fk_coarse_rollup_run_id FOREIGN KEY(run_id) REFERENCES run (id) ON DELETE CASCADE
 )
@@ -564,4 +564,4 @@ CREATE VIEW all_rollup AS
 /* Rollups, those of buckets that are over and the newest. */
 SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM rollup
 UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM recent_rollup;
-INSERT INTO alembic_version (version_num) VALUES ('0007');
+INSERT INTO alembic_version (version_num) VALUES ('0008');

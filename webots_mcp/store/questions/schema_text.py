@@ -23,6 +23,8 @@ _BOOKKEEPING_COLUMNS: Final = (
     "first_until_sim_time_s",
     "last_since_sim_time_s",
     "swings",
+    "standstills",
+    "jumps",
 )
 _COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
 # A column that was added later stands on the line of the last one, after a comma.

@@ -564,4 +564,13 @@ CREATE VIEW all_rollup AS
 /* Rollups, those of buckets that are over and the newest. */
 SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM rollup
 UNION ALL SELECT run_id, signal_id, bucket, rows, present, changes, first, first_sim_time_s, last, last_sim_time_s, min, min_sim_time_s, max, max_sim_time_s, sum, squares, sines, cosines, largest_step, first_until_sim_time_s, last_since_sim_time_s FROM recent_rollup;
+CREATE TABLE console_line (
+	id INTEGER NOT NULL PRIMARY KEY AUTOINCREMENT, 
+	instance TEXT NOT NULL /* session.instance of who said it */, 
+	wall_time_s FLOAT NOT NULL, 
+	level TEXT NOT NULL, 
+	source TEXT NOT NULL /* webots, or console: a controller, not told which; as in log later on */, 
+	message TEXT NOT NULL, 
+	logger TEXT /* stdout or stderr */
+);
 INSERT INTO alembic_version (version_num) VALUES ('0008');

@@ -1,4 +1,4 @@
-"""The standstills and the jumps of 500 s, beside what its rollups come to.
+"""The standstills and the jumps of 500 s; lines of Webots' console that wait for a run.
 
 Revision ID: 0008
 Revises: 0007
@@ -28,12 +28,29 @@ def upgrade() -> None:
     for name, comment in FOUND.items():
         op.add_column("coarse_rollup", sa.Column(name, sa.Text(), comment=comment))
     op.execute(MERGE_AGAIN)
+    create_console_line()
     if op.get_context().dialect.name == "sqlite":
         op.execute("PRAGMA user_version = 8")
+
+
+def create_console_line() -> None:
+    said_by = "webots, or console: a controller, not told which; as in log later on"
+    op.create_table(
+        "console_line",
+        sa.Column("id", sa.Integer(), primary_key=True),
+        sa.Column("instance", sa.Text(), nullable=False, comment="session.instance of who said it"),
+        sa.Column("wall_time_s", sa.Float(), nullable=False),
+        sa.Column("level", sa.Text(), nullable=False),
+        sa.Column("source", sa.Text(), nullable=False, comment=said_by),
+        sa.Column("message", sa.Text(), nullable=False),
+        sa.Column("logger", sa.Text(), comment="stdout or stderr"),
+        sqlite_autoincrement=True,
+    )
 
 
 def downgrade() -> None:
     if op.get_context().dialect.name == "sqlite":
         op.execute("PRAGMA user_version = 7")
+    op.drop_table("console_line")
     for name in FOUND:
         op.drop_column("coarse_rollup", name)

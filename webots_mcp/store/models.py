@@ -301,7 +301,7 @@ class Watermark(SQLModel, table=True):
 
 
 class Log(SQLModel, table=True):
-    """A line that the controller or the bridge logged."""
+    """A line that the controller or the bridge logged, or of Webots' console."""
 
     __table_args__ = (Index(None, "run_id", "sim_time_s"), _KEEP_IDS)
     id: int | None = _id()
@@ -309,9 +309,25 @@ class Log(SQLModel, table=True):
     sim_time_s: float = _number(nullable=False)
     wall_time_s: float = _number(nullable=False)
     level: str = _text("debug, info, ... critical", nullable=False)
-    source: str = _text("controller or bridge", nullable=False)
+    source: str = _text("controller, bridge, console or webots", nullable=False)
     message: str = _text(nullable=False)
     logger: str | None = _text("name of the Python logger, where one logged it")
+
+
+class ConsoleLine(SQLModel, table=True):
+    """A line of Webots' console that waits for a run of its simulation; a log row after that."""
+
+    __tablename__: ClassVar[Any] = "console_line"
+    __table_args__ = (_KEEP_IDS,)
+    id: int | None = _id()
+    instance: str = _text("session.instance of who said it", nullable=False)
+    wall_time_s: float = _number(nullable=False)
+    level: str = _text(nullable=False)
+    source: str = _text(
+        "webots, or console: a controller, not told which; as in log later on", nullable=False
+    )
+    message: str = _text(nullable=False)
+    logger: str | None = _text("stdout or stderr")
 
 
 class Event(SQLModel, table=True):

@@ -44,7 +44,7 @@ _REFERENCES: Final = {
 _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
                   "signal", "rollup", "coarse_rollup", "change", "watermark",
                   "parameter", "parameter_value", "breakpoint", "trial_set", "trial",
-                  "kept_stretch", "kept_state")  # fmt: skip
+                  "kept_stretch", "kept_state", "console_line")  # fmt: skip
 # What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
 # be stored, a run that is not there.
 _UNSTORABLE: Final = (

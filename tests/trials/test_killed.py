@@ -20,6 +20,7 @@ from tests.processes.stopping import stop_between_writes
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.liveness import process_identity
 from webots_mcp.trials.simulators import Simulator
+from webots_mcp.webots.kept_program import CommandLine
 
 Write = Callable[[str], Path]
 
@@ -37,7 +38,9 @@ time.sleep(600)
 RUNNER = """
 import os, pathlib, signal, sys, time
 from webots_mcp.trials.simulators import Simulator
-simulator = Simulator([sys.executable, "simulator.py"], pathlib.Path(), {})
+from webots_mcp.webots.kept_program import CommandLine
+command = CommandLine([sys.executable, "simulator.py"], [])
+simulator = Simulator(command, pathlib.Path(), {})
 print(simulator.pid, flush=True)
 if "start" in sys.argv:
     simulator.start()
@@ -92,7 +95,7 @@ def test_a_simulator_whose_keeper_is_killed_ends(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "simulator.py").write_text(SIMULATOR.format(deaf=deaf))
     simulator, told = (
-        Simulator([sys.executable, "simulator.py"], tmp_path, {}),
+        Simulator(CommandLine([sys.executable, "simulator.py"], []), tmp_path, {}),
         Path("simulator.txt"),
     )
     simulator.start()

@@ -51,14 +51,15 @@ from webots_mcp.store.trials import (
 )
 from webots_mcp.store.window import Window
 from webots_mcp.trials.plan import Plan, WorldPlan
-from webots_mcp.trials.simulators import Simulator, end_left_over
+from webots_mcp.trials.simulators import Simulator
 from webots_mcp.trials.watching import End, Watch
+from webots_mcp.webots.kept_program import CommandLine, end_left_over
 
 FOLDER: Final = "trials"
 _LOOK_EVERY_S: Final = 0.05
 _PATIENCE_S: Final = 0.5  # between two looks at whether somebody wants to stop
 
-Command = Callable[[str], list[str]]
+Command = Callable[[str], CommandLine]
 Told = Callable[[Trial, Result], object]
 Search = Callable[[Plan, list[Trial]], "dict[str, Any] | None"]
 

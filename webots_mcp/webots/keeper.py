@@ -6,6 +6,7 @@ its own that loads little else. Where the keeper itself is killed, Linux ends th
 it takes who started the keeper, and outlives both only where both are killed at once.
 """
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -16,18 +17,29 @@ from types import FrameType
 
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
 _STDIN = 0  # not sys.stdin, whose lock a thread that reads would hold when Python ends
+_SIGNALLED = 128  # added to the number of the signal that ended a command, as shells do
 GRACE_S = 5.0  # Webots gives its controllers 1 s, and ends them after another
 
 
 def main(command: list[str]) -> int:
     """Keep a command; returns its exit code, and 0 where it was never told to start it."""
     signal.signal(signal.SIGTERM, _leave_it_to_the_simulator)
+    _lead_a_group()
     if not os.read(_STDIN, 1):
         return 0
     ask_first = _end_with_keeper()
     simulator = subprocess.Popen(command, stdin=subprocess.DEVNULL, preexec_fn=ask_first)
     threading.Thread(target=_end_with_input, args=(simulator,), daemon=True).start()
-    return simulator.wait()
+    code = simulator.wait()
+    if os.name == "posix":
+        os.killpg(os.getpgrp(), signal.SIGTERM)  # controllers that a crash left over
+    return code if code >= 0 else _SIGNALLED - code
+
+
+def _lead_a_group() -> None:
+    """Of the simulator and its controllers alone: not of `xvfb-run`, which cleans up after them."""
+    if os.name == "posix" and os.getpgrp() != os.getpid():
+        os.setpgid(0, 0)
 
 
 def _end_with_keeper() -> Callable[[], object] | None:
@@ -50,22 +62,41 @@ def _leave_it_to_the_simulator(number: int, frame: FrameType | None) -> None:
     """A signal goes to all of the process group."""
 
 
-def _end_with_input(simulator: subprocess.Popen[bytes]) -> None:
+def _end_with_input(simulator: "subprocess.Popen[bytes]") -> None:
     while os.read(_STDIN, 1):
         pass
-    _end(simulator, hard=False)
+    _ask_to_end(simulator)
     try:
         simulator.wait(GRACE_S)
     except subprocess.TimeoutExpired:
-        _end(simulator, hard=True)
+        _end(simulator)
 
 
-def _end(simulator: subprocess.Popen[bytes], *, hard: bool) -> None:
+def _ask_to_end(simulator: "subprocess.Popen[bytes]") -> None:
+    """Webots passes it on to its controllers, which get -1 from their step."""
+    if sys.platform == "win32":
+        _run(windows_command(simulator.pid, hard=False))
+    else:
+        simulator.terminate()
+
+
+def _end(simulator: "subprocess.Popen[bytes]") -> None:
     """With all of its process group, which is ours: Webots is a script that starts the program."""
     if sys.platform == "win32":
+        _run(windows_command(simulator.pid, hard=True))
         simulator.kill()
     else:
-        os.killpg(os.getpgrp(), signal.SIGKILL if hard else signal.SIGTERM)
+        os.killpg(os.getpgrp(), signal.SIGKILL)
+
+
+def windows_command(pid: int, *, hard: bool) -> list[str]:
+    """Ends a program with those that it has started; softly by closing their windows."""
+    return ["taskkill", "/T", *(["/F"] if hard else []), "/PID", str(pid)]
+
+
+def _run(command: list[str]) -> None:
+    with contextlib.suppress(OSError):  # there is none: it is ended the hard way alone
+        subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, check=False)
 
 
 if __name__ == "__main__":

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, Final
+from typing import Any, Final, cast
 
 from controller.wire import Message
 
 from webots_mcp.standin.arena import Body
+from webots_mcp.standin.errors import WorldError
+from webots_mcp.standin.export import as_text
 from webots_mcp.standin.nodes import NODE_TYPES, FieldDefinition
 from webots_mcp.standin.picture import Label
 from webots_mcp.standin.protos import shown_definitions
 from webots_mcp.standin.simulator import Mode, Robot, Simulator, Wanted
-from webots_mcp.standin.vrml import Node
+from webots_mcp.standin.vrml import Node, Parser, descendants_of
 
 CUSTOM_DATA_TAG: Final = 0
 """Stands for the robot itself where devices have their tags."""
@@ -82,6 +84,10 @@ def _step(
     return None
 
 
+class _GoneError(Exception):
+    """Something was asked of a node that was removed."""
+
+
 class SupervisorRequests:
     """Carries out the requests of one robot's `Supervisor`.
 
@@ -97,7 +103,16 @@ class SupervisorRequests:
     def carry_out(self, operation: str, arguments: list[Any]) -> Any:
         """Answer one request by name."""
         method: Callable[..., Any] = getattr(self, f"on_{operation}")
-        return method(*arguments)
+        try:
+            return method(*arguments)
+        except _GoneError:
+            return None
+
+    def _node(self, node_id: int) -> Node:
+        node = self._world.node(node_id)
+        if node is None:
+            raise _GoneError(node_id)
+        return node
 
     # Nodes ---------------------------------------------------------------------------------------
 
@@ -115,8 +130,7 @@ class SupervisorRequests:
 
     def on_node_get_from_id(self, node_id: int) -> Any:
         """A node by its number."""
-        nodes = self._world.nodes
-        return self._shown(nodes[node_id]) if 0 <= node_id < len(nodes) else None
+        return self._shown(self._world.node(node_id))
 
     def on_node_get_from_device(self, tag: int) -> Any:
         """The node of one of the robot's devices."""
@@ -125,7 +139,7 @@ class SupervisorRequests:
 
     def on_node_get_parent_node(self, node_id: int) -> Any:
         """The node around a node."""
-        return self._shown(self._world.parent_of(self._world.nodes[node_id]))
+        return self._shown(self._world.parent_of(self._node(node_id)))
 
     def _shown(self, node: Node | None) -> Any:
         if node is None:
@@ -137,26 +151,26 @@ class SupervisorRequests:
 
     def on_node_get_field(self, node_id: int, name: str) -> Any:
         """Type and number of entries of a field; None if the node has no such field."""
-        node = self._world.nodes[node_id]
+        node = self._node(node_id)
         return _described(node, name, shown_definitions(node))
 
     def on_node_get_base_node_field(self, node_id: int, name: str) -> Any:
         """The same of the node that a PROTO node is made of."""
-        node = self._world.nodes[node_id]
+        node = self._node(node_id)
         return _described(node, name, NODE_TYPES[node.type_name])
 
     def on_node_get_base_node_field_names(self, node_id: int) -> list[str]:
         """The names of all fields of what a PROTO node is made of."""
-        return [*NODE_TYPES[self._world.nodes[node_id].type_name]]
+        return [*NODE_TYPES[self._node(node_id).type_name]]
 
     def on_node_get_field_names(self, node_id: int) -> list[str]:
         """The names of all fields of a node."""
-        return [*shown_definitions(self._world.nodes[node_id])]
+        return [*shown_definitions(self._node(node_id))]
 
     def on_field_get(self, field: FieldReference, index: int | None) -> Any:
         """The value of a field or of one entry of it; None beyond its end."""
         node_id, name = field
-        value = self._world.nodes[node_id].fields[name]
+        value = self._node(node_id).fields[name]
         if index is not None:
             value = value[index] if -len(value) <= index < len(value) else None
         return self._shown(value) if isinstance(value, Node) else value
@@ -164,12 +178,89 @@ class SupervisorRequests:
     def set_fields(self, field_sets: list[FieldSet]) -> None:
         """Write fields, and let what they describe follow."""
         for (node_id, name), index, value in field_sets:
-            node = self._world.nodes[node_id]
+            node = self._world.node(node_id)
+            if node is None:
+                continue
             if index is None:
                 node.fields[name] = value
             elif -len(node.fields[name]) <= index < len(node.fields[name]):
                 node.fields[name][index] = value
             self._follow(node, name, value)
+
+    def on_field_insert(self, field: FieldReference, index: int, value: Any) -> int:
+        """Add an entry; the number of entries after it."""
+        node_id, name = field
+        node = self._node(node_id)
+        values: list[Any] = node.fields[name]
+        values.insert(index if index >= 0 else len(values) + index + 1, value)
+        self._follow(node, name, value)
+        return len(values)
+
+    def on_field_remove(self, field: FieldReference, index: int | None) -> int:
+        """Remove an entry, or the node of a single field; the number of entries after it."""
+        node_id, name = field
+        node = self._node(node_id)
+        value = node.fields[name] if index is None else node.fields[name][index]
+        if isinstance(value, Node):
+            self._remove(value)
+        else:
+            del node.fields[name][index]
+            self._follow(node, name, None)
+        return -1 if index is None else len(node.fields[name])
+
+    def on_field_import(self, field: FieldReference, index: int | None, text: str) -> int:
+        """Add a node; the number of entries after it, which shows whether it was taken."""
+        node_id, name = field
+        around = self._node(node_id)
+        many: list[Any] | None = None if index is None else around.fields[name]
+        if index is not None and many is not None and index < 0:
+            index += len(many) + 1
+        try:
+            self._add(Parser(text).nodes(), around, name, index)
+        except WorldError as error:
+            self._simulator.log(f"ERROR: importing a node: {error}")
+        return -1 if many is None else len(many)
+
+    def _add(self, nodes: list[Node], around: Node, name: str, index: int | None) -> None:
+        if len(nodes) != 1:
+            raise WorldError("one node is to be given")
+        (node,) = nodes
+        if any(each.type_name == "Robot" for each in (node, *descendants_of(node))):
+            raise WorldError("the stand-in adds no robots")
+        self._world.add(node, around, name, index)
+        self._simulator.note_added(node)
+        self._stand_anew(around)
+
+    def on_node_remove(self, node_id: int) -> Any:
+        """Remove a node; the field that it stood in, and the number of entries left there."""
+        found = self._remove(self._node(node_id))
+        if found is None:
+            return None
+        parent, name = found
+        left = parent.fields[name]
+        count = len(cast("list[Any]", left)) if isinstance(left, list) else -1
+        return self._world.id_of(parent), name, count
+
+    def _remove(self, node: Node) -> tuple[Node, str] | None:
+        if any(each.type_name == "Robot" for each in (node, *descendants_of(node))):
+            self._simulator.log("ERROR: the stand-in removes no robots")
+            return None
+        if node.type_name in ("WorldInfo", "Viewpoint") or node is self._world.root:
+            self._simulator.log(f"ERROR: the {node.type_name} node cannot be removed")
+            return None
+        found = self._world.remove(node)
+        if found is not None:
+            self._stand_anew(found[0])
+        return found
+
+    def _stand_anew(self, around: Node) -> None:
+        self._simulator.arena.follow()
+        if body := self._body_around(around):
+            self._simulator.stand_anew(body)
+
+    def on_node_export_string(self, node_id: int) -> str:
+        """A node and all in it, as written in a world file."""
+        return as_text(self._node(node_id))
 
     def _follow(self, node: Node, name: str, value: Any) -> None:
         if node.type_name == "Robot" and name == "customData":
@@ -189,15 +280,15 @@ class SupervisorRequests:
 
         None for what has no place.
         """
-        frame = self._world.frame_of(self._world.nodes[node_id])
+        frame = self._world.frame_of(self._node(node_id))
         if frame is not None and seen_from_id is not None:
-            seen_from = self._world.frame_of(self._world.nodes[seen_from_id])
+            seen_from = self._world.frame_of(self._node(seen_from_id))
             frame = frame if seen_from is None else seen_from.inverse().then(frame)
         return None if frame is None else (frame.rotation, frame.translation)
 
     def on_node_get_velocity(self, node_id: int) -> Any:
         """Linear and angular velocity; None for what is not a Solid."""
-        node = self._world.nodes[node_id]
+        node = self._node(node_id)
         body = self._body_around(node)
         if body is None or "boundingObject" not in node.fields:
             return None
@@ -205,21 +296,21 @@ class SupervisorRequests:
 
     def on_node_set_velocity(self, node_id: int, velocity: list[float]) -> None:
         """Set a body in motion, on the plane."""
-        if body := self._body_around(self._world.nodes[node_id]):
+        if body := self._body_around(self._node(node_id)):
             body.velocity_mps, body.yaw_rate_radps = (velocity[0], velocity[1]), velocity[5]
             body.is_pushed = True
 
     def on_node_reset_physics(self, node_id: int) -> None:
         """Take a body's speed away."""
-        if body := self._body_around(self._world.nodes[node_id]):
+        if body := self._body_around(self._node(node_id)):
             body.stop()
         for robot in self._simulator.robots:
-            if robot.node is self._world.nodes[node_id]:
+            if robot.node is self._node(node_id):
                 robot.vehicle.stop()
 
     def on_node_set_joint_position(self, node_id: int, position_rad: float) -> None:
         """Turn a hinge to an angle at once; its motor goes on with what it was told."""
-        node = self._world.nodes[node_id]
+        node = self._node(node_id)
         for robot in self._simulator.robots:
             for joint in robot.vehicle.joints:
                 if joint.node is node:
@@ -227,7 +318,7 @@ class SupervisorRequests:
 
     def on_node_restart_controller(self, node_id: int) -> None:
         """End a robot's controller and start it again."""
-        node = self._world.nodes[node_id]
+        node = self._node(node_id)
         if node.type_name == "Robot":
             self._simulator.wanted = Wanted("restart", robot=node.fields["name"])
 

@@ -92,7 +92,6 @@ class Body:
         self.touched: list[tuple[float, float]] = []
         """By how much it was pushed back by what it ran into in the last step, metres."""
         self.stand(frame)
-        self.is_obstacle = any(part.is_solid for part in self.parts)
 
     def stand(self, frame: Frame) -> None:
         """Put the body where `frame` says, tilted as it may be."""
@@ -101,6 +100,7 @@ class Body:
         upright = frame_of((0.0, 0.0, 0.0), (0.0, 0.0, 1.0, -self.yaw_rad))
         tilt = upright.then(Frame(frame.rotation))
         self.parts = [*_parts_of(self.node, tilt, _color_of(self.node))]
+        self.is_obstacle = any(part.is_solid for part in self.parts)
         self.footprint = Footprint.around(self.parts)
         self._shapes: tuple[Shape, ...] | None = None
         self._solid_of: tuple[Shape, ...] | None = None
@@ -168,11 +168,20 @@ class Arena:
         self.bodies = [*_bodies_in(world.root, Frame())]
         self.world = world
         self.colors = _scene_colors(world)
-        self.lights = [node for node in world.nodes if node.type_name in _LIGHTS]
         self.gravity_mps2: float = world.info.fields["gravity"]
         self.step_s = world.basic_time_step_ms / 1000.0
+        self._sort()
+
+    def _sort(self) -> None:
+        self.lights = [node for node in self.world.nodes if node.type_name in _LIGHTS]
         self._obstacles = [body for body in self.bodies if body.is_obstacle]
         self._movable = [body for body in self._obstacles if body.is_movable]
+
+    def follow(self) -> None:
+        """Nodes were added or removed: bodies that are new stand there, those that are gone not."""
+        known = {body.node: body for body in self.bodies}
+        self.bodies[:] = [known.get(b.node, b) for b in _bodies_in(self.world.root, Frame())]
+        self._sort()
 
     def scene(self, without: Body) -> list[Shape]:
         """All shapes but those of one body: what that one can see."""

@@ -120,6 +120,7 @@ class Simulator:
         self.wanted: Wanted | None = None
         self.labels: dict[int, Label] = {}
         self._reset_asked = False
+        self._added: list[Node] = []
         self._load_asked: Wanted | None = None
         self._pictures: list[Picture] = []
         self._start = {
@@ -214,6 +215,10 @@ class Simulator:
         """Put everything back to the start of the world, at time 0; controllers go on."""
         self._reset_asked = False
         self.time_ms = 0.0
+        added, self._added = self._added, []
+        for node in added:
+            self.world.remove(node)
+        self.arena.follow()
         for node, (translation, rotation) in self._start.items():
             node.fields["translation"], node.fields["rotation"] = [*translation], [*rotation]
         for body in self.arena.bodies:
@@ -225,6 +230,10 @@ class Simulator:
             robot.ahead_ms = 0.0
             for device in robot.devices.values():
                 device.make_due()
+
+    def note_added(self, node: Node) -> None:
+        """A controller has added it: the next reset removes it."""
+        self._added.append(node)
 
     def stand_anew(self, body: Body) -> None:
         """Let a body follow its node's fields."""

@@ -28,10 +28,12 @@ class World:
         self.path = path
         self.root = Node("Group", "", 1, {"children": [*top]})
         self.nodes: list[Node] = []
-        """Every node once, in the order of the scene tree; a node's id is its index here."""
+        """Every node once, in the order of the scene tree; what was added comes last."""
         self.left_out: list[Node] = []
         """What stands in the file and not in the world: nodes of types that are not known here."""
         self._ids: dict[Node, int] = {}
+        self._by_id: dict[int, Node] = {}
+        self._next_id = 0
         self._parents: dict[Node, Node] = {}
         self._register(self.root, None)
         info = next((node for node in top if node.type_name == "WorldInfo"), None)
@@ -51,7 +53,8 @@ class World:
             build(node)
         else:
             give_types(node, NODE_TYPES[node.type_name])
-        self._ids[node] = len(self.nodes)
+        self._ids[node], self._by_id[self._next_id] = self._next_id, node
+        self._next_id += 1
         self.nodes.append(node)
         if parent is not None:
             self._parents[node] = parent
@@ -118,6 +121,53 @@ class World:
     def id_of(self, node: Node) -> int:
         """The number that a controller knows the node by."""
         return self._ids[node]
+
+    def node(self, node_id: int) -> Node | None:
+        """The node of that number; None where it was removed."""
+        return self._by_id.get(node_id)
+
+    def add(self, node: Node, parent: Node, name: str, index: int | None) -> None:
+        """Put a node, as the parser gives it, into a field, or before one of its entries.
+
+        Raises:
+            WorldError: It is of a type that is not known here, or a value in it is of another.
+        """
+        if node.type_name not in NODE_TYPES and node.type_name not in PROTOS:
+            raise WorldError(f"the stand-in has no {node.type_name} nodes")
+        there = len(self.nodes)
+        try:
+            self._register(node, parent)
+        except WorldError:
+            self._forget(self.nodes[there:])
+            raise
+        if index is None:
+            parent.fields[name] = node
+        else:
+            parent.fields[name].insert(index, node)
+
+    def remove(self, node: Node) -> tuple[Node, str] | None:
+        """Take a node out of the field that it stands in, which is returned."""
+        parent = self._parents.get(node)
+        if parent is None:
+            return None
+        for name, value in parent.fields.items():
+            if value is node:
+                parent.fields[name] = None
+            elif isinstance(value, list) and any(item is node for item in cast("list[Any]", value)):
+                items = cast("list[Any]", value)
+                items[:] = [item for item in items if item is not node]
+            else:
+                continue
+            self._forget([node, *descendants_of(node)])
+            return parent, name
+        return None
+
+    def _forget(self, nodes: list[Node]) -> None:
+        gone = set(nodes)
+        self.nodes = [node for node in self.nodes if node not in gone]
+        for node in gone & self._ids.keys():
+            del self._by_id[self._ids.pop(node)]
+            self._parents.pop(node, None)
 
     def parent_of(self, node: Node) -> Node | None:
         """The node around this one; None for the root."""

@@ -1,6 +1,6 @@
 """Fields of nodes."""
 
-# ruff: noqa: N802 - the names are those of Webots
+# ruff: noqa: N802, N803 - the names are those of Webots
 
 from __future__ import annotations
 
@@ -25,11 +25,7 @@ _BEYOND_THE_END: Final[dict[str, Any]] = {
 }
 
 
-@lacks(
-    "disableSFTracking enableSFTracking getActualField importMFNodeFromString "
-    "importSFNodeFromString insertMFBool insertMFColor insertMFFloat insertMFInt32 "
-    "insertMFRotation insertMFString insertMFVec2f insertMFVec3f removeMF removeSF"
-)
+@lacks("disableSFTracking enableSFTracking getActualField")
 class Field:
     """A field of a node. Reads are answered at once, writes go out with the next step."""
 
@@ -43,7 +39,6 @@ class Field:
     _session: Session
     _key: tuple[int, str]
     _type_name: str
-    _count: int
     _is_inner: bool
 
     def __init__(self, ref: Any) -> None:
@@ -62,7 +57,7 @@ class Field:
         field = cls.__new__(cls)
         field._is_inner = is_inner
         field._session, field._key = session, (node_id, name)
-        field._type_name, field._count = found
+        field._type_name, session.counts[field._key] = found
         field.type = FIELD_NUMBER_OF[field._type_name]
         return field
 
@@ -91,6 +86,10 @@ class Field:
     def getCount(self) -> int:
         """The number of entries; -1 for a single field."""
         return self._count
+
+    @property
+    def _count(self) -> int:
+        return self._session.counts[self._key]
 
     @property
     def count(self) -> int:
@@ -215,14 +214,17 @@ class Field:
         function = f"Error: wb_supervisor_field_{what}_mf_{kind.lower()}()"
         if self._type_name != f"MF{kind}":
             say(f"{function} called with a field of type {self._type_name}.")
-        elif not self._count:
+            return False
+        if not self._count:
             say(f"{function} called on an empty list.")
-        elif not -self._count <= index < self._count:
-            bounds = f"(should be between {-self._count} and {self._count - 1})"
+            return False
+        return self._is_within(function, index, -self._count, self._count - 1)
+
+    def _is_within(self, function: str, index: int, least: int, most: int) -> bool:
+        if not least <= index <= most:
+            bounds = f"(should be between {least} and {most})"
             say(f"{function} called with an out-of-bound index: {index} {bounds}.")
-        else:
-            return True
-        return False
+        return least <= index <= most
 
     def getMFBool(self, index: int) -> bool:
         """One entry."""
@@ -291,6 +293,103 @@ class Field:
     def setMFString(self, index: int, value: str) -> None:
         """Set one entry with the next step."""
         self._set_entry("String", index, text(value))
+
+    # More and fewer entries: at once, after the changes that were not sent yet -------------------
+
+    def _insert(self, kind: str, index: int, value: Any) -> None:
+        function = f"Error: wb_supervisor_field_insert_mf_{kind.lower()}()"
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._type_name != f"MF{kind}":
+            say(f"{function} called with a field of type {self._type_name}.")
+        elif self._is_within(function, integer(index, 2), -self._count - 1, self._count):
+            self._change("field_insert", index, value)
+
+    def _change(self, operation: str, *arguments: Any) -> None:
+        count = self._session.change_field(operation, self._key, *arguments)
+        if count is not None and self._count >= 0:
+            self._session.counts[self._key] = count
+
+    def insertMFBool(self, index: int, value: bool) -> None:
+        """Add an entry before that of the index; -1 adds it at the end."""
+        self._insert("Bool", index, bool(value))
+
+    def insertMFInt32(self, index: int, value: int) -> None:
+        """Add an entry before that of the index; -1 adds it at the end."""
+        self._insert("Int32", index, integer(value, position=3))
+
+    def insertMFFloat(self, index: int, value: float) -> None:
+        """Add an entry before that of the index; -1 adds it at the end."""
+        self._insert("Float", index, number(value))
+
+    def insertMFVec2f(self, index: int, value: list[float]) -> None:
+        """Add an entry before that of the index; -1 adds it at the end."""
+        self._insert("Vec2f", index, numbers(value, 2))
+
+    def insertMFVec3f(self, index: int, value: list[float]) -> None:
+        """Add an entry before that of the index; -1 adds it at the end."""
+        self._insert("Vec3f", index, numbers(value, 3))
+
+    def insertMFRotation(self, index: int, value: list[float]) -> None:
+        """Add an entry before that of the index; -1 adds it at the end."""
+        self._insert("Rotation", index, numbers(value, 4))
+
+    def insertMFColor(self, index: int, value: list[float]) -> None:
+        """Add an entry before that of the index; -1 adds it at the end."""
+        self._insert("Color", index, numbers(value, 3))
+
+    def insertMFString(self, index: int, value: str) -> None:
+        """Add an entry before that of the index; -1 adds it at the end."""
+        self._insert("String", index, text(value))
+
+    def removeMF(self, index: int) -> None:
+        """Remove an entry; of a field of nodes the node."""
+        function = "Error: wb_supervisor_field_remove_mf()"
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._count <= 0:
+            say(f"{function} called for an empty field.")
+        elif self._is_within(function, integer(index, 2), -self._count, self._count - 1):
+            self._change("field_remove", index)
+
+    def removeSF(self) -> None:
+        """Remove the node of a field that holds one."""
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._type_name != "SFNode":
+            say("Error: wb_supervisor_field_remove_sf() called with wrong field type.")
+        elif self.value is None:
+            say("Error: wb_supervisor_field_remove_sf() called for an empty field.")
+        else:
+            self._change("field_remove", None)
+
+    def importMFNodeFromString(self, position: int, nodeString: str) -> None:
+        """Add a node that is written as in a world file; -1 adds it at the end."""
+        function = "Error: wb_supervisor_field_import_mf_node_from_string()"
+        if self._may_import(function, "MFNode", text(nodeString)) and self._is_within(
+            function, integer(position, 2), -self._count - 1, self._count
+        ):
+            self._change("field_import", position, nodeString)
+
+    def importSFNodeFromString(self, nodeString: str) -> None:
+        """Put a node that is written as in a world file into a field that is NULL."""
+        function = "Error: wb_supervisor_field_import_sf_node_from_string()"
+        if self._may_import(function, "SFNode", text(nodeString)):
+            if self.value is not None:
+                say(f"{function} called with a non-empty field.")
+            else:
+                self._change("field_import", None, nodeString)
+
+    def _may_import(self, function: str, kind: str, node: str) -> bool:
+        if self._is_inner:
+            say(_READ_ONLY)
+        elif self._type_name != kind:
+            say(f"{function} called with a wrong field type: {self._type_name}.")
+        elif not node:
+            say(f"{function} called with a NULL or empty 'node_string' argument.")
+        else:
+            return True
+        return False
 
 
 def _as_sent(value: Any) -> Any:

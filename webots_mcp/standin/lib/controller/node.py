@@ -27,10 +27,9 @@ else:
 
 @lacks(
     "addForce addForceWithOffset addTorque disableContactPointsTracking "
-    "enableContactPointsTracking exportString getCenterOfMass getContactPoints getFromProtoDef "
+    "enableContactPointsTracking getCenterOfMass getContactPoints getFromProtoDef "
     "getProto getProtoField getProtoFieldByIndex getStaticBalance "
-    "loadState moveViewpoint remove saveState "
-    "setVisibility"
+    "loadState moveViewpoint saveState setVisibility"
 )
 class Node(metaclass=_NodeTypes):
     """A node of the scene tree; a null node (no rights) answers with defaults.
@@ -113,6 +112,17 @@ class Node(metaclass=_NodeTypes):
         """The node around this one; None for the root."""
         found = self._session.ask("node_get_parent_node", self._id)
         return None if found is None else node_of(self._session, found)
+
+    def exportString(self) -> str:
+        """The node and all in it, as written in a world file."""
+        return self._session.ask("node_export_string", self._id, default="")
+
+    def remove(self) -> None:
+        """Take the node, and all in it, out of the world."""
+        found = self._session.ask("node_remove", self._id)
+        if found is not None:
+            node_id, name, count = found
+            self._session.counts[node_id, name] = count
 
     # Fields --------------------------------------------------------------------------------------
 

@@ -54,6 +54,8 @@ class Session:
         self.lock = threading.RLock()
         self._values: dict[int, Any] = {}
         self._changes: dict[tuple[int, str], Any] = {}
+        self.counts: dict[tuple[int, str], int] = {}
+        """The number of entries of each field that was asked for, by node and name."""
         self._field_sets: dict[Any, Any] = {}
         self._fetched: dict[int, tuple[Any, Any]] = {}
         self._stepped: Message | None = None
@@ -132,6 +134,11 @@ class Session:
             if (field, index) in self._field_sets:
                 return self._field_sets[field, index]
             return self._ask("field_get", (field, index), self._take_field_sets(), None)
+
+    def change_field(self, operation: str, field: tuple[int, str], *arguments: Any) -> Any:
+        """Add or remove entries at once; changes that were not sent yet go first."""
+        with self.lock:
+            return self._ask(operation, (field, *arguments), self._take_field_sets(), None)
 
     def fetch(self, tag: int) -> Any:
         """The picture or scan that belongs to a sensor's last sample; None before the first."""

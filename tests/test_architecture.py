@@ -43,6 +43,7 @@ STDLIB = {
     *ALLOWED["adoption"],
 }
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
+ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
 ALLOWED["store"] = STDLIB | {"store"}
 ALLOWED["trials"] = STDLIB | {"store", "trials", "webots"}
 ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}

@@ -78,6 +78,11 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "keep": BuiltInAction(needs_supervisor=False),
 }
 
+OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the others, and steers
+OBSERVER_NAME: Final = "mcp_observer"  # of its Robot node and of its controller
+WORLD_EVENT: Final = "world"  # the event that tells which robots and solids an observer sees
+LOOK_AT: Final = "look_at"  # its action
+
 BreakpointAction = Literal["pause", "log", "keep"]
 BREAKPOINT_ACTIONS: Final[tuple[BreakpointAction, ...]] = get_args(BreakpointAction)
 MAX_BREAKPOINTS: Final = 32  # of one robot that are armed

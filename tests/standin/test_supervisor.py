@@ -262,3 +262,22 @@ def test_a_joint_can_be_turned_at_once(
     assert robot.getSelf().getPosition()[0] == -1.2  # the wheel was turned, not rolled
     joint.setJointPosition(1.0, 2)
     assert "no axis 2" in capfd.readouterr().err
+
+
+def test_a_tracked_pose_comes_with_the_steps(robot: InProcessSupervisor) -> None:
+    node, asked = robot.getSelf(), robot.getSelf()
+    node.enablePoseTracking(4 * STEP_MS)
+    robot.step(STEP_MS)
+    at_first = node.getPose()
+    assert at_first == asked.getPose()
+    for name in ("left wheel motor", "right wheel motor"):
+        robot.getDevice(name).setPosition(inf)
+        robot.getDevice(name).setVelocity(5.0)
+    robot.step(2 * STEP_MS)
+    assert node.getPose() == at_first  # until its period is over
+    assert node.getPosition() != at_first[3:12:4]  # which is asked for
+    robot.step(2 * STEP_MS)
+    assert node.getPose()[3] == node.getPosition()[0]
+    node.disablePoseTracking()
+    robot.step(STEP_MS)
+    assert node.getPose()[3] == node.getPosition()[0] > at_first[3]

@@ -35,12 +35,14 @@ class Identity(NamedTuple):
     throttle_interval: int
 
 
-def identify(robot: Any, supervisor: bool, version: str, throttle_interval: int) -> Identity:
+def identify(
+    robot: Any, supervisor: bool, version: str, throttle_interval: int, kind: str | None = None
+) -> Identity:
     """Collect the identity; what cannot be found out is None, never an error."""
     controller = controller_file()
     return Identity(
         robot_name=str(robot.getName() or os.environ.get("WEBOTS_ROBOT_NAME") or "robot"),
-        kind="Supervisor" if supervisor else "Robot",
+        kind=kind or ("Supervisor" if supervisor else "Robot"),
         supervisor=supervisor,
         devices={str(name): type(device).__name__ for name, device in _devices(robot).items()},
         world=_plain_text(robot.getWorldPath()) if hasattr(robot, "getWorldPath") else None,

@@ -90,6 +90,8 @@ class MCPBridge:
         ValueError: `throttle_interval` is less than 1, or `keep_last_s` not from 0 to 3600.
     """
 
+    _kind: str | None = None  # of its robot, where it is of a kind of its own
+
     def __init__(
         self,
         robot: Any,
@@ -113,7 +115,9 @@ class MCPBridge:
         simulation = Simulation(robot)
         open_bridges.close_former(robot)
         where = (self.database, self.data_dir)
-        self._session = Session(simulation, *where, throttle, keep_last_s, self._errors)
+        self._session = Session(
+            simulation, *where, throttle, keep_last_s, self._errors, kind=self._kind
+        )
         self._publisher = self._session.publisher
         self._session.begin()
         self._capture = Capture(self._record_output)

@@ -55,11 +55,12 @@ class Session:
         throttle: Throttle,
         keep_last_s: float,
         errors: ErrorReport,
+        kind: str | None = None,
     ) -> None:
         from webots_mcp import __version__
 
         self._identity = identify(
-            simulation.robot, simulation.supervisor, __version__, throttle.interval
+            simulation.robot, simulation.supervisor, __version__, throttle.interval, kind
         )
         clock = Clock(simulation)
         recorder = Recorder(database, self._identity, clock, errors)

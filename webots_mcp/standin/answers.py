@@ -61,8 +61,11 @@ def answer(simulator: Simulator, robot: Robot, message: Message) -> Message | No
 
 def step_over(simulator: Simulator, robot: Robot) -> Message:
     """The answer to a step request: time, mode and the values measured since the last one."""
-    values = [*robot.fresh.items()]
+    values: list[tuple[Any, Any]] = [*robot.fresh.items()]
     robot.fresh.clear()
+    requests = SupervisorRequests(simulator, robot)
+    due = robot.due_poses(simulator.time_ms)
+    values.extend((pose, requests.carry_out("node_get_pose", [*pose])) for pose in due)
     return ("stepped", simulator.time_s, int(simulator.mode), robot.delay_ms, values)
 
 
@@ -76,6 +79,8 @@ def _step(
     for tag, setting, value in changes:
         if tag == CUSTOM_DATA_TAG:
             robot.node.fields["customData"] = value
+        elif setting == "track":
+            robot.track(tag, value)
         else:
             robot.devices[tag].configure(setting, value)
     SupervisorRequests(simulator, robot).set_fields(field_sets)

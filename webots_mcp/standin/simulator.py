@@ -10,7 +10,7 @@ from collections.abc import Callable
 from enum import IntEnum
 from math import ceil
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from webots_mcp.standin.arena import Arena, Body
 from webots_mcp.standin.devices import Device, devices_in
@@ -19,6 +19,9 @@ from webots_mcp.standin.physics import Vehicle, joints_in
 from webots_mcp.standin.picture import Label, Picture, save_picture
 from webots_mcp.standin.vrml import Node
 from webots_mcp.standin.world import World
+
+PoseKey: TypeAlias = "tuple[int, int | None]"
+"""The ids of a node and of the one that it is seen from; None is the world."""
 
 
 class Mode(IntEnum):
@@ -56,6 +59,8 @@ class Robot:
         """By how much the last step came too late, for robots without synchronization."""
         self.fresh: dict[int, Any] = {}
         """Values that the controller has not been sent yet, by tag."""
+        self._tracked: dict[PoseKey, tuple[int, float]] = {}
+        """Poses that are sent with the steps: their periods, and when they are due, in ms."""
 
     @property
     def name(self) -> str:
@@ -88,10 +93,29 @@ class Robot:
         """Whether it drives against something now."""
         return self.vehicle.touching
 
+    def track(self, pose: PoseKey, period_ms: int) -> None:
+        """Send a pose with the steps, at once and then once in a period; 0 ends that."""
+        self._tracked.pop(pose, None)
+        if period_ms:
+            self._tracked[pose] = (period_ms, 0.0)
+
+    def due_poses(self, time_ms: float) -> list[PoseKey]:
+        """The tracked poses that are to be sent now."""
+        due = [pose for pose, (_, due_ms) in self._tracked.items() if time_ms >= due_ms]
+        for pose in due:
+            period_ms, _ = self._tracked[pose]
+            self._tracked[pose] = (period_ms, time_ms + period_ms)
+        return due
+
+    def make_poses_due(self) -> None:
+        """After a reset they are due at once, as sensors are."""
+        self._tracked = {pose: (period_ms, 0.0) for pose, (period_ms, _) in self._tracked.items()}
+
     def forget_controller(self) -> None:
         """Make ready for another controller: no request, no sensor enabled, motors still."""
         self.remaining_ms, self.ahead_ms = None, 0.0
         self.fresh.clear()
+        self._tracked.clear()
         for device in self.devices.values():
             device.configure("period", 0)
         for joint in self.vehicle.joints:
@@ -228,6 +252,7 @@ class Simulator:
         for robot in self.robots:
             robot.vehicle.reset()
             robot.ahead_ms = 0.0
+            robot.make_poses_due()
             for device in robot.devices.values():
                 device.make_due()
 

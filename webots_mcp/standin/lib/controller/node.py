@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from math import nan
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from .arguments import integer, number, numbers, text
 from .console import say
@@ -23,6 +23,9 @@ if TYPE_CHECKING:
         def __getattr__(cls, name: str) -> int: ...
 else:
     _NodeTypes = type
+
+
+_NO_POSE: Final = ([nan] * 9, [nan] * 3)
 
 
 @lacks(
@@ -188,13 +191,17 @@ class Node(metaclass=_NodeTypes):
         return [*self._pose()[0]]
 
     def getPose(self, fromNode: Node | None = None) -> list[float]:
-        """The 4 x 4 matrix by rows, in the world or in another node: sixteen numbers."""
-        r, (x, y, z) = self._pose(fromNode)
+        """The 4 x 4 matrix by rows, in the world or in another node: sixteen numbers.
+
+        As in Webots only this one is answered from the last step, where the pose is tracked.
+        """
+        tracked = self._session.tracked((self._id, fromNode._id if fromNode else None))
+        r, (x, y, z) = tracked or self._pose(fromNode)
         return [*r[0:3], x, *r[3:6], y, *r[6:9], z, 0.0, 0.0, 0.0, 1.0]
 
     def _pose(self, seen_from: Node | None = None) -> Any:
         node_ids = (self._id, seen_from._id if seen_from else None)
-        return self._session.ask("node_get_pose", *node_ids, default=([nan] * 9, [nan] * 3))
+        return self._session.ask("node_get_pose", *node_ids, default=_NO_POSE)
 
     def getVelocity(self) -> list[float]:
         """Linear (metres a second) and angular (radians a second) velocity: six numbers."""
@@ -205,11 +212,13 @@ class Node(metaclass=_NodeTypes):
         self._session.ask("node_set_velocity", self._id, numbers(velocity, 6))
 
     def enablePoseTracking(self, samplingPeriod: int, fromNode: Node | None = None) -> None:
-        """Nothing changes: here a pose is asked for at once, tracked or not."""
-        integer(samplingPeriod, position=2)
+        """Have the pose sent with the steps, so that `getPose` need not ask for it."""
+        period_ms = integer(samplingPeriod, position=2)
+        self._session.track((self._id, fromNode._id if fromNode else None), period_ms)
 
     def disablePoseTracking(self, fromNode: Node | None = None) -> None:
-        """Nothing changes: here a pose is asked for at once, tracked or not."""
+        """Have it sent no more."""
+        self._session.track((self._id, fromNode._id if fromNode else None), 0)
 
     def setJointPosition(self, position: float, index: int = 1) -> None:
         """Turn a HingeJoint to an angle in radians at once."""

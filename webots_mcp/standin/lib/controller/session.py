@@ -11,6 +11,8 @@ from .wire import Message
 
 CUSTOM_DATA_TAG: Final = 0
 """Stands for the robot itself where devices have their tags."""
+PoseKey = tuple[int, int | None]
+"""The ids of a node and of the one that it is seen from; None is the world."""
 
 
 class Link(Protocol):
@@ -52,10 +54,11 @@ class Session:
         self.periods_ms: dict[int, int] = {}
         """Sampling periods by device tag; a device without one is disabled."""
         self.lock = threading.RLock()
-        self._values: dict[int, Any] = {}
-        self._changes: dict[tuple[int, str], Any] = {}
+        self._values: dict[Any, Any] = {}
+        self._changes: dict[tuple[Any, str], Any] = {}
         self.counts: dict[tuple[int, str], int] = {}
         """The number of entries of each field that was asked for, by node and name."""
+        self._tracked: set[PoseKey] = set()
         self._field_sets: dict[Any, Any] = {}
         self._fetched: dict[int, tuple[Any, Any]] = {}
         self._stepped: Message | None = None
@@ -78,6 +81,18 @@ class Session:
         """Set a sampling period; 0 disables."""
         self.change(tag, "period", period_ms)
         self.periods_ms[tag] = period_ms
+
+    def track(self, pose: PoseKey, period_ms: int) -> None:
+        """Have a pose sent with the steps, once in a period; 0 ends that."""
+        with self.lock:
+            self._changes[pose, "track"] = period_ms
+            self._values.pop(pose, None)
+            (self._tracked.add if period_ms else self._tracked.discard)(pose)
+
+    def tracked(self, pose: PoseKey) -> Any:
+        """A tracked pose as it came last; None where it has to be asked for."""
+        with self.lock:
+            return self._values.get(pose) if pose in self._tracked else None
 
     def value(self, tag: int, default: Any) -> Any:
         """The last value of a sensor."""

@@ -1,0 +1,168 @@
+"""The observer's controller: its loop, and what it answers when it is asked."""
+
+from __future__ import annotations
+
+import math
+import sys
+from typing import Any, Final
+
+from webots_mcp.bridge.mcp_bridge import MCPBridge
+from webots_mcp.contract import LOOK_AT, OBSERVER, WORLD_EVENT
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.observer.body import Body
+from webots_mcp.observer.pace import Pace
+from webots_mcp.observer.world import World
+
+PERIOD_MS: Final = 100
+_MOST_CONTACTS: Final = 30
+_DIGITS: Final = 6
+_NO_RIGHTS: Final = (
+    "the observer needs a robot with 'supervisor TRUE': {!r} is none. 'webots-mcp init --observer "
+    "WORLD' adds one to a copy of a world"
+)
+
+
+class ObserverBridge(MCPBridge):
+    """The bridge of a robot that only looks."""
+
+    _kind = OBSERVER
+
+    def record_world(self, world: dict[str, object]) -> None:
+        """Record what there is: an event, as it changes seldom."""
+        self._session.context.journal.event(WORLD_EVENT, world)
+
+    def failed(self, error: Exception) -> None:
+        """Count what could not be seen, and say it once on stderr."""
+        self._errors.failed("the observer", error)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """The whole controller; its first argument may be a period in milliseconds."""
+    from controller import Supervisor  # type: ignore[import-not-found]
+
+    given = sys.argv[1:] if arguments is None else arguments
+    observe(Supervisor(), _period(given))
+
+
+def _period(given: list[str]) -> int:
+    if not given:
+        return PERIOD_MS
+    try:
+        period_ms = int(given[0])
+    except ValueError:
+        period_ms = 0
+    if len(given) > 1 or not 1 <= period_ms <= 60_000:
+        raise SystemExit(f"give a period of 1 to 60000 ms, not {' '.join(given)!r}")
+    return period_ms
+
+
+def observe(robot: Any, period_ms: int = PERIOD_MS, **options: Any) -> None:
+    """Record the world until Webots ends the controller.
+
+    Args:
+        robot: A `Supervisor`.
+        period_ms: Simulation time between two rows; it is rounded up to whole basic time steps.
+        options: As of `MCPBridge`.
+
+    Raises:
+        CommandRefusedError: The robot has no supervisor's rights.
+    """
+    with Observer(robot, period_ms, **options) as observer:
+        while observer.go_on():
+            pass
+
+
+class Observer:
+    """Looks at a world, round by round.
+
+    Raises:
+        CommandRefusedError: The robot has no supervisor's rights.
+    """
+
+    def __init__(self, robot: Any, period_ms: int = PERIOD_MS, **options: Any) -> None:
+        if not robot.getSupervisor():
+            raise CommandRefusedError(_NO_RIGHTS.format(str(robot.getName())))
+        basic_ms = float(robot.getBasicTimeStep())
+        self._period_ms = max(int(math.ceil(period_ms / basic_ms) * basic_ms), 1)
+        self._robot = robot
+        self.bridge = ObserverBridge(robot, throttle_interval=1, keep_last_s=0, **options)
+        self.world = World(robot, self._period_ms, self._warn)
+        self._pace = Pace(robot, self._period_ms)
+        self._due_s = -math.inf
+        self.bridge.register_command(LOOK_AT, self.look_at)
+
+    def __enter__(self) -> Observer:
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, traceback: object) -> None:
+        self.bridge.__exit__(kind, error, traceback)
+
+    def go_on(self) -> bool:
+        """One round; False where Webots wants the controller to end."""
+        if not self._pace.go_on():
+            return False
+        try:
+            self._look()
+        except Exception as error:  # noqa: BLE001  (it goes on to steer, and looks again)
+            self.bridge.failed(error)
+        self.bridge.get_command()
+        return True
+
+    def _look(self) -> None:
+        """Look around, and record where everything is if it is time to."""
+        sim_time_s = float(self._robot.getTime())
+        if self.bridge.detect_reload():
+            self.world.begin_run()
+            self._due_s = -math.inf
+        self.world.go_on()
+        if self.world.is_new:
+            self.bridge.record_world(self.world.describe())
+        if sim_time_s >= self._due_s and (seen := self.world.look(sim_time_s)):
+            self._due_s = sim_time_s + self._period_ms / 1000 - 1e-6
+            self.bridge.publish({"world": seen})
+
+    def _warn(self, text: str) -> None:
+        self.bridge.log(text, "warning")
+
+    def look_at(self, command: dict[str, Any]) -> dict[str, Any]:
+        """Velocity, contact points, centre of mass and static balance of a robot or solid now.
+
+        params: of (its DEF, its name, or its word in the signals world.WORD.x_m).
+        """
+        body = self.world.find(command["params"].get("of"))
+        if body is None:
+            there = ", ".join(self.world.bodies) or "nothing yet"
+            raise InvalidInputError(f"give params.of: one of {there}")
+        return _looked_at(body, self._robot)
+
+
+def _looked_at(body: Body, robot: Any) -> dict[str, Any]:
+    node = body.scene.node
+    velocity = [round(float(value), _DIGITS) for value in node.getVelocity()]
+    told: dict[str, Any] = {
+        "key": body.key,
+        "position_m": [round(float(value), _DIGITS) for value in node.getPosition()],
+        "velocity_mps": velocity[:3],
+        "angular_velocity_radps": velocity[3:],
+    }
+    return told | _standing(node, robot)
+
+
+def _standing(node: Any, robot: Any) -> dict[str, Any]:
+    """What Webots tells of a Solid that stands on its own, as far as this one does."""
+    if not hasattr(node, "getContactPoints"):
+        return {"not_told": "contact points and balance: this simulator does not have them"}
+    contacts = node.getContactPoints(True)
+    return {
+        "contacts": [_contact(contact, robot) for contact in contacts[:_MOST_CONTACTS]],
+        "contacts_in_all": len(contacts),
+        "center_of_mass_m": [round(float(value), _DIGITS) for value in node.getCenterOfMass()],
+        "is_balanced": bool(node.getStaticBalance()),
+    }
+
+
+def _contact(contact: Any, robot: Any) -> list[Any]:
+    """Where it touches, and with which of its nodes."""
+    point = [round(float(value), _DIGITS) for value in contact.getPoint()[:3]]
+    node = robot.getFromId(contact.getNodeId())
+    return [*point, None if node is None else node.getDef() or node.getTypeName()]

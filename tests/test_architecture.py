@@ -47,6 +47,7 @@ ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
 ALLOWED["store"] = STDLIB | {"store"}
 ALLOWED["trials"] = STDLIB | {"store", "trials", "webots"}
 ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}
+ALLOWED["launching"] = STDLIB | {"store", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
 ALLOWED["server"] = STDLIB | {
     "store", "plotting", "diagnosis", "trials", "server", "webots", "__version__"

@@ -21,6 +21,7 @@ from webots_mcp.cli import (
     data,
     diagnosing,
     history,
+    launching,
     looking,
     serving,
     setting_up,
@@ -39,6 +40,7 @@ __all__ = ["COMMANDS", "main"]
 FAMILIES: Final = (
     serving,
     setting_up,
+    launching,
     looking,
     diagnosing,
     history,

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -11,6 +13,9 @@ from webots_mcp.contract import find_project, full_path
 from webots_mcp.errors import InvalidInputError
 
 _PYTHON: Final = "Python"
+_BRIDGE: Final = b"MCPBridge"
+# Of a world file: strings and names; a comment is neither, and hides what is in it.
+_WORDS: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\n]*|\w+')
 
 
 class Controller(NamedTuple):
@@ -69,3 +74,19 @@ def _started(folder: Path, platform: str) -> Iterator[Controller]:
         if language and (folder / file).is_file():
             yield Controller(name, folder / file, language)
             return
+
+
+def has_bridge(controller: Path) -> bool:
+    """Whether a file of a controller's folder speaks of the bridge."""
+    return any(_BRIDGE in file.read_bytes() for file in sorted(controller.glob("*.py")))
+
+
+def controllers_in(world: Path) -> list[str]:
+    """The controllers that a world file names, each once; robots of PROTOs may have others.
+
+    Raises:
+        OSError: It cannot be read.
+    """
+    words = _WORDS.findall(world.read_text("utf-8", "replace"))
+    named = (after[1:-1] for word, after in pairwise(words) if word == "controller")
+    return list(dict.fromkeys(name for name in named if name))

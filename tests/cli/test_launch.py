@@ -1,0 +1,215 @@
+"""`webots-mcp launch` on a program named `webots` that behaves as Webots' sources tell."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.trials.test_killed import wait_until
+from tests.webots.conftest import CONTROLLER, free_port, webots, write_project
+
+__all__ = ["webots"]
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="the program `webots` is a script")
+
+Launch = Callable[..., "subprocess.Popen[str]"]
+PLAIN = "from controller import Robot\nrobot = Robot()\nwhile robot.step(16) != -1: pass\n"
+FAILING = (
+    "from webots_mcp import MCPBridge\nprint('hello', flush=True)\nraise ValueError('no arm')\n"
+)
+QUITTING = CONTROLLER.replace("robot.getTime()})", "1})\n    robot.simulationQuit(5)", 1)
+
+
+@pytest.fixture
+def launch(webots: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Launch]:
+    """Run the command, in the way of a person at a desktop."""
+    monkeypatch.setenv("DISPLAY", ":99")
+    running: list[subprocess.Popen[str]] = []
+
+    def begin(*arguments: object) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", "webots_mcp", "launch", *map(str, arguments)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        running.append(process)
+        return process
+
+    yield begin
+    for process in running:
+        process.kill()
+        process.communicate(timeout=30)
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Callable[[str], Path]:
+    """A project whose robot has this controller; the world of it."""
+    return lambda controller=CONTROLLER: write_project(tmp_path / "project", controller)
+
+
+def _told(process: subprocess.Popen[str], text: str) -> str:
+    """The first line of its stderr with a text in it."""
+    assert process.stderr is not None
+    said = list[str]()
+    for line in process.stderr:
+        said.append(line)
+        if text in line:
+            return line
+    raise AssertionError(f"{text!r} never came: {said}")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_it_says_who_records_and_leaves_nothing_running_however_it_ends(
+    launch: Launch, project: Callable[..., Path], number: signal.Signals, tmp_path: Path
+) -> None:
+    port = free_port()
+    process = launch(project(), "--mode", "fast", "--headless", "--port", port)
+    said = _told(process, "records")
+    assert said == f"webots-mcp: rover records: run 1, Webots listens at port {port}\n"
+    assert (tmp_path / "project" / "mcp_data" / "webots.db").exists()
+    family = psutil.Process(process.pid).children(recursive=True)
+    assert any("rover.py" in " ".join(each.cmdline()) for each in family)
+
+    process.send_signal(number)
+    out, rest = process.communicate(timeout=60)
+
+    assert "[rover] ready" in out
+    wait_until(lambda: not any(each.is_running() for each in family))
+    if number != signal.SIGKILL:
+        assert process.returncode == 128 + number
+        assert "webots-mcp: ending Webots\n" in rest
+        assert "Traceback" not in out + rest
+
+
+def test_webots_ends_by_itself_with_its_own_exit_code(
+    launch: Launch, project: Callable[..., Path]
+) -> None:
+    process = launch(project(QUITTING), "--mode", "fast")
+    out, said = process.communicate(timeout=60)
+    assert process.returncode == 5, said
+    assert "webots-mcp: rover records: run 1" in said
+    assert "[rover] ready" in out
+    assert "ending Webots" not in said
+
+
+def test_a_port_that_is_taken_is_told_by_the_one_that_webots_took(
+    launch: Launch, project: Callable[..., Path]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        process = launch(project(), "--port", port)
+        said = _told(process, "records")
+    taken = int(said.split()[-1])
+    assert port < taken <= port + 10
+
+
+@pytest.mark.parametrize(
+    ("controller", "said"),
+    [
+        (PLAIN, "without a bridge: rover (attach one: webots-mcp init --patch "),
+        (FAILING, "ValueError: no arm | WARNING: 'rover' controller exited with status: 1."),
+    ],
+)
+def test_it_says_why_nobody_records(
+    launch: Launch, project: Callable[..., Path], controller: str, said: str
+) -> None:
+    process = launch(project(controller), "--patience", "3", "--mode", "fast")
+    told = _told(process, "no controller has recorded within 3 s: ")
+    assert said in told
+
+
+def test_it_says_that_controllers_do_not_begin_in_a_pause(
+    launch: Launch, project: Callable[..., Path]
+) -> None:
+    process = launch(project(), "--patience", "3", "--mode", "pause")
+    assert "it begins paused" in _told(process, "no controller has recorded within 3 s: ")
+
+
+def test_an_extern_controller_that_is_missing_is_named(
+    launch: Launch, project: Callable[..., Path]
+) -> None:
+    world = project()
+    text = world.read_text("utf-8").replace('controller "rover"', 'controller "<extern>"')
+    world.write_text(text, "utf-8")
+    process = launch(world, "--patience", "3")
+    told = _told(process, "no controller has recorded within 3 s: ")
+    assert "a robot has the controller <extern>: start it with webots-controller" in told
+
+
+def test_webots_that_ends_at_its_start_is_told_with_what_it_said(
+    launch: Launch, project: Callable[..., Path]
+) -> None:
+    world = project()
+    world.write_text("no world at all", "utf-8")
+    process = launch(world)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert "webots-mcp: Webots ended with exit code 1; its console said: " in said
+
+
+def test_without_a_free_port_webots_says_so_and_ends(
+    launch: Launch, project: Callable[..., Path]
+) -> None:
+    with contextlib.ExitStack() as taken:
+        first = free_port()
+        for port in range(first, first + 11):
+            with contextlib.suppress(OSError):  # somebody else has it
+                taken.enter_context(socket.create_server(("127.0.0.1", port)))
+        process = launch(project(), "--port", first)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert f"Could not initialize TCP server on port {first}" in said
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["worlds/arna.wbt"], "arna.wbt; in {}/worlds there is arena.wbt"),
+        (["controllers/rover/rover.py"], "is no world: its name does not end with .wbt"),
+        (["../lonely.wbt"], "lies in no Webots project: that is a folder with worlds/ and"),
+        (["worlds/arena.wbt", "--port", "70000"], "'70000' is no port: it is from 1 to 65535"),
+    ],
+)
+def test_a_world_that_cannot_be_meant_is_refused(
+    launch: Launch,
+    project: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    arguments: list[str],
+    said: str,
+) -> None:
+    folder = project().parent.parent
+    (folder.parent / "lonely.wbt").write_text("#VRML_SIM R2025a utf8\n")
+    monkeypatch.chdir(folder)
+    process = launch(*arguments)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert said.format(folder) in told
+
+
+def test_without_webots_the_places_that_were_looked_at_are_named(
+    launch: Launch, project: Callable[..., Path], webots: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    webots.unlink()
+    monkeypatch.setenv("WEBOTS_HOME", "/opt/nowhere")
+    process = launch(project())
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 2
+    assert "no program 'webots' in WEBOTS_HOME (/opt/nowhere), on the PATH or in /usr/" in told
+
+
+def test_who_reads_no_longer_ends_it(launch: Launch, project: Callable[..., Path]) -> None:
+    process = launch(project(CONTROLLER + '    print("x" * 9999)\n'), "--mode", "fast")
+    _told(process, "records")
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.wait(60) == 0

@@ -1,0 +1,165 @@
+"""Starting the user's Webots on a world of a project, until the first controller records."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.contract import find_project, full_path
+from webots_mcp.errors import InvalidInputError, NoDatabaseError
+from webots_mcp.setup.project import controllers_in, has_bridge
+from webots_mcp.store.beginnings import Beginning, beginnings, newest_session
+from webots_mcp.store.recording import Recording
+from webots_mcp.webots.command_line import Start
+from webots_mcp.webots.launched import LaunchedWebots, Show
+from webots_mcp.webots.stream import Address, ConsoleLine, address_of
+
+WORLD_ENDING: Final = ".wbt"
+_SHOWN_LINES: Final = 3
+_EXTERN: Final = "<extern>"
+_NOBODYS: Final = (_EXTERN, "<none>", "<generic>", "void")
+_NO_NEWS: Final = ("INFO:", "DEBUG:")
+_TROUBLE: Final = re.compile(r"^(WARNING|ERROR):|\b\w*(Error|Exception)\b")
+
+
+def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, Path]:
+    """The file of a world, and the project that it lies in.
+
+    Args:
+        path: Absolute, or from the current folder or the project's.
+        project: It has to lie in this one; None for any.
+
+    Raises:
+        InvalidInputError: There is no such world, or it lies in no project, or in another one.
+        OSError: The path cannot be followed.
+    """
+    world = _found(Path(path), project)
+    if world.suffix != WORLD_ENDING:
+        raise InvalidInputError(f"{world} is no world: its name does not end with {WORLD_ENDING}")
+    if project is not None and not world.is_relative_to(project):
+        raise InvalidInputError(f"{world} lies outside of the project {project}")
+    own = find_project(world.parent)
+    if own is None:
+        raise InvalidInputError(
+            f"{world} lies in no Webots project: that is a folder with worlds/ and controllers/"
+        )
+    return world, project or own
+
+
+def _found(path: Path, project: Path | None) -> Path:
+    """The file that is meant: in the project, a name alone is that of one of its worlds."""
+    folders = [Path()] if project is None else [project, project / "worlds"]
+    places = [full_path(folder / path) for folder in folders]
+    for place in places:
+        if place.is_file():
+            return place
+    there = [world.name for world in sorted(places[-1].parent.glob(f"*{WORLD_ENDING}"))]
+    beside = f"; in {places[-1].parent} there is {', '.join(there[:20])}" if there else ""
+    raise InvalidInputError(f"there is no world {places[0]}{beside}")
+
+
+class Launch:
+    """A Webots that we have started, and what is recorded in it.
+
+    Args:
+        recording: Where its controllers record.
+        start: How it is started.
+        environment: What its controllers get beside the environment of this process.
+        show: Called with each line of its console, in a thread of its own.
+
+    Raises:
+        CommandRefusedError: There is no Webots, or no display.
+        DatabaseError: The recording cannot be read.
+    """
+
+    def __init__(
+        self, recording: Recording, start: Start, environment: Mapping[str, str], show: Show
+    ) -> None:
+        self.start = start
+        self._recording = recording
+        self._before = newest_in(recording)
+        self.webots = LaunchedWebots(start, environment, show)
+        self.webots.start()
+
+    def first_record(self) -> Beginning | None:
+        """The first of its controllers that has recorded a state."""
+        return next((each for each in self._begun() if each.run_id is not None), None)
+
+    def silence(self) -> str:
+        """Why no controller has recorded yet, as far as that shows."""
+        reasons = [*self._of_webots(), *self._of_controllers()]
+        return "; ".join(reasons) or "no controller has recorded yet"
+
+    def _begun(self) -> list[Beginning]:
+        asked = Address("127.0.0.1", self.start.port)
+        address, pids = self.webots.address or asked, self.webots.pids
+        found = begun_since(self._recording, self._before)
+        return [each for each in found if each.pid in pids or address_of(each.instance) == address]
+
+    def _of_webots(self) -> list[str]:
+        said = [line.text for line in self.webots.lines if _is_of_trouble(line)]
+        reasons = list[str]()
+        if self.webots.is_over:
+            reasons.append(f"Webots ended with exit code {self.webots.exit_code}")
+        elif self.webots.address is None:
+            reasons.append(f"Webots does not listen at port {self.start.port} yet: it is starting")
+        elif self.start.mode == "pause":
+            reasons.append("it begins paused: controllers are started when it is played")
+        if said:
+            reasons.append(f"its console said: {' | '.join(said[-_SHOWN_LINES:])}")
+        return reasons
+
+    def _of_controllers(self) -> list[str]:
+        begun = [each.robot for each in self._begun()]
+        if begun:
+            return [f"{', '.join(begun)} has a bridge and has published nothing yet"]
+        return list(_without_record(self.start.world))
+
+
+def _is_of_trouble(line: ConsoleLine) -> bool:
+    """What came on stderr; also what looks so, as `xvfb-run` may put both into one."""
+    if line.stream == "stderr":
+        return bool(line.text.strip()) and not line.text.startswith(_NO_NEWS)
+    return bool(_TROUBLE.search(line.text))
+
+
+def _without_record(world: Path) -> list[str]:
+    """What the world and its controllers say of it."""
+    folder = (find_project(world.parent) or world.parent.parent) / "controllers"
+    names = controllers_in(world)
+    own = [name for name in names if name not in _NOBODYS and (folder / name).is_dir()]
+    missing = [name for name in names if name not in (*_NOBODYS, *own)]
+    without = [name for name in own if not has_bridge(folder / name)]
+    reasons = list[str]()
+    if _EXTERN in names:
+        reasons.append("a robot has the controller <extern>: start it with webots-controller")
+    if missing:
+        reasons.append(f"not in {folder}: {', '.join(missing)}")
+    if without:
+        file = folder / without[0] / f"{without[0]}.py"
+        reasons.append(
+            f"without a bridge: {', '.join(without)} (attach one: webots-mcp init --patch {file})"
+        )
+    if not own and not reasons:
+        reasons.append(f"{world.name} names no controller (robots of PROTOs may have one)")
+    return reasons
+
+
+def newest_in(recording: Recording) -> int:
+    """The newest session of a recording; 0 where there is none yet."""
+    try:
+        with recording.reader() as connection:
+            return newest_session(connection)
+    except NoDatabaseError:
+        return 0
+
+
+def begun_since(recording: Recording, session: int) -> list[Beginning]:
+    """The sessions of a recording after that one."""
+    try:
+        with recording.reader() as connection:
+            return beginnings(connection, session)
+    except NoDatabaseError:
+        return []

@@ -1,4 +1,4 @@
-"""The conversation in examples/ is one that takes place: it is had again, and compared."""
+"""The conversations in examples/ are such as take place: they are had again, and compared."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ import sys
 from pathlib import Path
 from typing import NamedTuple
 
-FOLDER = Path(__file__).parent.parent / "examples" / "conversation"
+import pytest
+
+EXAMPLES = Path(__file__).parent.parent / "examples"
+CONVERSATIONS = sorted(path.parent.name for path in EXAMPLES.glob("*/conversation.toml"))
 TURN = re.compile(r"```\n(.*?)\n```\n\n```\n(.*?)\n```\n\n\*\*Assistant:\*\* (.*?)\n\n", re.S)
 
 
@@ -30,13 +33,18 @@ def without_numbers(text: str) -> str:
     return re.sub(r"\d+(\.\d+)?", "#", text)
 
 
-def test_the_page_shows_what_is_said_and_answered_today() -> None:
-    line = [sys.executable, str(FOLDER / "conversation.py")]
-    had = subprocess.run(line, capture_output=True, text=True, timeout=180, check=False)
-    assert had.returncode == 0, had.stderr
-    shown = (FOLDER / "README.md").read_text("utf-8")
+def test_there_are_conversations_to_have() -> None:
+    assert {"conversation", "e_puck", "tag"} <= set(CONVERSATIONS)
 
-    assert len(turns_of(shown)) == 10
+
+@pytest.mark.parametrize("name", CONVERSATIONS)
+def test_the_page_shows_what_is_said_and_answered_today(name: str) -> None:
+    line = [sys.executable, str(EXAMPLES / "ask.py"), str(EXAMPLES / name)]
+    had = subprocess.run(line, capture_output=True, text=True, timeout=240, check=False)
+    assert had.returncode == 0, had.stderr
+    shown = (EXAMPLES / name / "README.md").read_text("utf-8")
+
+    assert len(turns_of(shown)) == shown.count("**Assistant:**") > 4
     assert turns_of(had.stdout) == turns_of(shown)
     assert [text for text in shown.splitlines() if text.startswith("**You:**")] == [
         text for text in had.stdout.splitlines() if text.startswith("**You:**")

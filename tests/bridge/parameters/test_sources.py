@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.bridge.conftest import STEP_MS, Recording, catch_up, eager, heartbeat_now, write_lock
-from tests.bridge.test_parameters import VALUES, ask
+from tests.bridge.parameters.conftest import VALUES, ask
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.contract import PARAMETERS_VARIABLE
 from webots_mcp.standin import InProcessSupervisor

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
@@ -31,12 +30,6 @@ from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.standin import InProcessSupervisor
 
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be deleted there")
-
-
-@pytest.fixture
-def bridge(robot: InProcessSupervisor, file: Path) -> Iterator[MCPBridge]:
-    with MCPBridge(robot, data_dir=file.parent, throttle_interval=1) as bridge:
-        yield bridge
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")

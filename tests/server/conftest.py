@@ -21,6 +21,15 @@ from webots_mcp.standin import InProcessSupervisor
 
 STEP_MS = 16
 Connect = Callable[..., AbstractAsyncContextManager[Client]]
+DATA_TOOLS = (  # that read the present
+    "webots_list_robots",
+    "webots_get_world_info",
+    "webots_get_robot_state",
+    "webots_get_sensors",
+    "webots_get_full_state",
+    "webots_get_logs",
+    "webots_list_commands",
+)
 
 
 @pytest.fixture

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import re
 import sqlite3
 from collections import Counter
 from itertools import count
-from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
+from tests.store.questions.asking import ask, spans
 from webots_mcp.errors import InvalidInputError, UnknownSignalError
 from webots_mcp.store.analysis.jumps import find_jumps
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
@@ -25,19 +24,9 @@ from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.signals.catalogue import known_signals
 
 
-def ask(connection: sqlite3.Connection, kind: Any, *, bounds: Any = None, **options: Any) -> Events:
-    given: dict[str, Any] = bounds or {"run_id": 1}
-    found = find_range(connection, Scope(**given))
-    return find_events(connection, found, EventOptions(kinds=(kind,), **options), limit=200)
-
-
 def is_unrolled(events: Events) -> bool:
     """A long range without rollups is not searched for these, and the answer admits it."""
     return any("not rolled up yet" in why for why in events.verdicts.not_searched.values())
-
-
-def spans(events: Events) -> list[tuple[float, float]]:
-    return [(round(event.start_s, 1), round(event.end_s, 1)) for event in events.events]
 
 
 def test_a_robot_that_should_move_and_does_not_is_stuck(
@@ -275,107 +264,6 @@ def test_options_without_sense_are_refused(rover: sqlite3.Connection) -> None:
 def test_noise_neither_jumps_nor_swings(seed: int) -> None:
     noise = np.random.default_rng(seed).normal(size=2000)
     assert find_jumps(np.arange(2000.0), noise, 12.0) == []
-
-
-def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tuple[Event, ...]:
-    """Ten seconds of driving and ten of standing; each signal has a value for either."""
-    recorder = start_run(empty)
-    for step in range(200):
-        state = {name: pair[step > 100] for name, pair in moving_and_standing.items()}
-        recorder.publish(step * 0.1, state | {"gps": {"x": min(step, 100) * 0.02, "y": 0}})
-    return ask(empty, "stuck").events
-
-
-def test_a_measured_speed_of_zero_does_not_hide_that_it_is_stuck(empty: sqlite3.Connection) -> None:
-    (stuck,) = publish_stuck(empty, speed=(0.2, 0.0), mode=("drive", "drive"))
-    assert stuck.start_s == pytest.approx(10.0, abs=0.2) and stuck.ongoing
-
-
-def test_a_robot_told_to_stand_is_not_stuck(empty: sqlite3.Connection) -> None:
-    assert not publish_stuck(empty, commanded_m_s=(0.2, 0.0), mode=("drive", "drive"))
-
-
-@pytest.mark.parametrize("mode", ["returning", "threshold_wait", "forest", "already_home", "idle"])
-def test_no_verdict_hangs_on_what_a_mode_is_called(empty: sqlite3.Connection, mode: str) -> None:
-    (stuck,) = publish_stuck(empty, mode=(mode, mode))
-    assert stuck.start_s == pytest.approx(10.0, abs=0.2)
-    assert stuck.details["evidence"] == f"in mode {mode}, in which it moved at 0.2 m/s"
-
-
-def test_what_is_ready_or_idle_beside_switches_nothing_off(empty: sqlite3.Connection) -> None:
-    arm = {"state": "idle"}
-    others = {"status": ("ready", "ready"), "arm": (arm, arm)}
-    (stuck,) = publish_stuck(empty, commanded_m_s=(0.2, 0.2), **others)
-    assert stuck.details["commanded"] == 0.2
-
-
-def test_wheels_that_turn_show_that_it_is_stuck(empty: sqlite3.Connection) -> None:
-    wheels = {"left": 4.0, "right": 4.0}
-    (stuck,) = publish_stuck(empty, wheels=(wheels, wheels))
-    assert "wheels at 4" in stuck.details["evidence"]
-
-
-def test_a_mode_of_an_earlier_run_in_which_it_moved_is_evidence(empty: sqlite3.Connection) -> None:
-    publish_stuck(empty, mode=("S3", "S3"))
-    recorder = Recorder(empty, WALL_START_S + 1000)
-    recorder.run(1, 1)
-    for step in range(100):
-        recorder.publish(step * 0.1, {"mode": "S3", "gps": {"x": 1, "y": 0}})
-    (stuck,) = ask(empty, "stuck", bounds={"run_id": 2}).events
-    assert stuck.details["evidence"] == "in mode S3, in which it moved at 0.2 m/s in run 1"
-
-
-def test_what_stood_is_told_also_where_nothing_shows_that_it_was_stuck(
-    empty: sqlite3.Connection,
-) -> None:
-    assert not publish_stuck(empty, mode=("go", "S0"))
-    (still,) = ask(empty, "still").events
-    assert (still.start_s, still.ongoing) == (pytest.approx(10.0, abs=0.2), True)
-    assert still.details["mode"] == "S0"
-    assert still.details["not_stuck"] == "not seen moving in mode S0"
-
-
-def test_without_any_evidence_a_standstill_says_that_there_is_none(
-    empty: sqlite3.Connection,
-) -> None:
-    assert not publish_stuck(empty, volts=(12.0, 12.1))
-    (still,) = ask(empty, "still").events
-    assert "nothing that is published shows" in still.details["not_stuck"]
-
-
-def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
-    recorder = start_run(empty)
-    for step in range(300):
-        turned, driven = max(0, step - 150) * 0.05, min(step, 150) * 0.02
-        place = [driven, 0.0, math.remainder(turned, 2 * math.pi)]
-        recorder.publish(step * 0.1, {"pose": place, "mode": "go"})
-    assert ask(empty, "stuck").events == ()
-    (still,) = ask(empty, "still").events
-    assert still.details["turned_rad"] == pytest.approx(7.45, abs=0.3)
-    assert "it turned in place" in still.details["not_stuck"]
-
-
-def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Connection) -> None:
-    recorder = start_run(empty)
-    for step in range(300):
-        recorder.publish(step * 0.1, {"gps": {"x": step * 0.03, "y": 0}})
-    assert "0.9 m in 3 s" in ask(empty, "stuck").verdicts.absent["stuck"]
-
-
-def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
-    recorder = start_run(empty)
-    for step in (*range(100), *range(200, 300)):
-        recorder.publish(step * 0.1, {"gps": {"x": 1.0, "y": 0.0}})
-    assert spans(ask(empty, "still")) == [(0.0, 9.9), (20.0, 29.9)]
-
-
-def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(
-    empty: sqlite3.Connection,
-) -> None:
-    recorder = start_run(empty)
-    recorder.publish(0.0, {"mode": "drive", "range": 1.0})
-    told = ask(empty, "stuck", bounds={"run_id": 1}).verdicts
-    assert "no position is known" in told.not_searched["stuck"] and not told.absent
 
 
 def test_a_wall_range_over_several_runs_knows_the_signals_of_each(

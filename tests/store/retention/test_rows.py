@@ -1,11 +1,9 @@
-"""What is kept, and what goes."""
+"""Which rows are kept, and which go."""
 
 from __future__ import annotations
 
 import sqlite3
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,23 +13,12 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.runs import ROW_S, Recorded, states
-from webots_mcp.connection import connect
+from tests.store.retention.conftest import TABLES
 from webots_mcp.errors import InvalidInputError, UnknownRunError
-from webots_mcp.schema import create_schema
 from webots_mcp.settlement import end_session
 from webots_mcp.store.retention import Limit, Retention, mark_kept, plan
 from webots_mcp.store.retention.purge import purge
-from webots_mcp.store.rollup.buckets import buckets
 from webots_mcp.store.rollup.rolling import roll
-
-TABLES = ("state", "rollup", "change", "log", "event", "image", "command", "run", "session")
-NO_LIMIT = Retention(Limit(), Limit(), Limit(), Limit(), Limit(), outlive=0)
-
-
-@pytest.fixture
-def recorded(tmp_path: Path) -> Iterator[Recorded]:
-    with memory_connection() as connection:
-        yield Recorded(connection, tmp_path)
 
 
 def test_finished_runs_lose_their_oldest_rows_first(recorded: Recorded) -> None:
@@ -163,180 +150,6 @@ def test_rows_go_by_age_also_within_a_run(recorded: Recorded) -> None:
     assert recorded.rows() == {1: 41}
 
 
-def bytes_by_name(connection: sqlite3.Connection) -> dict[str, int]:
-    try:
-        sizes = connection.execute("SELECT name, sum(pgsize) FROM dbstat GROUP BY name").fetchall()
-    except sqlite3.OperationalError as error:
-        pytest.skip(f"this SQLite does not tell the size of a table: {error}")
-    return dict(sizes)
-
-
-def mixed(low: int, high: int) -> list[int]:
-    return [low + number * 7919 % (high - low) for number in range(97)]
-
-
-@pytest.mark.parametrize(
-    "lengths",
-    [
-        *([length] for length in (100, 300, 700, 1000, 1300, 1500, 2000, 2500, 3000)),
-        *([length] for length in (4000, 4050, 5000, 8000, 12_000, 20_000)),
-        [1300, 2500],
-        [100] * 20 + [20_000],
-        mixed(200, 3000),
-        mixed(1300, 9000),
-    ],
-    ids=lambda lengths: f"{min(lengths)} to {max(lengths)} bytes",
-)
-@pytest.mark.parametrize("runs", [1, 6])
-def test_what_states_take_is_known_within_a_twentieth_of_what_sqlite_says(
-    tmp_path: Path, lengths: list[int], runs: int
-) -> None:
-    with closing(connect(tmp_path / "webots.db", "writer", create=True)) as connection:
-        create_schema(connection)
-        recorded = Recorded(connection, tmp_path)
-        connection.execute("BEGIN")
-        run_ids = [recorded.add_run(0) for _ in range(runs)]
-        for i in range(2000):
-            recorded.run_id = run_ids[i % runs]
-            text = "t" * (lengths[i % len(lengths)] - len('{"text": ""}'))
-            recorded.publish(i * 0.016, {"text": text})
-        connection.execute("COMMIT")
-        sizes = bytes_by_name(connection)
-        on_disk = sizes["state"] + sizes["ix_state_run_id_sim_time_s"]
-        held = plan(connection, NO_LIMIT).held_bytes["state"]
-    assert held == pytest.approx(on_disk, rel=0.05)
-
-
-@pytest.mark.parametrize("length", [1300, 1500, 2500, 3000, 6000])
-def test_the_file_of_long_rows_shrinks_to_the_limit(tmp_path: Path, length: int) -> None:
-    file = tmp_path / "webots.db"
-    with closing(connect(file, "writer", create=True)) as connection:
-        create_schema(connection)
-        recorded = Recorded(connection, tmp_path)
-        connection.execute("BEGIN")
-        run_ids = [recorded.add_run(0) for _ in range(6)]
-        for i in range(2400):
-            recorded.run_id = run_ids[i % 6]
-            recorded.publish(i // 6 * 0.016, {"text": "t" * length})
-        connection.execute("COMMIT")
-        roll(connection, 10_000)
-        states_bytes = 2_000_000
-        recorded.prune(states(size_bytes=states_bytes))
-        rest_bytes = sum(
-            size for name, size in bytes_by_name(connection).items()
-            if name not in ("state", "ix_state_run_id_sim_time_s")
-        )  # fmt: skip
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    assert file.stat().st_size - rest_bytes == pytest.approx(states_bytes, rel=0.05)
-
-
-def test_a_size_budget_is_met_within_a_tenth(tmp_path: Path) -> None:
-    file = tmp_path / "webots.db"
-    with closing(connect(file, "writer", create=True)) as connection:
-        create_schema(connection)
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-        empty_bytes = file.stat().st_size
-        recorded = Recorded(connection, tmp_path)
-        connection.execute("BEGIN")
-        for _ in range(2):
-            recorded.add_run(0)
-        recorded.run(1, recorded.robot_id)
-        for i in range(8000):
-            recorded.publish(i * ROW_S, {"x": i, "text": "t" * (300 + i % 200)})
-        connection.execute("COMMIT")
-        recorded.prune(states(size_bytes=2_000_000, spared_rows=0))
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
-    assert file.stat().st_size - empty_bytes == pytest.approx(2_000_000, rel=0.1)
-
-
-def test_logs_events_and_pictures_have_limits_of_their_own(recorded: Recorded) -> None:
-    for _ in range(3):
-        recorded.add_run(40)
-    before = Counter({table: recorded.count(table) for table in TABLES})
-    few = Limit(rows=25, spared_rows=0)
-    limits = Retention(Limit(), Limit(), few, few, Limit(rows=2, spared_rows=0), outlive=0)
-    done = recorded.prune(limits)
-    assert [recorded.count(table) for table in ("log", "event", "image")] == [25, 25, 2]
-    assert done.rows == Counter(log=35, event=35, image=1)
-    assert done.files == 1
-    assert recorded.count("state") == before["state"]
-
-
-def test_finished_commands_go_with_the_age_of_events(recorded: Recorded) -> None:
-    for _ in range(3):
-        recorded.add_run(10)
-    recorded.connection.execute("UPDATE command SET status = 'pending' WHERE id = 1")
-    recorded.connection.execute("UPDATE run SET keep = 1 WHERE id = 2")
-    limits = Retention(Limit(), Limit(), Limit(), Limit(age_s=0), Limit(), outlive=0)
-    recorded.prune(limits, recorded.wall_s + 1)
-    rows = recorded.connection.execute("SELECT id FROM command").fetchall()
-    assert rows == [(1,), (2,)]  # the one that waits, and the one of the run that is kept
-
-
-def test_what_is_left_of_a_run_outlives_its_rows_ten_times(recorded: Recorded) -> None:
-    for _ in range(13):
-        recorded.add_run(10)
-    roll(recorded.connection, 1000)
-    limits = Retention(Limit(rows=10, spared_rows=0), Limit(), Limit(), Limit(), Limit())
-    recorded.prune(limits)
-    assert recorded.rows() == {13: 10}
-    for table in ("run", "session", "command"):
-        assert recorded.connection.execute(f"SELECT min(id) FROM {table}").fetchone() == (3,)
-    for table in ("rollup", "change", "log", "event", "image", "parameter_value"):
-        sql = f"SELECT count(DISTINCT run_id), min(run_id) FROM {table}"
-        assert recorded.connection.execute(sql).fetchone() == (11, 3)
-    assert recorded.connection.execute("PRAGMA foreign_key_check").fetchall() == []
-
-
-def test_rollups_stay_when_their_rows_go(recorded: Recorded) -> None:
-    recorded.add_run(100)
-    recorded.add_run(1)
-    recorded.prune(states(rows=1))
-    assert recorded.rows() == {2: 1}
-    signals = dict(recorded.connection.execute("SELECT name, id FROM signal").fetchall())
-    summaries = [part for _, part in buckets(recorded.connection, 1, signals["x"], range(100))]
-    assert sum(part.rows for part in summaries) == 100
-    assert max(part.max or 0 for part in summaries) == 99
-    roll(recorded.connection)
-    assert recorded.count("rollup") > 0
-
-
-def test_rollups_go_only_after_the_rows_that_they_stand_for(recorded: Recorded) -> None:
-    for _ in range(3):
-        recorded.add_run(10)
-    roll(recorded.connection, 1000)
-    only_rollups = Limit(rows=0)
-    recorded.prune(Retention(Limit(), only_rollups, Limit(), Limit(), Limit(), outlive=0))
-    assert recorded.connection.execute("SELECT count(DISTINCT run_id) FROM rollup").fetchone() == (
-        3,
-    )
-    recorded.prune(Retention(Limit(rows=10), only_rollups, Limit(), Limit(), Limit(), outlive=0))
-    assert recorded.connection.execute("SELECT DISTINCT run_id FROM rollup").fetchall() == [(3,)]
-
-
-def test_a_picture_whose_path_leads_out_of_the_folder_is_forgotten_but_not_deleted(
-    recorded: Recorded, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    outside = tmp_path_factory.mktemp("elsewhere") / "mine.png"
-    outside.write_bytes(b"mine")
-    for _ in range(2):
-        recorded.add_run(2)
-    recorded.connection.execute("UPDATE image SET path = ? WHERE id = 1", (str(outside),))
-    limits = Retention(Limit(), Limit(), Limit(), Limit(), Limit(rows=0, spared_rows=0), outlive=0)
-    done = recorded.prune(limits)
-    assert outside.exists()
-    assert (done.rows["image"], done.files) == (2, 1)
-
-
-def test_a_file_that_another_row_stands_for_stays(recorded: Recorded) -> None:
-    for _ in range(2):
-        recorded.add_run(2)
-    recorded.connection.execute("UPDATE image SET path = 'camera/2.png'")
-    limits = Retention(Limit(), Limit(), Limit(), Limit(), Limit(rows=1, spared_rows=0), outlive=0)
-    assert recorded.prune(limits).files == 0
-    assert (recorded.folder / "camera" / "2.png").exists()
-
-
 def test_a_run_that_is_marked_after_the_plan_was_made_loses_nothing_more(
     recorded: Recorded,
 ) -> None:
@@ -379,8 +192,6 @@ def test_absurd_limits_are_refused(limits: dict[str, Any]) -> None:
     with pytest.raises(InvalidInputError, match=next(iter(limits))):
         Limit(**limits)
 
-
-# -- laws -----------------------------------------------------------------------------------------
 
 LIMITS = st.builds(
     Limit,

@@ -1,0 +1,161 @@
+"""Events, the timeline and the monitor, asked by a client of a recording whose story is known."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import GAP_S, NAN_S, STUCK_S
+from tests.recordings.rows import Recorded
+from tests.server.conftest import Connect, ask, fail
+from tests.server.history.conftest import STORY, refuse, tell
+from tests.server.story import WAYS, Way, client_on, copy_of, rows_of
+from webots_mcp.connection import connect
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.registry import asked_kinds
+
+pytestmark = pytest.mark.anyio
+
+
+@pytest.mark.parametrize("way", WAYS)
+async def test_since_when_is_it_stuck_is_one_call_in_both_eras_and_over_stdio(
+    story: Path, way: Way
+) -> None:
+    async with client_on(story, way) as client:
+        answer = await ask(client, "webots_find_events", kinds=["stuck"], run_id=STORY)
+    (stuck,) = rows_of(answer["events"])
+    assert stuck["start_s"] == pytest.approx(STUCK_S[0], abs=0.2)
+    assert stuck["duration_s"] == pytest.approx(STUCK_S[1] - STUCK_S[0], abs=0.3)
+    assert (stuck["details"]["mode"], stuck["@mode"], stuck["@pose.0"]) == ("cruise", "cruise", 8.0)
+
+
+async def test_position_and_mode_can_be_named(recorded: Recorded, connect: Connect) -> None:
+    robot = recorded.robot()
+    for step in range(200):
+        x_mm = 30.0 * min(step, 100)  # it drives 3 m in 10 s, and stands
+        robot.state(step * 0.1, {"rail": {"alongMm": x_mm, "acrossMm": 0.0}, "betriebsart": 1})
+    named = {"position": ["rail.alongMm", "rail.acrossMm"], "mode": "betriebsart"}
+    async with connect(read_only=True) as client:
+        unnamed = await ask(client, "webots_find_events", kinds=["stuck"])
+        assert "position=[x, y]" in str(unnamed["verdicts"]["not_searched"])
+        answer = await ask(client, "webots_find_events", kinds=["stuck"], **named)
+        (stuck,) = rows_of(answer["events"])
+        assert stuck["start_s"] == pytest.approx(10.0, abs=0.2)
+        assert stuck["details"]["x_m"] == pytest.approx(3.0, abs=0.05)
+        compared = await ask(client, "webots_compare_runs", run_ids=[robot.run_id], **named)
+        medians = {each["name"]: each["median"] for each in rows_of(compared["measures"])}
+        assert medians["distance_m"] == [pytest.approx(3.0, rel=0.05)]
+        assert medians["share of 1"] == [1.0]
+        wrong = await fail(client, "webots_compare_runs", position=["rail.alongMm"])
+        assert "position" in wrong
+
+
+async def test_events_tell_what_nobody_noted(story: Path) -> None:
+    answer = await tell(story, "webots_find_events", run_id=STORY)
+    events = rows_of(answer["events"])
+    found = {(event["kind"], event["name"]): event for event in events}
+    assert found["silent", "sensors.front"]["start_s"] == NAN_S[0]
+    assert found["gap", None]["start_s"] == pytest.approx(GAP_S[0], abs=0.2)
+    assert found["oscillation", "heading"]["details"]["period_s"] == pytest.approx(2.0, rel=0.05)
+    assert found["jump", "ir"]["start_s"] == 70.0
+    assert [event["start_s"] for event in events] == sorted(event["start_s"] for event in events)
+    assert sum(answer["verdicts"]["found"].values()) == len(events)
+
+
+async def test_a_condition_is_found_in_the_past_as_often_as_it_would_have_been_hit(
+    story: Path,
+) -> None:
+    where = "sensors.bumper and displacement(3) < 0.01"
+    answer = await tell(story, "webots_find_events", run_id=STORY, where=where)
+    assert answer["verdicts"]["found"] == {"condition": 1}
+    (row,) = rows_of(answer["events"])
+    assert (row["start_s"], row["name"]) == (43.0, where)
+    assert row["details"]["sensors.bumper"] is True
+    assert any("between two rows" in note for note in answer["notes"])
+    assert "column 3" in await refuse(story, "webots_find_events", where="n = 3")
+
+
+async def test_a_threshold_holds_for_at_least_so_long(story: Path) -> None:
+    asked = {"signals": ["pose.0"], "above": 7.9, "run_id": STORY}
+    both = await tell(story, "webots_find_events", **asked, for_s=2)
+    assert [row["start_s"] for row in rows_of(both["events"])] == [39.6, 95.6]
+    none = await tell(story, "webots_find_events", **asked, for_s=60)
+    assert "pose.0 was beyond it for" in none["verdicts"]["came_near"]["threshold"]
+    assert "need signals" in await refuse(story, "webots_find_events", above=1)
+
+
+async def test_the_timeline_goes_on_page_by_page(story: Path) -> None:
+    seen: list[tuple[Any, ...]] = []
+    cursor = ""
+    async with client_on(story) as client:
+        while True:
+            page = await ask(client, "webots_get_timeline", run_id=STORY, limit=4, cursor=cursor)
+            seen += [(r["kind"], r.get("name"), r["start_s"]) for r in rows_of(page["events"])]
+            if not (cursor := page.get("cursor", "")):
+                break
+    assert len(seen) == len(set(seen)) == sum(page["verdicts"]["found"].values())
+    assert [at for _, _, at in seen] == sorted(at for _, _, at in seen)
+    assert ("command", "set_speed", 20.0) in seen
+    assert ("image", "cam", 30.0) in seen
+
+
+async def test_looking_back_reports_at_once_on_exactly_those_rows(story: Path) -> None:
+    answer = await tell(story, "webots_monitor", lookback_s=15)
+    (trend,) = answer["trends"]
+    assert answer["rows"] == trend["rows"] == 301
+    assert (trend["start_s"], trend["end_s"]) == (29.9, 59.9)
+    assert answer["movement"]["distance_m"] == pytest.approx(9.0, abs=0.01)
+    assert [row["details"]["what"] for row in rows_of(answer["events"])] == ["ended"]
+
+
+async def test_looking_back_over_a_reset_tells_of_both_runs_and_no_way_between(
+    story: Path, tmp_path: Path
+) -> None:
+    file = copy_of(story, tmp_path / "webots.db")
+    with connect(file, "writer") as connection:
+        connection.execute("DELETE FROM run WHERE id = 3")
+    connection.close()
+    answer = await tell(file, "webots_monitor", lookback_s=20)
+    assert [trend["run_id"] for trend in answer["trends"]] == [1, 2]
+    ways = answer["movement"]["runs"]
+    assert sum(way["distance_m"] for way in ways) < 12  # the jump back would add 12.8
+
+
+async def test_of_each_kind_it_is_told_whether_it_was_found_is_absent_or_was_not_searched(
+    story: Path,
+) -> None:
+    for kinds in (["stuck", "gap"], ["jump", "silent", "flat", "oscillation"], None):
+        told = (await tell(story, "webots_find_events", kinds=kinds))["verdicts"]
+        absent = [*told.get("came_near", ()), *told.get("absent", "").split(", ")]
+        unsearched = [kind for each in told.get("not_searched", ()) for kind in each.split(", ")]
+        lacking = [kind for kind in (*absent, *unsearched) if kind]
+        assert len(lacking) == len(set(lacking))
+        asked = {*(kinds or (kind.name for kind in asked_kinds(EventOptions())))}
+        assert {*told.get("found", ()), *lacking} == asked
+    (answer,) = [await tell(story, "webots_find_events", kinds=["still"], signals=["mode"])]
+    assert "still" in answer["verdicts"]["came_near"] or answer["verdicts"]["found"]["still"]
+    blind = await tell(story, "webots_find_events", kinds=["silent"], signals=["mode"])
+    assert blind["verdicts"] == {
+        "not_searched": {"silent": "no number was published, or none of these names"}
+    }
+
+
+async def test_what_find_events_does_not_show_is_named_by_time_and_a_cursor_shows_it(
+    story: Path,
+) -> None:
+    async with client_on(story) as client:
+        told: Counter[str] = Counter()
+        asked: dict[str, Any] = {"run_id": STORY, "limit": 4}
+        while True:
+            answer = await ask(client, "webots_find_events", **asked)
+            rows = answer["events"]["rows"]
+            assert 0 < len(rows) <= 4
+            told.update(row[0] for row in rows)
+            if "cursor" not in answer:
+                break
+            assert all(" from " in each for each in answer["not_shown"].values())
+            asked["cursor"] = answer["cursor"]
+    assert told == Counter(answer["verdicts"]["found"]) and "image" not in told

@@ -1,0 +1,109 @@
+"""What the tools about the past answer to bad questions, and where there is nothing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.recordings.rows import Recorded
+from tests.server.conftest import ask, text_of
+from tests.server.history.conftest import EVERY, refuse, tell
+from tests.server.story import client_on
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_sql_reads_and_the_schema_is_a_resource(story: Path) -> None:
+    async with client_on(story) as client:
+        sql = "SELECT run_id, count(*) AS rows FROM state GROUP BY run_id"
+        answer = await ask(client, "webots_query_sql", sql=sql)
+        assert answer["result"] == {"columns": ["run_id", "rows"],
+                                    "rows": [[1, 1150], [2, 300], [3, 600]]}  # fmt: skip
+        (content,) = (await client.read_resource("webots://schema")).contents
+        assert "sim_time_s" in getattr(content, "text", "")
+
+
+async def test_the_schema_is_told_before_anything_was_recorded(tmp_path: Path) -> None:
+    async with client_on(tmp_path / "webots.db") as client:
+        (content,) = (await client.read_resource("webots://schema")).contents
+    assert "table state:" in getattr(content, "text", "")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("tool", "arguments", "words"),
+    [
+        ("webots_query_history", {"signals": ["moed"]}, "mode"),
+        ("webots_query_history", {"signals": ["mode"], "run_id": 99}, "newest runs are [3, 2, 1]"),
+        ("webots_get_trends", {"robot": "rovr"}, "did you mean 'rover'"),
+        ("webots_get_trends", {"start_s": 9, "end_s": 3}, "reversed"),
+        ("webots_find_events", {"start_s": 3, "end_s": 3}, "empty"),
+        ("webots_get_trends", {"start_s": 3, "last_s": 3}, "two ways"),
+        ("webots_get_trends", {"since": "yesterday"}, "ISO 8601"),
+        ("webots_get_trends", {"since": 1700000100, "until": 1.7e9}, "until=1700000000"),
+        ("webots_query_history", {"signals": ["mode"], "max_points": 10**9}, "less than or equal"),
+        ("webots_find_events", {"kinds": ["threshold"]}, "above or below"),
+        ("webots_find_events", {"kinds": ["explosion"]}, "must be one of 'run', 'gap'"),
+        ("webots_get_timeline", {"cursor": "xyz"}, "no cursor"),
+        ("webots_compare_runs", {"run_ids": [1, 1]}, "1 to 10"),
+        ("webots_compare_runs", {"run_ids": [1, 99]}, "no run 99"),
+        ("webots_plot", {"signals": ["nope"]}, "no signal 'nope'"),
+        ("webots_query_sql", {"sql": "DELETE FROM state"}, "only one reading statement"),
+        ("webots_query_sql", {"sql": "SELECT 1; SELECT 2"}, "only one statement"),
+        ("webots_query_sql", {"sql": "ATTACH 'x' AS y"}, "only one reading statement"),
+        ("webots_query_sql", {"sql": "SELECT sim_time FROM state"}, "sim_time_s"),
+        ("webots_query_sql", {"sql": "SELECT * FROM stat"}, "state"),
+    ],
+)
+async def test_bad_input_is_an_error_with_the_next_step(
+    story: Path, tool: str, arguments: dict[str, Any], words: str
+) -> None:
+    assert words in await refuse(story, tool, **arguments)
+
+
+async def test_without_a_database_every_tool_about_the_past_says_how_to_get_one(
+    tmp_path: Path,
+) -> None:
+    file = tmp_path / "folder" / "webots.db"
+    async with client_on(file) as client:
+        for tool, arguments in EVERY:
+            answer = await ask(client, tool, **arguments)
+            assert answer["status"] == "never seen", tool
+            assert "MCPBridge" in answer["hint"], tool
+        assert "MCPBridge" in text_of(await client.call_tool("webots_plot", {}))
+    assert not file.parent.exists()
+
+
+async def test_a_run_without_a_row_says_so_in_every_tool(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    recorded.robot().log(0.0, "hello")
+    async with client_on(tmp_path / "webots.db") as client:
+        for tool, arguments in EVERY:
+            if tool not in ("webots_list_runs", "webots_query_sql"):
+                answer = await ask(client, tool, **arguments)
+                assert (answer["robot"], answer["run_id"]) == ("rover", 1), tool
+                assert answer["hint"], tool
+    recorded.close()
+
+
+async def test_sql_that_never_ends_is_ended(story: Path) -> None:
+    endless = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x FROM c"
+    assert "give a recursion an end" in await refuse(
+        story, "webots_query_sql", sql=endless.replace("SELECT x FROM c", "SELECT count(*) FROM c")
+    )
+    answer = await tell(story, "webots_query_sql", sql=endless)
+    assert "only the first 100 rows" in answer["truncated"]
+    huge = "SELECT hex(zeroblob(900000000))"
+    assert "only reading" in await refuse(story, "webots_query_sql", sql=huge)
+
+
+async def test_empty_answers_say_why_and_what_to_try(story: Path) -> None:
+    for tool, arguments, words in (
+        ("webots_get_trends", {"start_s": 500}, "leave the range out"),
+        ("webots_query_history", {"signals": ["*"], "start_s": 500}, "leave the range out"),
+        ("webots_get_trends", {"since": "2035-01-01"}, "webots_list_runs"),
+        ("webots_query_sql", {"sql": "SELECT 1 WHERE 0"}, "webots_list_signals"),
+    ):
+        assert words in (await tell(story, tool, **arguments))["hint"], tool

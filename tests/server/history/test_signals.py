@@ -1,0 +1,145 @@
+"""Signals, their history and trends, asked by a client of a recording whose story is known."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.recordings.rover import GAP_S, WALL_START_S
+from tests.server.conftest import ask
+from tests.server.history.conftest import EVERY, STORY, tell
+from tests.server.story import client_on, copy_of, rows_of
+from webots_mcp.connection import connect
+from webots_mcp.store.rollup.rolling import roll
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_every_answer_says_about_which_robot_and_run_and_as_of_when(story: Path) -> None:
+    for tool, arguments in EVERY:
+        answer = await tell(story, tool, **arguments)
+        assert (answer["robot"], answer["run_id"], answer["sim_time_s"]) == ("rover", 3, 59.9), tool
+        assert answer["status"].startswith("stopped "), tool
+        assert answer["age_s"] > 0, tool
+
+
+async def test_signals_have_kinds_ranges_and_rows_without_a_value(
+    story: Path,
+) -> None:
+    answer = await tell(story, "webots_list_signals", run_id=STORY)
+    signals = {row["signal"]: row for row in rows_of(answer["signals"])}
+    assert answer["total"] == len(signals) == 15
+    assert (signals["mode"]["kind"], signals["mode"]["last"]) == ("text", "cruise")
+    assert (signals["battery_v"]["unit"], signals["battery_v"]["max"]) == ("V", 12.6)
+    assert signals["sensors.bumper"]["last"] is False
+    assert signals["sensors.front"]["missing"] == "in 40 of 1150 rows; values from 0.0 to 119.9 s"
+    assert signals["mode"]["missing"] is None
+    assert "lidar.argmin" in signals
+
+
+async def test_signals_come_in_pages_and_by_pattern(story: Path) -> None:
+    first = await tell(story, "webots_list_signals", limit=10)
+    second = await tell(story, "webots_list_signals", limit=10, cursor=first["cursor"])
+    names = [row["signal"] for part in (first, second) for row in rows_of(part["signals"])]
+    assert names == sorted(set(names))
+    assert len(names) == first["total"] == 15
+    assert "cursor" not in second
+    part = await tell(story, "webots_list_signals", pattern="lidar.*")
+    assert part["total"] == 5
+
+
+async def test_an_extreme_is_never_lost_in_a_bucket(story: Path) -> None:
+    answer = await tell(story, "webots_query_history", signals=["ir"], run_id=STORY, max_points=4)
+    (run,) = answer["runs"]
+    assert len(run["sim_time_s"]) <= 4
+    assert max(run["numbers"]["ir"]["max"]) == 5.0
+    whole = run["numbers"]["ir"]["whole"]
+    assert (whole["max"], whole["max_at_s"]) == (5.0, 70.0)
+    assert run["gaps"] == [[89.9, 95.0]]
+    assert sum(run["count"]) == run["rows"] == 1150
+
+
+async def test_rows_in_a_gap_are_null_and_modes_are_change_points(story: Path) -> None:
+    answer = await tell(
+        story,
+        "webots_query_history",
+        signals=["pose.0", "mode"],
+        run_id=STORY,
+        start_s=85,
+        end_s=99,
+    )
+    (run,) = answer["runs"]
+    buckets = dict(zip(run["sim_time_s"], run["numbers"]["pose.0"]["mean"], strict=True))
+    assert all(mean is None for at, mean in buckets.items() if GAP_S[0] <= at < GAP_S[1] - 1)
+    assert run["states"]["mode"]["since_s"] == [60.0, 95.0]
+    assert run["states"]["mode"]["value"] == ["avoid", "cruise"]
+
+
+async def test_what_did_not_change_is_said_once(story: Path) -> None:
+    answer = await tell(story, "webots_query_history", signals=["target"])
+    assert answer["runs"][0]["numbers"]["target"] == {"constant": 3.0}
+
+
+async def test_raw_rows_come_in_pages_that_neither_repeat_nor_miss_one(story: Path) -> None:
+    times: list[float] = []
+    cursor: int | None = 0
+    async with client_on(story) as client:
+        while cursor is not None:
+            answer = await ask(
+                client, "webots_query_history",
+                signals=["pose.0"], raw=True, max_points=250, cursor=cursor, run_id=STORY,
+            )  # fmt: skip
+            times += answer["raw"]["sim_time_s"]
+            cursor = answer.get("cursor")
+    assert len(times) == len(set(times)) == 1150
+
+
+async def test_a_wall_time_range_reaches_over_runs(story: Path) -> None:
+    answer = await tell(
+        story,
+        "webots_query_history",
+        signals=["pose.0"],
+        since=WALL_START_S,
+        until=WALL_START_S + 70,
+    )
+    assert [run["run_id"] for run in answer["runs"]] == [1, 2]
+    iso = {"since": "2023-11-14T22:13:20Z", "until": "2023-11-14T22:14:30Z"}
+    same = await tell(story, "webots_query_history", signals=["pose.0"], **iso)
+    assert same["runs"] == answer["runs"]
+
+
+async def test_trends_say_in_one_line_what_a_person_would_notice(story: Path) -> None:
+    answer = await tell(story, "webots_get_trends", run_id=STORY)
+    (run,) = answer["runs"]
+    says = {row["signal"]: row["says"] for row in rows_of(run["numbers"])}
+    assert "rises from 0 to 12.78" in says["pose.0"]
+    assert "every 2 s" in says["heading"]
+    assert "1 spike, the largest 5 at 70 s" in says["ir"]
+    assert "no value in 40 of 1150 rows" in says["sensors.front"]
+    modes = {row["signal"]: row for row in rows_of(run["states"])}
+    assert modes["mode"]["time_by_value_s"]["back_up"] == pytest.approx(8.0, abs=0.2)
+    assert run["numbers"]["columns"] == ["signal", "says", "last", "mean", "deviation"]
+    told = run["constant"].split(", ")
+    assert "target 3" in told and len(told) == 4
+    assert not says.keys() & {each.split(" ")[0] for each in told}
+
+
+async def test_answers_are_the_same_before_and_after_rolling_up(
+    story: Path, tmp_path: Path
+) -> None:
+    rolled = copy_of(story, tmp_path / "webots.db")
+    with connect(rolled, "writer") as connection:
+        assert roll(connection, 100_000).done
+    connection.close()
+    for tool, arguments in (
+        ("webots_list_signals", {"run_id": STORY}),
+        ("webots_query_history", {"signals": ["*"], "run_id": STORY}),
+        ("webots_get_trends", {"run_id": STORY}),
+        ("webots_find_events", {"run_id": STORY}),
+    ):
+        before, after = [await tell(file, tool, **arguments) for file in (story, rolled)]
+        changing = ("age_s", "status")
+        assert {k: v for k, v in before.items() if k not in changing} == {
+            k: v for k, v in after.items() if k not in changing
+        }, tool

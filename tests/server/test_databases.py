@@ -1,0 +1,102 @@
+"""What the tools answer where there is no database that they can read."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from tests.recordings.rows import Recorded
+from tests.server.conftest import DATA_TOOLS, Connect, ask, fail, text_of
+from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.store.migrate import upgrade
+
+pytestmark = pytest.mark.anyio
+
+
+async def test_without_a_database_every_reading_tool_says_how_to_get_one(
+    connect: Connect, file: Path
+) -> None:
+    async with connect() as client:
+        for tool in DATA_TOOLS:
+            answer = await ask(client, tool)
+            assert answer["status"] == "never seen"
+            for word in (str(file), "MCPBridge", "webots-mcp demo", "--data-dir"):
+                assert word in answer["hint"], tool
+        assert "MCPBridge" in text_of(await client.call_tool("webots_get_camera", {}))
+        assert "MCPBridge" in text_of(await client.call_tool("webots_monitor", {}))
+    assert not file.exists()
+
+
+async def test_an_empty_file_and_an_empty_database_are_nothing_recorded_either(
+    connect: Connect, file: Path
+) -> None:
+    file.touch()
+    async with connect() as client:
+        assert "is empty" in (await ask(client, "webots_list_robots"))["hint"]
+        Recorded(file).close()
+        assert "MCPBridge" in (await ask(client, "webots_list_robots"))["hint"]
+
+
+async def test_a_database_that_appears_later_is_found(connect: Connect, file: Path) -> None:
+    async with connect() as client:
+        assert (await ask(client, "webots_get_robot_state"))["status"] == "never seen"
+        recorded = Recorded(file)
+        recorded.robot().state(1.0, {"x": 1})
+        assert (await ask(client, "webots_get_robot_state"))["state"] == {"x": 1}
+        recorded.close()
+
+
+async def test_a_file_that_is_no_database_is_a_clear_error(connect: Connect, file: Path) -> None:
+    file.write_text("certainly no database, " * 100)
+    async with connect() as client:
+        assert "is not a database" in await fail(client, "webots_list_robots")
+
+
+async def test_a_database_of_another_application_is_left_alone(
+    connect: Connect, file: Path
+) -> None:
+    with sqlite3.connect(file) as other:
+        other.execute("CREATE TABLE contact (name TEXT)")
+    other.close()
+    async with connect() as client:
+        text = await fail(client, "webots_list_robots")
+    assert f"{file} belongs to another application" in text
+
+
+async def test_a_damaged_database_is_a_clear_error(
+    connect: Connect, recorded: Recorded, file: Path
+) -> None:
+    recorded.robot()
+    recorded.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+    recorded.close()
+    data = file.read_bytes()
+    file.write_bytes(data[:4096] + b"\xff" * (len(data) - 4096))
+    async with connect() as client:
+        assert "damaged" in await fail(client, "webots_list_robots")
+
+
+async def test_a_database_of_a_newer_version_is_a_clear_error(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION + 1}")
+    async with connect() as client:
+        assert "pip install --upgrade" in await fail(client, "webots_list_robots")
+
+
+async def test_an_older_database_is_migrated_once_by_the_server(
+    connect: Connect, file: Path
+) -> None:
+    upgrade(file, "0001")
+    async with connect() as client:
+        assert (await ask(client, "webots_list_robots"))["status"] == "never seen"
+    connection = sqlite3.connect(file)
+    assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+    connection.close()
+
+
+async def test_a_read_only_server_does_not_migrate(connect: Connect, file: Path) -> None:
+    upgrade(file, "0001")
+    async with connect(read_only=True) as client:
+        assert "webots-mcp migrate" in await fail(client, "webots_list_robots")

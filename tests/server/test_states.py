@@ -1,0 +1,195 @@
+"""The tools that read the present: states, sensors, the world and the log."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from tests.recordings.rows import Recorded
+from tests.server.conftest import DATA_TOOLS, Connect, ask, fail
+from webots_mcp.bridge.encoding import encode
+from webots_mcp.server.sensing import unnamed_devices
+from webots_mcp.server.shortening import compact_json
+
+pytestmark = pytest.mark.anyio
+DEFAULT_LIMIT = 8_000  # characters: about 2,000 tokens
+FULL_LIMIT = 22_000
+
+
+async def test_the_state_is_rounded_and_long_arrays_are_summarised(
+    connect: Connect, recorded: Recorded
+) -> None:
+    lidar = [5.0 + i for i in range(180)]
+    lidar[7] = 0.123456
+    recorded.robot().state(1.0, {"pose": [1.23456, -2.0], "lidar": lidar})
+    async with connect() as client:
+        answer = await ask(client, "webots_get_robot_state")
+    assert answer["state"]["pose"] == [1.235, -2.0]
+    assert answer["state"]["lidar"]["argmin"] == 7
+    assert "arrays over 16 items" in answer["shortened"]
+    assert "webots_get_full_state" in answer["hint"]
+
+
+async def test_odd_values_are_recognisable(connect: Connect, recorded: Recorded) -> None:
+    lidar = [float("inf")] * 40 + [0.5] * 140
+    encoded = encode({"front": float("nan"), "lidar": lidar, "x": 1.0})
+    robot = recorded.robot()
+    robot.state(1.0, json.loads(encoded.text), encoded.odd)
+    async with connect() as client:
+        answer = await ask(client, "webots_get_sensors")
+    assert answer["sensors"]["front"] == "nan"
+    assert answer["sensors"]["lidar"]["inf"] == 40
+    assert answer["replaced"]["front"] == "nan"
+    assert "x" not in answer["sensors"]
+    assert answer["devices_not_named_in_state"] == "eye (Camera)"
+
+
+def test_a_device_is_named_in_the_state_however_its_words_are_arranged() -> None:
+    names = ("ds0", "ds7", "front left sonar", "leftEncoder", "range_finder", "gps")
+    devices: dict[str, str] = dict.fromkeys(names, "DistanceSensor")
+    state = {"ds": [1, 2], "sonar": {"front_left": 1.0}, "encoder": {"left": 3}, "seen": {"gps": 1}}
+    assert list(unnamed_devices(state, devices)) == ["ds7", "range_finder"]
+
+
+async def test_a_state_without_sensors_says_where_to_look(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot().state(1.0, {"x": 1.0})
+    async with connect() as client:
+        answer = await ask(client, "webots_get_sensors")
+    assert answer["sensors"] == {}
+    assert "webots_get_robot_state" in answer["hint"]
+
+
+@pytest.mark.parametrize(
+    "state",
+    [
+        {"lidar": [0.1 * i for i in range(180)], "pose": [1.0, 2.0, 3.0]},
+        {"text": "x" * 1_000_000},
+        {f"key {i}": {"value": i * 1.234567, "text": "y" * 50} for i in range(10_000)},
+        {"grid": [[float(i * j) for i in range(200)] for j in range(200)]},
+    ],
+    ids=["lidar", "long text", "1 MB of keys", "grid"],
+)
+async def test_answers_stay_short_whatever_is_published(
+    connect: Connect, recorded: Recorded, state: dict[str, Any]
+) -> None:
+    robot = recorded.robot()
+    robot.state(1.0, state)
+    robot.beat(actions=json.dumps({f"action {i}": "z" * 5000 for i in range(100)}))
+    for i in range(100):
+        robot.log(1.0, f"{i} " + "w" * 10_000, "warning")
+        robot.event(1.0, "change", "text", {"from": "v" * 5000, "to": "u" * 5000})
+    async with connect() as client:
+        for tool in DATA_TOOLS:
+            characters = len(compact_json(await ask(client, tool)))
+            limit = FULL_LIMIT if tool == "webots_get_full_state" else DEFAULT_LIMIT
+            assert characters < limit, tool
+
+
+async def test_a_part_of_the_state_comes_whole_in_pages(
+    connect: Connect, recorded: Recorded
+) -> None:
+    recorded.robot().state(1.0, {"sensors": {"lidar": [i + 0.123456 for i in range(180)]}})
+    async with connect() as client:
+        path = "sensors.lidar"
+        page = await ask(client, "webots_get_full_state", path=path, limit=100)
+        assert page["state"][:2] == [0.123456, 1.123456]
+        assert (page["total"], page["next_offset"]) == (180, 100)
+        rest = await ask(client, "webots_get_full_state", path=path, offset=100)
+        assert len(rest["state"]) == 80
+        assert "next_offset" not in rest
+        assert "there are ['lidar']" in await fail(
+            client, "webots_get_full_state", path="sensors.lidr"
+        )
+
+
+async def test_the_full_state_has_events_and_the_recorders_health(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot(rows_waiting=3, rows_dropped=2, last_error="disk full")
+    robot.state(1.0, {"x": 0.123456789})
+    robot.event(0.5, "change", "mode", {"from": "a", "to": "b"})
+    async with connect() as client:
+        answer = await ask(client, "webots_get_full_state")
+    assert answer["state"] == {"x": 0.123456789}
+    assert answer["events"]["rows"] == [[0.5, "change", "mode", {"from": "a", "to": "b"}]]
+    health = answer["recorder"]
+    assert (health["rows_waiting"], health["rows_dropped"]) == (3, 2)
+    assert health["last_error"] == "disk full"
+    assert health["controller_sha256"] == "a" * 64
+
+
+async def test_the_full_state_says_which_seconds_were_kept_last(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    robot.state(60.0, {"x": 1})
+    async with connect() as client:
+        assert "kept_at_full_rate" not in (await ask(client, "webots_get_full_state"))["recorder"]
+        robot.kept(5.0, 12.0, "breakpoint 1: front_m < 0.1")
+        robot.kept(40.0, 47.0, "error: the gear is gone")
+        answer = await ask(client, "webots_get_full_state")
+        seen = await ask(client, "webots_get_robot_state")
+        robot.kept(58.0, 62.0, "pause")
+        goes_on = (await ask(client, "webots_get_robot_state"))["kept_at_full_rate"]
+    assert goes_on == "58.000 s on, until 62.000 s: pause"
+    assert seen["kept_at_full_rate"] == answer["recorder"]["kept_at_full_rate"]
+    assert answer["recorder"]["kept_at_full_rate"] == "40.000-47.000 s: error: the gear is gone"
+
+
+async def test_the_world_is_described_with_its_companions(
+    connect: Connect, recorded: Recorded
+) -> None:
+    rover = recorded.robot("rover")
+    recorded.robot("referee")
+    for i in range(5):
+        rover.state(i * 1.0, {}, at=rover.now + i * 0.5)
+    async with connect() as client:
+        answer = await ask(client, "webots_get_world_info", robot="rover")
+    assert answer["world"].endswith("arena.wbt")
+    assert answer["basic_time_step_ms"] == 16.0
+    assert answer["real_time_factor"] == 2.0
+    assert answer["run"]["rows"] == 5
+    assert answer["companions"]["rows"] == [["referee", "Supervisor", ""]]
+    assert answer["controller"]["file"].endswith("rover.py")
+
+
+async def test_log_lines_are_paged_towards_older_ones(connect: Connect, recorded: Recorded) -> None:
+    robot = recorded.robot()
+    for i in range(120):
+        robot.log(i * 1.0, f"line {i}", "error" if i % 10 == 0 else "info")
+    async with connect() as client:
+        newest = await ask(client, "webots_get_logs")
+        assert [row[2] for row in newest["lines"]["rows"]][-1] == "line 119"
+        assert (len(newest["lines"]["rows"]), newest["matching"]) == (50, 120)
+        older = await ask(client, "webots_get_logs", cursor=newest["cursor"])
+        assert older["lines"]["rows"][-1][2] == "line 69"
+        errors = await ask(client, "webots_get_logs", level="error", start_s=50, end_s=100)
+        assert [row[0] for row in errors["lines"]["rows"]] == [50.0, 60.0, 70.0, 80.0, 90.0]
+        nothing = await ask(client, "webots_get_logs", filter_text="collision")
+        assert "leave out filter_text" in nothing["hint"]
+        assert "less than end_s" in await fail(client, "webots_get_logs", start_s=5, end_s=5)
+
+
+async def test_log_lines_come_from_before_a_reset_too_each_with_its_run(
+    connect: Connect, recorded: Recorded
+) -> None:
+    robot = recorded.robot()
+    before = robot.run_id
+    robot.log(60.0, "before the reset", "critical")
+    robot.run_id = robot.begin_run("reset")
+    robot.log(0.5, "after the reset")
+    recorded.robot("other").log(1.0, "of another robot")
+    async with connect() as client:
+        newest = await ask(client, "webots_get_logs", robot="rover")
+        rows = [(row[2], row[3]) for row in newest["lines"]["rows"]]
+        assert rows == [("before the reset", before), ("after the reset", robot.run_id)]
+        ranged = await ask(client, "webots_get_logs", robot="rover", last_s=10)
+        assert [row[2] for row in ranged["lines"]["rows"]] == ["after the reset"]
+        earlier = await ask(client, "webots_get_logs", run_id=before)
+        assert [row[2] for row in earlier["lines"]["rows"]] == ["before the reset"]
+        grave = await ask(client, "webots_get_logs", robot="rover", level="critical")
+        assert [row[1] for row in grave["lines"]["rows"]] == ["critical"]

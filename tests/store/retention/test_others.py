@@ -1,0 +1,101 @@
+"""Logs, events, pictures, commands and rollups are kept and go by limits of their own."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import pytest
+
+from tests.recordings.runs import Recorded, states
+from tests.store.retention.conftest import TABLES
+from webots_mcp.store.retention import Limit, Retention
+from webots_mcp.store.rollup.buckets import buckets
+from webots_mcp.store.rollup.rolling import roll
+
+
+def test_logs_events_and_pictures_have_limits_of_their_own(recorded: Recorded) -> None:
+    for _ in range(3):
+        recorded.add_run(40)
+    before = Counter({table: recorded.count(table) for table in TABLES})
+    few = Limit(rows=25, spared_rows=0)
+    limits = Retention(Limit(), Limit(), few, few, Limit(rows=2, spared_rows=0), outlive=0)
+    done = recorded.prune(limits)
+    assert [recorded.count(table) for table in ("log", "event", "image")] == [25, 25, 2]
+    assert done.rows == Counter(log=35, event=35, image=1)
+    assert done.files == 1
+    assert recorded.count("state") == before["state"]
+
+
+def test_finished_commands_go_with_the_age_of_events(recorded: Recorded) -> None:
+    for _ in range(3):
+        recorded.add_run(10)
+    recorded.connection.execute("UPDATE command SET status = 'pending' WHERE id = 1")
+    recorded.connection.execute("UPDATE run SET keep = 1 WHERE id = 2")
+    limits = Retention(Limit(), Limit(), Limit(), Limit(age_s=0), Limit(), outlive=0)
+    recorded.prune(limits, recorded.wall_s + 1)
+    rows = recorded.connection.execute("SELECT id FROM command").fetchall()
+    assert rows == [(1,), (2,)]  # the one that waits, and the one of the run that is kept
+
+
+def test_what_is_left_of_a_run_outlives_its_rows_ten_times(recorded: Recorded) -> None:
+    for _ in range(13):
+        recorded.add_run(10)
+    roll(recorded.connection, 1000)
+    limits = Retention(Limit(rows=10, spared_rows=0), Limit(), Limit(), Limit(), Limit())
+    recorded.prune(limits)
+    assert recorded.rows() == {13: 10}
+    for table in ("run", "session", "command"):
+        assert recorded.connection.execute(f"SELECT min(id) FROM {table}").fetchone() == (3,)
+    for table in ("rollup", "change", "log", "event", "image", "parameter_value"):
+        sql = f"SELECT count(DISTINCT run_id), min(run_id) FROM {table}"
+        assert recorded.connection.execute(sql).fetchone() == (11, 3)
+    assert recorded.connection.execute("PRAGMA foreign_key_check").fetchall() == []
+
+
+def test_rollups_stay_when_their_rows_go(recorded: Recorded) -> None:
+    recorded.add_run(100)
+    recorded.add_run(1)
+    recorded.prune(states(rows=1))
+    assert recorded.rows() == {2: 1}
+    signals = dict(recorded.connection.execute("SELECT name, id FROM signal").fetchall())
+    summaries = [part for _, part in buckets(recorded.connection, 1, signals["x"], range(100))]
+    assert sum(part.rows for part in summaries) == 100
+    assert max(part.max or 0 for part in summaries) == 99
+    roll(recorded.connection)
+    assert recorded.count("rollup") > 0
+
+
+def test_rollups_go_only_after_the_rows_that_they_stand_for(recorded: Recorded) -> None:
+    for _ in range(3):
+        recorded.add_run(10)
+    roll(recorded.connection, 1000)
+    only_rollups = Limit(rows=0)
+    recorded.prune(Retention(Limit(), only_rollups, Limit(), Limit(), Limit(), outlive=0))
+    assert recorded.connection.execute("SELECT count(DISTINCT run_id) FROM rollup").fetchone() == (
+        3,
+    )
+    recorded.prune(Retention(Limit(rows=10), only_rollups, Limit(), Limit(), Limit(), outlive=0))
+    assert recorded.connection.execute("SELECT DISTINCT run_id FROM rollup").fetchall() == [(3,)]
+
+
+def test_a_picture_whose_path_leads_out_of_the_folder_is_forgotten_but_not_deleted(
+    recorded: Recorded, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    outside = tmp_path_factory.mktemp("elsewhere") / "mine.png"
+    outside.write_bytes(b"mine")
+    for _ in range(2):
+        recorded.add_run(2)
+    recorded.connection.execute("UPDATE image SET path = ? WHERE id = 1", (str(outside),))
+    limits = Retention(Limit(), Limit(), Limit(), Limit(), Limit(rows=0, spared_rows=0), outlive=0)
+    done = recorded.prune(limits)
+    assert outside.exists()
+    assert (done.rows["image"], done.files) == (2, 1)
+
+
+def test_a_file_that_another_row_stands_for_stays(recorded: Recorded) -> None:
+    for _ in range(2):
+        recorded.add_run(2)
+    recorded.connection.execute("UPDATE image SET path = 'camera/2.png'")
+    limits = Retention(Limit(), Limit(), Limit(), Limit(), Limit(rows=1, spared_rows=0), outlive=0)
+    assert recorded.prune(limits).files == 0
+    assert (recorded.folder / "camera" / "2.png").exists()

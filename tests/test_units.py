@@ -28,6 +28,14 @@ from webots_mcp.units import metres_in, unit_in
         ("Lage.XMm", "mm"),
         ("heading_degrees", "deg"),
         ("deg_heading", "deg"),
+        ("mmAlong", "mm"),
+        ("cm_x", "cm"),
+        ("x_mm_filtered", "mm"),
+        ("radPerSLeft", "rad/s"),
+        ("speed_mm_per_sec", "mm/s"),
+        ("growth_mm_per_day", None),
+        ("ticks_per_mm", None),
+        ("mAlong", None),
         ("battery_v", "V"),
         ("side.a", None),
         ("sideA", None),
@@ -40,7 +48,9 @@ def test_the_unit_of_a_value_stands_in_its_name(name: str, unit: str | None) -> 
 
 
 def test_a_length_without_a_unit_is_in_metres() -> None:
-    assert [metres_in(name) for name in ("x", "x_mm", "pose_cm.0")] == [1.0, 0.001, 0.01]
+    assert [metres_in(name) for name in ("x", "x_mm", "pose_cm.0", "mmAlong")] == [
+        1.0, 0.001, 0.01, 0.001,
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Units in names: `front_mm`, `speed_m_s`, `heading_deg`, `headingDeg`, `pose_cm.0`.
+"""Units in names: `front_mm`, `speed_m_s`, `heading_deg`, `headingDeg`, `pose_cm.0`, `mmAlong`.
 
 Recorded rows are judged by these units, and so are the states that a controller publishes.
 """
@@ -15,11 +15,12 @@ METRES: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "km": 1000.0}  # of lengths
 _DEGREES: Final = ("deg", "degs", "degree", "degrees")
 _RADIANS: Final = ("rad", "rads", "radian", "radians")
 _MOVING: Final = (*METRES, "rad", "deg")
+_PER_SECOND: Final = ("_s", "ps", "_per_s", "_per_sec", "_per_second")
 _UNITS: Final = {
     **{each: each for each in METRES},
     **dict.fromkeys(_DEGREES, "deg"),
     **dict.fromkeys(_RADIANS, "rad"),
-    **{f"{unit}{per}": f"{unit}/s" for unit in _MOVING for per in ("_s", "ps", "_per_s")},
+    **{f"{unit}{per}": f"{unit}/s" for unit in _MOVING for per in _PER_SECOND},
     **{f"{unit}{per}": f"{unit}/s²" for unit in _MOVING for per in ("_s2", "ps2", "_per_s2")},
     "km_h": "km/h", "kmh": "km/h", "rpm": "rpm", "ms": "ms", "s": "s", "hz": "Hz", "v": "V",
     "a": "A", "w": "W", "nm": "N·m", "n": "N", "kg": "kg", "percent": "%", "bytes": "B",
@@ -33,7 +34,7 @@ _KEPT: Final = 4096  # names whose units are remembered
 
 @lru_cache(maxsize=_KEPT)
 def unit_in(name: str) -> str | None:
-    """The unit that the last part of a name ends in, or else one before it; None without any."""
+    """The unit that the last part of a name has, or else one before it; None without any."""
     units = (_unit_of(part) for part in reversed(name.split(".")))
     return next(filter(None, units), None)
 
@@ -78,10 +79,15 @@ def in_snake_case(name: str) -> str:
 
 
 def _unit_of(part: str) -> str | None:
-    """That of one part of a dotted name; a single letter is one only after an underscore."""
+    """That of one part of a dotted name: `front_mm`, `mmAlong`, `x_mm_filtered`.
+
+    The last one counts. A single letter is one only at the end, after an underscore, and what is
+    per anything but a second (`ticks_per_mm`) has none that is known.
+    """
     words = words_of(part)
-    for count in range(min(_LONGEST_UNIT, len(words)), 0, -1):
-        unit = "_".join(words[-count:])
-        if unit in _UNITS and (len(unit) > 1 or part.lower().endswith(f"_{unit}")):
-            return _UNITS[unit]
-    return "deg" if words[0] in _DEGREES else None
+    for end in range(len(words), 0, -1):
+        for start in range(max(0, end - _LONGEST_UNIT), end):
+            unit = "_".join(words[start:end])
+            if unit in _UNITS and (len(unit) > 1 or part.lower().endswith(f"_{unit}")):
+                return _UNITS[unit] if words.count("per") == unit.count("per") else None
+    return None

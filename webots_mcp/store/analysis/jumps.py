@@ -9,6 +9,7 @@ from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.analysis.rhythm import gap_borders, usual_interval_s
+from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
 
 MOST_JUMPS_SHARE: Final = 0.1  # of the rows: more of them are how the signal is
 LEAST_STEPS: Final = 10
@@ -18,6 +19,11 @@ BACK_HALF: Final = 0.5  # of a step: who comes back by so much to where it usual
 MOTION_SHARE: Final = 0.5  # of a step: the least of one beside it, if both are of one motion
 POSITION_STEPS: Final = 5.0  # a position jumps by so many times its 99th percentile step
 WHOLE_TURNS: Final = (math.tau, 360.0)
+SWING_PERIOD_S: Final = 5.0  # of a longer one no single step is as a jump
+BESIDE_SWINGS_S: Final = 20.0  # before and after jumps: so long six half swings of it last
+SWING_HEIGHTS: Final = 2.6  # amplitudes: from one turn to the other it is 2, and noise adds some
+SWING_STEP: Final = 1.3  # of the largest step of a sine
+SWITCHED_SHARE: Final = 0.5  # of the half swings: so many have a jump where a swing is switched
 
 
 @dataclass(frozen=True)
@@ -46,7 +52,7 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
     least half as large is part of a motion, however quick, and no jump. After a gap a step may be
     larger by as many times as the gap is longer than the usual interval; and the step of an angle
     over the end of its scale (pi, 180 degrees, 360 degrees) is as large as what is left of a whole
-    turn.
+    turn. The steps of a swing are no jumps.
 
     Args:
         times: Of the values.
@@ -59,12 +65,14 @@ def find_jumps(times: Array, values: Array, score: float, usual: Array | None = 
     sizes = steps[_stay(backs, len(steps))] if usual is None else np.abs(np.diff(usual))
     sizes = sizes[sizes > 0]
     if len(sizes) < LEAST_STEPS:
-        return [_excursion(times, values, row, back) for row, back in backs.items()]
+        away = [_excursion(times, values, row, back) for row, back in backs.items()]
+        return _without_swings(away, times, values)
     limit = _limit(sizes, score)
     wide = np.flatnonzero(steps > limit)
     far = _step(values[wide], values[wide + 1]) > limit * _intervals(times, wide)
     alone = far & ~_in_motion(values, wide)
     jumps = [_jump(times, values, row) for row in wide[alone].tolist()]
+    jumps = _without_swings(jumps, times, values)
     if len(jumps) < 2:
         return jumps
     return list(_with_return(jumps, float(np.median(values if usual is None else usual))))
@@ -134,6 +142,36 @@ def _in_motion(values: Array, rows: Indexes) -> Flags:
     here = steps[rows + 1]
     beside = np.maximum(steps[rows] * np.sign(here), steps[rows + 2] * np.sign(here))
     return beside >= MOTION_SHARE * np.abs(here)
+
+
+def _without_swings(jumps: Sequence[Jump], times: Array, values: Array) -> list[Jump]:
+    """Those that are no steps of a swing: fast for its rows, or switched from side to side."""
+    if not jumps:
+        return []
+    ends_s = jumps[0].sim_time_s - BESIDE_SWINGS_S, jumps[-1].sim_time_s + BESIDE_SWINGS_S
+    part = slice(*np.searchsorted(times, ends_s))
+    interval_s = usual_interval_s(times[part]) or 0.0
+    left = list(jumps)
+    for swing in find_swings(
+        times[part],
+        values[part],
+        least_half_swings=LEAST_HALF_SWINGS,
+        longest_period_s=SWING_PERIOD_S,
+    ):
+        own = [jump for jump in left if _may_be_of(swing, jump)]
+        if len(own) < SWITCHED_SHARE * swing.half_swings:
+            angle = min(math.pi / 2, math.pi * interval_s / swing.period_s)
+            limit = SWING_STEP * 2 * swing.amplitude * math.sin(angle)
+            own = [jump for jump in own if abs(jump.after - jump.before) < limit]
+        left = [jump for jump in left if jump not in own]
+    return left
+
+
+def _may_be_of(swing: Swing, jump: Jump) -> bool:
+    """Whether it lies in the swing, whose ends are known to half a period, and is no higher."""
+    about_s = swing.period_s / 2
+    inside = swing.start_s - about_s <= jump.sim_time_s <= swing.end_s + about_s
+    return inside and abs(jump.after - jump.before) < SWING_HEIGHTS * swing.amplitude
 
 
 def _intervals(times: Array, rows: Indexes) -> Array:

@@ -22,6 +22,8 @@ from webots_mcp.store.analysis.sines import TRIED_PERIODS, fit_sines, parabolas
 from webots_mcp.store.analysis.swings_on_bends import likely_swings, swings_on_bends
 
 LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again
+SLOW_PERIOD_S: Final = 5.0  # beyond, bends of a way come as regularly by chance ...
+SLOW_HALF_SWINGS: Final = 12  # ... but hardly ever so many
 SHORTEST_PERIOD_ROWS: Final = 8.0  # fewer rows a period do not show its shape
 SCALE_RATIO: Final = 2**0.5  # from one band to the next
 FINEST_SHARE: Final = 8  # of a band's period: what is shorter is smoothed away
@@ -36,7 +38,6 @@ MOST_VARIED: Final = 0.4  # and of how far the half swings reach
 LEAST_EXPLAINED: Final = (0.85, 0.70)  # of the variance by a sine, for 6 half swings and for 10
 PERIODS_FITTED: Final = 2.5  # at once: over more, a swing may change a little
 FEW_COLUMNS: Final = 8  # are added up faster one after the other than row by row
-CLIPPED_PER_PERIOD: Final = 16.0  # rows: among fewer the turning points may be missed
 PIECES_TRIED: Final = 16  # with each period; the whole with the best of them
 LEAST_TRIED: Final = 0.5  # explained of these pieces; less is not looked at further
 NOISE_BENDS: Final = 10.0  # deviations of the noise, over the root of the rows; it makes hardly 7
@@ -85,8 +86,8 @@ def find_swings(
     A swing counts when at least so many half swings follow each other, alike in length and reach,
     when a sine explains most of their variance about a parabola or about straight pieces, and when
     it rises above the noise of its own stretch. Period and amplitude are those of the best sine.
-    Each stretch between recording gaps is looked at by itself; a swing that reaches a gap and is
-    the same after it is one swing.
+    With a period of more than 5 s at least 12 half swings have to. Each stretch between recording
+    gaps is looked at by itself; a swing that reaches a gap and is the same after it is one swing.
     """
     moving = np.diff(times, prepend=-np.inf) > 0
     times, values = times[moving], values[moving]
@@ -185,7 +186,16 @@ def _in_stretch(
                 if _stands_out(whole, swing):
                     found.append(swing)
         rows *= SCALE_RATIO
-    return _connected(_best([each for each in found if each.period_s <= longest_period_s]))
+    lasting = [each for each in found if _lasts(each, longest_period_s)]
+    return _connected(_best(lasting))
+
+
+def _lasts(swing: Swing, longest_period_s: float) -> bool:
+    """Whether it counts: of slow ones more half swings have to follow each other."""
+    is_slow = swing.period_s > SLOW_PERIOD_S
+    return swing.period_s <= longest_period_s and (
+        not is_slow or swing.half_swings >= SLOW_HALF_SWINGS
+    )
 
 
 def _connected(swings: list[Swing]) -> list[Swing]:
@@ -492,9 +502,10 @@ def _best_sine(
         return period_s, 0.0, float(tried[best])
     periods = periods[best : best + 1] + _vertex(tried, best) * (periods[1] - periods[0])
     fit = fit_sines(moments, parts, periods, basis)
-    amplitude = median(fit.amplitudes[:, 0])
-    if period_s >= CLIPPED_PER_PERIOD * step * interval_s:  # of a clipped one the sine is higher
-        amplitude = min(amplitude, median(np.ptp(parts, axis=1)) / 2)
+    # Of a clipped one the sine is higher; the rows next to a turn are as far from it as the angle.
+    between = math.pi * step * interval_s / period_s
+    highest = median(np.ptp(parts, axis=1)) / 2 / math.cos(min(between, math.pi / 4))
+    amplitude = min(median(fit.amplitudes[:, 0]), highest)
     return float(periods[0]), amplitude, float(fit.explained[0])
 
 

@@ -11,7 +11,6 @@ from webots_mcp.contract import LOG_LEVELS
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS
-from webots_mcp.store.rollup.swings import LONGEST_PERIOD_S
 
 LEVELS: Final = LOG_LEVELS
 
@@ -107,8 +106,9 @@ class EventOptions:
             is noisy otherwise 0.15 of that are enough.
         jump_score: How many times larger than the usual step (modified z-score) a jump is.
         jump_m: A position jumps by at least so much between two rows.
-        oscillation_turns: Turning points in a row.
-        oscillation_period_s: The longest period that counts.
+        oscillation_turns: Turning points in a row; with a period of more than 5 s at least 12.
+        oscillation_period_s: The longest period that counts; None for as long a one as fits in
+            the stretch, and for 5 s where that is too long to be read row by row.
         log_level: Log lines of this level and above.
     """
 
@@ -128,7 +128,7 @@ class EventOptions:
     jump_score: float = 12.0
     jump_m: float = 0.3
     oscillation_turns: int = LEAST_HALF_SWINGS
-    oscillation_period_s: float = LONGEST_PERIOD_S
+    oscillation_period_s: float | None = None
     log_level: str = "warning"
 
     def __post_init__(self) -> None:

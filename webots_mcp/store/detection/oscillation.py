@@ -8,9 +8,9 @@ from typing import Final
 from webots_mcp.naming import listed
 from webots_mcp.store.analysis.swings import Swing, joined_swings
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.kind import EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
-from webots_mcp.store.rollup.swings import may_swing, swings_in
+from webots_mcp.store.rollup.swings import LONGEST_PERIOD_S, may_swing, swings_in
 from webots_mcp.store.signals.registry import Signal
 
 _MOST_NAMED: Final = 5
@@ -20,38 +20,48 @@ def oscillation_events(search: Search) -> Iterator[Event]:
     """Of heading, wheels, speed, position and the like, and of what is asked for."""
     signals = _swinging(search)
     if left := [each.name for each in search.required_numbers() if each not in signals]:
-        search.not_searched(
-            "oscillation",
+        why = (
             f"not in {len(left)} of {len(search.numbers)} signals, whose names are not of what a "
-            f"robot swings with: name them in signals ({listed(left, _MOST_NAMED)})",
+            f"robot swings with: name them in signals ({listed(left, _MOST_NAMED)})"
         )
-    found = _found(search, signals)
-    if not any(found.values()):
-        _note_shortness(search)
-    for name, swings in found.items():
+        if not signals:
+            raise NotSearchableError(why)
+        search.not_searched("oscillation", why)
+    _note_periods(search)
+    for name, swings in _found(search, signals).items():
         for swing in joined_swings(swings):
             details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
             ends = (swing.start_s, swing.end_s)
             yield search.event("oscillation", *ends, name, turns=swing.half_swings, **details)
 
 
-def _note_shortness(search: Search) -> None:
-    """Which periods are too long for a run to hold as many half swings as are asked for."""
-    turns = search.options.oscillation_turns
-    longest_s = 2 * search.length_s / turns
-    if longest_s < search.options.oscillation_period_s:
+def _note_periods(search: Search) -> None:
+    """Which periods are too long for the run to hold enough of them, or to be looked for at all."""
+    turns, longest_s = search.options.oscillation_turns, _longest_period_s(search)
+    fitting_s = 2 * search.length_s / turns
+    if fitting_s < longest_s:
         search.not_searched(
             "oscillation",
             f"run {search.segment.run_id} is only {search.length_s:.3g} s long: {turns} half "
-            f"swings with a period of more than {longest_s:.2g} s do not fit in",
+            f"swings with a period of more than {fitting_s:.2g} s do not fit in",
         )
+    elif search.view.is_long and search.options.oscillation_period_s is None:
+        search.not_searched(
+            "oscillation",
+            f"not with a period of more than {longest_s:g} s in so long a range: ask for less time",
+        )
+
+
+def _longest_period_s(search: Search) -> float:
+    asked_s = search.options.oscillation_period_s
+    return search.view.longest_period_s if asked_s is None else asked_s
 
 
 def _found(search: Search, signals: Sequence[Signal]) -> dict[str, list[Swing]]:
     """Those that are stored, and in the rows of which none are."""
     options = search.options
-    asked = options.oscillation_turns, options.oscillation_period_s
-    usual = asked == (EventOptions.oscillation_turns, EventOptions.oscillation_period_s)
+    asked = options.oscillation_turns, _longest_period_s(search)
+    usual = asked == (EventOptions.oscillation_turns, LONGEST_PERIOD_S)
     stored, found = search.view.stored_swings(signals if usual else ())
     for some, outside in (
         ([each for each in signals if each.name in found], stored),
@@ -72,7 +82,7 @@ def _swinging(search: Search) -> list[Signal]:
 
 
 def _least_s(options: EventOptions) -> float:
-    return options.oscillation_turns * options.oscillation_period_s / 2
+    return options.oscillation_turns * (options.oscillation_period_s or LONGEST_PERIOD_S) / 2
 
 
 OSCILLATION: Final = EventKind(

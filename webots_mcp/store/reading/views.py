@@ -18,7 +18,7 @@ from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.jumps import least_jump
 from webots_mcp.store.analysis.rhythm import usual_interval_s
 from webots_mcp.store.analysis.summary import Summary, merge, summarise_numbers
-from webots_mcp.store.analysis.swings import Swing
+from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.intervals import (
     Condition,
@@ -33,7 +33,12 @@ from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of,
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, buckets, totals
 from webots_mcp.store.rollup.rolling import watermark
-from webots_mcp.store.rollup.swings import ACROSS_S, STRETCH_ROWS, stored_swings
+from webots_mcp.store.rollup.swings import (
+    ACROSS_S,
+    LONGEST_PERIOD_S,
+    STRETCH_ROWS,
+    stored_swings,
+)
 from webots_mcp.store.signals.registry import Signal
 
 READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
@@ -82,6 +87,8 @@ class View(Protocol):
     notes: list[str]  # what could not be looked at, of what was asked since they were taken
     shortest_rest_s: float  # a shorter one may be missed
     sampled_s: float  # between the rows of `places`; 0 where these are all
+    longest_period_s: float  # of swings that show in it
+    is_long: bool  # not all of its rows are read
 
     def taken_notes(self) -> list[str]:
         """What could not be looked at since the notes were last taken; and what never can."""
@@ -163,6 +170,7 @@ class RowView:
 
     shortest_rest_s = 0.0
     sampled_s = 0.0
+    is_long = False
 
     def __init__(self, columns: Columns) -> None:
         self.notes: list[str] = []
@@ -171,6 +179,8 @@ class RowView:
             after = f"after {columns.times[-1]:.3f} s" if columns.times else "at all"
             self._lasting.append(f"the time was over: not read {after}; ask for less time")
         self._columns = columns
+        length_s = columns.times[-1] - columns.times[0] if columns.times else 0.0
+        self.longest_period_s = max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
         self._summaries: dict[str, Summary] = {}
 
     def taken_notes(self) -> list[str]:
@@ -225,6 +235,8 @@ class LongView:
     """The rollups of a long segment, and what has to be read besides."""
 
     shortest_rest_s = 2 * BUCKET_S  # a shorter one need not fill a bucket
+    longest_period_s = LONGEST_PERIOD_S
+    is_long = True
 
     def __init__(
         self,

@@ -30,7 +30,8 @@ _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
     "swing": ("oscillation",),
     "gap": ("gap",),
 }
-_OTHER_SIGNALS: Final = re.compile(r"not in \d+ of ")  # signals that are never searched
+# Signals that are never searched, and periods that are not drawn.
+_OTHERS: Final = re.compile(r"not in \d+ of |not with a period of more than 5 s ")
 _OF_ROBOT: Final = frozenset[Measure]({"standstill", "stuck", "leap", "gap"})
 
 
@@ -76,7 +77,7 @@ class Answer:
         """Whether it says that something of that kind may have been missed."""
         reasons = [self.not_searched.get(kind, "") for kind in _KINDS[measure]]
         parts = [part for reason in reasons for part in reason.split("; ")]
-        return any(part and not _OTHER_SIGNALS.match(part) for part in parts)
+        return any(part and not _OTHERS.match(part) for part in parts)
 
 
 def ask_run(

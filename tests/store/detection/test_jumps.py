@@ -134,6 +134,33 @@ def test_a_quick_swing_after_a_long_rest_is_a_motion_and_a_dropout_in_it_is_a_ju
     assert [(event.name, event.start_s) for event in jumps(empty)] == [("steering", 105.0)]
 
 
+SWINGS: dict[str, Callable[[float], float]] = {
+    "sine": lambda angle: math.sin(angle),
+    "from side to side": lambda angle: math.copysign(1.0, math.sin(angle + 0.1)),
+}
+
+
+@pytest.mark.parametrize("swing", SWINGS.values(), ids=SWINGS)
+@pytest.mark.parametrize("hz", [0.8, 1.2])
+def test_the_steps_of_a_quick_swing_are_no_jumps_and_a_dropout_beside_it_is_one(
+    empty: sqlite3.Connection, swing: Callable[[float], float], hz: float
+) -> None:
+    noise = np.random.default_rng(1).normal(0, 0.001, 2000).tolist()
+
+    def state(time_s: float) -> dict[str, Any]:
+        swings = 50 <= time_s < 70 or 120 <= time_s < 130
+        value = 0.3 * swing(math.tau * hz * time_s) if swings else 0.0
+        dropout = -2.0 if round(time_s, 1) == 100.0 else 0.0
+        return {"steering": value + dropout + noise[round(10 * time_s)]}
+
+    record(empty, state)
+    found = find_events(
+        empty, find_range(empty, Scope()), EventOptions(kinds=("jump", "oscillation"))
+    )
+    ends = [(each.kind, round(each.start_s), round(each.end_s)) for each in found.events]
+    assert ends == [("oscillation", 50, 70), ("jump", 100, 100), ("oscillation", 120, 130)]
+
+
 def test_which_beam_is_the_shortest_neither_jumps_nor_freezes(
     empty: sqlite3.Connection, tier: str
 ) -> None:

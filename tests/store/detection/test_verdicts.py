@@ -45,3 +45,13 @@ def test_of_a_short_run_it_is_said_which_swings_do_not_fit_in(empty: sqlite3.Con
     (why,) = ask(empty, 76, "oscillation").gaps.values()
     assert "run 1 is only 7.5 s long: 6 half swings with a period of more than 2.5 s" in why
     assert why.endswith("; none in the rest")
+
+
+def test_where_no_signal_is_searched_for_swings_nothing_is_absent(
+    empty: sqlite3.Connection,
+) -> None:
+    start_run(empty).publish(0.0, {"temp_c": 20.0})
+    asked = EventOptions(kinds=("oscillation",))
+    told = find_events(empty, find_range(empty, Scope()), asked).verdicts
+    assert told.unlooked("oscillation") == told.gaps["oscillation"]
+    assert "rest" not in told.gaps["oscillation"]

@@ -120,3 +120,20 @@ def test_what_swings_is_found_however_its_name_is_written(
         recorder.publish(step * 0.1, {branch: {last: value}} if branch else {last: value})
     ((_, _, period_s, amplitude, _),) = swings_of(empty)
     assert (period_s, amplitude) == pytest.approx((2.0, 5.0), rel=0.05)
+
+
+def test_slow_swings_are_looked_for_where_the_rows_are_read_else_the_answer_says_that_they_are_not(
+    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = start_run(empty)
+    for step in range(3000):
+        time_s = step / 10
+        swing = 0.5 * math.sin(math.tau * time_s / 12) if 60 <= time_s < 180 else 0.0
+        recorder.publish(time_s, {"yaw_rate": 0.0, "pitch": swing})
+    ((start_s, end_s, period_s, amplitude, _),) = swings_of(empty)
+    assert (start_s, end_s) == pytest.approx((60, 180), abs=3)
+    assert (period_s, amplitude) == pytest.approx((12, 0.5), rel=0.05)
+    monkeypatch.setattr(rows, "RAW_ROWS", 1000)
+    asked = EventOptions(kinds=("oscillation",))
+    (why,) = find_events(empty, find_range(empty, Scope()), asked).verdicts.gaps.values()
+    assert "not with a period of more than 5 s in so long a range: ask for less time" in why

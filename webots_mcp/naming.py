@@ -33,6 +33,13 @@ _OWN: Final = frozenset((*_BRANCHES, *METRES, "robot", "rover", "current", "actu
 _PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
 _LENGTHS: Final = ("m", "cm", "mm")  # units that a place is published in
 _AXES: Final = (("0", "1"), ("x", "y"), *((f"x_{unit}", f"y_{unit}") for unit in _LENGTHS))
+_TARGETS: Final = frozenset((
+    "target", "setpoint", "goal", "desired", "commanded", "command", "cmd", "reference", "ref",
+))  # fmt: skip
+_MEASURED: Final = frozenset((
+    "position", "pos", "actual", "measured", "current", "state", "feedback", "encoder", "sensor",
+))  # fmt: skip
+_RATES: Final = frozenset(("speed", "velocity", "vel", "rate"))
 _MODES: Final = ("mode", "behaviour", "behavior", "action", "task", "phase")
 _STATES: Final = ("state", "status")  # of anything, often of an arm
 USUAL_POSITIONS: Final = (
@@ -139,6 +146,34 @@ def _place_of(name: str) -> tuple[str, str, str] | None:
 
 def _branch_words(branch: str) -> list[str]:
     return [word for part in branch.split(".") for word in words_of(part)]
+
+
+def find_targets(name: str, names: Iterable[str]) -> tuple[str | None, str | None]:
+    """The names of the target of a measured value and of its commanded speed; None without any.
+
+    They differ from it in words alone that say target, or that it is measured: the target of
+    `arm.shoulder.position` is `arm.shoulder.target`, that of `joints.0` is `joint_targets.0`; of
+    `belt_position` the speed is `belt_speed_cmd`.
+    """
+    own = _subject_words(name)
+    if not _TARGETS.isdisjoint(own):
+        return None, None
+    subject = own - _MEASURED
+    place: str | None = None
+    speed: str | None = None
+    for other in names:
+        words = _subject_words(other)
+        if not _TARGETS.isdisjoint(words):
+            rest = words - _TARGETS - _MEASURED
+            place = place or (other if rest == subject else None)
+            is_rate = _RATES.isdisjoint(own) and not _RATES.isdisjoint(rest)
+            speed = speed or (other if is_rate and rest - _RATES == subject else None)
+    return place, speed
+
+
+def _subject_words(name: str) -> frozenset[str]:
+    """The words of all parts of a name, one of several being the same as one alone."""
+    return frozenset(word.rstrip("s") for word in _branch_words(name))
 
 
 def find_mode(texts: Collection[str]) -> str | None:

@@ -15,6 +15,7 @@ from webots_mcp.errors import UnknownSignalError
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading import rows
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals, list_signals, resolve_signals
@@ -221,3 +222,71 @@ def test_what_rests_by_nature_for_less_than_20_s_is_not_flat(
     force = noisy(2)
     record(empty, lambda t: state(t, force(t)))
     assert ask(empty, "flat").events == ()
+
+
+def front(time_s: float) -> float:
+    """A distance that a sensor with noise measures up to 2 m."""
+    return min(2.0, 1.5 + math.sin(time_s / 15) + noisy(1)(time_s) - 3.3)
+
+
+SAYS: dict[str, tuple[Callable[[float], dict[str, Any]], str | None]] = {
+    "frozen": (lambda t: {"force": 3.31 if 40 < t < 70 else noisy(1)(t)}, None),
+    "at the end of a sensor": (lambda t: {"front_m": front(t)}, "at its limit of 2 m"),
+    "gated": (
+        lambda t: {"stick": 0.0 if 70 < t < 100 or t % 20 < 1 else math.sin(3 * t)},
+        "at 0, as at other times",
+    ),
+    "stops at the farthest place": (lambda t: {"ticks": min(t, 60.0)}, None),
+    "behind its target": (
+        lambda t: {"arm": {"position": math.sin(min(t, 60) / 3), "target": math.sin(t / 3)}},
+        "frozen: its target arm.target went from 0.9129 to -1",
+    ),
+    "told to move": (
+        lambda t: {"belt_position": 0.2 * min(t, 60), "belt_speed_cmd": 0.2},
+        "frozen: belt_speed_cmd was 0.2",
+    ),
+}
+
+
+@pytest.mark.parametrize(("state", "says"), SAYS.values(), ids=SAYS)
+def test_what_stays_the_same_is_told_with_what_shows_why(
+    empty: sqlite3.Connection, tier: str, state: State, says: str | None
+) -> None:
+    record(empty, state)
+    (flat,) = ask(empty, "flat").events
+    assert flat.details.get("says") == says
+
+
+def test_a_joint_that_its_target_leaves_behind_is_flat_after_3_s(empty: sqlite3.Connection) -> None:
+    def state(time_s: float) -> dict[str, Any]:
+        angle = 60 if 60 < time_s < 66 else time_s
+        return {"joints": [math.sin(angle / 3)], "joint_targets": [math.sin(time_s / 3)]}
+
+    record(empty, state)
+    (flat,) = ask(empty, "flat").events
+    assert (flat.name, flat.start_s, flat.end_s) == ("joints.0", 60.0, 65.9)
+    assert "its target joint_targets.0 went from" in flat.details["says"]
+
+
+def test_what_a_device_gave_that_is_no_number_is_told_of_its_silence(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    for step in range(300):
+        free = 100 <= step < 200
+        odd = {"front": "inf"} if free else None
+        recorder.publish(step / 10, {"front": None if free else range_m(step / 10)}, odd)
+    (silent,) = ask(empty, "silent").events
+    assert silent.details == {"value": "inf"}
+
+
+def test_a_short_freeze_of_a_long_run_does_not_contradict_the_verdict(
+    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record(empty, lambda t: {"force": held(t / 2, noisy(1)(t), 3.31)})
+    monkeypatch.setattr(rows, "RAW_ROWS", 100)
+    answer = ask(empty, "flat")
+    assert told(answer) == [("force", 100.1, 119.9)]
+    assert answer.verdicts.gaps == {
+        "flat": "not all of noisy signals for less than 20 s: ask for less time"
+    }

@@ -37,14 +37,14 @@ def test_what_was_searched_in_some_signals_is_named_once_with_the_others(
     told = ask(empty, 400, "oscillation", "gap")
     (why,) = told.gaps.values()
     assert why.startswith("not in 1 of 4 signals")
-    assert "(temp_c)" in why and why.endswith("; none in the rest")
+    assert "(temp_c)" in why and why.endswith("; none in what was searched")
     assert (told.far, told.came_near) == (["gap"], {})
 
 
 def test_of_a_short_run_it_is_said_which_swings_do_not_fit_in(empty: sqlite3.Connection) -> None:
     (why,) = ask(empty, 76, "oscillation").gaps.values()
     assert "run 1 is only 7.5 s long: 6 half swings with a period of more than 2.5 s" in why
-    assert why.endswith("; none in the rest")
+    assert why.endswith("; none in what was searched")
 
 
 def test_where_no_signal_is_searched_for_swings_nothing_is_absent(

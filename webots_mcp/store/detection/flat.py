@@ -10,6 +10,7 @@ from webots_mcp.store.analysis.frozen import FEWEST_ROWS, is_noisy, may_be_measu
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.resting import is_limit, target_went_on, what_it_shows
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.intervals import MOSTLY, Flat, Span
 from webots_mcp.store.signals.registry import Signal
@@ -27,12 +28,13 @@ _LIVELY: Final = (
 def flat_events(search: Search) -> Iterator[Event]:
     """Of a long segment only rests that fill a stretch of the rollups.
 
-    One of a signal that is noisy otherwise counts much sooner, unless others rest at that time.
+    One of a signal that is noisy otherwise counts much sooner, unless others rest at that time; and
+    so does one that a target left behind.
     """
     least_s = max(search.options.flat_s, search.view.shortest_rest_s)
     signals = search.required_quantities()
     if (shortest_s := search.view.shortest_rest_s) and search.only is None:
-        why = f"noisy signals that freeze for less than {shortest_s:g} s: ask for less time"
+        why = f"not all of noisy signals for less than {shortest_s:g} s: ask for less time"
         search.not_searched("flat", why)
     resting: dict[str, list[Span]] = {}
     sooner: list[tuple[Signal, Span]] = []
@@ -49,18 +51,38 @@ def flat_events(search: Search) -> Iterator[Event]:
             resting[signal.name] = spans
         flat = [span for span in spans if _length_s(span) >= least_s]
         if flat and (_changes_otherwise(search, here, flat) or _is_lively(search, signal)):
-            for span in flat:
-                yield search.event("flat", span.start_s, span.end_s, signal.name, value=span.key)
+            yield from (_event(search, signal, span) for span in flat)
         elif spans and not flat:
-            frozen = _frozen(search, signal, spans)
+            left_behind = _left_behind(search, signal, spans)
+            yield from (_event(search, signal, span) for span in left_behind)
+            frozen = _frozen(search, signal, [each for each in spans if each not in left_behind])
             sooner += [(signal, span) for span in frozen]
-            if not frozen and not search.view.shortest_rest_s:
+            if not frozen and not left_behind and not search.view.shortest_rest_s:
                 _note_longest(search, signal, here, max(spans, key=_length_s))
     for signal, span in sooner:
         if not _rests_with_others(signal, span, resting):
-            yield search.event("flat", span.start_s, span.end_s, signal.name, value=span.key)
+            yield _event(search, signal, span)
         else:
             _note_longest(search, signal, search.view.summary(signal), span)
+
+
+def _event(search: Search, signal: Signal, span: Span) -> Event:
+    says = what_it_shows(search, signal, span)
+    details = {"value": span.key} | ({"says": says} if says else {})
+    return search.event("flat", span.start_s, span.end_s, signal.name, **details)
+
+
+def _left_behind(search: Search, signal: Signal, spans: Sequence[Span]) -> list[Span]:
+    """The rests in which its target went on, or in which it was told to move."""
+    least_s = FROZEN_SHARE * search.options.flat_s
+    if not _changes_otherwise(search, search.view.summary(signal), spans):
+        return []
+    return [
+        span
+        for span in spans
+        if _length_s(span) >= least_s and target_went_on(search, signal, span)
+        if not is_limit(search, signal, span)
+    ]
 
 
 def _frozen(search: Search, signal: Signal, spans: Sequence[Span]) -> list[Span]:
@@ -130,12 +152,14 @@ def _is_lively(search: Search, signal: Signal) -> bool:
 
 
 def _alike(events: Sequence[Event], unit: str) -> str:
-    return "times flat"
+    said = {event.details.get("says") for event in events}
+    what = said.pop() if len(said) == 1 else None
+    return f"times {what}" if what else "times flat"
 
 
 FLAT: Final = EventKind(
     "flat",
-    "frozen",
+    "frozen, or at a limit",
     flat_events,
     lasts=True,
     least_s=lambda options: options.flat_s,

@@ -8,6 +8,7 @@ from typing import Final
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.resting import replaced_value
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.intervals import MOSTLY, Silent, Span, common
 from webots_mcp.store.rollup.rolling import watermark
@@ -45,7 +46,9 @@ def silent_events(search: Search) -> Iterator[Event]:
         for span in spans:
             lasts_s = span.end_s - span.start_s
             if lasts_s >= least_s:
-                yield search.event("silent", span.start_s, span.end_s, signal.name)
+                instead = replaced_value(search, signal, span.start_s)
+                details = {"value": instead} if instead else {}
+                yield search.event("silent", span.start_s, span.end_s, signal.name, **details)
             elif lasts_s > 0:
                 what = f"{signal.name} had no value for {lasts_s:.3g} s from {span.start_s:.6g} s"
                 search.came_near("silent", lasts_s / least_s, what)

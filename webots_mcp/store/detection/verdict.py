@@ -19,7 +19,7 @@ class Verdicts:
         absent: Kinds that were looked for, be it in a part, and of which there is none, each with
             what came nearest, or with an empty text.
         not_searched: Kinds that were not looked for, or not everywhere, with why, and with what to
-            ask to have them looked for. One that is also found or absent is so in the rest.
+            ask to have them looked for. One that is also found or absent is so in what was.
 
     Shown are the properties, which name each kind that was not found once.
     """
@@ -43,16 +43,16 @@ class Verdicts:
         """What was not searched, with the kinds that share a reason under one key."""
         sharing: dict[str, list[str]] = {}
         for kind, why in self.not_searched.items():
-            sharing.setdefault(why + self._in_the_rest(kind), []).append(kind)
+            sharing.setdefault(why + self._searched(kind), []).append(kind)
         return {", ".join(kinds): why for why, kinds in sharing.items()}
 
     @property
     def _nowhere(self) -> list[str]:
         return [kind for kind in self.absent if kind not in self.not_searched]
 
-    def _in_the_rest(self, kind: str) -> str:
+    def _searched(self, kind: str) -> str:
         near = self.absent.get(kind)
-        return "" if near is None else f"; none in the rest{near and f' ({near})'}"
+        return "" if near is None else f"; none in what was searched{near and f' ({near})'}"
 
     def unlooked(self, kind: str) -> str | None:
         """Why a kind was not looked for anywhere; None if it was, at least in a part."""

@@ -76,6 +76,11 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "set_parameters": BuiltInAction(needs_supervisor=False),
     "arm_breakpoints": BuiltInAction(needs_supervisor=False),
     "keep": BuiltInAction(needs_supervisor=False),
+    "get_scene": BuiltInAction(),
+    "get_field": BuiltInAction(),
+    "set_field": BuiltInAction(),
+    "add_node": BuiltInAction(),
+    "remove_node": BuiltInAction(),
 }
 
 OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the others, and steers

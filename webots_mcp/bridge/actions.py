@@ -244,6 +244,46 @@ def keep(context: Context, command: Command) -> Progress:
     yield
 
 
+@_built_in
+def get_scene(context: Context, command: Command) -> Progress:
+    """The nodes of the scene tree that are asked for."""
+    from webots_mcp.bridge import scene_looking  # these are seldom asked for
+
+    return scene_looking.get_scene(context, command)
+
+
+@_built_in
+def get_field(context: Context, command: Command) -> Progress:
+    """What a path of the scene tree leads to."""
+    from webots_mcp.bridge import scene_looking
+
+    return scene_looking.get_field(context, command)
+
+
+@_built_in
+def set_field(context: Context, command: Command) -> Progress:
+    """Set a field of a node; Webots does so with the next step."""
+    from webots_mcp.bridge import scene_changing
+
+    return scene_changing.set_field(context, command)
+
+
+@_built_in
+def add_node(context: Context, command: Command) -> Progress:
+    """Add a node to the scene tree."""
+    from webots_mcp.bridge import scene_changing
+
+    return scene_changing.add_node(context, command)
+
+
+@_built_in
+def remove_node(context: Context, command: Command) -> Progress:
+    """Remove a node from the scene tree."""
+    from webots_mcp.bridge import scene_changing
+
+    return scene_changing.remove_node(context, command)
+
+
 def _run_until(context: Context, command: Command, goal: Goal) -> Progress:
     """Set what the goal asks for, run until it is reached, and say how far it came."""
     watch, pause, finish = context.watch, context.pause, _finish_of(context, command, goal.then)

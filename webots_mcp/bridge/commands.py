@@ -32,7 +32,7 @@ CLAIM: Final = (
     "WHERE robot_id = :robot AND status = 'pending' AND expires_wall_time_s > :now "
     "ORDER BY id LIMIT 1) AND NOT EXISTS (SELECT 1 FROM session s WHERE s.robot_id = :robot "
     "AND s.id > :session AND s.ended_wall_time_s IS NULL) "
-    "RETURNING id, CAST(action AS BLOB), CAST(params AS BLOB)"
+    "RETURNING id, CAST(action AS BLOB), CAST(params AS BLOB), CAST(requested_by AS BLOB)"
 )
 # A session that was judged dead although it lives may have a successor: commands are for that one.
 _SUCCESSOR: Final = (
@@ -48,13 +48,21 @@ _INTERRUPTED: Final = "the controller was interrupted before it began; it did no
 class Command:
     """A claimed command."""
 
-    __slots__ = ("action", "id", "params", "session_id")
+    __slots__ = ("action", "id", "params", "requested_by", "session_id")
 
-    def __init__(self, id: int, action: str, params: dict[str, Any], session_id: int) -> None:  # noqa: A002
+    def __init__(
+        self,
+        id: int,  # noqa: A002
+        action: str,
+        params: dict[str, Any],
+        session_id: int,
+        requested_by: str | None = None,
+    ) -> None:
         self.id = id
         self.action = action
         self.params = params
         self.session_id = session_id
+        self.requested_by = requested_by
 
     def as_dict(self) -> dict[str, Any]:
         """What handlers get: the parameters as keys too, where the names are free."""
@@ -116,10 +124,14 @@ class CommandQueue:
             )
 
     def _read(
-        self, row: tuple[int, bytes, bytes | None], session_id: int, sim_time_s: float
+        self,
+        row: tuple[int, bytes, bytes | None, bytes | None],
+        session_id: int,
+        sim_time_s: float,
     ) -> Command | None:
-        command_id, action, text = row
-        command = Command(command_id, action.decode("utf-8", "replace"), {}, session_id)
+        command_id, action, text, asker = row
+        by = None if asker is None else asker.decode("utf-8", "replace")
+        command = Command(command_id, action.decode("utf-8", "replace"), {}, session_id, by)
         try:
             params = json.loads(text or b"")
         except (ValueError, RecursionError):  # no JSON, no UTF-8, or nested beyond all sense

@@ -16,6 +16,7 @@ from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.reloads import Reloads
+from webots_mcp.bridge.scene_edits import SceneEdits
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.throttle import Throttle
 
@@ -37,3 +38,4 @@ class Context(NamedTuple):
     breakpoints: Breakpoints
     watch: Watch
     keeper: Keeper
+    scene: SceneEdits

@@ -8,6 +8,7 @@ from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.reloads import Reloads
+from webots_mcp.bridge.scene_edits import SceneEdits
 from webots_mcp.bridge.throttle import Throttle
 
 
@@ -23,6 +24,7 @@ class Runs:
         reloads: Reloads,
         parameters: Parameters,
         throttle: Throttle,
+        scene: SceneEdits,
     ) -> None:
         self._clock = clock
         self._recorder = recorder
@@ -31,6 +33,7 @@ class Runs:
         self._reloads = reloads
         self._parameters = parameters
         self._throttle = throttle
+        self._scene = scene
 
     def look(self, *, after_step: bool = False) -> None:
         """Begin a run if simulation time went back since the last look.
@@ -55,6 +58,7 @@ class Runs:
         self._journal.event("reset")
         # Before the callbacks, which may ask for values that waited for the reset.
         self._parameters.begin_run()
+        self._scene.begin_run()
         self._reloads.fire()
         self._heartbeat.beat()
 

@@ -137,7 +137,7 @@ def _nodes_in(
 ) -> Iterator[SceneNode]:
     hidden = around is not None and around.hidden
     for name, field, is_inside in node_fields(node, inside=inside, everything=everything):
-        for index, child in _entries(field):
+        for index, child in entries(field):
             if everything or child.getBaseTypeName() in _FIELDS or name.startswith("device"):
                 yield SceneNode(
                     child,
@@ -174,6 +174,11 @@ def _all_node_fields(node: Any) -> Iterator[NodeField]:
             yield NodeField(field.getName(), field, False)
 
 
+def holds_solids(node: Any) -> bool:
+    """Whether a walk gives it without being told to give everything."""
+    return node.getBaseTypeName() in _FIELDS
+
+
 def find_inner_field(node: Any, name: str) -> Any | None:
     """A field of the node that a PROTO node is made of, to be read only; None where it has none."""
     # R2025a renamed what R2023b calls getProtoField.
@@ -193,7 +198,7 @@ def read_value(node: Any, name: str) -> Any | None:
     return None if field is None or field.getCount() >= 0 else field.value
 
 
-def _entries(field: Any) -> Iterator[tuple[int | None, Any]]:
+def entries(field: Any) -> Iterator[tuple[int | None, Any]]:
     """The nodes in a field, with their places."""
     if field.getTypeName() == "SFNode":
         node = field.getSFNode()

@@ -27,6 +27,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.reloads import Reloads
 from webots_mcp.bridge.runs import Runs
+from webots_mcp.bridge.scene_edits import SceneEdits
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.start_values import StartValues
 from webots_mcp.bridge.throttle import Throttle
@@ -69,7 +70,8 @@ class Session:
         given = os.environ.get(PARAMETERS_VARIABLE)
         start_values = StartValues(given, self._identity.robot_name, errors)
         parameters = Parameters(clock, recorder, journal, start_values, self._set_parameter)
-        self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters, throttle)
+        scene = SceneEdits(simulation, clock, journal, errors.failed)
+        self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters, throttle, scene)
         album = Album(recorder, clock, data_dir)
         keeper = Keeper(clock, recorder, journal, album, throttle, keep_last_s)
         look = self.runs.look_after_step
@@ -89,6 +91,7 @@ class Session:
             breakpoints=Breakpoints(simulation, clock, recorder, journal, pause, keeper),
             watch=Watch(clock, simulation.basic_time_step_s / 100),
             keeper=keeper,
+            scene=scene,
         )
         self.control = Control(self.context)
         self.publisher = Publisher(self.context, self.runs)
@@ -125,6 +128,7 @@ class Session:
         self._take_wanted_parameters()
         if self.context.keeper.busy:
             self.context.keeper.go_on()
+        self.context.scene.look()
         command = self.control.serve()
         self.context.heartbeat.poll()
         if simulation.over:

@@ -1,0 +1,277 @@
+"""Fields that are set, nodes that are added and removed, and what a reset makes of it."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.bridge.asking_the_scene import Scene
+from tests.bridge.conftest import Recording, eager
+from webots_mcp import MCPBridge
+from webots_mcp.standin import InProcessSupervisor
+
+PILL = 'DEF PILL Solid { translation 1 0 0.1 name "pill" }'
+
+
+@pytest.fixture
+def scene(robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording) -> Scene:
+    return Scene(robot, bridge, recording)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "held"),
+    [
+        ("ROVER.translation", [0, 1, 0.04], [0.0, 1.0, 0.04]),
+        ("ROVER.rotation", [0, 0, 2, 1.5], [0.0, 0.0, 2.0, 1.5]),
+        ("BALL.children[0].appearance.baseColor", [1, 0, 0], [1.0, 0.0, 0.0]),
+        ("BALL.physics.mass", 2, 2.0),
+        ("BALL.locked", True, True),
+        ("BALL.children[0].geometry.subdivision", 3.0, 3),
+        ("ROVER.customData", 'a "text"', 'a "text"'),
+        ("FLOOR.children[0].geometry.size", [5, 6], [5.0, 6.0]),
+        ("WorldInfo.contactProperties[0].coulombFriction[0]", 0.25, 0.25),
+    ],
+)
+def test_a_field_of_any_type_is_set_and_read_back_after_a_step(
+    scene: Scene, path: str, value: object, held: object
+) -> None:
+    before = scene.get(path)
+    answer = scene.ask("set_field", path=path, value=value)
+    assert (answer["from"], answer["to"]) == (before, held)
+    assert "now" not in answer
+    assert scene.get(path) == held
+    ((name, data),) = scene.events("set_field")
+    assert name == path
+    told = json.loads(data)
+    assert (told["from"], told["to"]) == (before, held)
+
+
+@pytest.mark.parametrize("values", [[0.5, 1, 0.25], [0.5], []])
+def test_a_list_is_set_with_more_or_fewer_entries(scene: Scene, values: list[float]) -> None:
+    path = "WorldInfo.contactProperties[0].coulombFriction"
+    scene.ask("set_field", path=path, value=[0.1, 0.2])
+    answer = scene.ask("set_field", path=path, value=values)
+    assert answer["from"] == [0.1, 0.2]
+    assert scene.ask("get_field", path=path)["values"] == values
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        ("ROVER.translation", [1, 2], "type SFVec3f: give 3 finite numbers, such as [0, 0.5, 0.1]"),
+        ("ROVER.translation", [1, 2, "x"], "got [1, 2, 'x']"),
+        ("ROVER.translation", [1, 2, float("nan")], "finite"),
+        ("ROVER.translation", [1, 2, 1e39], "finite"),
+        ("ROVER.translation", "0 1 2", "3 finite numbers"),
+        ("ROVER.rotation", [0, 0, 0, 1], "an axis (not 0 0 0)"),
+        ("BALL.children[0].appearance.baseColor", [255, 0, 0], "each from 0 to 1"),
+        ("BALL.physics.mass", True, "a finite number, such as 0.5; got True"),
+        ("BALL.physics.mass", None, "a finite number"),
+        ("BALL.physics.mass", float("inf"), "a finite number"),
+        ("BALL.locked", 1, "true or false"),
+        ("BALL.children[0].geometry.subdivision", 1.5, "a whole number"),
+        ("BALL.name", 5, "a text of at most"),
+        ("BALL.physics", 5, "BALL.physics.name"),
+        ("BALL.children", [], "webots_add_node and webots_remove_node"),
+        ("BALL", 5, "name the field to set, such as BALL.translation"),
+        ("ROVER.controllerArgs", "x", "a list of at most 1000"),
+        ("ROVER.supervisor", False, "the bridge that would set it needs the right itself"),
+    ],
+)
+def test_a_value_that_a_field_cannot_have_is_refused_with_one_that_it_can(
+    scene: Scene, path: str, value: object, said: str
+) -> None:
+    assert said in scene.fail("set_field", path=path, value=value)
+    assert not scene.events("set_field")
+
+
+def test_a_robot_that_drives_on_was_moved_all_the_same(scene: Scene) -> None:
+    for name in ("left wheel motor", "right wheel motor"):
+        motor = scene.robot.getDevice(name)
+        motor.setPosition(float("inf"))
+        motor.setVelocity(5.0)
+    scene.rounds(5)
+    answer = scene.ask("set_field", path="ROVER.translation", value=[0, 0.5, 0.04])
+    assert answer["now"] == pytest.approx([0.0, 0.5, 0.04], abs=0.02)
+    assert answer["now"] != answer["to"]
+
+
+def test_a_body_is_put_somewhere_without_its_speed(scene: Scene) -> None:
+    ball = scene.robot.getFromDef("BALL")
+    assert ball is not None
+    ball.setVelocity([2.0, 0, 0, 0, 0, 0])
+    scene.ask("set_field", path="BALL.translation", value=[0, 1, 0.05], stop=True)
+    assert scene.get("BALL.translation") == [0.0, 1.0, 0.05]
+    assert ball.getVelocity()[:2] == [0.0, 0.0]
+
+
+def test_while_it_is_paused_a_field_is_set_too(scene: Scene) -> None:
+    sent = [
+        scene.recording.send("pause"),
+        scene.recording.send("set_field", path="BALL.physics.mass", value=3),
+        scene.recording.send("get_field", path="BALL.physics.mass"),
+        scene.recording.send("resume"),
+    ]
+    eager(scene.bridge)
+    scene.rounds(1)
+    fates = [scene.recording.fate(each) for each in sent]
+    assert [status for status, _, _ in fates] == ["done"] * 4
+    assert fates[1][1]["to"] == fates[2][1]["value"] == 3.0
+
+
+def test_a_reset_puts_back_what_webots_does_not(scene: Scene) -> None:
+    colour, friction = "BALL.children[0].appearance.baseColor", "WorldInfo.contactProperties[0]"
+    friction += ".coulombFriction"
+    before = (scene.get(colour), scene.ask("get_field", path=friction)["values"])
+    for value in ([1, 0, 0], [0, 1, 0]):
+        assert scene.ask("set_field", path=colour, value=value)["a_reset"] == "puts it back"
+    scene.ask("set_field", path=friction, value=[0.5, 0.25])
+    scene.ask("set_field", path="ROVER.translation", value=[0, 1, 0.04])
+    scene.reset()
+    assert (scene.get(colour), scene.ask("get_field", path=friction)["values"]) == before
+    assert scene.get("ROVER.translation") == [-1.2, 0.0, 0.04]
+    ((_, data),) = scene.events("put_back")
+    told = json.loads(data)
+    assert told == {"by_webots": ["ROVER.translation"], "by_bridge": [friction, colour]}
+
+
+def test_a_reset_leaves_what_somebody_else_has_set_since(scene: Scene) -> None:
+    scene.ask("set_field", path="BALL.physics.mass", value=2)
+    ball = scene.robot.getFromDef("BALL")
+    physics = ball.getField("physics") if ball else None
+    node = physics.getSFNode() if physics else None
+    mass = node.getField("mass") if node else None
+    assert mass is not None
+    mass.setSFFloat(7.0)
+    scene.reset()
+    assert scene.get("BALL.physics.mass") == 7.0
+
+
+def test_the_pose_that_a_reset_brings_is_never_that_of_the_middle_of_a_run(scene: Scene) -> None:
+    scene.ask("set_field", path="ROVER.translation", value=[1, 1, 0.04])
+    scene.ask("set_field", path="ROVER.translation", value=[-1.2, 0, 0.04])
+    scene.reset()
+    assert scene.get("ROVER.translation") == [-1.2, 0.0, 0.04]
+
+
+def test_a_node_is_added_with_a_path_that_leads_to_it_until_a_reset(scene: Scene) -> None:
+    named = scene.ask("add_node", vrml=PILL)
+    assert (named["path"], named["parent"], named["a_reset"]) == (
+        "PILL",
+        "root.children",
+        "removes it",
+    )
+    second = scene.ask("add_node", vrml='Solid { name "second" }', path="FLOOR")
+    assert second["path"].startswith("#")
+    assert second["parent"] == "FLOOR.children"
+    assert scene.get(f"{second['path']}.name") == "second"
+    assert [name for name, _ in scene.events("add_node")] == ["PILL", second["path"]]
+    scene.reset()
+    assert "no node is called 'PILL'" in scene.fail("get_field", path="PILL")
+    ((_, data),) = scene.events("put_back")
+    assert json.loads(data) == {"by_webots": ["PILL (added)", f"{second['path']} (added)"]}
+
+
+def test_a_field_that_is_null_takes_a_node(scene: Scene) -> None:
+    answer = scene.ask("add_node", path="FLOOR.physics", vrml="Physics { mass 4 }")
+    assert answer["parent"] == "FLOOR.physics"
+    assert scene.get("FLOOR.physics.mass") == 4.0
+    said = scene.fail("add_node", path="FLOOR.physics", vrml="Physics { mass 4 }")
+    assert "FLOOR.physics holds a node (Physics): remove that one first" in said
+
+
+@pytest.mark.parametrize(
+    ("params", "said"),
+    [
+        ({"vrml": "Hologram { }"}, "Webots added nothing to root.children"),
+        ({"vrml": "Hologram { }"}, "IMPORTABLE EXTERNPROTO"),
+        ({"vrml": "Solid {"}, "give vrml as one node of a world file"),
+        ({"vrml": "Solid { children [ }"}, "1 [ and 0 ]"),
+        ({"vrml": ""}, "give vrml as one node"),
+        ({"vrml": None}, "give vrml as one node"),
+        ({"vrml": PILL, "path": "ROVER.translation"}, "it takes no nodes"),
+        ({"vrml": PILL, "path": "WorldInfo"}, "has no field children"),
+        ({"vrml": PILL, "path": "nowhere"}, "no node is called 'nowhere'"),
+    ],
+)
+def test_a_node_that_cannot_be_added_is_said_to_be_none(
+    scene: Scene, params: dict[str, object], said: str
+) -> None:
+    assert said in scene.fail("add_node", **params)
+    assert not scene.events("add_node")
+
+
+def test_brackets_in_texts_and_comments_are_no_brackets(scene: Scene) -> None:
+    odd = 'DEF ODD Solid { # { in a comment\n name "a { and a \\" [" }'
+    assert scene.ask("add_node", vrml=odd)["path"] == "ODD"
+    assert scene.get("ODD.name") == 'a { and a " ['
+
+
+def test_a_node_that_was_removed_is_brought_back_by_each_reset(scene: Scene) -> None:
+    whole = scene.robot.getFromDef("CRATE")
+    assert whole is not None
+    written = whole.exportString()
+    assert scene.ask("remove_node", path="CRATE")["a_reset"] == "puts it back"
+    assert "no node is called 'CRATE'" in scene.fail("get_field", path="CRATE")
+    for _ in range(2):
+        scene.reset()
+        again = scene.robot.getFromDef("CRATE")
+        assert again is not None and again.exportString() == written
+    assert [json.loads(data) for _, data in scene.events("put_back")] == [
+        {"by_bridge": ["CRATE (removed)"]}
+    ] * 2
+
+
+def test_what_was_added_and_removed_again_stays_away(scene: Scene) -> None:
+    scene.ask("add_node", vrml=PILL)
+    scene.ask("remove_node", path="PILL")
+    scene.reset()
+    assert scene.robot.getFromDef("PILL") is None
+    assert not scene.events("put_back")
+
+
+def test_the_node_of_a_single_field_is_removed_and_brought_back(scene: Scene) -> None:
+    scene.ask("remove_node", path="BALL.physics")
+    assert scene.get("BALL.physics") is None
+    scene.reset()
+    assert scene.get("BALL.physics.mass") == 0.05
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("ROVER", "holds the robot 'rover', whose bridge would remove it: it stays"),
+        ("root", "cannot be removed from a world"),
+        ("WorldInfo", "cannot be removed from a world"),
+        ("Viewpoint", "cannot be removed from a world"),
+        ("BALL.translation", "is a field of type SFVec3f, not a node"),
+        ("FLOOR.physics", "FLOOR.physics is NULL"),
+    ],
+)
+def test_what_the_world_needs_is_not_removed(scene: Scene, path: str, said: str) -> None:
+    assert said in scene.fail("remove_node", path=path)
+    assert not scene.events("remove_node")
+
+
+def test_more_changes_than_are_remembered_are_said_to_stay(scene: Scene) -> None:
+    sent = [
+        scene.recording.send("set_field", path="BALL.name", value=f"ball {i}") for i in range(3)
+    ]
+    scene.rounds(30)
+    assert all(scene.recording.fate(each)[1]["a_reset"] == "puts it back" for each in sent)
+    path = "WorldInfo.info"
+    scene.ask("set_field", path=path, value=["x"] * 400)
+    last = ""
+    for i in range(200):
+        last = scene.ask("set_field", path=f"{path}[{i}]", value="y")["a_reset"]
+    assert last == "leaves it so: 200 changes are remembered, and no more"
+
+
+def test_the_command_that_made_a_change_stands_in_its_event(
+    scene: Scene, recording: Recording
+) -> None:
+    sent = recording.send("set_field", path="BALL.name", value="b")
+    scene.rounds()
+    ((_, data),) = scene.events("set_field")
+    assert json.loads(data)["command_id"] == sent

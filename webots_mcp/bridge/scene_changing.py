@@ -1,0 +1,261 @@
+"""The built-in actions that change the scene tree: set a field, add and remove a node.
+
+Webots sets a field with the next step, so an answer says what the field holds after it. Each change
+is an event, and is remembered, so that a reset puts it back.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Generator
+from dataclasses import replace
+from typing import Any, Final, cast
+
+from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.context import Context
+from webots_mcp.bridge.scene_edits import MOST_EDITS, FieldEdit, Removal
+from webots_mcp.bridge.scene_path import Place, children, find, find_node, label
+from webots_mcp.bridge.scene_restoring import find_again, import_node, spot_of
+from webots_mcp.bridge.scene_values import MOST_ENTRIES, checked, is_nearer, is_same, read, write
+from webots_mcp.bridge.text import cut
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
+
+_Progress = Generator[None, None, object]
+
+_LONGEST_NODE: Final = 50_000  # characters of a node that is added
+_STAY: Final = ("WorldInfo", "Viewpoint")
+_ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
+_SAYS: Final = "Webots' console (webots_get_logs, if it is recorded) says why"
+
+
+def set_field(context: Context, command: Command) -> _Progress:
+    """Set the field, or the entry of one, that a `path` leads to, to a `value`."""
+    robot, params = context.simulation.robot, command.params
+    place = yield from find(robot, params.get("path"))
+    _require_settable(robot, place)
+    value = checked(place.path, place.type_name, params.get("value"))
+    before = read(place.field, place.index)
+    is_remembered = context.scene.remember_field(_edit(place, before, value))
+    write(place.field, value, place.index)
+    if params.get("stop") is True:
+        place.node.resetPhysics()
+    facts: dict[str, Any] = {"path": place.path, "type": place.type_name}
+    facts |= {"from": before, "to": value}
+    is_stepped = yield from _until_stepped(context)
+    now = _read_again(robot, place)
+    if not is_stepped and not is_same(place.type_name, now, value):
+        facts["now"], facts["when"] = now, "it is set with the next step: the simulation is paused"
+    elif not is_nearer(place.type_name, now, value, before) and not is_same(
+        place.type_name, before, value
+    ):
+        raise CommandRefusedError(f"{place.path} is {now!r:.200} after it was set; {_SAYS}")
+    elif not is_same(place.type_name, now, value):
+        facts["now"] = now  # the simulation has moved it on
+    context.journal.event("set_field", facts | _asked_by(command), place.path)
+    return facts | {"sim_time_s": context.clock.sim_time_s} | _told_of_reset(is_remembered)
+
+
+def _edit(place: Place, before: Any, value: Any) -> FieldEdit:
+    field = cast("Any", place.field)
+    name = str(field.getName())
+    node_id = int(place.node.getId())
+    return FieldEdit(place.path, node_id, name, place.index, place.type_name, before, value)
+
+
+def _require_settable(robot: Any, place: Place) -> None:
+    if place.field is None:
+        raise InvalidInputError(
+            f"{place.path} is a node ({label(place.node)}): name the field to set, such as "
+            f"{place.path}.translation"
+        )
+    if place.is_hidden:
+        raise InvalidInputError(
+            f"{place.path} is inside a PROTO, where nothing can be set: set a field of the PROTO "
+            "node itself"
+        )
+    if place.index is None and place.field.getCount() > MOST_ENTRIES:
+        raise InvalidInputError(
+            f"{place.path} has {place.field.getCount()} entries: set one, such as {place.path}[0]"
+        )
+    if place.field.getName() == "supervisor" and place.node.getId() == robot.getSelf().getId():
+        raise InvalidInputError(
+            f"{place.path} stays as it is: the bridge that would set it needs the right itself"
+        )
+
+
+def _read_again(robot: Any, place: Place) -> Any:
+    """Setting a field may make a PROTO's inside anew, so that it is looked for once more."""
+    assert place.field is not None
+    field = find_again(robot, int(place.node.getId()), str(place.field.getName()))
+    if field is None:
+        raise CommandRefusedError(f"{place.path} is not there any more after it was set")
+    return read(field, place.index)
+
+
+def _until_stepped(context: Context) -> Generator[None, None, bool]:
+    """Wait for a step of the simulation; False where it is paused."""
+    clock, from_step = context.clock, context.clock.steps_seen
+    while clock.steps_seen == from_step:
+        yield
+        if context.pause.active and clock.steps_seen == from_step:
+            return False
+    return True
+
+
+def _asked_by(command: Command) -> dict[str, Any]:
+    return {"command_id": command.id, "requested_by": command.requested_by}
+
+
+def _told_of_reset(is_remembered: bool) -> dict[str, Any]:
+    if is_remembered:
+        return {"a_reset": "puts it back"}
+    return {"a_reset": f"leaves it so: {MOST_EDITS} changes are remembered, and no more"}
+
+
+def add_node(context: Context, command: Command) -> _Progress:
+    """Add the node that `vrml` describes to the children of a `path`, or to a field of nodes."""
+    robot, params = context.simulation.robot, command.params
+    text = _require_one_node(params.get("vrml"))
+    place = yield from _find_room(robot, params.get("path") or "root")
+    before = _count(place)
+    node = import_node(place.field, text)
+    if node is None:
+        yield from _until_stepped(context)
+        node = _newest(robot, place, before)
+    if node is None:
+        raise CommandRefusedError(
+            f"Webots added nothing to {place.path}; {_SAYS}. A PROTO has to be declared in the "
+            "world first: IMPORTABLE EXTERNPROTO"
+        )
+    path = _path_of(robot, node)
+    is_remembered = context.scene.remember_added(path, int(node.getId()))
+    facts: dict[str, Any] = {"path": path, "type": str(node.getTypeName()), "parent": place.path}
+    yield from _until_stepped(context)
+    context.journal.event("add_node", facts | {"vrml": cut(text, 2000)} | _asked_by(command), path)
+    reset = {"a_reset": "removes it"} if is_remembered else _told_of_reset(is_remembered)
+    return facts | {"node": label(node), "sim_time_s": context.clock.sim_time_s} | reset
+
+
+def _count(place: Place) -> int:
+    return int(cast("Any", place.field).getCount())
+
+
+def _newest(robot: Any, place: Place, before: int) -> Any | None:
+    """The node that came to a field since; None where none did."""
+    field = find_again(robot, int(place.node.getId()), str(cast("Any", place.field).getName()))
+    if field is None or place.type_name == "SFNode":
+        return None if field is None else field.getSFNode()
+    return field.getMFNode(-1) if field.getCount() > before else None
+
+
+def _require_one_node(text: object) -> str:
+    """The text of a node; what is no node at all is refused before Webots is asked.
+
+    Raises:
+        InvalidInputError: It is none.
+    """
+    what = 'give vrml as one node of a world file, such as DEF BOX Solid { name "box" }'
+    if not isinstance(text, str) or len(text) > _LONGEST_NODE or not _ONE_NODE.match(text):
+        raise InvalidInputError(f"{what}; got {text!r:.100}")
+    unquoted = re.sub(r'"(?:[^"\\]|\\.)*"|#[^\n]*', "", text)
+    for opening, closing in ("{}", "[]"):
+        if unquoted.count(opening) != unquoted.count(closing):
+            raise InvalidInputError(
+                f"{what}; this has {unquoted.count(opening)} {opening} and "
+                f"{unquoted.count(closing)} {closing}"
+            )
+    return text
+
+
+def _find_room(robot: Any, path: object) -> Generator[None, None, Place]:
+    """The field that a node is added to.
+
+    Raises:
+        InvalidInputError: There is none, or no room in it.
+    """
+    place = yield from find(robot, path)
+    if place.field is None:
+        room = children(place.node)
+        if room is None:
+            raise InvalidInputError(
+                f"{place.path} ({label(place.node)}) has no field children: name a field of nodes"
+            )
+        place = replace(place, path=f"{place.path}.children", field=room)
+    room = cast("Any", place.field)
+    if place.type_name == "SFNode" and room.getSFNode() is not None:
+        holds = label(room.getSFNode())
+        raise InvalidInputError(f"{place.path} holds a node ({holds}): remove that one first")
+    if not place.type_name.endswith("Node"):
+        raise InvalidInputError(f"{place.path} is of type {place.type_name}: it takes no nodes")
+    if place.is_hidden:
+        raise InvalidInputError(f"{place.path} is inside a PROTO, where nothing can be added")
+    return place
+
+
+def _path_of(robot: Any, node: Any) -> str:
+    """A path that leads to a node for as long as it is there."""
+    definition = str(node.getDef())
+    found = robot.getFromDef(definition) if definition else None
+    is_first = found is not None and found.getId() == node.getId()
+    return definition if is_first else f"#{node.getId()}"
+
+
+def remove_node(context: Context, command: Command) -> _Progress:
+    """Remove the node that a `path` leads to, with all in it."""
+    robot = context.simulation.robot
+    place = yield from find_node(robot, command.params.get("path"))
+    _require_removable(robot, place)
+    node, node_id = place.node, int(place.node.getId())
+    facts: dict[str, Any] = {
+        "path": place.path,
+        "type": str(node.getTypeName()),
+        "node": label(node),
+    }
+    removal = _removal(robot, place, node_id)
+    node.remove()
+    if robot.getFromId(node_id) is not None:
+        yield from _until_stepped(context)
+    if robot.getFromId(node_id) is not None:
+        raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
+    is_remembered = removal is not None and context.scene.remember_removed(removal)
+    context.journal.event("remove_node", facts | _asked_by(command), place.path)
+    reset = _brought_back(removal, is_remembered)
+    return facts | {"sim_time_s": context.clock.sim_time_s, "a_reset": reset}
+
+
+def _brought_back(removal: Removal | None, is_remembered: bool) -> str:
+    if is_remembered:
+        return "puts it back"
+    if removal is None or not removal.is_written_out:
+        return "does not bring it back; a reload does"
+    return str(_told_of_reset(False)["a_reset"])
+
+
+def _require_removable(robot: Any, place: Place) -> None:
+    """Refuse what the world, or this very bridge, cannot do without.
+
+    Raises:
+        InvalidInputError: With the reason.
+    """
+    node = place.node
+    if place.is_hidden:
+        raise InvalidInputError(f"{place.path} is inside a PROTO, where nothing can be removed")
+    if node.getTypeName() in _STAY or node.getId() == robot.getRoot().getId():
+        raise InvalidInputError(f"{place.path} ({label(node)}) cannot be removed from a world")
+    each = robot.getSelf()
+    while each is not None:
+        if each.getId() == node.getId():
+            raise InvalidInputError(
+                f"{place.path} holds the robot {robot.getName()!r}, whose bridge would remove it: "
+                "it stays"
+            )
+        each = each.getParentNode()
+
+
+def _removal(robot: Any, place: Place, node_id: int) -> Removal | None:
+    """How to bring it back; None where its place is not found, or Webots cannot write it out."""
+    found = spot_of(robot, place.node)
+    export = getattr(place.node, "exportString", None)
+    if found is None or export is None:
+        return None
+    return Removal(place.path, node_id, *found, str(export() or ""))

@@ -1,0 +1,199 @@
+"""The built-in actions that look at the scene tree: its nodes, and what a path leads to.
+
+They ask Webots from within the controller's loop, a few milliseconds a round.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Generator, Iterable
+from fnmatch import fnmatchcase
+from typing import Any, Final, cast
+
+from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.context import Context
+from webots_mcp.bridge.scene import DEEPEST, SceneNode, find_field, holds_solids, walk
+from webots_mcp.bridge.scene_path import Pace, Place, children, fields_of, find, find_node, label
+from webots_mcp.bridge.scene_values import read, read_entries
+from webots_mcp.bridge.text import cut
+from webots_mcp.errors import InvalidInputError
+
+_Progress = Generator[None, None, object]
+
+_MOST_CHARACTERS: Final = 2_600  # of an answer's rows; the server would shorten more
+_MOST_SHOWN: Final = 50  # entries of a field
+_FIRST_ENTRIES: Final = 3  # of a field among others
+_LONGEST_TEXT: Final = 80  # of a field among others
+_USUAL_DEPTH: Final = 2
+_MOST_AT_THE_TOP: Final = 200
+_MOST_PATTERNS: Final = 20
+
+
+def get_scene(context: Context, command: Command) -> _Progress:
+    """The nodes of the tree, or below a `path`, that match `types` and `names`."""
+    params, robot = command.params, context.simulation.robot
+    types, names = _patterns(params, "types"), _patterns(params, "names")
+    wanted, after = _patterns(params, "fields"), _whole(params, "cursor", 0, 0, 10**9)
+    usual = DEEPEST if types or names else _USUAL_DEPTH
+    depth = _whole(params, "depth", usual, 1, DEEPEST)
+    path = params.get("path")
+    place = (yield from find_node(robot, path)) if path else None
+    around = robot.getRoot() if place is None else place.node
+    inside = bool(place or types or names)  # of PROTO nodes
+    tree = walk(around, deepest=depth, inside=inside, everything=bool(types))
+    rows, pace = _Rows(["depth", "path", "type", "name", *wanted]), Pace()
+    shown, looked, definitions = list[tuple[tuple[int, ...], list[Any]]](), 0, set[str]()
+    keys: dict[int, tuple[int, ...]] = {}
+    for looked, found in enumerate(tree, 1):
+        yield from pace.rest()
+        before = keys.get(found.parent.id, ()) if found.parent else ()
+        keys[found.id] = (*before, looked)
+        row = _row(found, definitions, wanted)
+        if looked <= after or not _matches(found, row[3], types, names):
+            continue
+        if not rows.fits(row):
+            return rows.told([row for _, row in sorted(shown)]) | {"cursor": looked - 1}
+        shown.append((keys[found.id], row))
+    told = rows.told([row for _, row in sorted(shown)]) | {"looked_at": looked}
+    if place is not None:
+        return told | {"below": place.path}
+    return told if types or names else told | {"also_at_the_top": _others_at_the_top(around)}
+
+
+def _others_at_the_top(root: Any) -> list[str]:
+    """The types of the nodes that are neither solids nor groups of them: WorldInfo, lights."""
+    field = children(root)
+    found = (field.getMFNode(index) for index in range(min(field.getCount(), _MOST_AT_THE_TOP)))
+    others = (str(node.getTypeName()) for node in found if not holds_solids(node))
+    return list(dict.fromkeys(others))
+
+
+class _Rows:
+    """Rows of an answer, as far as there is room for them."""
+
+    def __init__(self, columns: list[str]) -> None:
+        self._columns = columns
+        self._characters = 0
+
+    def fits(self, row: list[Any]) -> bool:
+        self._characters += len(json.dumps(row, default=str)) + 1
+        return self._characters <= _MOST_CHARACTERS
+
+    def told(self, rows: list[list[Any]]) -> dict[str, Any]:
+        return {"columns": self._columns, "rows": rows}
+
+
+def _row(found: SceneNode, definitions: set[str], wanted: list[str]) -> list[Any]:
+    """Its depth, a path to it that is no other's, its type, its name, and the wanted fields."""
+    path = found.definition if found.definition not in definitions else ""
+    definitions.add(found.definition)
+    kind = found.type_name
+    if kind != found.base_type:
+        kind = f"{kind} ({found.base_type})"
+    if found.hidden:
+        kind = f"{kind}, inside a PROTO"
+    values = [_brief(find_field(found.node, each)) for each in wanted]
+    return [found.depth + 1, path or f"#{found.id}", kind, found.name or None, *values]
+
+
+def _matches(found: SceneNode, name: str | None, types: list[str], names: list[str]) -> bool:
+    kinds = (found.type_name, found.base_type)
+    called = (found.definition, name or "")
+    return (not types or _any_match(kinds, types)) and (not names or _any_match(called, names))
+
+
+def _any_match(texts: Iterable[str], patterns: list[str]) -> bool:
+    return any(fnmatchcase(text, pattern) for text in texts for pattern in patterns)
+
+
+def get_field(context: Context, command: Command) -> _Progress:
+    """What a `path` leads to: the value of a field, or a node with all its fields."""
+    place = yield from find(context.simulation.robot, command.params.get("path"))
+    start = _whole(command.params, "start", 0, 0, 10**9)
+    facts: dict[str, Any] = {"path": place.path}
+    if place.is_hidden:
+        facts["read_only"] = "it is inside a PROTO"
+    if place.field is None:
+        return facts | (yield from _describe_node(place, start))
+    facts["type"] = str(place.field.getTypeName()) if place.index is None else place.type_name
+    if place.field.getCount() >= 0 and place.index is None:
+        return facts | _describe_entries(place, start)
+    return facts | {"value": _value(place.field, place.index)}
+
+
+def _describe_node(place: Place, start: int) -> Generator[None, None, dict[str, Any]]:
+    node, pace, rows = place.node, Pace(), _Rows(["field", "type", "value"])
+    facts = {"node": label(node), "id": int(node.getId())}
+    if node.isProto():
+        facts["proto_of"] = str(node.getBaseTypeName())
+    shown: list[list[Any]] = []
+    for index, field in enumerate(fields_of(node)):
+        yield from pace.rest()
+        row = [field.getName(), field.getTypeName(), _brief(field)]
+        if index < start:
+            continue
+        if not rows.fits(row):
+            return facts | rows.told(shown) | {"next_start": index}
+        shown.append(row)
+    return facts | rows.told(shown)
+
+
+def _describe_entries(place: Place, start: int) -> dict[str, Any]:
+    field = place.field
+    assert field is not None
+    count, size, shown = int(field.getCount()), 0, list[Any]()
+    for index in range(start, min(start + _MOST_SHOWN, count)):
+        value = _value(field, index)
+        size += len(json.dumps(value)) + 1
+        if size > _MOST_CHARACTERS:
+            break
+        shown.append(value)
+    more = start + len(shown)
+    return {"count": count, "values": shown} | ({"next_start": more} if more < count else {})
+
+
+def _value(field: Any, index: int | None) -> Any:
+    """A single value, or an entry; nodes in few words."""
+    if not str(field.getTypeName()).endswith("Node"):
+        value = read(field, index)
+        return cut(value, _MOST_CHARACTERS // 2) if isinstance(value, str) else value
+    node = field.getSFNode() if index is None else field.getMFNode(index)
+    return None if node is None else f"#{node.getId()} {label(node)}"
+
+
+def _brief(field: Any) -> Any:
+    """A value among others: of a list the first entries and how many there are."""
+    if field is None:
+        return None
+    if field.getCount() < 0:
+        value = _value(field, None)
+        return cut(value, _LONGEST_TEXT) if isinstance(value, str) else value
+    count = int(field.getCount())
+    if str(field.getTypeName()) == "MFNode":
+        return f"{count} nodes"
+    first = read_entries(field, 0, _FIRST_ENTRIES)
+    first = [cut(each, _LONGEST_TEXT) if isinstance(each, str) else each for each in first]
+    return first if count <= len(first) else [*first, f"... {count} in all"]
+
+
+def _patterns(params: dict[str, Any], name: str) -> list[str]:
+    given = params.get(name)
+    if given is None:
+        return []
+    if not isinstance(given, list) or not all(
+        isinstance(each, str) for each in cast("list[Any]", given)
+    ):
+        raise InvalidInputError(f'{name} is a list of texts, such as ["Robot"], not {given!r:.80}')
+    texts = cast("list[str]", given)
+    if len(texts) > _MOST_PATTERNS:
+        raise InvalidInputError(f"{name} are {len(texts)}: at most {_MOST_PATTERNS}")
+    return texts
+
+
+def _whole(params: dict[str, Any], name: str, usual: int, least: int, most: int) -> int:
+    value = params.get(name)
+    if value is None:
+        return usual
+    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+        raise InvalidInputError(f"{name} is a whole number from {least} to {most}, not {value!r}")
+    return value

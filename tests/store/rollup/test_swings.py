@@ -15,7 +15,7 @@ from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading import rows, views
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention, prune
-from webots_mcp.store.rollup import swings
+from webots_mcp.store.rollup import findings
 from webots_mcp.store.rollup.rolling import roll
 
 # In a bucket of 500 s, across the border of two, and after the last that is over.
@@ -27,7 +27,7 @@ END_S = 1300.0
 def long(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
     """1300 s, of which two coarse buckets are over."""
     monkeypatch.setattr(rows, "RAW_ROWS", 1000)
-    monkeypatch.setattr(swings, "STRETCH_ROWS", 1500)
+    monkeypatch.setattr(findings, "STRETCH_ROWS", 1500)
     monkeypatch.setattr(views, "STRETCH_ROWS", 1500)
     recorder = Recorder(empty)
     robot_id = recorder.robot("rover")

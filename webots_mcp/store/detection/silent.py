@@ -11,7 +11,7 @@ from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.resting import replaced_value
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.intervals import MOSTLY, Silent, Span, common
-from webots_mcp.store.rollup.rolling import watermark
+from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.catalogue import other_form
 from webots_mcp.store.signals.registry import Signal
 

@@ -14,7 +14,7 @@ from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rollups import rows_after
 from webots_mcp.store.reading.rows import read_columns
-from webots_mcp.store.rollup.rolling import watermark
+from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal
 

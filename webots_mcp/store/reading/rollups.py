@@ -30,7 +30,7 @@ from webots_mcp.store.rollup.buckets import (
     buckets,
     by_grain,
 )
-from webots_mcp.store.rollup.rolling import watermark
+from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.registry import Signal
 
 # By ids, from the watermark on: the + keeps SQLite from sorting all rows of the run instead.

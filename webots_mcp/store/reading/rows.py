@@ -83,6 +83,14 @@ class Columns:
             self._aligned[name] = aligned_numbers(self.values[name])
         return self._aligned[name]
 
+    def add(self, later: Columns) -> None:
+        """Take in rows of the same signals that come after these."""
+        self.ids += later.ids
+        self.times += later.times
+        self.walls += later.walls
+        for name, values in self.values.items():
+            values += later.values[name]
+
     def numbers(self, name: str) -> tuple[Array, Array]:
         """Times and numbers of a numeric signal, of the rows that have a usable one."""
         return usable_part(self.moments, self.aligned(name))

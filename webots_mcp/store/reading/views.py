@@ -32,13 +32,13 @@ from webots_mcp.store.reading.rollups import Pieces, read_pieces, rows_after
 from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of, read_columns
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, buckets, totals
-from webots_mcp.store.rollup.rolling import watermark
 from webots_mcp.store.rollup.swings import (
     ACROSS_S,
     LONGEST_PERIOD_S,
     STRETCH_ROWS,
     stored_swings,
 )
+from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.registry import Signal
 
 READING_SHARE: Final = 0.5  # of the time: what is read has to be searched as well
@@ -89,13 +89,16 @@ class View(Protocol):
     sampled_s: float  # between the rows of `places`; 0 where these are all
     longest_period_s: float  # of swings that show in it
     is_long: bool  # not all of its rows are read
+    inside: range  # buckets of 10 s of which what was found is stored; none where all rows are read
 
     def taken_notes(self) -> list[str]:
         """What could not be looked at since the notes were last taken; and what never can."""
         ...
 
-    def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
-        """Rows close enough to see a stay of that length."""
+    def places(
+        self, signals: Sequence[Signal], stay_s: float, outside: range = _NOTHING
+    ) -> Columns:
+        """Rows close enough to see a stay of that length, of the time outside of some buckets."""
         ...
 
     def sample(self, signals: Sequence[Signal]) -> Columns:
@@ -171,6 +174,7 @@ class RowView:
     shortest_rest_s = 0.0
     sampled_s = 0.0
     is_long = False
+    inside = _NOTHING
 
     def __init__(self, columns: Columns) -> None:
         self.notes: list[str] = []
@@ -187,7 +191,9 @@ class RowView:
         """Of rows only that not all were read."""
         return self._lasting
 
-    def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
+    def places(
+        self, signals: Sequence[Signal], stay_s: float, outside: range = _NOTHING
+    ) -> Columns:
         """All rows."""
         return self._columns
 
@@ -255,6 +261,8 @@ class LongView:
         self._deadline = deadline
         self.sampled_s = 0.0
         self._signals = [signal for signal in signals if signal.is_number]
+        start, end = -(-segment.start_s // BUCKET_S), segment.end_s // BUCKET_S
+        self.inside = range(int(start), int(end))
         self._span = (segment.run_id, bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
         late = rows_after(connection, segment, watermark(connection, segment.run_id))
         self._late_s = None
@@ -266,22 +274,30 @@ class LongView:
         taken, self.notes = list(dict.fromkeys(self.notes)), []
         return taken
 
-    def places(self, signals: Sequence[Signal], stay_s: float) -> Columns:
+    def places(
+        self, signals: Sequence[Signal], stay_s: float, outside: range = _NOTHING
+    ) -> Columns:
         """A row every fifth of the stay; fewer where that would be too many."""
-        self._note_purged()
-        span_s = self._segment.end_s - self._segment.start_s
+        parts = _around(self._segment, outside)[::-1]
+        if parts[0].start_s < outside.start * BUCKET_S or not outside:
+            self._note_purged()
+        span_s = sum(part.end_s - part.start_s for part in parts)
         every_s = max(stay_s / SAMPLES_PER_STAY, span_s / MOST_SAMPLES)
         self.sampled_s = every_s
         if every_s > stay_s / 2:
             self.notes.append(f"not those of less than {2 * every_s:.3g} s: ask for less time")
         plain = [signal for signal in signals if signal.is_plain]
-        found = read_sampled(self._connection, self._segment, plain, every_s, self._deadline)
+        found = Columns(self._segment.run_id, values={signal.name: [] for signal in plain})
+        for part in parts:
+            sampled = read_sampled(self._connection, part, plain, every_s, self._deadline)
+            found.add(sampled)
+            if sampled.cut:
+                reached_s = sampled.times[-1] if sampled.times else part.start_s
+                self.notes.append(
+                    f"the time was over: not after {reached_s:.3f} s; ask start_s={reached_s:.3f}"
+                )
+                return found
         self._add_newest(found, plain, every_s)
-        if found.cut:
-            reached_s = found.times[-1] if found.times else self._segment.start_s
-            self.notes.append(
-                f"the time was over: not after {reached_s:.3f} s; ask start_s={reached_s:.3f}"
-            )
         return found
 
     def sample(self, signals: Sequence[Signal]) -> Columns:
@@ -372,8 +388,7 @@ class LongView:
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """Those of the coarse rollups that lie inside."""
-        start, end = -(-self._segment.start_s // BUCKET_S), self._segment.end_s // BUCKET_S
-        return stored_swings(self._connection, self._segment, range(int(start), int(end)), signals)
+        return stored_swings(self._connection, self._segment, self.inside, signals)
 
     def stretches(
         self,
@@ -485,16 +500,11 @@ class LongView:
 
     def _add_newest(self, found: Columns, signals: Sequence[Signal], every_s: float) -> None:
         """The rows after the last sample: who is stuck may be so up to the newest one."""
-        after_s = found.times[-1] if found.times and not found.cut else math.inf
+        after_s = found.times[-1] if found.times else math.inf
         part = replace(
             self._segment, start_s=just_after(max(after_s, self._segment.end_s - 2 * every_s))
         )
-        newest = read_columns(self._connection, part, signals, self._deadline)
-        found.ids += newest.ids
-        found.times += newest.times
-        found.walls += newest.walls
-        for signal in signals:
-            found.values[signal.name] += newest.values[signal.name]
+        found.add(read_columns(self._connection, part, signals, self._deadline))
 
     def _note_late(self) -> None:
         if self._late_s is not None:

@@ -21,6 +21,10 @@ _BUCKETS: Final = (
     f"SELECT bucket, {', '.join(Summary._fields)} FROM {{table}} "
     "WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ? ORDER BY bucket"
 )
+_STORED: Final = (
+    "SELECT {name} FROM coarse_rollup WHERE run_id = ? AND signal_id = ? "
+    "AND bucket >= ? AND bucket < ? AND present > 0 ORDER BY bucket"
+)
 EVER: Final = range(-(2**62), 2**62)  # every bucket
 # Of a few buckets of each signal, which the primary key finds signal by signal.
 _TOTALS: Final = (
@@ -72,6 +76,29 @@ def by_grain(connection: sqlite3.Connection, run_id: int, span: range) -> list[t
         (FINE, range(borders[1], span.stop)),
     )
     return [(grain, part) for grain, part in parts if part]
+
+
+def stored_texts(
+    connection: sqlite3.Connection, run_id: int, span: range, signal_id: int | None, name: str
+) -> tuple[range, list[str | None]]:
+    """What was found of a signal in the coarse buckets of a span of buckets of 10 s, in order.
+
+    Args:
+        connection: Any.
+        run_id: Of which run.
+        span: What is asked for.
+        signal_id: Which signal.
+        name: The column: swings, standstills or jumps.
+
+    Returns:
+        Which coarse buckets are there, and the texts of those with a value of the signal; None
+        where it was not looked for.
+    """
+    parts = by_grain(connection, run_id, span)
+    coarse = next((part for grain, part in parts if grain is COARSE), range(0))
+    asked = (run_id, signal_id, coarse.start, coarse.stop)
+    rows = connection.execute(_STORED.format(name=name), asked)
+    return coarse, [text for (text,) in rows]
 
 
 def totals(

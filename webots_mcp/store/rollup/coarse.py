@@ -1,6 +1,6 @@
 """Coarse rollups, merged from those of 10 s once these are over, in steps of about a millisecond.
 
-The swings of what a robot swings with are looked for then as well, and stored with them.
+Swings and standstills are looked for then as well, and stored with them.
 
 The column `coarse_end` of a run tells up to where they are complete. It moves on here, and back
 where a row comes late into what was merged already; then that is merged again.
@@ -17,12 +17,12 @@ from webots_mcp.connection import Step
 from webots_mcp.notice import warn
 from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, COARSE_S, bucket_of
-from webots_mcp.store.rollup.swings import swings_to_store
+from webots_mcp.store.rollup.findings import FINDINGS, findings_to_store
 from webots_mcp.store.rollup.tables import RUN_MARK, in_short_steps, run_mark
 from webots_mcp.store.sound import MAX_SIM_TIME_S, is_over_a_value, sound_rows
 
 _FIGURES: Final = ", ".join(Summary._fields)
-_COLUMNS: Final = f"run_id, bucket, signal_id, {_FIGURES}, swings"
+_COLUMNS: Final = f"run_id, bucket, signal_id, {_FIGURES}, {', '.join(FINDINGS)}"
 _COARSE_END: Final = "iif(typeof(coarse_end) = 'integer', coarse_end, NULL)"
 _PENDING: Final = (
     f"SELECT id, robot_id, {_COARSE_END}, last_sim_time_s FROM run "
@@ -113,14 +113,14 @@ def _first_to_merge(connection: sqlite3.Connection, run: _Run, end: int) -> int:
 def _merged(connection: sqlite3.Connection, run: _Run, bucket: int) -> Iterator[tuple[Any, ...]]:
     """Rows of the table: what a coarse bucket comes to, signal by signal."""
     first = bucket * COARSE_BUCKETS
-    swings: dict[int, str] = {}
+    findings: list[dict[int, str]] = [{} for _ in FINDINGS]
     values = {
         "run": run.id, "robot": run.robot_id, "first": first, "end": first + COARSE_BUCKETS
     }  # fmt: skip
     try:
         merged = _merged_parts(connection.execute(_PARTS.format(table="rollup"), values).fetchall())
         rows = {signal_id: summary.rows for signal_id, summary in merged}
-        swings = swings_to_store(connection, run.id, run.robot_id, bucket, rows)
+        findings = findings_to_store(connection, run.id, run.robot_id, bucket, rows)
     except Exception as error:
         if not is_over_a_value(error):
             raise
@@ -129,7 +129,8 @@ def _merged(connection: sqlite3.Connection, run: _Run, bucket: int) -> Iterator[
             merged = _merged_parts([row for row in parts if _is_whole(Summary._make(row[1:]))])
         warn(f"left out of the coarse rollups: {'; '.join(unsound.described())}")
     for signal_id, summary in merged:
-        yield (run.id, bucket, signal_id, *summary, swings.get(signal_id))
+        found = (each.get(signal_id) for each in findings)
+        yield (run.id, bucket, signal_id, *summary, *found)
 
 
 def _merged_parts(rows: Sequence[Any]) -> list[tuple[int, Summary]]:

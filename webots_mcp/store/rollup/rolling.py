@@ -28,6 +28,7 @@ from webots_mcp.store.rollup.tables import (
     move,
     run_mark,
     store,
+    watermark,
 )
 from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal, count, enter_signals, seen_now
@@ -37,7 +38,6 @@ __all__ = ["Rolled", "forget", "roll", "watermark"]
 
 BATCH_ROWS: Final = 2000
 
-_WATERMARK: Final = "SELECT state_id FROM watermark WHERE name = 'rollup'"
 _SET_WATERMARK: Final = (
     "INSERT INTO watermark (name, state_id) VALUES ('rollup', ?) "
     "ON CONFLICT (name) DO UPDATE SET state_id = max(state_id, excluded.state_id)"
@@ -103,14 +103,6 @@ def roll(connection: sqlite3.Connection, budget_rows: int = 2000, pause_s: float
     move(connection, pause_s)
     # Later, where rows are left: one of an old run would go into what was merged already.
     return Rolled(taken, done and merge_coarse(connection, budget_rows, pause_s))
-
-
-def watermark(connection: sqlite3.Connection, run_id: int | None = None) -> int:
-    """The id of the last state row in the rollups, of a run or of all; 0 before the first."""
-    if run_id is not None:
-        return run_mark(connection, run_id) or 0
-    row = connection.execute(_WATERMARK).fetchone()
-    return int(row[0]) if row else 0
 
 
 def _roll_batch(connection: sqlite3.Connection, limit: int, pause_s: float) -> int | None:

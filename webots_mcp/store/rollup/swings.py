@@ -8,36 +8,28 @@ from __future__ import annotations
 import json
 import re
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import astuple, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple
 from typing import Final
 
 from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings, joined_swings
-from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment
-from webots_mcp.store.reading.rows import Numbers, numbers_of, read_columns
-from webots_mcp.store.reading.sampling import newest_part
-from webots_mcp.store.rollup.buckets import COARSE, COARSE_BUCKETS, COARSE_S, by_grain
-from webots_mcp.store.signals.registry import Signal, registered
+from webots_mcp.store.reading.rows import Columns, Numbers, numbers_of
+from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, stored_texts
+from webots_mcp.store.signals.registry import Signal
 from webots_mcp.units import in_snake_case
 
 LONGEST_PERIOD_S: Final = 5.0
 ACROSS_S: Final = 20.0  # of the stretch beside: longer than six half swings of that period
 STRETCH_ROWS: Final = 10_000  # that are searched at once
 MOST_SIGNALS: Final = 20  # of which swings are stored
-MOST_ROWS: Final = 100_000  # in 500 s: of more a maintainer had to read too much at once
-_LONGEST_S: Final = 60.0  # that it reads
 
 # Sensors swing by nature while a robot drives.
 _SWINGING: Final = re.compile(
     r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"
     r"|left|right|cmd|command\w*|error)([._]|$)",
     re.IGNORECASE,
-)
-_STORED: Final = (
-    "SELECT swings FROM coarse_rollup WHERE run_id = ? AND signal_id = ? "
-    "AND bucket >= ? AND bucket < ? AND present > 0 ORDER BY bucket"
 )
 
 
@@ -53,58 +45,27 @@ def swings_in(numbers: Numbers, signal: Signal, half_swings: int, period_s: floa
     return find_swings(times, values, least_half_swings=half_swings, longest_period_s=period_s)
 
 
-def swings_to_store(
-    connection: sqlite3.Connection, run_id: int, robot_id: int, bucket: int, rows: Mapping[int, int]
-) -> dict[int, str]:
-    """What is stored of a coarse bucket, by the ids of its signals.
+class SwingsToStore:
+    """Collects the swings of a coarse bucket, stretch by stretch."""
 
-    Nothing where rows of it are missing, which were purged, or where it has too many.
+    def __init__(self, signals: Iterable[Signal]) -> None:
+        self.signals = [signal for signal in signals if may_swing(signal)][:MOST_SIGNALS]
+        self._found: dict[str, list[Swing]] = {signal.name: [] for signal in self.signals}
 
-    Args:
-        connection: Any.
-        run_id: Of which run.
-        robot_id: Of which robot.
-        bucket: The number of the bucket, of 500 s.
-        rows: How many of its rows each signal is in.
-    """
-    known = registered(connection, robot_id).values()
-    signals = [signal for signal in known if signal.id in rows and may_swing(signal)]
-    segment = Segment(run_id, bucket * COARSE_S, (bucket + 1) * COARSE_S)
-    most = max(rows.values(), default=0)
-    if not signals or most > MOST_ROWS:
-        return {}
-    found: dict[str, list[Swing]] = {}
-    left = 0
-    for numbers, own_rows in _stretches(connection, segment, signals[:MOST_SIGNALS]):
-        left += own_rows
-        for name in numbers.values:
-            signal = next(each for each in signals if each.name == name)
+    def add(self, columns: Columns) -> None:
+        """Look in some rows one after the other."""
+        numbers = numbers_of(columns, self.signals)
+        for signal in self.signals:
             swings = swings_in(numbers, signal, LEAST_HALF_SWINGS, LONGEST_PERIOD_S)
-            found.setdefault(name, []).extend(swings)
-    if left < most:
-        return {}
-    return {
-        signal.id: json.dumps([astuple(swing) for swing in joined_swings(found[signal.name])])
-        for signal in signals[:MOST_SIGNALS]
-        if signal.id is not None
-    }
+            self._found[signal.name].extend(swings)
 
-
-def _stretches(
-    connection: sqlite3.Connection, segment: Segment, signals: Sequence[Signal]
-) -> Iterator[tuple[Numbers, int]]:
-    """Its rows and some before them, the newest first, and how many of them are its own."""
-    deadline = Deadline(_LONGEST_S)
-    left = segment
-    while left.end_s > left.start_s:
-        part = newest_part(connection, left, STRETCH_ROWS)
-        reached_s = part.start_s
-        whole = replace(part, start_s=reached_s - ACROSS_S)
-        columns = read_columns(connection, whole, signals, deadline)
-        if columns.cut:
-            return
-        yield numbers_of(columns, signals), sum(time_s >= reached_s for time_s in columns.times)
-        left = replace(left, end_s=reached_s)
+    def stored(self) -> dict[int, str]:
+        """What is stored, by the ids of the signals."""
+        return {
+            signal.id: json.dumps([astuple(swing) for swing in joined_swings(found)])
+            for signal, found in zip(self.signals, self._found.values(), strict=True)
+            if signal.id is not None
+        }
 
 
 def stored_swings(
@@ -118,14 +79,12 @@ def stored_swings(
         span: Buckets of 10 s that lie inside of what is asked for.
         signals: Which; those that have to be searched are left out.
     """
-    coarse = next(
-        (part for grain, part in by_grain(connection, segment.run_id, span) if grain is COARSE),
-        range(0),
-    )
+    coarse = range(0)
     found: dict[str, list[Swing]] = {}
     for signal in signals:
-        asked = (segment.run_id, signal.id, coarse.start, coarse.stop)
-        texts = [text for (text,) in connection.execute(_STORED, asked)]
+        coarse, texts = stored_texts(connection, segment.run_id, span, signal.id, "swings")
         if coarse and None not in texts:
-            found[signal.name] = [Swing(*each) for text in texts for each in json.loads(text)]
+            found[signal.name] = [
+                Swing(*each) for text in texts for each in json.loads(text or "[]")
+            ]
     return range(coarse.start * COARSE_BUCKETS, coarse.stop * COARSE_BUCKETS), found

@@ -27,6 +27,7 @@ Key = tuple[int, int]  # bucket, signal id
 
 _FIGURES: Final = ", ".join(Summary._fields)
 _COLUMNS: Final = f"run_id, bucket, signal_id, {_FIGURES}"
+_WATERMARK: Final = "SELECT state_id FROM watermark WHERE name = 'rollup'"
 RUN_MARK: Final = (
     "SELECT max(iif(typeof(rolled_state_id) = 'integer', rolled_state_id, 0), "
     "coalesce((SELECT state_id FROM watermark WHERE name = 'rollup'), 0)) FROM run WHERE id = {}"
@@ -127,6 +128,14 @@ def run_mark(connection: sqlite3.Connection, run_id: int) -> int | None:
     """The id of the last state row of a run that the rollups hold; None without such a run."""
     row = connection.execute(RUN_MARK.format("?"), (run_id,)).fetchone()
     return int(row[0]) if row else None
+
+
+def watermark(connection: sqlite3.Connection, run_id: int | None = None) -> int:
+    """The id of the last state row in the rollups, of a run or of all; 0 before the first."""
+    if run_id is not None:
+        return run_mark(connection, run_id) or 0
+    row = connection.execute(_WATERMARK).fetchone()
+    return int(row[0]) if row else 0
 
 
 def held(connection: sqlite3.Connection, run_id: int, mark: int) -> Held:

@@ -18,7 +18,7 @@ from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
 from webots_mcp.store.rollup.buckets import EVER, totals
-from webots_mcp.store.rollup.rolling import watermark
+from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.flatten import Kind, parse
 from webots_mcp.store.signals.registry import MAX_SIGNALS, Signal, by_name, registered, seen_now
 

@@ -9,8 +9,10 @@ world, through an MCP client and a server as an assistant's own would.
 import json
 import os
 import re
+import sqlite3
 import sys
 import tempfile
+from contextlib import closing
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,7 @@ from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.standin import Simulation
 
 SHOWN_CHARACTERS = 600
+READY = "SELECT 1 FROM state WHERE sim_time_s > 1"
 
 Answer = dict[str, Any]
 Turn = dict[str, Any]
@@ -38,10 +41,17 @@ def main(example: Path) -> None:
         environment = {DATA_DIR_VARIABLE: folder}
         world, mode = example / conversation["world"], conversation.get("mode", "realtime")
         with Simulation(world, mode=mode, environment=environment) as simulation:
-            simulation.wait_for(lambda: (Path(folder) / DATABASE_NAME).exists(), 30.0)
-            simulation.wait_for(lambda: simulation.time_s > conversation.get("first_s", 1.0), 60.0)
+            database, ready = Path(folder) / DATABASE_NAME, conversation.get("ready", READY)
+            simulation.wait_for(lambda: database.exists() and answers(database, ready), 120.0)
             parts = anyio.run(converse, Path(folder), conversation["turn"])
     print("\n".join((conversation["beginning"], *parts)), end="")
+
+
+def answers(database: Path, sql: str) -> bool:
+    """Whether the recording has what the conversation begins with."""
+    with closing(sqlite3.connect(database)) as connection:
+        has_tables = connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'log'").fetchone()
+        return bool(has_tables and connection.execute(sql).fetchone())
 
 
 async def converse(folder: Path, turns: list[Turn]) -> list[str]:

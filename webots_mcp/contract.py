@@ -86,6 +86,7 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
 OBSERVER: Final = "Observer"  # the kind of a robot that only looks at the others, and steers
 OBSERVER_NAME: Final = "mcp_observer"  # of its Robot node and of its controller
 WORLD_EVENT: Final = "world"  # the event that tells which robots and solids an observer sees
+MODE_EVENT: Final = "mode"  # the event that tells which simulation mode it sees
 LOOK_AT: Final = "look_at"  # its action
 
 BreakpointAction = Literal["pause", "log", "keep"]

@@ -124,7 +124,7 @@ async def test_without_stream_each_way_says_why_it_does_not_work(in_project: Any
     assert "websocket: Webots at 127.0.0.1:" in text
     assert "was started without --stream" in text
     assert "keyboard: force=true would press" in text
-    assert "Press Ctrl+2 in Webots, or start Webots with --stream" in text
+    assert "Press Ctrl+2 in Webots, start Webots with --stream, or open the world with an" in text
 
 
 async def test_a_webots_without_any_controller_of_ours_is_found_and_steered(

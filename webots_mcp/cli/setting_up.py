@@ -28,8 +28,14 @@ if TYPE_CHECKING:
     argument("--name", default="webots", help="what clients call the server (webots)"),
     argument("--patch", metavar="FILE",
              help="put the bridge's lines into this controller, and do nothing else"),
-    argument("--undo", metavar="FILE", help="take them out again"),
-    argument("--yes", action="store_true", help="patch or undo without asking"),
+    argument("--observer", metavar="WORLD",
+             help="add a robot that records where all robots are, to a copy of this world"),
+    argument("--in-place", action="store_true", help="with --observer: to the world itself"),
+    argument("--extern", action="store_true",
+             help="with --observer: to be run by 'webots-mcp observe', not by Webots"),
+    argument("--undo", metavar="FILE",
+             help="take the bridge's lines out of a controller, or the observer out of a world"),
+    argument("--yes", action="store_true", help="change what is there without asking"),
     argument("--dry-run", action="store_true", help="write nothing, and say what would be written"),
     JSON,
 )  # fmt: skip
@@ -45,9 +51,24 @@ def init(arguments: argparse.Namespace) -> None:
     --patch writes those lines, after a question:
 
         webots-mcp init --patch controllers/my_robot/my_robot.py
+
+    --observer adds a robot to a copy of a world (arena_observed.wbt, say), and its controller to
+    the project; then nothing has to be changed in any controller:
+
+        webots-mcp init --observer worlds/arena.wbt
     """
-    if arguments.patch and arguments.undo:
-        raise InvalidInputError("--patch and --undo exclude each other")
+    if sum(map(bool, (arguments.patch, arguments.undo, arguments.observer))) > 1:
+        raise InvalidInputError("--patch, --observer and --undo exclude each other")
+    if (arguments.in_place or arguments.extern) and not arguments.observer:
+        raise InvalidInputError("--in-place and --extern say what --observer WORLD does")
+    if arguments.observer:
+        from webots_mcp.cli.observing import add_observer
+
+        return add_observer(arguments)
+    if arguments.undo and arguments.undo.endswith(".wbt"):
+        from webots_mcp.cli.observing import remove_observer
+
+        return remove_observer(arguments)
     if arguments.patch or arguments.undo:
         return _change_controller(arguments)
     _make_ready(arguments)
@@ -69,11 +90,11 @@ def _change_controller(arguments: argparse.Namespace) -> None:
         return _tell_patched(arguments, file, "unchanged", note=f"already patched: {error}")
     except InvalidInputError as error:
         raise InvalidInputError(f"{file} is left as it is: {error}") from error
-    diff = _diff(wanted)
+    diff = diff_of(wanted)
     if not arguments.json:
         print(diff)
     if not arguments.dry_run:
-        _ask(arguments, file)
+        require_yes(arguments, file)
         apply(wanted)
     done = "would be written" if arguments.dry_run else "written"
     _tell_patched(arguments, file, done, diff=diff)
@@ -81,11 +102,11 @@ def _change_controller(arguments: argparse.Namespace) -> None:
 
 def _tell_patched(arguments: argparse.Namespace, file: str, outcome: str, **more: str) -> None:
     if arguments.json:
-        return _print_json({"file": file, "outcome": outcome, **more})
+        return print_json({"file": file, "outcome": outcome, **more})
     print(f"{file}: {more.get('note', outcome)}")
 
 
-def _diff(change: Change) -> str:
+def diff_of(change: Change) -> str:
     """The lines that change, whatever the file's encoding."""
     before, after = (
         (content or b"").decode("utf-8", "replace").splitlines()
@@ -95,7 +116,12 @@ def _diff(change: Change) -> str:
     return "\n".join(difflib.unified_diff(before, after, *names, lineterm="", n=2))
 
 
-def _ask(arguments: argparse.Namespace, file: str) -> None:
+def require_yes(arguments: argparse.Namespace, file: str) -> None:
+    """Ask whether a file may be written.
+
+    Raises:
+        CommandRefusedError: It may not, or nobody can be asked.
+    """
     if arguments.yes:
         return
     if not sys.stdin.isatty() or arguments.json:
@@ -108,7 +134,8 @@ def _ask(arguments: argparse.Namespace, file: str) -> None:
         raise CommandRefusedError(f"{file} is left as it is")
 
 
-def _print_json(found: dict[str, Any]) -> None:
+def print_json(found: dict[str, Any]) -> None:
+    """Print an answer for programs."""
     print(json.dumps(found, ensure_ascii=False))
 
 
@@ -132,7 +159,7 @@ def _make_ready(arguments: argparse.Namespace) -> None:
     note = server_hindrance()
     found = {"project": str(project), "server": line, "files": files, "controllers": controllers}
     if arguments.json:
-        _print_json(found | ({"note": note} if note else {}))
+        print_json(found | ({"note": note} if note else {}))
     else:
         _print(found, [note] if note else [])
     refused = [each["file"] for each in files if each["outcome"] == "refused"]
@@ -149,7 +176,7 @@ def _ignored(data_dir: Path, *, dry_run: bool) -> dict[str, str]:
         change = ignore_file(data_dir)
         if change.is_needed and not dry_run:
             make_folder(data_dir)
-        return _done(change, dry_run=dry_run)
+        return apply_change(change, dry_run=dry_run)
     except (WebotsMCPError, OSError) as error:
         return {"file": str(file), "outcome": "refused", "note": str(error)}
 
@@ -161,12 +188,13 @@ def _told(client: Client, line: list[str], arguments: argparse.Namespace) -> dic
     try:
         entry = plan_entry(client, arguments.name, line)
         note = {"note": entry.note} if entry.note else {}
-        return named | _done(entry.change, dry_run=arguments.dry_run) | note
+        return named | apply_change(entry.change, dry_run=arguments.dry_run) | note
     except (WebotsMCPError, OSError) as error:
         return {**named, "file": str(client.file), "outcome": "refused", "note": str(error)}
 
 
-def _done(change: Change, *, dry_run: bool) -> dict[str, str]:
+def apply_change(change: Change, *, dry_run: bool) -> dict[str, str]:
+    """Write a file unless it holds that already or nothing is to be written; what was done."""
     from webots_mcp.setup.files import apply
 
     if not change.is_needed:

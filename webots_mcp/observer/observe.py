@@ -7,7 +7,7 @@ import sys
 from typing import Any, Final
 
 from webots_mcp.bridge.mcp_bridge import MCPBridge
-from webots_mcp.contract import LOOK_AT, OBSERVER, WORLD_EVENT
+from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.observer.body import Body
 from webots_mcp.observer.pace import Pace
@@ -30,6 +30,11 @@ class ObserverBridge(MCPBridge):
     def record_world(self, world: dict[str, object]) -> None:
         """Record what there is: an event, as it changes seldom."""
         self._session.context.journal.event(WORLD_EVENT, world)
+
+    def record_mode(self) -> None:
+        """Record in which mode the simulation is seen to be: an event."""
+        mode = self._session.context.simulation.mode_name
+        self._session.context.journal.event(MODE_EVENT, {"mode": mode})
 
     def failed(self, error: Exception) -> None:
         """Count what could not be seen, and say it once on stderr."""
@@ -89,6 +94,7 @@ class Observer:
         self.world = World(robot, self._period_ms, self._warn)
         self._pace = Pace(robot, self._period_ms)
         self._due_s = -math.inf
+        self._mode = -1
         self.bridge.register_command(LOOK_AT, self.look_at)
 
     def __enter__(self) -> Observer:
@@ -114,6 +120,9 @@ class Observer:
         if self.bridge.detect_reload():
             self.world.begin_run()
             self._due_s = -math.inf
+        if (mode := int(self._robot.simulationGetMode())) != self._mode:
+            self._mode = mode
+            self.bridge.record_mode()
         self.world.go_on()
         if self.world.is_new:
             self.bridge.record_world(self.world.describe())

@@ -88,7 +88,14 @@ class WorldAnswer(Answer):
     """The world, the run, and who is in it."""
 
     world: str | None = None
+    title: str | None = None
     basic_time_step_ms: float | None = None
+    observer: str | None = Field(
+        default=None, description="Robot whose signals world.KEY.x_m are where everything is."
+    )
+    in_world: Table | None = Field(
+        default=None, description="What the observer sees: robots, and solids with a DEF."
+    )
     real_time_factor: float | None = Field(
         default=None, description="Simulation time per wall time over the last seconds recorded."
     )

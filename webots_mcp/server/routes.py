@@ -1,4 +1,4 @@
-"""Ways to steer the simulation, tried in turn: its controller, Webots' WebSocket, Webots' keys.
+"""Ways to steer the simulation, tried in turn: controller, observer, Webots' WebSocket, its keys.
 
 An answer names the way that worked and what shows that it did; where none does, each says why.
 """
@@ -19,6 +19,7 @@ from webots_mcp.errors import CommandRefusedError, NoDatabaseError, NothingRecor
 from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.target import find_target
+from webots_mcp.store.observers import live_observer
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.sessions import Session
 from webots_mcp.store.status import find_holder
@@ -65,6 +66,7 @@ class Situation:
         silent: Why a command would wait now; None where the controller's loop turns.
         address: Where its session says that Webots listens.
         before: Where its recording was.
+        observer: The name of the observer of its simulation, if one lives.
     """
 
     robot: str | None
@@ -72,6 +74,7 @@ class Situation:
     silent: str | None
     address: Address | None
     before: Moment
+    observer: str | None = None
 
 
 @dataclass
@@ -108,8 +111,7 @@ class Attempt:
         if situation.silent is None:
             return await self._by_bridge()
         self.tried["bridge"] = situation.silent
-        # The observer, a robot that only steers, will be asked here.
-        for way in (self._by_websocket, self._by_keyboard):
+        for way in (self._by_observer, self._by_websocket, self._by_keyboard):
             answer = await way(situation)
             if answer is not None:
                 return answer
@@ -126,15 +128,37 @@ class Attempt:
         Args:
             claiming_s: Nobody waits for longer until its loop takes the command.
         """
-        wait_s = min(self._left_s(), claiming_s)
-        answer = await self.dispatcher.ask(self.robot, self.order, wait_s, self.params)
-        if answer.outcome == "claimed" and answer.command_id is not None:
-            answer = await self.dispatcher.wait(answer.command_id, self._left_s())
-        answer.waited_s = self._waited_s
+        answer = await self._sent(self.robot, claiming_s)
         answer.route = "bridge" if answer.outcome == "done" else None
         others = {name: why for name, why in self.tried.items() if name != "bridge"}
         if answer.outcome != "done" and others:
             answer.tried = others
+        return answer
+
+    async def _sent(self, robot: str | None, claiming_s: float) -> CommandAnswer:
+        wait_s = min(self._left_s(), claiming_s)
+        answer = await self.dispatcher.ask(robot, self.order, wait_s, self.params)
+        if answer.outcome == "claimed" and answer.command_id is not None:
+            answer = await self.dispatcher.wait(answer.command_id, self._left_s())
+        answer.waited_s = self._waited_s
+        return answer
+
+    async def _by_observer(self, situation: Situation) -> CommandAnswer | None:
+        """Its loop turns also where time stands still, so it is asked without a long wait."""
+        observer = situation.observer
+        if observer is None or observer == situation.robot:
+            return None
+        try:
+            answer = await self._sent(observer, _CLAIMING_S)
+        except CommandRefusedError as error:
+            self.tried["observer"] = str(error)
+            return None
+        if answer.outcome in _UNCLAIMED:
+            self.tried["observer"] = f"robot {observer!r} did not take the command: {answer.why}"
+            return None
+        answer.route = "observer" if answer.outcome == "done" else None
+        if answer.outcome == "done" and self.order not in ("pause", "step"):
+            answer.proof = await self._shown(situation, _PROOF_S)
         return answer
 
     @property
@@ -263,14 +287,19 @@ def _require_not_held_elsewhere(view: View, error: CommandRefusedError) -> None:
     if session is None or not session.is_alive(view.now_s):
         return
     holder = find_holder(view.connection, session, view.now_s)
-    if holder is not None and holder.id != session.id:
+    if holder is None or holder.id == session.id:
+        return
+    observer = live_observer(view.connection, session, view.now_s)
+    if observer is None or observer.id != holder.robot_id:
         raise error
 
 
 def _situation(view: View, *, can_command: bool, silent: str | None) -> Situation:
     moment = Moment(view.run.id if view.run else None, view.header()["sim_time_s"])
     address = address_of(view.session.instance) if view.session else None
-    return Situation(view.robot.name, can_command, silent, address, moment)
+    observer = live_observer(view.connection, view.session, view.now_s)
+    name = observer.name if observer else None
+    return Situation(view.robot.name, can_command, silent, address, moment, name)
 
 
 def _why_silent(view: View) -> str | None:
@@ -348,5 +377,6 @@ def _no_way(order: Order, tried: Mapping[str, str]) -> str:
     told = "; ".join(f"{route}: {why}" for route, why in tried.items())
     return (
         f"no way to {order} the simulation works. {told}. Press {keyboard.KEYS[order].spoken} in "
-        "Webots, or start Webots with --stream, which lets it be steered without a controller"
+        "Webots, start Webots with --stream, or open the world with an observer in it (made by "
+        "'webots-mcp init --observer WORLD'): both let it be steered without a controller"
     )

@@ -10,7 +10,7 @@ from typing import Final
 from webots_mcp.contract import BUILT_IN_ACTIONS, ISSUED_TIME_TO_LIVE_S
 from webots_mcp.errors import CommandRefusedError, UnknownActionError
 from webots_mcp.store.recording import View, look
-from webots_mcp.store.robots import list_robots, robot_name
+from webots_mcp.store.robots import list_robots, robot_name, without_observers
 from webots_mcp.store.sessions import Session, companions
 from webots_mcp.store.status import find_holder
 
@@ -51,7 +51,8 @@ def _needs_supervisor(action: str) -> bool:
 
 def _only_supervisor(connection: sqlite3.Connection) -> str | None:
     robots = [robot for robot in list_robots(connection, time.time()) if robot.live]
-    names = [robot.name for robot in robots if robot.session and robot.session.supervisor]
+    supervisors = [robot for robot in robots if robot.session and robot.session.supervisor]
+    names = [robot.name for robot in without_observers(supervisors)]
     return names[0] if len(names) == 1 else None
 
 

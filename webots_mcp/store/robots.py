@@ -8,6 +8,7 @@ import sqlite3
 from dataclasses import dataclass
 from typing import Final
 
+from webots_mcp.contract import OBSERVER
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
 from webots_mcp.store.sessions import Session, newest_session
 
@@ -53,6 +54,8 @@ def robot_name(connection: sqlite3.Connection, robot_id: int) -> str:
 def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float) -> Robot:
     """The robot of that name; without a name the only live one, else the only one ever seen.
 
+    An observer is meant without a name only where there is no other robot.
+
     Raises:
         NothingRecordedError: No robot was ever seen.
         UnknownRobotError: None has that name; the text offers near ones.
@@ -64,13 +67,18 @@ def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float
     if name is not None:
         return _named(robots, name)
     live = [robot for robot in robots if robot.live]
-    candidates = live or robots
+    candidates = without_observers(live or robots)
     if len(candidates) == 1:
         return candidates[0]
     state = "are live" if live else "were recorded and none is live"
     raise AmbiguousRobotError(
         f"{len(candidates)} robots {state}: {_listed(candidates)}; say which one with robot=..."
     )
+
+
+def without_observers(robots: list[Robot]) -> list[Robot]:
+    """Those that do something; the observers where there is nobody else."""
+    return [robot for robot in robots if robot.kind != OBSERVER] or robots
 
 
 def _named(robots: list[Robot], name: str) -> Robot:

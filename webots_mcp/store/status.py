@@ -5,7 +5,7 @@ from __future__ import annotations
 import sqlite3
 from typing import Final, NamedTuple
 
-from webots_mcp.contract import BUILT_IN_ACTIONS, ENDED_BY, HEARTBEAT_INTERVAL_S, PAUSED
+from webots_mcp.contract import BUILT_IN_ACTIONS, ENDED_BY, HEARTBEAT_INTERVAL_S, MODE_EVENT, PAUSED
 from webots_mcp.settlement import EXTERN
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.runs import Run
@@ -77,6 +77,17 @@ _STARTED: Final = "its controller has just started; simulation time has not move
 _NOT_STARTED: Final = (
     "its controller has started, but simulation time has not moved since: the simulation may be "
     "paused in Webots, or the controller has not reached its loop"
+)
+_SEEN_MODE: Final = (
+    "SELECT json_extract(data, '$.mode') FROM event WHERE run_id IN "
+    f"(SELECT id FROM run WHERE session_id = ?) AND kind = '{MODE_EVENT}' ORDER BY id DESC LIMIT 1"
+)
+_SEEN_PAUSED: Final = (
+    "paused in Webots, as robot {!r} sees; webots_simulation_control('resume') goes on"
+)
+_SEEN_RUNNING: Final = (
+    "not paused, as robot {!r} sees, and yet time stands still: a controller hangs, or an extern "
+    "one is missing"
 )
 _STANDING: Final = (
     "its loop is alive but simulation time stands still: paused by the controller's own code, or "
@@ -184,6 +195,8 @@ def _why_standing(
     """Why the time of a living controller, which its bridge does not hold, stands still."""
     if inside := handler_at_work(connection, session, now_s):
         return inside
+    if seen := _seen_by_observer(connection, session, now_s):
+        return seen
     if moved_s is None:
         return _NOT_STARTED
     # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
@@ -192,6 +205,16 @@ def _why_standing(
         return _STANDING
     left = left_holding(connection, session, now_s)
     return SILENT if left is None else _LEFT_PAUSED.format(robot_name(connection, left.robot_id))
+
+
+def _seen_by_observer(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
+    """What a live observer of the simulation knows of it; None where there is none."""
+    for each in (session, *companions(connection, session, now_s)):
+        found = connection.execute(_SEEN_MODE, (each.id,)).fetchone()
+        if found is not None and each.heartbeat_is_fresh(now_s):
+            text = _SEEN_PAUSED if found[0] == "pause" else _SEEN_RUNNING
+            return text.format(robot_name(connection, each.robot_id))
+    return None
 
 
 def _breakpoint_at(connection: sqlite3.Connection, session: Session) -> str | None:

@@ -9,14 +9,14 @@ from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.contract import MAX_STEPS
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.server.declaring import ACTS, RESTARTS, tool
 from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.parameters import MAX_WAIT_S, RobotName, TimeoutS
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.routes import Attempt
 from webots_mcp.server.target import find_target
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import Recording, look
 from webots_mcp.webots.stream import Order
 
 Force = Annotated[bool, Field(description="Press Webots' own keys where nothing else works.")]
@@ -47,10 +47,11 @@ async def webots_simulation_control(
 ) -> CommandAnswer:
     """Pause, resume, run fast, step, reset or reload, and wait for the outcome.
 
-    By a controller that is a Supervisor, else by Webots itself if it was started with --stream;
-    `route` says which. The whole simulation is steered, not one robot. `reload` restarts the
-    controllers that Webots starts, with their code as it is on disk now; an extern controller
-    ends, and somebody has to start it again by hand.
+    By a controller that is a Supervisor, else by an observer in the world (webots-mcp init
+    --observer), else by Webots itself if it was started with --stream; `route` says which. The
+    whole simulation is steered, not one robot. `reload` restarts the controllers that Webots
+    starts, with their code as it is on disk now; an extern controller ends, and somebody has to
+    start it again by hand.
     """
     if steps is not None and command != "step":
         raise InvalidInputError(f"steps is for command='step', not for {command!r}: leave it out")
@@ -106,6 +107,11 @@ def _usual_wait_s(recording: Recording, command: Order, steps: int, robot: str |
     if command != "step":
         return _WAIT_S
     with recording.reader() as connection:
-        run = find_target(connection, robot, command).run
+        try:
+            run = find_target(connection, robot, command).run
+        except CommandRefusedError:  # another way may do it
+            run = look(connection, robot).run
+        except NothingRecordedError:
+            run = None
         step_ms = (run.basic_time_step_ms if run else None) or 32.0  # Webots' default
     return min(_WAIT_S + 2 * steps * step_ms / 1000, MAX_WAIT_S)

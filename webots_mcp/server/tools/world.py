@@ -11,6 +11,7 @@ from webots_mcp.server.parameters import RobotName, RunId
 from webots_mcp.server.results import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.server.shortening import cut_text, round_number
 from webots_mcp.settlement import gone_sessions
+from webots_mcp.store.observers import WorldSeen, world_seen
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention.limits import described, unheeded
 from webots_mcp.store.retention.usage import file_sizes
@@ -20,6 +21,9 @@ from webots_mcp.store.sessions import Session, companions, fetch_session
 from webots_mcp.store.states import real_time_factor
 
 _SHOWN_ROBOTS: Final = 50
+_SHOWN_IN_WORLD: Final = 40
+_TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")
+_PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
 _SHOWN_DEVICES: Final = 60
 _LONGEST_NAME: Final = 100
 _ROBOT_COLUMNS: Final = (
@@ -55,6 +59,7 @@ def webots_get_world_info(
 ) -> WorldAnswer:
     """The world file, its time step, the run and its pace, the controller's code, other robots.
 
+    With an observer in the world (webots-mcp init --observer): all its robots and where they are.
     Also where the database and the pictures lie.
     """
     with recording.view(robot, run_id) as view:
@@ -62,6 +67,7 @@ def webots_get_world_info(
         session = fetch_session(view.connection, run.session_id)
         return WorldAnswer(
             **view.header(),
+            **_seen(world_seen(view.connection, run)),
             world=run.world,
             basic_time_step_ms=run.basic_time_step_ms,
             real_time_factor=_pace(view, run),
@@ -75,6 +81,38 @@ def webots_get_world_info(
             retention=_retention(recording, view),
             data_dir=str(recording.data_dir),
         )
+
+
+def _seen(world: WorldSeen | None) -> dict[str, Any]:
+    """What an observer has seen of the world, robots first."""
+    if world is None:
+        return {}
+    bodies = [*world.told.get("robots", ()), *world.told.get("solids", ())]
+    shown = [body | world.places.get(body["key"], {}) for body in bodies[:_SHOWN_IN_WORLD]]
+    used = [
+        column
+        for column in (*_TOLD_IN_WORLD, *_PLACE)
+        if any(body.get(column) is not None for body in shown)
+    ]
+    more = f"the first {len(shown)} of {len(bodies)} bodies are shown"
+    return {
+        "title": world.told.get("title"),
+        "observer": world.observer,
+        "in_world": Table(columns=used, rows=[_in_world(body, used) for body in shown]),
+        "hint": more if len(shown) < len(bodies) or world.told.get("more") else None,
+    }
+
+
+def _in_world(body: dict[str, Any], columns: list[str]) -> list[Any]:
+    values = [body.get(column) for column in columns]
+    return [
+        round_number(value)
+        if isinstance(value, float)
+        else cut_text(value, _LONGEST_NAME)
+        if isinstance(value, str)
+        else value
+        for value in values
+    ]
 
 
 def _retention(recording: Recording, view: View) -> dict[str, Any]:

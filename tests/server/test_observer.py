@@ -1,0 +1,151 @@
+"""A world with an observer: no controller knows of us, and yet all is seen and steered."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from anyio import to_thread
+from mcp import Client
+
+from tests.server.conftest import ask
+from tests.webots.conftest import (
+    CONTROLLER,
+    StartWebots,
+    free_port,
+    start_webots,
+    wait_for_line,
+    webots,
+    write_project,
+)
+from webots_mcp.server import create_server
+from webots_mcp.setup.files import apply
+from webots_mcp.setup.observing import controller_change, with_observer
+from webots_mcp.webots.instances import instances
+from webots_mcp.webots.stream import give_order
+
+__all__ = ["start_webots", "webots"]
+pytestmark = pytest.mark.anyio
+
+DRIVES = """
+from math import inf
+from controller import Robot
+robot = Robot()
+for name, radps in (("left wheel motor", 3.0), ("right wheel motor", 5.0)):
+    robot.getDevice(name).setPosition(inf)
+    robot.getDevice(name).setVelocity(radps)
+while robot.step(16) != -1:
+    pass
+"""
+PLAIN = CONTROLLER.replace("Supervisor", "Robot")
+HANGS = (
+    PLAIN
+    + """
+    while robot.getTime() > 0.2:
+        pass
+"""
+)
+
+
+@pytest.fixture
+def begin(tmp_path: Path, start_webots: StartWebots) -> Callable[..., Client]:
+    """A Webots without --stream, whose world has an observer, and a client."""
+
+    def started(controller: str, *options: str) -> Client:
+        world = write_project(tmp_path / "project", controller)
+        world.write_bytes(with_observer(world.read_bytes()))
+        apply(controller_change(tmp_path / "project"))
+        process = start_webots("--stdout", *options, f"--port={free_port()}", world)
+        wait_for_line(process, "mcp_observer: Starting")
+        data = tmp_path / "project" / "mcp_data"
+        return Client(create_server(data / "webots.db", data))
+
+    return started
+
+
+async def until(client: Client, tool: str, reached: Callable[[dict[str, Any]], Any]) -> Any:
+    """What a tool answers once it is so."""
+    with anyio.fail_after(60):
+        while True:
+            result = await client.call_tool(tool, {})
+            answer: dict[str, Any] = result.structured_content or {}
+            if not result.is_error and answer.get("robot") and reached(answer):
+                return answer
+            await anyio.sleep(0.1)
+
+
+def in_world(answer: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    table = answer["in_world"]
+    rows = [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+    return {row["key"]: row for row in rows}
+
+
+def moves(answer: dict[str, Any]) -> bool:
+    return bool(answer.get("in_world")) and (in_world(answer)["ROVER"].get("speed_mps") or 0) > 0.05
+
+
+async def test_a_controller_that_knows_nothing_of_us_is_seen_and_asked_about(begin: Any) -> None:
+    async with begin(DRIVES, "--mode=fast") as client:
+        world = await until(client, "webots_get_world_info", moves)
+        assert (world["observer"], world["robot"]) == ("mcp_observer", "mcp_observer")
+        assert (
+            in_world(world)["ROVER"] | {"type": "Robot", "name": "rover"}
+            == in_world(world)["ROVER"]
+        )
+        assert world["title"]
+        await until(client, "webots_get_robot_state", lambda at: at["sim_time_s"] > 5)
+        position = ["world.ROVER.x_m", "world.ROVER.y_m"]
+        trends = await ask(client, "webots_get_trends", signals=[*position])
+        assert trends["robot"] == "mcp_observer"
+        events = await ask(client, "webots_find_events", kinds=["stuck"], position=position)
+        assert events["robot"] == "mcp_observer"
+        assert len(json.dumps(world)) < 6000
+
+
+async def test_a_robot_that_is_no_supervisor_is_steered_by_the_observer(begin: Any) -> None:
+    async with begin(PLAIN) as client:
+        await until(client, "webots_get_world_info", lambda at: at.get("in_world"))
+        await until(client, "webots_get_robot_state", lambda at: at["robot"] == "rover")
+        answers: dict[str, dict[str, Any]] = {}
+        for command in ("pause", "resume", "fast", "step", "resume", "reset", "reload"):
+            answers[command] = await ask(
+                client, "webots_simulation_control", command=command, robot="rover"
+            )
+        told = {name: (answer["outcome"], answer["route"]) for name, answer in answers.items()}
+        assert set(told.values()) == {("done", "observer")}
+        assert answers["resume"]["proof"].startswith("simulation time went on to ")
+        assert answers["reload"]["proof"].endswith("began")
+
+
+async def test_a_controller_that_hangs_is_told_from_a_pause_and_ended_by_a_reload(
+    begin: Any,
+) -> None:
+    async with begin(HANGS) as client:
+
+        def is_silent(answer: dict[str, Any]) -> bool:
+            return answer["robot"] == "rover" and answer["status"].startswith("stopped")
+
+        stopped = await until(client, "webots_get_world_info", is_silent)
+        assert "not paused, as robot 'mcp_observer' sees" in stopped["why"]
+        answer = await ask(
+            client, "webots_simulation_control", command="reload", robot="rover", timeout_s=60
+        )
+        assert (answer["outcome"], answer["route"]) == ("done", "observer")
+
+
+async def test_a_pause_by_hand_is_taken_back_by_the_observer(begin: Any) -> None:
+    async with begin(DRIVES, "--stream") as client:
+        await until(client, "webots_get_world_info", moves)
+        (webots,) = await to_thread.run_sync(instances)
+        await to_thread.run_sync(give_order, webots.address, "pause", 10.0)
+        stopped = await until(
+            client, "webots_get_robot_state", lambda at: at["status"].startswith("stopped")
+        )
+        assert "paused in Webots, as robot 'mcp_observer' sees" in stopped["why"]
+        answer = await ask(client, "webots_simulation_control", command="resume")
+        assert (answer["outcome"], answer["route"]) == ("done", "bridge")
+        await until(client, "webots_get_robot_state", lambda at: at["status"] == "running")

@@ -21,7 +21,6 @@ TARGET_WENT: Final = 0.1  # of the whole range of a target: so far it goes on, t
 LONGEST_READ_S: Final = 120.0  # of a span: longer ones show it in their first part
 MOSTLY_TOLD: Final = 0.5  # of the rows of a span have a speed that is not 0
 
-_EXTREMES: Final = "SELECT min(min), max(max) FROM all_rollup WHERE run_id = ? AND signal_id = ?"
 _THERE_AT_OTHER_TIMES: Final = (
     "SELECT EXISTS (SELECT 1 FROM all_rollup WHERE run_id = :run AND signal_id = :signal "
     "AND (min = :value OR max = :value) AND (bucket < :first OR bucket > :last))"
@@ -69,8 +68,7 @@ def _rows_there(search: Search, signal: Signal, span: Span) -> int:
 
 def _extremes(search: Search, signal: Signal) -> tuple[float | None, float | None]:
     """Of the whole run as far as it is rolled up, and of what was read."""
-    asked = (search.segment.run_id, signal.id)
-    rolled_up = search.connection.execute(_EXTREMES, asked).fetchone()
+    rolled_up = search.extremes.get(signal.id or 0, (None, None))
     here = search.view.summary(signal)
     lows, highs = ((each for each in pair if each is not None) for pair in zip(
         rolled_up, (here.min, here.max), strict=True
@@ -96,8 +94,7 @@ def _went(search: Search, target: Signal, span: Span) -> str | None:
     values = _values(search, target, span)
     if not len(values):
         return None
-    asked = (search.segment.run_id, target.id)
-    low, high = search.connection.execute(_EXTREMES, asked).fetchone()
+    low, high = search.extremes.get(target.id or 0, (None, None))
     seen = [each for each in (low, high, values.min(), values.max()) if each is not None]
     far = np.abs(values - values[0])
     if not far.max() > TARGET_WENT * (max(seen) - min(seen)):

@@ -16,6 +16,7 @@ from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.views import View, view_of
+from webots_mcp.store.rollup.buckets import EVER, totals
 from webots_mcp.store.signals.catalogue import resolve_signals
 from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
@@ -135,6 +136,13 @@ class Search:
                 "which item of an array is the least leaps and rests by nature"
             )
         return quantities
+
+    @cached_property
+    def extremes(self) -> dict[int, tuple[float | None, float | None]]:
+        """The least and the greatest number of each signal in the rollups of the run, by its id."""
+        figures = {"min": "min", "max": "max"}
+        found = totals(self.connection, self.segment.run_id, EVER, figures)
+        return {signal_id: (least, greatest) for signal_id, (least, greatest) in found.items()}
 
     @cached_property
     def view(self) -> View:

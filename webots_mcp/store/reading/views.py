@@ -256,6 +256,7 @@ class LongView:
         self._through = through
         self._kept: dict[Segment, Numbers] = {}
         self._read: dict[Segment, Columns] = {}
+        self._samples: dict[tuple[str, ...], Columns] = {}
         self._connection = connection
         self._segment = segment
         self._deadline = deadline
@@ -301,9 +302,12 @@ class LongView:
         return found
 
     def sample(self, signals: Sequence[Signal]) -> Columns:
-        """The newest rows."""
-        part = newest_part(self._connection, self._segment, SAMPLE_ROWS)
-        return read_columns(self._connection, part, signals, self._deadline)
+        """The newest rows, of the same signals read once."""
+        names = tuple(signal.name for signal in signals)
+        if names not in self._samples:
+            part = newest_part(self._connection, self._segment, SAMPLE_ROWS)
+            self._samples[names] = read_columns(self._connection, part, signals, self._deadline)
+        return self._samples[names]
 
     def rows_between(self, start_s: float, end_s: float, signals: Sequence[Signal]) -> Columns:
         """Read from the segment."""
@@ -489,8 +493,7 @@ class LongView:
 
     @functools.cached_property
     def _sample(self) -> Columns:
-        part = newest_part(self._connection, self._segment, SAMPLE_ROWS)
-        return read_columns(self._connection, part, self._signals, self._deadline)
+        return self.sample(self._signals)
 
     @functools.cached_property
     def _resting(self) -> list[Signal]:

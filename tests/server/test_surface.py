@@ -39,6 +39,8 @@ READING = {
     "webots_plot",
     "webots_query_sql",
     "webots_list_breakpoints",
+    "webots_get_scene",
+    "webots_get_field",
 }
 ACTING = {
     "webots_annotate_run",
@@ -53,6 +55,9 @@ ACTING = {
     "webots_send_command",
     "webots_breakpoint",
     "webots_remove_breakpoint",
+    "webots_set_field",
+    "webots_add_node",
+    "webots_remove_node",
 }
 SHARED = ("robot", "run_id", "last_s", "start_s", "end_s", "timeout_s", "cursor")
 

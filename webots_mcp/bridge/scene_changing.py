@@ -7,6 +7,7 @@ is an event, and is remembered, so that a reset puts it back.
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Generator
 from dataclasses import replace
 from typing import Any, Final, cast
@@ -23,6 +24,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 _Progress = Generator[None, None, object]
 
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
+_LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
 _STAY: Final = ("WorldInfo", "Viewpoint")
 _ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
 _SAYS: Final = "Webots' console (webots_get_logs, if it is recorded) says why"
@@ -44,7 +46,7 @@ def set_field(context: Context, command: Command) -> _Progress:
     is_stepped = yield from _until_stepped(context)
     now = _read_again(robot, place)
     if not is_stepped and not is_same(place.type_name, now, value):
-        facts["now"], facts["when"] = now, "it is set with the next step: the simulation is paused"
+        facts["now"], facts["when"] = now, "it is set with the next step: time stands still"
     elif not is_nearer(place.type_name, now, value, before) and not is_same(
         place.type_name, before, value
     ):
@@ -93,11 +95,13 @@ def _read_again(robot: Any, place: Place) -> Any:
 
 
 def _until_stepped(context: Context) -> Generator[None, None, bool]:
-    """Wait for a step of the simulation; False where it is paused."""
+    """Wait for a step of the simulation; False where its time stands still."""
     clock, from_step = context.clock, context.clock.steps_seen
+    until_s = time.monotonic() + _LONGEST_STEP_S
     while clock.steps_seen == from_step:
         yield
-        if context.pause.active and clock.steps_seen == from_step:
+        stands = context.simulation.paused or time.monotonic() > until_s
+        if stands and clock.steps_seen == from_step:
             return False
     return True
 

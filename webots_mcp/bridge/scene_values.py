@@ -6,6 +6,7 @@ was not checked here first.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple, cast
@@ -45,6 +46,8 @@ def _float(value: object) -> float:
 
 
 def _string(value: object) -> str:
+    if isinstance(value, (list, dict)):  # a JSON text, which clients and their SDK like to read
+        value = json.dumps(value, ensure_ascii=False)
     if not isinstance(value, str) or len(value) > MOST_CHARACTERS or "\0" in value:
         raise _RefusedError
     return value

@@ -24,6 +24,7 @@ from webots_mcp.cli import (
     launching,
     looking,
     observing,
+    scene,
     serving,
     setting_up,
     steering,
@@ -51,6 +52,7 @@ FAMILIES: Final = (
     trials,
     tuning,
     steering,
+    scene,
     breakpoints,
 )
 EXIT_SYSTEM: Final = 1

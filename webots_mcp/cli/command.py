@@ -154,11 +154,12 @@ def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> d
         name, equals, value = text.partition("=")
         if not equals:
             raise InvalidInputError(f"{text!r} names no value: write {name}=VALUE")
-        values[name] = value if kinds.get(name) == "str" else _value_of(value)
+        values[name] = value if kinds.get(name) == "str" else value_of(value)
     return values
 
 
-def _value_of(text: str) -> Any:
+def value_of(text: str) -> Any:
+    """What was typed, as JSON; what is none is a text."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):

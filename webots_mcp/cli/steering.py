@@ -193,14 +193,19 @@ def writable(arguments: argparse.Namespace) -> Recording:
 
 
 def _conclude(answer: CommandAnswer | RunAnswer, arguments: argparse.Namespace) -> None:
-    _require_done(answer, arguments)
+    require_done(answer, arguments)
     if answer.action == "run" and not arguments.json:
         _print_run(cast("RunAnswer", answer))
     else:
         _print(answer, arguments)
 
 
-def _require_done(answer: CommandAnswer, arguments: argparse.Namespace) -> None:
+def require_done(answer: CommandAnswer, arguments: argparse.Namespace) -> None:
+    """Refuse to go on with a command that was not done.
+
+    Raises:
+        CommandRefusedError: With what became of it, and what to do next.
+    """
     if answer.outcome == "done":
         return
     under_way = answer.outcome == "claimed"

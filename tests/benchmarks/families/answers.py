@@ -39,6 +39,10 @@ _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
     "webots_breakpoint": {"condition": "distance_m.left < 0", "action": "log"},
     "webots_remove_breakpoint": {"breakpoint_id": 1},
     "webots_set_parameters": {"values": {"speed": 6.0}},
+    "webots_get_field": {"path": "ROVER"},
+    "webots_set_field": {"path": "BALL.physics.mass", "value": 0.06},
+    "webots_add_node": {"vrml": 'DEF PILL Solid { name "pill" }'},
+    "webots_remove_node": {"path": "CRATE"},
     "webots_compare_runs": {"run_ids": [1, 2]},
     "webots_wait_for_command": {"command_id": 1},
 }

@@ -1,0 +1,190 @@
+"""Looking at the scene over MCP, and changing it, by whichever Supervisor there is."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.bridge.conftest import Recording
+from tests.recordings.rows import Recorded
+from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
+from webots_mcp import MCPBridge
+from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
+
+pytestmark = pytest.mark.anyio
+
+WORLD = Path(__file__).parents[1] / "bridge" / "worlds" / "crowd.wbt"
+
+
+class Loop(threading.Thread):
+    """The loop of a robot that shares a simulation with others."""
+
+    def __init__(self, robot: InProcessRobot, file: Path) -> None:
+        super().__init__(daemon=True)
+        self.robot = robot
+        self.bridge = MCPBridge(robot, throttle_interval=1, database=file)
+        self._pace = threading.Event()
+
+    def run(self) -> None:
+        while self.robot.step(STEP_MS) != -1:
+            self.bridge.publish({"time": self.robot.getTime()})
+            self.bridge.get_command()
+            self._pace.wait(0.008)
+
+
+class Crowd:
+    """Robots of one world, each with its loop."""
+
+    def __init__(self, file: Path) -> None:
+        self.simulation = InProcessSimulation(WORLD)
+        self._file = file
+        self.loops: list[Loop] = []
+
+    def add(self, kind: type[InProcessRobot], name: str) -> None:
+        loop = Loop(kind(name, world=self.simulation), self._file)
+        loop.start()
+        self.loops.append(loop)
+
+    def close(self) -> None:
+        self.simulation.quit()
+        for loop in self.loops:
+            loop.join(timeout=10)
+            assert not loop.is_alive()
+            loop.bridge.close()
+
+
+@pytest.fixture
+def crowd(file: Path) -> Iterator[Crowd]:
+    robots = Crowd(file)
+    yield robots
+    robots.close()
+
+
+@pytest.mark.usefixtures("driver")
+async def test_the_scene_is_shown_with_paths_and_fields(connect: Connect) -> None:
+    async with connect() as client:
+        answer = await ask(client, "webots_get_scene", depth=1, fields=["translation"])
+        scene = answer["result"]
+        paths = {row[1]: row for row in scene["rows"]}
+        assert paths["BALL"] == [1, "BALL", "Solid", "ball", [0.2, -0.2, 0.05]]
+        assert scene["also_at_the_top"][:2] == ["WorldInfo", "Viewpoint"]
+        assert answer["robot"] == "rover"
+        assert len(json.dumps(answer)) < 4_000
+        only = await ask(client, "webots_get_scene", types="Robot")
+        assert [row[3] for row in only["result"]["rows"]] == ["rover"]
+
+
+async def test_a_robot_is_moved_and_its_event_says_by_whom(
+    connect: Connect, driver: Driver, file: Path
+) -> None:
+    async with connect() as client:
+        path, value = "ROVER.translation", [0.0, 1.0, 0.04]
+        answer = (await ask(client, "webots_set_field", path=path, value=value))["result"]
+        assert (answer["from"], answer["to"]) == ([-1.2, 0.0, 0.04], value)
+        assert driver.robot.simulation.robot("rover").position == pytest.approx((0.0, 1.0, 0.04))
+        told = (await ask(client, "webots_get_field", path="ROVER.translation"))["result"]
+        assert told["value"] == pytest.approx(value)
+        events = await ask(client, "webots_find_events", kinds=["noticed"])
+        assert "set_field" in json.dumps(events)
+        assert "ROVER.translation" in json.dumps(events)
+        await ask(client, "webots_world_reset")
+        told = (await ask(client, "webots_get_field", path="ROVER.translation"))["result"]
+        assert told["value"] == pytest.approx([-1.2, 0.0, 0.04], abs=0.05)
+    ((data,),) = [Recording(file).rows("SELECT data FROM event WHERE kind = 'set_field'")]
+    assert json.loads(data)["requested_by"] is not None
+
+
+@pytest.mark.usefixtures("driver")
+async def test_a_value_may_come_as_the_text_of_one(connect: Connect) -> None:
+    """Some clients write lists so; a text that is itself JSON stays one."""
+    async with connect() as client:
+        for path, value, held in (
+            ("BALL.translation", "[0, 1, 0.05]", [0.0, 1.0, 0.05]),
+            ("ROVER.customData", '{"lap": 3}', '{"lap": 3}'),
+            ("ROVER.customData", "7", "7"),
+            ("BALL.locked", True, True),
+        ):
+            answer = await ask(client, "webots_set_field", path=path, value=value)
+            assert answer["result"]["to"] == held
+
+
+@pytest.mark.usefixtures("driver")
+async def test_nodes_are_added_and_removed(connect: Connect) -> None:
+    async with connect() as client:
+        vrml = 'DEF PILL Solid { translation 1 1 0.1 name "pill" }'
+        added = await ask(client, "webots_add_node", vrml=vrml)
+        assert added["result"]["path"] == "PILL"
+        found = await ask(client, "webots_get_field", path="PILL.translation")
+        assert found["result"]["value"] == [1.0, 1.0, 0.1]
+        await ask(client, "webots_remove_node", path="PILL")
+        assert "no node is called 'PILL'" in await fail(client, "webots_get_field", path="PILL")
+        assert "it stays" in await fail(client, "webots_remove_node", path="ROVER")
+        assert "added nothing" in await fail(client, "webots_add_node", vrml="Hologram { }")
+
+
+@pytest.mark.usefixtures("driver")
+async def test_the_errors_say_what_there_is_and_what_is_expected(connect: Connect) -> None:
+    async with connect() as client:
+        said = await fail(client, "webots_get_field", path="ROVER.tranlation")
+        assert "(the nearest first): translation" in said
+        said = await fail(client, "webots_set_field", path="ROVER.translation", value=[1, 2])
+        assert "give 3 finite numbers, such as [0, 0.5, 0.1]; got [1, 2]" in said
+
+
+async def test_a_robot_that_is_no_supervisor_is_looked_at_by_one_that_is(
+    connect: Connect, crowd: Crowd
+) -> None:
+    crowd.add(InProcessRobot, "rover")
+    async with connect() as client:
+        said = await fail(client, "webots_get_scene", robot="rover")
+        assert "no live controller may look at the scene of the simulation of robot 'rover'" in said
+        assert "'supervisor' of a Robot node to TRUE" in said
+        assert "webots-mcp init --observer" in said
+        crowd.add(InProcessSupervisor, "referee")
+        for robot in ("rover", None):
+            path = "rover.translation"
+            answer = await ask(client, "webots_get_field", path=path, robot=robot)
+            assert answer["robot"] == "referee"
+            assert answer["result"]["value"] == [1.0, 2.0, 0.0]
+
+
+async def test_where_one_robot_holds_the_simulation_it_is_the_one_that_is_asked(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        await ask(client, "webots_simulation_control", command="pause")
+        answer = await ask(client, "webots_set_field", path="BALL.physics.mass", value=2)
+        assert answer["result"]["to"] == 2.0
+        answer = await ask(client, "webots_get_field", path="BALL.physics.mass")
+        assert answer["result"]["value"] == 2.0
+        await ask(client, "webots_simulation_control", command="resume")
+    assert driver.is_alive()
+
+
+async def test_supervisors_of_several_simulations_are_told_apart_by_a_name(
+    connect: Connect, recorded: Recorded
+) -> None:
+    for name in ("one", "two"):
+        recorded.robot(name, instance=f"webots of {name}")
+    async with connect() as client:
+        said = await fail(client, "webots_get_scene")
+        assert "Supervisors of several simulations are live: 'one', 'two'" in said
+
+
+@pytest.mark.usefixtures("driver")
+async def test_a_server_that_only_reads_asks_no_controller(connect: Connect) -> None:
+    async with connect(read_only=True) as client:
+        for tool, arguments in (("get_scene", dict[str, Any]()), ("get_field", {"path": "BALL"})):
+            said = await fail(client, f"webots_{tool}", **arguments)
+            assert "a server that is --read-only asks for nothing" in said
+
+
+async def test_where_nothing_was_recorded_it_says_how_to_record(connect: Connect) -> None:
+    async with connect() as client:
+        answer = await ask(client, "webots_get_scene")
+        assert answer["status"] == "never seen"

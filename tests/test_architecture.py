@@ -49,8 +49,11 @@ ALLOWED["trials"] = STDLIB | {"store", "trials", "webots"}
 ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}
 ALLOWED["launching"] = STDLIB | {"store", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
+ALLOWED["belonging"] = STDLIB | {"store", "webots"}
+ALLOWED["console"] = ALLOWED["belonging"] | {"belonging", "console"}
 ALLOWED["server"] = STDLIB | {
-    "store", "plotting", "diagnosis", "trials", "server", "webots", "__version__"
+    "belonging", "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
+    "__version__",
 }  # fmt: skip
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
 ALLOWED["pytest_plugin"] = {"contract", "standin", "testing", "MCPBridge", "MemoryDatabase"}

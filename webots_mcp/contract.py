@@ -35,6 +35,10 @@ CommandStatus = Literal["pending", "claimed", "done", "failed", "expired", "canc
 FINAL_STATUSES: Final = ("done", "failed", "expired", "cancelled", "lost")
 LogLevel = Literal["debug", "info", "warning", "error", "critical"]
 LOG_LEVELS: Final[tuple[LogLevel, ...]] = get_args(LogLevel)  # rising; in `logging` 10, 20, ... 50
+# Who logged a line. Those of Webots' console: what Webots says itself is of `webots`, what a
+# controller printed, and it does not say which, of `console`.
+LogSource = Literal["controller", "bridge", "console", "webots"]
+LOG_SOURCES: Final[tuple[LogSource, ...]] = get_args(LogSource)
 _LEVEL_ALIASES: Final[dict[str, LogLevel]] = {
     **{level: level for level in LOG_LEVELS},
     "warn": "warning",
@@ -238,6 +242,16 @@ def find_project(folder: Path) -> Path | None:
         if (each / "worlds").is_dir() and (each / "controllers").is_dir():
             return each
     return None
+
+
+def project_of(data_dir: Path) -> Path | None:
+    """The Webots project in which a data folder lies, where it lies as `choose_data_dir` puts it.
+
+    Raises:
+        OSError: The path cannot be followed.
+    """
+    folder = full_path(data_dir)
+    return folder.parent if folder.name == PROJECT_DATA_FOLDER else None
 
 
 def resolve_database(

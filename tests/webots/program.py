@@ -6,6 +6,7 @@ its WebSocket there, and runs the world with its controllers on the stand-in.
 
 from __future__ import annotations
 
+import re
 import signal
 import sys
 import threading
@@ -23,6 +24,7 @@ from webots_mcp.standin.controllers import Address
 _ROOT: Final = Path(__file__).parents[2]
 _DEFAULT_PORT: Final = 1234
 _FLAGS: Final = ("batch", "minimize", "no-rendering", "stdout", "stderr", "stream")
+_PRINTED_BY: Final = re.compile(r"\[.+?\] (.*)")  # as the stand-in tells it
 _PRINTED: Final = ("pause", "real-time", "fast", "step")  # as it obeys
 
 
@@ -76,7 +78,10 @@ def main(arguments: list[str]) -> int:
 
     def show(line: str) -> None:
         kind = "stderr" if line.startswith(("WARNING", "ERROR")) else "stdout"
-        server.log(kind, line)
+        of_controller = _PRINTED_BY.fullmatch(line)
+        if of_controller:  # Webots tells neither its clients nor its stdout which one it is
+            line = of_controller[1]
+        server.log(kind, line + "\n" * bool(of_controller))
         if kind in options:
             print(line, file=getattr(sys, kind), flush=True)
 

@@ -7,6 +7,7 @@ silent, slow, or rude.
 from __future__ import annotations
 
 import json
+import socket
 import threading
 from collections.abc import Callable
 from contextlib import suppress
@@ -85,6 +86,17 @@ class WebotsServer:
         with self._lock:
             self._console.append(f"{stream}:{text}")
             self._tell_console()
+
+    def send_raw(self, data: bytes) -> None:
+        """Send bytes to all who listen to the console, whatever they mean."""
+        for listener in self._listeners:
+            listener.socket.sendall(data)
+
+    def hang_up(self) -> None:
+        """End all connections without a word."""
+        for listener in self._listeners:
+            with suppress(OSError):
+                listener.socket.shutdown(socket.SHUT_RDWR)
 
     def _tell_console(self) -> None:
         if not (self._listeners and self._console):

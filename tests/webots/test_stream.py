@@ -5,7 +5,6 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from contextlib import closing
 from typing import get_args
 
 import pytest
@@ -18,9 +17,10 @@ from webots_mcp.webots.stream import (
     Address,
     ConsoleLine,
     Order,
+    Stream,
     address_of,
+    begin_console,
     connected,
-    console,
     console_lines,
     give_order,
     load_world,
@@ -76,8 +76,8 @@ def test_the_words_that_pause_by_accident_are_never_sent() -> None:
     with WebotsServer(streams=True) as server:
         for order in get_args(Order):
             give_order(at(server), order, 0.2)
-        with closing(console(at(server), 1)) as lines:
-            next(lines)
+        with connected(at(server), 1) as stream:
+            begin_console(stream)
         assert not {"w3d", "x3d"} & set(server.heard)
 
 
@@ -155,15 +155,23 @@ def test_frames_are_shortened_however_their_bytes_arrive() -> None:
 def test_the_console_is_told_without_stream_from_its_first_line_on() -> None:
     with WebotsServer(streams=False) as server:
         server.log("stdout", "INFO: rover: Starting controller: python3 -u rover.py")
-        server.log("stderr", "[rover] Traceback\n[rover]   in loop")
-        with closing(console(at(server), 1)) as lines:
-            assert next(lines) == [
+        server.log("stderr", "Traceback\n")
+        server.log("stderr", "  in loop\n")
+        with connected(at(server), 5) as stream:
+            begin_console(stream)
+            assert _next_lines(stream) == [
                 ConsoleLine("stdout", "INFO: rover: Starting controller: python3 -u rover.py"),
-                ConsoleLine("stderr", "[rover] Traceback"),
-                ConsoleLine("stderr", "[rover]   in loop"),
+                ConsoleLine("stderr", "Traceback"),
+                ConsoleLine("stderr", "  in loop"),
             ]
-            server.log("stdout", "[rover] later")
-            assert next(lines) == [ConsoleLine("stdout", "[rover] later")]
+            server.log("stdout", "later\n")
+            assert _next_lines(stream) == [ConsoleLine("stdout", "later")]
+
+
+def _next_lines(stream: Stream) -> list[ConsoleLine]:
+    message = stream.receive(time.monotonic() + 20)
+    assert message is not None
+    return list(console_lines(message.text))
 
 
 def test_what_is_no_console_is_none() -> None:
@@ -171,8 +179,10 @@ def test_what_is_no_console_is_none() -> None:
     assert list(console_lines("paused by client")) == []
     assert list(console_lines("stdout:a:b\n\nstderr:")) == [
         ConsoleLine("stdout", "a:b"),
-        ConsoleLine("stdout", ""),
-        ConsoleLine("stderr", ""),
+    ]
+    assert list(console_lines("stderr:two\nlines")) == [
+        ConsoleLine("stderr", "two"),
+        ConsoleLine("stderr", "lines"),
     ]
 
 

@@ -81,11 +81,11 @@ def tail(arguments: argparse.Namespace) -> None:
         _print_lines(follower.look(arguments.limit))
         following = not arguments.no_follow and not storage(connection)
         while following:
-            _wait(arguments.interval)
+            wait(arguments.interval)
             _print_lines(_newest_states_only(follower.look()))
 
 
-def _wait(seconds: float) -> None:
+def wait(seconds: float) -> None:
     """Wait for the next look, or end where nobody reads a pipe any more (`tail | head`).
 
     Raises:

@@ -12,6 +12,7 @@ from anyio import CancelScope, to_thread
 from mcp.server import MCPServer
 
 from webots_mcp import __version__
+from webots_mcp.console.watching import ConsoleWatch
 from webots_mcp.contract import Database
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.server.declaring import tools_of
@@ -100,7 +101,10 @@ def create_server(
 def _lifespan(
     recording: Recording, retain: Upkeep, asked: Asked
 ) -> Callable[[MCPServer], AbstractAsyncContextManager[TrialWorkers]]:
-    """While a server runs, trials may, and the database is maintained if it may be written."""
+    """While a server runs, trials may; a database that may be written is maintained and followed.
+
+    What it follows is the console of each Webots that belongs to the recording.
+    """
     unasked = dict(asked)
 
     def work(connection: Connection) -> None:
@@ -113,16 +117,18 @@ def _lifespan(
 
     @asynccontextmanager
     async def lifespan(_: MCPServer) -> AsyncGenerator[TrialWorkers]:
-        workers, maintainer = TrialWorkers(recording), None
+        workers, helpers = TrialWorkers(recording), list[Maintainer | ConsoleWatch]()
         if isinstance(recording.database, Path) and not recording.read_only:
             maintainer = Maintainer(recording.database, "server", work=work)
-            maintainer.start()
+            helpers = [maintainer, ConsoleWatch(recording)]
+        for helper in helpers:
+            helper.start()
         try:
             yield workers
         finally:
             with CancelScope(shield=True):
                 await to_thread.run_sync(workers.stop)
-            if maintainer is not None:
-                await to_thread.run_sync(maintainer.stop, abandon_on_cancel=True)
+            for helper in reversed(helpers):
+                await to_thread.run_sync(helper.stop, abandon_on_cancel=True)
 
     return lifespan

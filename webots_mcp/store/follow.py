@@ -21,7 +21,14 @@ _COMMAND: Final = (
 _NEWS: Final[dict[str, str]] = {
     "state": _ROW.format(table="state", kind="'state'", text=f"substr(t.data, 1, {_LONGEST_TEXT})")
     + _OF_ROBOT.format(order="t.id"),
-    "log": _ROW.format(table="log", kind="t.level", text=f"substr(t.message, 1, {_LONGEST_TEXT})")
+    "log": _ROW.format(
+        table="log",
+        kind="t.level",
+        text=(
+            "iif(t.source IN ('console', 'webots'), t.source || ': ', '') || "
+            f"substr(t.message, 1, {_LONGEST_TEXT})"
+        ),
+    )
     + _OF_ROBOT.format(order="t.id"),
     "event": _ROW.format(
         table="event",

@@ -6,20 +6,25 @@ import sqlite3
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.contract import LOG_LEVELS
+from webots_mcp.contract import LOG_LEVELS, LogSource
 from webots_mcp.store.rows import columns_of
 from webots_mcp.store.window import Window
 
 COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it tells
+OF_CONSOLE: Final[tuple[LogSource, ...]] = ("console", "webots")
 
 
 @dataclass(frozen=True)
 class LogLine:
-    """A line that the controller or the bridge logged."""
+    """A line that the controller or the bridge logged, or of Webots' console.
+
+    Attributes:
+        run_id: None for a line of the console that waits for a run, as is its time.
+    """
 
     id: int
-    run_id: int
-    sim_time_s: float
+    run_id: int | None
+    sim_time_s: float | None
     wall_time_s: float
     level: str
     source: str
@@ -29,16 +34,43 @@ class LogLine:
 
 _COLUMNS: Final = columns_of(LogLine)
 _RANKS: Final = " ".join(f"WHEN '{level}' THEN {rank}" for rank, level in enumerate(LOG_LEVELS))
+_SAYING: Final = (
+    "(:text = '' OR instr(lower(message), :text) > 0) "
+    "AND (:source IS NULL OR source = :source) "
+    f"AND CASE level {_RANKS} ELSE {LOG_LEVELS.index('error')} END >= :lowest"
+)
 _MATCHING: Final = (
     "AND sim_time_s >= :start_s AND sim_time_s < :end_s "
-    "AND (:before_id IS NULL OR id < :before_id) "
-    "AND (:text = '' OR instr(lower(message), :text) > 0) "
-    f"AND CASE level {_RANKS} ELSE {LOG_LEVELS.index('error')} END >= :lowest"
+    f"AND (:before_id IS NULL OR id < :before_id) AND {_SAYING}"
 )
 _OF_RUN: Final = f"FROM log WHERE run_id = :run_id {_MATCHING}"
 # The newest lines are wanted: from the end of the table, not run by run.
 _OF_ROBOT: Final = (
     f"FROM log WHERE +run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) {_MATCHING}"
+)
+# Of several robots in a simulation Webots does not tell which one printed a line, and nobody's are
+# those of its own: they stand in the run of any of them, and are shown for all.
+_COMPANIONS: Final = (
+    "SELECT id FROM session WHERE robot_id <> :robot_id "
+    "AND instance IN (SELECT instance FROM session WHERE robot_id = :robot_id)"
+)
+_RUNS_BESIDE: Final = (
+    f"SELECT o.id FROM run r JOIN run o ON o.session_id IN ({_COMPANIONS}) WHERE r.id = :run_id "
+    "AND o.started_wall_time_s <= coalesce(r.ended_wall_time_s, 9e99) "
+    "AND coalesce(o.ended_wall_time_s, 9e99) >= r.started_wall_time_s"
+)
+_CONSOLE_OF: Final = f"(source IN {OF_CONSOLE} AND +run_id IN ({{}}))"
+_BESIDE_RUN: Final = (
+    f"FROM log WHERE (run_id = :run_id OR {_CONSOLE_OF.format(_RUNS_BESIDE)}) {_MATCHING}"
+)
+_BESIDE_ROBOT: Final = (
+    "FROM log WHERE (+run_id IN (SELECT id FROM run WHERE robot_id = :robot_id) OR "
+    + _CONSOLE_OF.format(f"SELECT id FROM run WHERE session_id IN ({_COMPANIONS})")
+    + f") {_MATCHING}"
+)
+_WAITING: Final = (
+    "SELECT id, NULL, NULL, wall_time_s, level, source, message, logger FROM console_line "
+    f"WHERE {_SAYING} ORDER BY id DESC LIMIT :limit"
 )
 
 
@@ -53,6 +85,7 @@ class LogFilter:
         lowest_level: This level and those above it.
         before_id: Only lines with smaller ids, to page towards older ones.
         robot_id: The robot, where no run is given.
+        source: Only lines of this one.
     """
 
     run_id: int | None
@@ -61,24 +94,35 @@ class LogFilter:
     lowest_level: str = "debug"
     before_id: int | None = None
     robot_id: int | None = None
+    source: LogSource | None = None
 
 
 def newest_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
     """The newest lines that match, oldest first; with a limit of -1 all of them."""
     order = "id" if asked.run_id is None else "sim_time_s DESC, id"
-    query = f"SELECT {_COLUMNS} {_source(asked)} ORDER BY {order} DESC LIMIT :limit"
+    query = f"SELECT {_COLUMNS} {_rows_of(connection, asked)} ORDER BY {order} DESC LIMIT :limit"
     rows = connection.execute(query, {**_values(asked), "limit": limit}).fetchall()
+    return [LogLine(*row) for row in reversed(rows)]
+
+
+def waiting_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
+    """The newest lines of Webots' console that wait for a run, oldest first; of no run or time."""
+    rows = connection.execute(_WAITING, {**_values(asked), "limit": limit}).fetchall()
     return [LogLine(*row) for row in reversed(rows)]
 
 
 def count_lines(connection: sqlite3.Connection, asked: LogFilter) -> int:
     """How many lines match; `COUNT_LIMIT` stands for that many or more."""
-    query = f"SELECT count(*) FROM (SELECT 1 {_source(asked)} LIMIT {COUNT_LIMIT})"
+    query = f"SELECT count(*) FROM (SELECT 1 {_rows_of(connection, asked)} LIMIT {COUNT_LIMIT})"
     return int(connection.execute(query, _values(asked)).fetchone()[0])
 
 
-def _source(asked: LogFilter) -> str:
-    return _OF_ROBOT if asked.run_id is None else _OF_RUN
+def _rows_of(connection: sqlite3.Connection, asked: LogFilter) -> str:
+    alone, beside = (_OF_ROBOT, _BESIDE_ROBOT) if asked.run_id is None else (_OF_RUN, _BESIDE_RUN)
+    if asked.robot_id is None:
+        return alone
+    found = connection.execute(f"SELECT EXISTS ({_COMPANIONS})", {"robot_id": asked.robot_id})
+    return beside if found.fetchone()[0] else alone
 
 
 def _values(asked: LogFilter) -> dict[str, object]:
@@ -90,4 +134,5 @@ def _values(asked: LogFilter) -> dict[str, object]:
         "text": asked.text.lower(),
         "lowest": LOG_LEVELS.index(asked.lowest_level),
         "before_id": asked.before_id,
+        "source": asked.source,
     }

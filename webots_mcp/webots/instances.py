@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Final
 
+from webots_mcp.contract import host_name
 from webots_mcp.webots.stream import Address
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ class Instance:
         mode: Of `--mode`; None where its preferences decide.
         streams: Whether it was started with `--stream`, so that it obeys orders from outside.
         world: The world file that it was started with.
+        started_wall_time_s: When; 0 where the system does not tell.
     """
 
     pid: int
@@ -39,6 +41,26 @@ class Instance:
     mode: str | None
     streams: bool
     world: Path | None
+    started_wall_time_s: float = field(default=0.0, compare=False)
+
+    @property
+    def name(self) -> str:
+        """As the sessions of its controllers name it."""
+        return f"{host_name()}:{self.port}"
+
+    @property
+    def runs(self) -> bool:
+        """Whether it still does."""
+        import psutil
+
+        try:
+            process = psutil.Process(self.pid)
+            is_it = process.create_time() == self.started_wall_time_s
+            return is_it and process.status() != psutil.STATUS_ZOMBIE
+        except psutil.AccessDenied:
+            return True
+        except psutil.Error:
+            return False
 
     @property
     def address(self) -> Address:
@@ -89,6 +111,7 @@ def _look(process: psutil.Process, arguments: list[str]) -> Instance:
         options.get("mode"),
         "stream" in options,
         _world(process, arguments),
+        _started_s(process),
     )
 
 
@@ -109,6 +132,15 @@ def _ports(process: psutil.Process) -> Iterator[int]:
                 yield connection.laddr.port
     except psutil.Error:
         return
+
+
+def _started_s(process: psutil.Process) -> float:
+    import psutil
+
+    try:
+        return process.create_time()
+    except psutil.Error:
+        return 0.0
 
 
 def _world(process: psutil.Process, arguments: Sequence[str]) -> Path | None:

@@ -54,10 +54,15 @@ class Address(NamedTuple):
 
 
 class Message(NamedTuple):
-    """What Webots sent: its text as far as it is kept, or that it answered a ping."""
+    """What Webots sent: its text as far as it is kept, or that it answered a ping.
+
+    Attributes:
+        dropped_bytes: How much of the end is not kept, about.
+    """
 
     text: str
     is_pong: bool = False
+    dropped_bytes: int = 0
 
 
 class ConsoleLine(NamedTuple):
@@ -100,7 +105,7 @@ class Stream:
         )
         self._trimmer = FrameTrimmer()
         self._message = bytearray()
-        self._dropped_bytes = 0
+        self._dropped_bytes = self._told_dropped_bytes = 0
         self._socket = socket.create_connection(address, _left_s(until_s))
         self._arrived: list[Message] = []
         try:
@@ -110,12 +115,22 @@ class Stream:
             raise
 
     def send(self, text: str) -> None:
-        """Send a text."""
+        """Send a text.
+
+        Raises:
+            CommandRefusedError: Webots closed the connection.
+        """
+        self._require_open()
         self._protocol.send_text(text.encode())
         self._write()
 
     def ping(self) -> None:
-        """Ask Webots' main thread for a sign of life, which comes after what was sent before."""
+        """Ask Webots' main thread for a sign of life, which comes after what was sent before.
+
+        Raises:
+            CommandRefusedError: Webots closed the connection.
+        """
+        self._require_open()
         self._protocol.send_ping(b"webots-mcp")
         self._write()
 
@@ -138,12 +153,24 @@ class Stream:
     def close(self) -> None:
         """Say goodbye, wait a moment for the same, and close the socket."""
         until_s = time.monotonic() + _CLOSING_S
+        try:
+            self._say_goodbye(until_s)
+        finally:
+            self._socket.close()
+
+    @property
+    def _is_open(self) -> bool:
+        from websockets.protocol import OPEN
+
+        return self._protocol.state is OPEN
+
+    def _say_goodbye(self, until_s: float) -> None:
         with suppress(OSError, CommandRefusedError):
-            self._protocol.send_close(1000)
-            self._write()
+            if self._is_open:  # else Webots was first
+                self._protocol.send_close(1000)
+                self._write()
             while self._read(until_s):
                 self._arrived.clear()
-        self._socket.close()
 
     def _shake_hands(self, until_s: float) -> None:
         self._protocol.send_request(self._protocol.connect())
@@ -159,8 +186,8 @@ class Stream:
         head_bytes, end, rest = bytes(head).partition(_HEAD_END)
         self._protocol.receive_data(head_bytes + end)
         self._protocol.events_received()
-        if self._protocol.handshake_exc is not None or not end:
-            why = self._protocol.handshake_exc or "it closed the connection"
+        if not self._is_open:
+            why = self._protocol.handshake_exc or "it does not speak as a WebSocket does"
             raise CommandRefusedError(f"what listens at {self.address} is no Webots ({why})")
         self._take(rest)
 
@@ -173,8 +200,15 @@ class Stream:
             self._take(data)
             self._write()  # pongs
         if not data or (self._protocol.close_expected() and not self._arrived):
-            raise CommandRefusedError(f"Webots at {self.address} closed the connection")
+            raise self._closed()
         return True
+
+    def _require_open(self) -> None:
+        if not self._is_open:
+            raise self._closed()
+
+    def _closed(self) -> CommandRefusedError:
+        return CommandRefusedError(f"Webots at {self.address} closed the connection")
 
     def _take(self, data: bytes) -> None:
         self._protocol.receive_data(self._trimmer.feed(data))
@@ -195,7 +229,10 @@ class Stream:
         self._message += frame.data[:room]
         self._dropped_bytes += max(len(frame.data) - room, 0)
         if frame.fin:
-            self._arrived.append(Message(self._message.decode("utf-8", "replace")))
+            dropped_bytes = self.dropped_bytes - self._told_dropped_bytes
+            self._told_dropped_bytes += dropped_bytes
+            text = self._message.decode("utf-8", "replace")
+            self._arrived.append(Message(text, dropped_bytes=dropped_bytes))
             self._message = bytearray()
 
     def _bytes(self, until_s: float) -> bytes | None:
@@ -290,35 +327,25 @@ def no_obedience(address: Address, reply: Reply) -> str:
     )
 
 
-def console(address: Address, timeout_s: float) -> Generator[list[ConsoleLine]]:
-    """Webots' console, from its first line that nobody has taken yet; works without `--stream`.
-
-    Yields at least once a second, also nothing, until who asks stops or Webots ends.
-
-    Args:
-        address: Where it listens.
-        timeout_s: For the connection.
-
-    Raises:
-        CommandRefusedError: There is no Webots to speak to, or it has ended.
-    """
-    with connected(address, timeout_s) as stream:
-        stream.send(_BEGIN_CONSOLE)
-        while True:
-            message = stream.receive(time.monotonic() + ANSWER_S)
-            yield [] if message is None else list(console_lines(message.text))
+def begin_console(stream: Stream) -> None:
+    """Have Webots tell its console to all its clients, from its first line that nobody has had."""
+    stream.send(_BEGIN_CONSOLE)
 
 
 def console_lines(text: str) -> Iterator[ConsoleLine]:
-    """The lines of a message; each names its stream, those that go on with it do not."""
+    """The lines of a message; each names its stream, those that go on with it do not.
+
+    Empty ones are left out: where a line of a controller ends, there is one.
+    """
     kind = None
-    for line in text.splitlines():
+    for line in text.split("\n"):
         head, colon, rest = line.partition(":")
         if colon and head in ("stdout", "stderr"):
             kind, line = head, rest
         if kind is None:  # it is about something else
             return
-        yield ConsoleLine(kind, line)
+        if line.strip():
+            yield ConsoleLine(kind, line)
 
 
 def _left_s(until_s: float) -> float:

@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Final
 
 from pydantic import Field
 
-from webots_mcp.contract import LogLevel
+from webots_mcp.console.state import console_state
+from webots_mcp.contract import LogLevel, LogSource
+from webots_mcp.errors import NothingRecordedError
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import Cursor, EndS, LastS, RobotName, RunId, StartS
 from webots_mcp.server.results import LogsAnswer, Table
 from webots_mcp.server.shortening import cut_text
-from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, count_lines, newest_lines
+from webots_mcp.store.logs import (
+    COUNT_LIMIT,
+    OF_CONSOLE,
+    LogFilter,
+    LogLine,
+    count_lines,
+    newest_lines,
+    waiting_lines,
+)
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording, View
-from webots_mcp.store.window import window_of
+from webots_mcp.store.window import Window, window_of
 
 LOG_COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
 _LONGEST_MESSAGE: Final = 500
 _BUDGET: Final = 6_000
+_NO_RUN_YET: Final = (
+    "lines without a run_id came from Webots' console before a run began: a controller that never "
+    "began one may have failed there"
+)
 
 
 @tool("Get log lines", READS)
@@ -29,6 +44,7 @@ def webots_get_logs(
         str, Field(max_length=200, description="Only lines that contain this text.")
     ] = "",
     level: Annotated[LogLevel | None, Field(description="This level and those above it.")] = None,
+    source: Annotated[LogSource | None, Field(description="Only lines of this one.")] = None,
     last_s: LastS = None,
     start_s: StartS = None,
     end_s: EndS = None,
@@ -39,39 +55,64 @@ def webots_get_logs(
     """The newest log lines, oldest first, each with its run.
 
     Of all runs of the robot, so also from before a reset; with a run_id or a range of time of
-    that run, or the current one. Lines of the bridge begin with 'bridge:', those of Python's
-    logging with '[name of the logger]'.
+    that run, or the current one. A line begins with its source, unless that is the controller:
+    'bridge:', 'webots:' (Webots' own messages), 'console:' (printed by a controller, Webots does
+    not tell which); those of Python's logging with '[name of the logger]'.
     """
     scope = Scope(robot=robot, run_id=run_id, last_s=last_s, start_s=start_s, end_s=end_s)
-    with recording.view(robot, run_id) as view:
-        run = view.require_run()
-        lowest = level or "debug"
-        window = window_of(scope, run.last_sim_time_s)
-        one_run = run.id if scope.in_one_run else None
-        asked = LogFilter(one_run, window, filter_text, lowest, cursor, view.robot.id)
-        return _answer(view, asked, lines)
+    lowest = level or "debug"
+    anytime = Window(-math.inf, math.inf)
+    try:
+        with recording.view(robot, run_id) as view:
+            run = view.require_run()
+            window = window_of(scope, run.last_sim_time_s)
+            one_run = run.id if scope.in_one_run else None
+            asked = LogFilter(one_run, window, filter_text, lowest, cursor, view.robot.id, source)
+            return _answer(recording, view, asked, lines)
+    except NothingRecordedError:
+        asked = LogFilter(None, anytime, filter_text, lowest, source=source)
+        with recording.reader() as connection:
+            waiting = waiting_lines(connection, asked, lines)
+        if not waiting:
+            raise
+        return LogsAnswer(lines=_table(waiting), matching=len(waiting), hint=_NO_RUN_YET)
 
 
 def _log_row(line: LogLine) -> list[object]:
     """A line as a row under `LOG_COLUMNS`."""
-    message = line.message if line.source == "controller" else f"{line.source}: {line.message}"
-    if line.logger is not None:
+    message = line.message
+    if line.source == "controller" and line.logger is not None:
         message = f"[{line.logger}] {message}"
+    if line.source != "controller":
+        message = f"{line.source}: {message}"
     text = cut_text(message, _LONGEST_MESSAGE)
-    return [round(line.sim_time_s, 3), line.level, text, line.run_id]
+    time_s = None if line.sim_time_s is None else round(line.sim_time_s, 3)
+    return [time_s, line.level, text, line.run_id]
 
 
-def _answer(view: View, asked: LogFilter, limit: int) -> LogsAnswer:
+def _table(lines: list[LogLine]) -> Table:
+    return Table(columns=list(LOG_COLUMNS), rows=[_log_row(line) for line in lines])
+
+
+def _answer(recording: Recording, view: View, asked: LogFilter, limit: int) -> LogsAnswer:
     newest = newest_lines(view.connection, asked, limit)
-    shown = _fitting(newest)
     matching = count_lines(view.connection, asked)
-    older = matching > len(shown)
+    waiting = list[LogLine]()
+    if asked.run_id is None and asked.before_id is None:
+        waiting = waiting_lines(view.connection, asked, limit)
+    shown = _fitting([*newest, *waiting][-limit:])
+    recorded = [line for line in shown if line.run_id is not None]
+    older = matching > len(recorded)
+    hints = [_hint(asked, matching, len(recorded))] * bool(older or not waiting)
+    hints += [_NO_RUN_YET] * bool(waiting)
+    if asked.source in OF_CONSOLE or not shown:
+        hints.append(console_state(recording, view.connection))
     return LogsAnswer(
         **view.header(),
-        lines=Table(columns=list(LOG_COLUMNS), rows=[_log_row(line) for line in shown]),
+        lines=_table(shown),
         matching=matching,
-        cursor=shown[0].id if older and shown else None,
-        hint=_hint(asked, matching, len(shown)),
+        cursor=recorded[0].id if older and recorded else None,
+        hint="; ".join(hint for hint in hints if hint) or None,
     )
 
 
@@ -95,9 +136,11 @@ def _hint(asked: LogFilter, matching: int, shown: int) -> str | None:
 def _why_empty(asked: LogFilter) -> str:
     if asked.before_id is not None:
         return "no older lines match"
-    if asked.text or asked.lowest_level != "debug":
-        return "no line matches: leave out filter_text, level or the time range to see others"
+    if asked.text or asked.source or asked.lowest_level != "debug":
+        return (
+            "no line matches: leave out filter_text, level, source or the time range to see others"
+        )
     return (
-        "no lines in this run or time range: bridge.log('text', level='info') records one; what a "
-        "controller only prints is not recorded"
+        "no lines in this run or time range: bridge.log('text', level='info') records one, "
+        "capture_output=True what a controller prints"
     )

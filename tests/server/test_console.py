@@ -1,0 +1,135 @@
+"""Webots' console, as who asks the server or the command line reads it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from mcp import Client
+
+from tests.recordings.rows import Recorded, insert
+from tests.server.conftest import Connect, ask, fail
+from tests.webots.conftest import (
+    CONTROLLER,
+    StartWebots,
+    free_port,
+    start_webots,
+    wait_for_line,
+    webots,
+    write_project,
+)
+from webots_mcp.server import create_server
+from webots_mcp.store.recording import Recording
+
+__all__ = ["start_webots", "webots"]
+pytestmark = pytest.mark.anyio
+
+FAILS = """
+print("about to fail")
+import nothing_of_that_name
+"""
+
+
+async def lines_with(client: Client, text: str, **arguments: object) -> list[list[Any]]:
+    """Rows of log lines with a text, as soon as there is one."""
+    with anyio.fail_after(60):
+        while True:
+            answer = await client.call_tool("webots_get_logs", {"filter_text": text, **arguments})
+            found = (answer.structured_content or {}).get("lines")
+            if found and found["rows"]:
+                return found["rows"]
+            await anyio.sleep(0.1)
+
+
+async def test_a_server_records_what_the_controllers_of_its_project_print(
+    tmp_path: Path, start_webots: StartWebots
+) -> None:
+    world = write_project(tmp_path / "project", CONTROLLER)
+    data = tmp_path / "project" / "mcp_data"
+    async with Client(create_server(data / "webots.db", data)) as client:
+        wait_for_line(start_webots("--stdout", f"--port={free_port()}", world), "ready")
+        ((_, level, message, run_id),) = await lines_with(client, "ready", source="console")
+        assert (level, message, run_id) == ("info", "console: ready", 1)
+        own = await lines_with(client, "Starting controller", source="webots")
+        assert own[0][2].startswith("webots: INFO: ")
+        answer = await ask(client, "webots_get_logs", source="console")
+        assert "is followed; it was started without --stream" in answer["hint"]
+        assert "is followed" not in (await ask(client, "webots_get_logs")).get("hint", "")
+
+
+async def test_why_a_controller_never_recorded_is_told_before_there_is_a_run(
+    tmp_path: Path, start_webots: StartWebots
+) -> None:
+    world = write_project(tmp_path / "project", FAILS)
+    data = tmp_path / "project" / "mcp_data"
+    Recording(data / "webots.db", data).create()
+    async with Client(create_server(data / "webots.db", data)) as client:
+        process = start_webots("--stdout", "--stderr", f"--port={free_port()}", world)
+        wait_for_line(process, "about to fail")
+        ((time_s, _, message, run_id),) = await lines_with(client, "ModuleNotFoundError")
+        assert "nothing_of_that_name" in message
+        assert (time_s, run_id) == (None, None)
+        answer = await ask(client, "webots_get_logs")
+        assert "before a run began" in answer["hint"]
+    arguments = [sys.executable, "-m", "webots_mcp", "logs", "--data-dir", str(data)]
+    told = subprocess.run(arguments, capture_output=True, text=True, check=True, env=os.environ)
+    assert "console: ModuleNotFoundError" in told.stdout
+
+
+async def test_without_a_webots_of_the_recording_it_is_said_that_no_console_is_followed(
+    connect: Connect, recorded: Recorded, tmp_path: Path, start_webots: StartWebots
+) -> None:
+    recorded.robot()
+    world = write_project(tmp_path / "another", "print('ready', flush=True)")
+    wait_for_line(start_webots("--stdout", f"--port={free_port()}", world), "ready")
+    async with connect() as client:
+        answer = await ask(client, "webots_get_logs", source="webots")
+    assert "no Webots of this recording runs on this machine" in answer["hint"]
+
+
+async def test_a_server_that_only_reads_follows_nothing_and_says_so(
+    tmp_path: Path, start_webots: StartWebots
+) -> None:
+    world = write_project(tmp_path / "project", CONTROLLER)
+    data = tmp_path / "project" / "mcp_data"
+    wait_for_line(start_webots("--stdout", f"--port={free_port()}", world), "ready")
+    async with Client(create_server(data / "webots.db", data, read_only=True)) as client:
+        answer = await ask(client, "webots_get_logs", source="console")
+    assert "is not followed: a server with --read-only does not" in answer["hint"]
+
+
+async def test_a_line_that_may_be_of_any_robot_of_a_simulation_is_told_of_each(
+    connect: Connect, recorded: Recorded
+) -> None:
+    rover, referee = recorded.robot("rover"), recorded.robot("referee")
+    elsewhere = recorded.robot("elsewhere", instance="another")
+    for source, message in (("console", "foul"), ("webots", "WARNING: slow"), ("bridge", "its")):
+        stamp = {"run_id": referee.run_id, "sim_time_s": 1.0, "wall_time_s": referee.now}
+        line = {"level": "info", "source": source, "message": message}
+        insert(recorded.connection, "log", stamp | line)
+    rover.log(2.0, "mine")
+    async with connect() as client:
+        for scope in ({}, {"run_id": rover.run_id}):
+            answer = await ask(client, "webots_get_logs", robot="rover", **scope)
+            told = [row[2] for row in answer["lines"]["rows"]]
+            assert told == ["console: foul", "webots: WARNING: slow", "mine"]
+            assert answer["matching"] == 3
+        other = await ask(client, "webots_get_logs", robot=elsewhere.name)
+        assert other["lines"]["rows"] == []
+        assert "'x'" in await fail(client, "webots_get_logs", source="x")
+
+
+async def test_the_command_line_follows_what_comes(recorded: Recorded, file: Path) -> None:
+    robot = recorded.robot()
+    robot.log(1.0, "first")
+    arguments = [sys.executable, "-m", "webots_mcp", "logs", "--follow", "--database", str(file)]
+    with subprocess.Popen(arguments, stdout=subprocess.PIPE, text=True) as process:
+        wait_for_line(process, "first")
+        robot.log(2.0, "second")
+        assert wait_for_line(process, "second") == "2.0 info 1 second\n"
+        process.terminate()

@@ -83,7 +83,7 @@ def test_it_says_who_records_and_leaves_nothing_running_however_it_ends(
     process.send_signal(number)
     out, rest = process.communicate(timeout=60)
 
-    assert "[rover] ready" in out
+    assert "ready\n" in out
     wait_until(lambda: not any(each.is_running() for each in family))
     if number != signal.SIGKILL:
         assert process.returncode == 128 + number
@@ -98,7 +98,7 @@ def test_webots_ends_by_itself_with_its_own_exit_code(
     out, said = process.communicate(timeout=60)
     assert process.returncode == 5, said
     assert "webots-mcp: rover records: run 1" in said
-    assert "[rover] ready" in out
+    assert "ready\n" in out
     assert "ending Webots" not in said
 
 

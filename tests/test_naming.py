@@ -54,3 +54,9 @@ def test_a_mode_is_found_by_the_last_word_of_its_name(name: str) -> None:
     others = {"lastAction", "next_state", "previousMode", "modest", "text"}
     assert find_mode({name, *others}) == name
     assert find_mode(others) is None
+
+
+def test_of_several_robots_that_an_observer_sees_none_is_meant() -> None:
+    rover = {"world.ROVER.x_m", "world.ROVER.y_m", "solid.CRATE.x_m", "solid.CRATE.y_m"}
+    assert find_position(rover) == ("world.ROVER.x_m", "world.ROVER.y_m")
+    assert find_position({*rover, "world.TWO.x_m", "world.TWO.y_m"}) is None

@@ -19,6 +19,8 @@ REDUCTIONS: Final = ("count", "min", "max", "mean", "argmin")
 INDEXES: Final = tuple(str(index) for index in range(LONGEST_SPREAD_ARRAY))
 FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer of 400 digits)
 
+WORLD: Final = "world"  # the branch in which an observer publishes where each robot is
+SOLIDS: Final = "solid"  # the one of other bodies
 _BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
 # Words of what is no place, or the place of something else.
 _ELSEWHERE: Final = frozenset((
@@ -26,10 +28,11 @@ _ELSEWHERE: Final = frozenset((
     "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed",
     "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired",
     "destination", "goal", "image", "item", "marker", "object", "obstacle", "pixel",
-    "reference", "setpoint", "target", "waypoint",
+    "reference", "setpoint", "solid", "target", "waypoint",
 ))  # fmt: skip
 # Words beside an x that leave it the robot's own, as in robot_x and currentPosX.
 _OWN: Final = frozenset((*_BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self"))
+_SEEN: Final = f"{WORLD}."
 _PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
 _LENGTHS: Final = ("m", "cm", "mm")  # units that a place is published in
 _AXES: Final = (("0", "1"), ("x", "y"), *((f"x_{unit}", f"y_{unit}") for unit in _LENGTHS))
@@ -114,6 +117,7 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
     one with such a word in its name before others (`currentPosition.x`, `posX`, `robotPose.0`), and
     none of what is elsewhere (`goal`, `ball`) or no place (`velocity`). The views robot_now and
     robot_trajectory have the same rule, row by row, but for names in camelCase and for a `pos_x`.
+    Of several robots that an observer sees none is meant.
     """
     for x, y in USUAL_POSITIONS:
         if x in numeric and y in numeric:
@@ -124,7 +128,10 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
         for (branch, key, axis), name in places.items()
         if axis == "x" and (branch, key, "y") in places
     ]
-    return min(pairs, key=_place_first, default=("", None))[1]
+    branch, found = min(pairs, key=_place_first, default=("", None))
+    if branch.startswith(_SEEN) and sum(each.startswith(_SEEN) for each, _ in pairs) > 1:
+        return None
+    return found
 
 
 def _place_of(name: str) -> tuple[str, str, str] | None:

@@ -39,10 +39,8 @@ class Watching:
         with closing(connect(self.database, "reader")) as connection:
             return connection.execute(sql).fetchall()
 
-    def newest(self) -> dict[str, dict[str, float]]:
-        return json.loads(self.rows("SELECT data FROM state ORDER BY id DESC LIMIT 1")[0][0])[
-            "world"
-        ]
+    def newest(self) -> dict[str, dict[str, dict[str, float]]]:
+        return json.loads(self.rows("SELECT data FROM state ORDER BY id DESC LIMIT 1")[0][0])
 
     def worlds(self) -> list[dict[str, Any]]:
         rows = self.rows("SELECT data FROM event WHERE kind = 'world' ORDER BY id")

@@ -17,7 +17,7 @@ from webots_mcp.standin.in_process import DEFAULT_WORLD
 
 def test_all_robots_are_recorded_by_their_def_or_their_name(watching: Watching) -> None:
     watching.go_on(20)
-    seen = watching.newest()
+    seen = watching.newest()["world"]
     assert set(seen) == {"ROVER", "RIDER", "_2nd_robot", "e_puck", "turret", "REFEREE"}
     rover = seen["ROVER"]
     assert (rover["x_m"], rover["y_m"], rover["heading_rad"]) == (1.0, 2.0, 0.5)
@@ -39,12 +39,12 @@ def test_what_there_is_is_told_once_as_an_event(watching: Watching) -> None:
 
 def test_a_solid_is_recorded_from_when_it_moves(watching: Watching) -> None:
     watching.go_on(20)
-    assert "CRATE" not in watching.newest()
+    assert "solid" not in watching.newest()
     crate = watching.robot.getFromDef("CRATE")
     assert crate is not None
     crate.setVelocity([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     watching.go_on(4)
-    seen = watching.newest()
+    seen = watching.newest()["solid"]
     assert seen["CRATE"]["x_m"] > 0.01
     assert seen["CRATE"]["speed_mps"] > 0.1
     assert "PILLAR" not in seen
@@ -79,7 +79,7 @@ def test_a_reset_begins_a_run_without_a_leap(watching: Watching) -> None:
         "start",
         "reset",
     ]
-    assert "CRATE" not in watching.newest()
+    assert "solid" not in watching.newest()
     assert len(watching.worlds()) == 2
 
 
@@ -90,9 +90,9 @@ def test_a_node_that_is_gone_is_told_no_more(
     rider = watching.observer.world.bodies["RIDER"].scene.node
     monkeypatch.setattr(rider, "getId", lambda: -1)  # as of a node that Webots has removed
     watching.go_on()
-    assert "RIDER" not in watching.newest()
+    assert "RIDER" not in watching.newest()["world"]
     watching.go_on(20)  # here it is still there, and so found again, by the same name
-    assert "RIDER" in watching.newest()
+    assert "RIDER" in watching.newest()["world"]
 
 
 def test_what_is_added_is_found_at_once_and_what_is_removed_is_followed_no_more(
@@ -110,10 +110,10 @@ def test_what_is_added_is_found_at_once_and_what_is_removed_is_followed_no_more(
     assert node is not None
     node.setVelocity([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     watching.go_on(5)
-    assert watching.newest()["BALL"]["speed_mps"] > 0.1
+    assert watching.newest()["solid"]["BALL"]["speed_mps"] > 0.1
     node.remove()
     watching.go_on(5)
-    assert "BALL" not in watching.newest()
+    assert "solid" not in watching.newest()
     assert "BALL" not in {solid["key"] for solid in watching.worlds()[-1]["solids"]}
     assert len(watching.worlds()) == 3
     assert capfd.readouterr().err == ""
@@ -134,7 +134,7 @@ def test_where_tracked_poses_do_not_come_they_are_asked_for(
         watching.go_on(10)
     monkeypatch.undo()
     watching.go_on(5)
-    assert watching.newest()["CRATE"]["x_m"] > 0.01
+    assert watching.newest()["solid"]["CRATE"]["x_m"] > 0.01
     logs = watching.rows("SELECT message FROM log WHERE level = 'warning'")
     assert [text for (text,) in logs] == [
         "Webots does not send the poses that are tracked: each is asked for from now on"

@@ -128,7 +128,7 @@ class Observer:
             self.bridge.record_world(self.world.describe())
         if sim_time_s >= self._due_s and (seen := self.world.look(sim_time_s)):
             self._due_s = sim_time_s + self._period_ms / 1000 - 1e-6
-            self.bridge.publish({"world": seen})
+            self.bridge.publish(seen)
 
     def _warn(self, text: str) -> None:
         self.bridge.log(text, "warning")

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import time
 from collections.abc import Generator
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
+from webots_mcp.naming import SOLIDS, WORLD
 from webots_mcp.observer.body import Body, Place, body_of, is_followed
 from webots_mcp.observer.words import word_of
 
@@ -19,6 +20,7 @@ MOST_ROBOTS: Final = 200
 MOST_SOLIDS: Final = 100
 _WALK_S: Final = 0.004  # of wall time in one look
 _REST_S: Final = 5.0  # of wall time between two walks
+Seen: TypeAlias = "dict[str, dict[str, dict[str, float | None]]]"
 _STALE_M: Final = 0.01
 
 
@@ -56,13 +58,16 @@ class World:
         """A walk has found something else than `describe` has told."""
         return self._is_new and self._is_walked
 
-    def look(self, sim_time_s: float) -> dict[str, dict[str, float | None]]:
-        """Where everything is now, by the words of its signals."""
+    def look(self, sim_time_s: float) -> Seen:
+        """Where everything is now, by the words of its signals: robots, and solids that moved."""
         gone = [key for key, body in self.bodies.items() if not body.look(sim_time_s)]
         for key in gone:
             self._lose(key)
-        told = [body for body in self.bodies.values() if body.is_told]
-        return {body.key: signals for body in told if (signals := body.signals())}
+        seen: Seen = {}
+        for body in self.bodies.values():
+            if body.is_told and (signals := body.signals()):
+                seen.setdefault(WORLD if body.is_robot else SOLIDS, {})[body.key] = signals
+        return seen
 
     def go_on(self) -> None:
         """Walk on, or begin to walk where it is time to."""

@@ -91,7 +91,8 @@ class WorldAnswer(Answer):
     title: str | None = None
     basic_time_step_ms: float | None = None
     observer: str | None = Field(
-        default=None, description="Robot whose signals world.KEY.x_m are where everything is."
+        default=None,
+        description="Its signals world.KEY.x_m and solid.KEY.x_m are places.",
     )
     in_world: Table | None = Field(
         default=None, description="What the observer sees: robots, and solids with a DEF."

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import sqlite3
 from dataclasses import dataclass
-from typing import Any, Final, cast
+from typing import Any, Final
 
 from webots_mcp.contract import OBSERVER, WORLD_EVENT
+from webots_mcp.naming import SOLIDS, WORLD
 from webots_mcp.store.robots import Robot, list_robots
 from webots_mcp.store.runs import Run
 from webots_mcp.store.sessions import Session
@@ -77,5 +78,5 @@ def world_seen(connection: sqlite3.Connection, run: Run) -> WorldSeen | None:
 def _places(connection: sqlite3.Connection, run_id: int, run: Run) -> dict[str, Any]:
     until_s = run.last_sim_time_s if run.ended_wall_time_s is not None else float("inf")
     state = state_at(connection, run_id, until_s)
-    places: Any = state.value().get("world") if state else None
-    return cast("dict[str, Any]", places) if isinstance(places, dict) else {}
+    seen = state.value() if state else {}
+    return {**seen.get(WORLD, {}), **seen.get(SOLIDS, {})}

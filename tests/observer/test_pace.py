@@ -22,13 +22,13 @@ class Simulator:
         self.time_s = self.told_s = 0.0
         self.asked: list[int] = []
 
-    def getSynchronization(self) -> bool:  # noqa: N802
+    def getSynchronization(self) -> bool:
         return self.synchronous
 
-    def getTime(self) -> float:  # noqa: N802
+    def getTime(self) -> float:
         return self.told_s
 
-    def simulationGetMode(self) -> int:  # noqa: N802
+    def simulationGetMode(self) -> int:
         return self.mode
 
     def step(self, duration_ms: int) -> int:

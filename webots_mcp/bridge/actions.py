@@ -87,11 +87,13 @@ def fast(context: Context, command: Command) -> Progress:
 def step(context: Context, command: Command) -> Progress:
     """Let the user's loop come round `steps` times, each with its own step, then pause.
 
-    A loop that does not ask for commands in every round makes more; those made are told.
+    A loop that does not ask for commands in every round makes more; those made are told. A world
+    that does not wait for the robot goes on in real time meanwhile, so that it can be stopped.
     """
     clock, steps = context.clock, _whole_number(command.params, "steps", 1, MAX_STEPS)
     from_s, from_step = clock.sim_time_s, clock.steps_seen
-    context.pause.end(command, stepping=True)
+    mode = None if context.simulation.waits_for_robot else "real_time"
+    context.pause.end(command, mode, stepping=True)
     try:
         while (made := clock.steps_seen - from_step) < steps and not context.pause.active:
             yield

@@ -21,7 +21,8 @@ class Clock:
         self._simulation = simulation
         self.sim_time_s = simulation.time_s
         self.moved_s: float | None = None  # by the monotonic clock
-        self.steps_seen = 0  # looks at which time had gone forward
+        self.steps_seen = 0  # looks at which time had gone forward, or the steps between them
+        self.step_s: float | None = None  # of a loop that does not make the steps itself
         self.run = Run("start", self.sim_time_s)
         self.ended_sim_time_s = self.sim_time_s  # of the run before this one
         self._reset_from_s: float | None = None
@@ -37,7 +38,7 @@ class Clock:
         self.sim_time_s = now
         if now > before + _EPSILON_S:
             self.moved_s = time.monotonic()
-            self.steps_seen += 1
+            self.steps_seen += max(round((now - before) / self.step_s), 1) if self.step_s else 1
         if now >= before - _EPSILON_S and not self._is_awaited_reset(now, after_step):
             return False
         self._reset_from_s = None

@@ -39,6 +39,11 @@ class Simulation:
         return float(self.robot.getBasicTimeStep()) / 1000
 
     @property
+    def waits_for_robot(self) -> bool:
+        """Whether the world stands still until this robot asks for its next step."""
+        return bool(self.robot.getSynchronization())
+
+    @property
     def mode(self) -> int:
         """The simulation mode as of the last answer from Webots."""
         return int(self.robot.simulationGetMode())

@@ -31,6 +31,10 @@ class ObserverBridge(MCPBridge):
         """Record what there is: an event, as it changes seldom."""
         self._session.context.journal.event(WORLD_EVENT, world)
 
+    def count_steps_by_time(self) -> None:
+        """The world goes on between two rounds of the loop."""
+        self._session.context.clock.step_s = self._session.context.simulation.basic_time_step_s
+
     def record_mode(self) -> None:
         """Record in which mode the simulation is seen to be: an event."""
         mode = self._session.context.simulation.mode_name
@@ -91,6 +95,7 @@ class Observer:
         self._period_ms = max(int(math.ceil(period_ms / basic_ms) * basic_ms), 1)
         self._robot = robot
         self.bridge = ObserverBridge(robot, throttle_interval=1, keep_last_s=0, **options)
+        self.bridge.count_steps_by_time()
         self.world = World(robot, self._period_ms, self._warn)
         self._pace = Pace(robot, self._period_ms)
         self._due_s = -math.inf

@@ -53,7 +53,7 @@ ALLOWED["belonging"] = STDLIB | {"store", "webots"}
 ALLOWED["console"] = ALLOWED["belonging"] | {"belonging", "console"}
 ALLOWED["server"] = STDLIB | {
     "belonging", "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
-    "__version__",
+    "launching", "__version__",
 }  # fmt: skip
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
 ALLOWED["pytest_plugin"] = {"contract", "standin", "testing", "MCPBridge", "MemoryDatabase"}

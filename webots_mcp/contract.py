@@ -74,6 +74,8 @@ BUILT_IN_ACTIONS: Final[dict[str, BuiltInAction]] = {
     "cancel_run": BuiltInAction(needs_supervisor=False),
     "reset": BuiltInAction(ends_steps=True),
     "reload": BuiltInAction(ends_steps=True),
+    "load_world": BuiltInAction(ends_steps=True),
+    "quit": BuiltInAction(ends_steps=True),
     "screenshot": BuiltInAction(),
     "take_frame": BuiltInAction(needs_supervisor=False),
     "reset_state": BuiltInAction(needs_supervisor=False, runs_user_code=True),
@@ -99,6 +101,7 @@ MAX_BREAKPOINTS: Final = 32  # of one robot that are armed
 KEEP_LAST_S: Final = 5.0  # before a moment, kept at full rate
 KEEP_AFTER_S: Final = 2.0  # after it
 LOOPING: Final = ("step", "run")  # actions that let the loop come round; one is under way at most
+ENDING: Final = ("load_world", "quit")  # actions that are done when the controller ends
 Pace = Literal["fast", "real_time"]  # of a `run` command
 Then = Literal["pause", "go_on", "as_before"]  # what it does at its end
 RunEnd = Literal[

@@ -69,6 +69,10 @@ class Launch:
         environment: What its controllers get beside the environment of this process.
         show: Called with each line of its console, in a thread of its own.
 
+    Attributes:
+        world: The world that it runs, as far as that is known.
+        webots: Its processes.
+
     Raises:
         CommandRefusedError: There is no Webots, or no display.
         DatabaseError: The recording cannot be read.
@@ -78,6 +82,7 @@ class Launch:
         self, recording: Recording, start: Start, environment: Mapping[str, str], show: Show
     ) -> None:
         self.start = start
+        self.world = start.world
         self._recording = recording
         self._before = newest_in(recording)
         self.webots = LaunchedWebots(start, environment, show)
@@ -115,7 +120,7 @@ class Launch:
         begun = [each.robot for each in self._begun()]
         if begun:
             return [f"{', '.join(begun)} has a bridge and has published nothing yet"]
-        return list(_without_record(self.start.world))
+        return list(_without_record(self.world))
 
 
 def _is_of_trouble(line: ConsoleLine) -> bool:

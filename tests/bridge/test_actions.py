@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -12,6 +13,7 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import actions
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.standin import InProcessRobot, InProcessSupervisor
+from webots_mcp.standin.in_process import DEFAULT_WORLD
 
 
 def test_pause_holds_the_loop_and_resume_lets_it_go(
@@ -254,7 +256,8 @@ def test_a_screenshot_is_done_when_its_file_is_complete(
 def test_a_plain_robot_refuses_what_needs_a_supervisor(
     database: MemoryDatabase, recording: Recording
 ) -> None:
-    actions = ("pause", "resume", "fast", "step", "reset", "reload", "screenshot")
+    actions = ("pause", "resume", "fast", "step", "reset", "reload", "load_world", "quit",
+               "screenshot")  # fmt: skip
     with MCPBridge(InProcessRobot("rover"), database=database) as bridge:
         for action in actions:
             sent = recording.send(action)
@@ -263,6 +266,42 @@ def test_a_plain_robot_refuses_what_needs_a_supervisor(
             assert status == "failed"
             assert error is not None
             assert error.startswith(f"{action} needs a Supervisor") and "Supervisor()" in error
+
+
+@pytest.mark.parametrize(
+    ("action", "params"), [("load_world", {"world": str(DEFAULT_WORLD)}), ("quit", {"status": 3})]
+)
+@pytest.mark.parametrize("paused", [False, True])
+def test_what_ends_the_controller_is_done_when_it_has_ended(
+    robot: InProcessSupervisor,
+    bridge: MCPBridge,
+    recording: Recording,
+    drive: Callable[[int], None],
+    action: str,
+    params: dict[str, Any],
+    paused: bool,
+) -> None:
+    drive(2)
+    if paused:
+        recording.send("pause")
+    sent = recording.send(action, **params)
+    while robot.step(STEP_MS) != -1:
+        eager(bridge)
+    bridge.close()
+    assert recording.fate(sent)[:2] == ("done", {"controller": "it has ended"})
+    assert robot.simulation.exit_status == (3 if action == "quit" else None)
+
+
+def test_a_world_that_is_not_there_is_not_loaded(
+    bridge: MCPBridge, recording: Recording, drive: Callable[[int], None]
+) -> None:
+    sent = recording.send("load_world", world="/nowhere/arena.wbt")
+    drive(1)
+    status, _, error = recording.fate(sent)
+    assert (status, error) == (
+        "failed", "world must be the full path of a world file, not '/nowhere/arena.wbt'"
+    )  # fmt: skip
+    drive(1)
 
 
 def test_each_action_that_the_server_offers_is_one_that_bridges_run() -> None:

@@ -58,6 +58,9 @@ ACTING = {
     "webots_set_field",
     "webots_add_node",
     "webots_remove_node",
+    "webots_launch_world",
+    "webots_load_world",
+    "webots_quit",
 }
 SHARED = ("robot", "run_id", "last_s", "start_s", "end_s", "timeout_s", "cursor")
 

@@ -32,6 +32,8 @@ Action = Callable[[Context, Command], Progress]
 _SCREENSHOT_TIMEOUT_S: Final = 10.0
 _RESET_TIMEOUT_S: Final = 10.0
 _RELOAD_TIMEOUT_S: Final = 30.0
+_DIALOG: Final = "a dialog may be open in Webots (start it with --batch)"
+_HIGHEST_STATUS: Final = 255
 
 _actions: Final[dict[str, Action]] = {}
 
@@ -161,7 +163,41 @@ def reload(context: Context, command: Command) -> Progress:
     context.reloads.requested_by = None
     raise CommandRefusedError(
         f"worldReload() was called, but the controller still runs after "
-        f"{_RELOAD_TIMEOUT_S:.0f} s; a dialog may be open in Webots (start it with --batch)"
+        f"{_RELOAD_TIMEOUT_S:.0f} s; {_DIALOG}"
+    )
+
+
+@_built_in
+def load_world(context: Context, command: Command) -> Progress:
+    """Ask for another world; this process ends, as all controllers do."""
+    world = command.params.get("world")
+    if not isinstance(world, str) or not Path(world).is_file():
+        raise InvalidInputError(f"world must be the full path of a world file, not {world!r}")
+    context.pause.end(command)  # first: a paused simulation makes no physics step
+    context.simulation.robot.worldLoad(world)
+    return (yield from _until_ended("worldLoad"))
+
+
+@_built_in
+def quit(context: Context, command: Command) -> Progress:  # noqa: A001  (the action's name)
+    """Ask Webots to end; this process ends with it."""
+    status = _whole_number(command.params, "status", 0, _HIGHEST_STATUS, default=0)
+    context.pause.end(command)
+    context.simulation.robot.simulationQuit(status)
+    return (yield from _until_ended("simulationQuit"))
+
+
+def _until_ended(asked: str) -> Progress:
+    """Done when the controller ends, which is what Webots does first."""
+    deadline_s = time.monotonic() + _RELOAD_TIMEOUT_S
+    try:
+        while time.monotonic() < deadline_s:
+            yield
+    except ControllerEndedError:
+        return {"controller": "it has ended"}
+    raise CommandRefusedError(
+        f"{asked}() was called, but the controller still runs after {_RELOAD_TIMEOUT_S:.0f} s; "
+        f"{_DIALOG}"
     )
 
 

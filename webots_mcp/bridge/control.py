@@ -14,7 +14,7 @@ from webots_mcp.bridge.handlers import Handlers
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S
 from webots_mcp.bridge.text import describe
 from webots_mcp.connection import is_busy
-from webots_mcp.contract import BUILT_IN_ACTIONS, LOOPING
+from webots_mcp.contract import BUILT_IN_ACTIONS, ENDING, LOOPING
 from webots_mcp.errors import (
     CommandRefusedError,
     ControllerEndedError,
@@ -44,7 +44,7 @@ class Control:
 
     def report_end(self, *, extern: bool) -> None:
         """The process is about to end: say what no successor will say."""
-        for under_way in [c for c in self._under_way if c.action in LOOPING]:
+        for under_way in [c for c in self._under_way if c.action in (*LOOPING, *ENDING)]:
             self._end(under_way, ControllerEndedError(self.why_ended))
         command = self._context.reloads.requested_by
         if command is not None and extern and not self._reported:

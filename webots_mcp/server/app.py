@@ -16,6 +16,7 @@ from webots_mcp.console.watching import ConsoleWatch
 from webots_mcp.contract import Database
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.server.declaring import tools_of
+from webots_mcp.server.launcher import Companions, Launcher
 from webots_mcp.server.prompts import add_prompts
 from webots_mcp.server.resources import add_resources
 from webots_mcp.server.tools import (
@@ -39,6 +40,7 @@ from webots_mcp.server.tools import (
     timeline,
     trends,
     trials,
+    webots,
     world,
 )
 from webots_mcp.server.trial_worker import TrialWorkers
@@ -61,7 +63,7 @@ _PAUSE_S: Final = 0.002  # between two short writes, for the robots to write the
 # In the order in which clients list them.
 _MODULES: Final = (
     world, diagnosis, state, pictures, logs, monitor, signals, history, trends, events, timeline,
-    runs, plot, sql, control, run, trials, breakpoints, commands, parameters, scene,
+    runs, plot, sql, control, webots, run, trials, breakpoints, commands, parameters, scene,
 )  # fmt: skip
 
 
@@ -100,8 +102,8 @@ def create_server(
 
 def _lifespan(
     recording: Recording, retain: Upkeep, asked: Asked
-) -> Callable[[MCPServer], AbstractAsyncContextManager[TrialWorkers]]:
-    """While a server runs, trials may; a database that may be written is maintained and followed.
+) -> Callable[[MCPServer], AbstractAsyncContextManager[Companions]]:
+    """While a server runs, trials and Webots may; what may be written is maintained and followed.
 
     What it follows is the console of each Webots that belongs to the recording.
     """
@@ -116,18 +118,19 @@ def _lifespan(
         retain(connection)
 
     @asynccontextmanager
-    async def lifespan(_: MCPServer) -> AsyncGenerator[TrialWorkers]:
-        workers, helpers = TrialWorkers(recording), list[Maintainer | ConsoleWatch]()
+    async def lifespan(_: MCPServer) -> AsyncGenerator[Companions]:
+        companions = Companions(TrialWorkers(recording), Launcher(recording))
+        helpers = list[Maintainer | ConsoleWatch]()
         if isinstance(recording.database, Path) and not recording.read_only:
             maintainer = Maintainer(recording.database, "server", work=work)
             helpers = [maintainer, ConsoleWatch(recording)]
         for helper in helpers:
             helper.start()
         try:
-            yield workers
+            yield companions
         finally:
             with CancelScope(shield=True):
-                await to_thread.run_sync(workers.stop)
+                await to_thread.run_sync(companions.stop)
             for helper in reversed(helpers):
                 await to_thread.run_sync(helper.stop, abandon_on_cancel=True)
 

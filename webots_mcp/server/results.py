@@ -156,7 +156,7 @@ class CommandAnswer(Answer):
     result: Any = Field(default=None, description="What the controller answered.")
     error: str | None = Field(default=None, description="What the controller or the bridge said.")
     route: str | None = Field(
-        default=None, description="What steered: bridge, websocket (of Webots), keyboard."
+        default=None, description="What steered: bridge, websocket (of Webots), keyboard, process."
     )
     proof: str | None = Field(default=None, description="What shows that it happened.")
     tried: dict[str, str] | None = Field(default=None, description="Why other routes did not work.")

@@ -37,12 +37,12 @@ from webots_mcp.webots.stream import (
 )
 
 _POLL_S: Final = 0.05
-_CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # by then a loop that has just stopped is known as such
-_UNCLAIMED: Final = ("cancelled", "expired")
+CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # by then a loop that has just stopped is known as such
+UNCLAIMED: Final = ("cancelled", "expired")
 _PROOF_S: Final = 3.0  # a heartbeat tells within half a second that time goes on
 _RESTART_S: Final = 5.0  # until a controller that Webots starts again has recorded
 _LEAST_S: Final = 0.1
-_NOTHING_SEEN: Final = (
+NOTHING_SEEN: Final = (
     "the recording does not show it yet: a controller that hangs, or an extern one that is "
     "missing, stops the time of a simulation that runs"
 )
@@ -104,8 +104,8 @@ class Attempt:
         """
         situation = await self._look_around()
         if situation.silent is None:
-            answer = await self._by_bridge(_CLAIMING_S)
-            if answer.outcome not in _UNCLAIMED:
+            answer = await self._by_bridge(CLAIMING_S)
+            if answer.outcome not in UNCLAIMED:
                 return answer
             situation = await self._look_around()
         if situation.silent is None:
@@ -120,7 +120,7 @@ class Attempt:
         return await self._by_bridge()
 
     async def _look_around(self) -> Situation:
-        return await to_thread.run_sync(_look_around, self.recording, self.robot, self.order)
+        return await to_thread.run_sync(look_around, self.recording, self.robot, self.order)
 
     async def _by_bridge(self, claiming_s: float = math.inf) -> CommandAnswer:
         """Send a command to the controller, and wait for it as long as there is time.
@@ -167,7 +167,7 @@ class Attempt:
 
     async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:
         try:
-            address = situation.address or await to_thread.run_sync(_only_webots)
+            address = situation.address or await to_thread.run_sync(only_webots)
             reply, made = await self._give(address)
         except CommandRefusedError as error:
             self.tried["websocket"] = str(error)
@@ -209,7 +209,7 @@ class Attempt:
         if made < self._wanted:
             answer.outcome = "failed"
         elif seen is None and self.order != "pause" and situation.robot is not None:
-            answer.hint = _NOTHING_SEEN
+            answer.hint = NOTHING_SEEN
         return answer
 
     async def _by_keyboard(self, situation: Situation) -> CommandAnswer | None:
@@ -267,11 +267,17 @@ class Attempt:
         return max(self.timeout_s - (time.monotonic() - self.started_s), _LEAST_S)
 
 
-def _look_around(recording: Recording, robot: str | None, order: Order) -> Situation:
+def look_around(recording: Recording, robot: str | None, action: str) -> Situation:
+    """Who could be asked for an action of the bridge that steers the simulation.
+
+    Raises:
+        InvalidInputError: There is no such robot, or several are possible.
+        CommandRefusedError: Another robot's bridge holds the simulation.
+    """
     try:
         with recording.reader() as connection:
             try:
-                view = find_target(connection, robot, order)
+                view = find_target(connection, robot, action)
             except CommandRefusedError as error:
                 view = look(connection, robot)
                 _require_not_held_elsewhere(view, error)
@@ -347,7 +353,7 @@ _SIGNS: Final[dict[Order, Callable[[Moment, View], str | None]]] = {
 }
 
 
-def _only_webots() -> Address:
+def only_webots() -> Address:
     """The Webots that runs here, where no session names it."""
     return _only(instances()).address
 

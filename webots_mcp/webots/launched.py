@@ -85,8 +85,9 @@ class LaunchedWebots(KeptProgram):
             reader.join(_LAST_WORDS_S)
 
     def _read(self, name: str, pipe: IO[bytes]) -> None:
-        for data in pipe:
-            line = ConsoleLine(name, data.decode("utf-8", "replace").rstrip("\r\n"))
-            self._lines.append(line)
-            with suppress(OSError, ValueError):  # nobody looks any more: Webots goes on
-                self._show(line)
+        with pipe:
+            for data in pipe:
+                line = ConsoleLine(name, data.decode("utf-8", "replace").rstrip("\r\n"))
+                self._lines.append(line)
+                with suppress(OSError, ValueError):  # nobody looks any more: Webots goes on
+                    self._show(line)

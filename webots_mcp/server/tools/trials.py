@@ -93,7 +93,7 @@ async def webots_run_trials(
     given = parameters is not None or score is not None
     if (trial_set is None) != given:
         raise InvalidInputError("give parameters and score for a new set, or trial_set, not both")
-    workers: TrialWorkers = ctx.request_context.lifespan_context
+    workers: TrialWorkers = ctx.request_context.lifespan_context.trials
     if trial_set is None:
         if parameters is None or score is None:
             raise InvalidInputError("give both: parameters to try, and a score to rank them by")

@@ -1,0 +1,184 @@
+"""Starting Webots, opening another world in it, and ending it, by tools."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import anyio
+import psutil
+import pytest
+from mcp import Client
+
+from tests.server.conftest import ask, fail
+from tests.webots.conftest import (
+    CONTROLLER,
+    StartWebots,
+    free_port,
+    start_webots,
+    wait_for_line,
+    webots,
+    write_project,
+)
+from webots_mcp.server import create_server
+
+__all__ = ["start_webots", "webots"]
+pytestmark = pytest.mark.anyio
+
+PLAIN = CONTROLLER.replace("Supervisor", "Robot")
+Begin = Callable[..., Client]
+
+
+@pytest.fixture
+def project(tmp_path: Path) -> Path:
+    return tmp_path / "project"
+
+
+@pytest.fixture
+def begin(project: Path, webots: Path, monkeypatch: pytest.MonkeyPatch) -> Begin:
+    """A client of a server for a project of two worlds, whose robot has this controller."""
+    monkeypatch.setenv("DISPLAY", ":99")
+
+    def client(controller: str = CONTROLLER) -> Client:
+        world = write_project(project, controller)
+        shutil.copy(world, world.with_name("field.wbt"))
+        data = project / "mcp_data"
+        return Client(create_server(data / "webots.db", data))
+
+    return client
+
+
+async def _ends(family: list[psutil.Process]) -> None:
+    with anyio.fail_after(30):
+        while any(each.is_running() and each.status() != psutil.STATUS_ZOMBIE for each in family):
+            await anyio.sleep(0.05)
+
+
+def _family(answer: dict[str, Any]) -> list[psutil.Process]:
+    process = psutil.Process(answer["result"]["pid"])
+    return [process, *process.children(recursive=True)]
+
+
+async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path) -> None:
+    async with begin() as client:
+        answer = await ask(client, "webots_launch_world", world="worlds/arena.wbt", mode="fast")
+        assert (answer["outcome"], answer["route"]) == ("done", "process")
+        assert answer["proof"] == f"rover records: run {answer['run_id']}"
+        assert answer["result"]["world"] == str(project / "worlds" / "arena.wbt")
+        family = _family(answer)
+        text = await fail(client, "webots_launch_world", world="field.wbt")
+        assert "still runs arena.wbt: webots_load_world opens another world in it" in text
+
+        loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_s=60)
+        assert (loaded["outcome"], loaded["route"]) == ("done", "bridge")
+        assert loaded["run_id"] > answer["run_id"]
+        assert loaded["proof"] == (
+            f"its controller has ended; run {loaded['run_id']} of rover began in field.wbt"
+        )
+        world = await ask(client, "webots_get_world_info")
+        assert world["world"].endswith("field.wbt")
+
+        ended = await ask(client, "webots_quit")
+        assert (ended["outcome"], ended["route"]) == ("done", "process")
+        assert ended["proof"] == "its processes have ended, exit code 0"
+        await _ends(family)
+        assert "rover" in await fail(client, "webots_quit")
+
+
+async def test_webots_ends_with_the_server_that_started_it(begin: Begin) -> None:
+    async with begin() as client:
+        family = _family(await ask(client, "webots_launch_world", world="arena.wbt", headless=True))
+    await _ends(family)
+
+
+async def test_where_nobody_records_the_answer_comes_in_time_and_says_why(begin: Begin) -> None:
+    async with begin("from controller import Robot\nRobot().step(16)\n") as client:
+        answer = await ask(client, "webots_launch_world", world="arena.wbt", timeout_s=4)
+        assert answer["outcome"] == "claimed"
+        assert "without a bridge: rover (attach one: webots-mcp init --patch" in answer["hint"]
+        assert "run_id" not in answer
+        ended = await ask(client, "webots_quit")
+        assert ended["route"] == "process"
+
+
+async def test_webots_that_ends_at_its_start_is_an_error_with_what_it_said(
+    begin: Begin, project: Path
+) -> None:
+    async with begin() as client:
+        (project / "worlds" / "arena.wbt").write_text("no world", "utf-8")
+        text = await fail(client, "webots_launch_world", world="arena.wbt")
+        assert "Webots ended with exit code 1; its console said: " in text
+        assert (await ask(client, "webots_launch_world", world="field.wbt"))["outcome"] == "done"
+
+
+@pytest.mark.parametrize(
+    ("world", "said"),
+    [
+        ("../outside.wbt", "lies outside of the project"),
+        ("arna.wbt", "/worlds there is arena.wbt, field.wbt"),
+        ("controllers/rover/rover.py", "its name does not end with .wbt"),
+    ],
+)
+@pytest.mark.parametrize("tool", ["webots_launch_world", "webots_load_world"])
+async def test_only_worlds_of_the_project_are_opened(
+    begin: Begin, tmp_path: Path, tool: str, world: str, said: str
+) -> None:
+    async with begin() as client:
+        shutil.copy(tmp_path / "project" / "worlds" / "arena.wbt", tmp_path / "outside.wbt")
+        assert said in await fail(client, tool, world=world)
+
+
+async def test_without_webots_the_places_that_were_looked_at_are_named(
+    begin: Begin, webots: Path
+) -> None:
+    webots.unlink()
+    async with begin() as client:
+        text = await fail(client, "webots_launch_world", world="arena.wbt")
+    assert "there is no program 'webots' in WEBOTS_HOME (not set), on the PATH or in" in text
+
+
+async def test_a_robot_that_is_no_supervisor_has_another_world_by_webots_itself(
+    begin: Begin,
+) -> None:
+    async with begin(PLAIN) as client:
+        first = await ask(client, "webots_launch_world", world="arena.wbt", stream=True)
+        loaded = await ask(client, "webots_load_world", world="field.wbt", timeout_s=60)
+        assert loaded["route"] == "websocket"
+        assert loaded["proof"].startswith("Webots said 'delete world'; run ")
+        assert loaded["proof"].endswith(" of rover began in field.wbt")
+        assert loaded["run_id"] > first["run_id"]
+
+
+async def test_without_stream_it_is_said_how_to_have_another_world(begin: Begin) -> None:
+    async with begin(PLAIN) as client:
+        await ask(client, "webots_launch_world", world="arena.wbt")
+        text = await fail(client, "webots_load_world", world="field.wbt")
+    assert "bridge: load_world needs a Supervisor" in text
+    assert "was started without --stream" in text
+    assert "Open it in Webots (File, Open World); or end Webots and start it with that" in text
+
+
+@pytest.mark.parametrize("controller", [CONTROLLER, PLAIN])
+async def test_a_webots_that_somebody_else_started_is_ended_by_a_supervisor_alone(
+    begin: Begin, start_webots: StartWebots, project: Path, controller: str
+) -> None:
+    async with begin(controller) as client:
+        port = free_port()
+        world = project / "worlds" / "arena.wbt"
+        process = start_webots("--stdout", "--mode=fast", f"--port={port}", world)
+        wait_for_line(process, "ready")
+        with anyio.fail_after(60):
+            while (await ask(client, "webots_get_robot_state"))["status"] != "running":
+                await anyio.sleep(0.05)
+        if controller == PLAIN:
+            text = await fail(client, "webots_quit")
+            assert "was not started by this server" in text
+            assert "bridge: quit needs a Supervisor" in text and "(Ctrl+Q)" in text
+            assert process.poll() is None
+            return
+        answer = await ask(client, "webots_quit", timeout_s=60)
+        assert (answer["outcome"], answer["route"]) == ("done", "bridge")
+        assert answer["proof"] == f"no Webots listens at port {port} any more"
+    assert process.wait(30) == 0

@@ -1,0 +1,217 @@
+"""Opening another world in a Webots that runs, and ending it: by its controller, or by itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import anyio
+from anyio import to_thread
+
+from webots_mcp.errors import CommandRefusedError
+from webots_mcp.launching import begun_since, newest_in
+from webots_mcp.server.dispatch import Dispatcher
+from webots_mcp.server.launcher import Launcher
+from webots_mcp.server.results import CommandAnswer
+from webots_mcp.server.routes import (
+    CLAIMING_S,
+    UNCLAIMED,
+    Situation,
+    look_around,
+    only_webots,
+)
+from webots_mcp.store.beginnings import Beginning
+from webots_mcp.store.recording import Recording
+from webots_mcp.webots.instances import instance_at
+from webots_mcp.webots.stream import ANSWER_S, Address, address_of, load_world, no_obedience
+
+_POLL_S: Final = 0.1
+_GONE_S: Final = 5.0  # from the end of its controllers to that of Webots
+_NOBODY_YET: Final = (
+    "no controller has recorded in it yet: its robots may have no bridge, or the simulation is "
+    "paused; webots_get_logs and webots_diagnose tell more"
+)
+
+
+@dataclass
+class WorldRequest:
+    """A request about the world as a whole, in the Webots that a recording knows.
+
+    Attributes:
+        tried: Why each way did not work, by its name.
+    """
+
+    recording: Recording
+    dispatcher: Dispatcher
+    launcher: Launcher
+    robot: str | None
+    timeout_s: float
+    tried: dict[str, str] = field(default_factory=dict[str, str])
+    started_s: float = field(default_factory=time.monotonic)
+
+    async def load(self, world: Path) -> CommandAnswer:
+        """Open another world.
+
+        Raises:
+            InvalidInputError: There is no such robot, or several are possible.
+            CommandRefusedError: No way works; each is named with the reason.
+        """
+        situation = await self._look_around("load_world")
+        before = await to_thread.run_sync(newest_in, self.recording)
+        answer = await self._by_bridge(situation, "load_world", {"world": str(world)})
+        if answer is not None and answer.outcome != "done":
+            return answer
+        said = "its controller has ended"
+        if answer is None:
+            said = await self._by_websocket(situation, world)
+        answer = answer or CommandAnswer(action="load_world", outcome="done", route="websocket")
+        return await self._proven(answer, situation, said, world, before)
+
+    async def quit(self) -> CommandAnswer:
+        """End Webots.
+
+        Raises:
+            InvalidInputError: There is no such robot, or several are possible.
+            CommandRefusedError: It is not ours, and no controller can be asked.
+        """
+        ours = self.launcher.running
+        if ours is not None and self.robot is None:
+            await to_thread.run_sync(self.launcher.stop)
+            proof = f"its processes have ended, exit code {ours.webots.exit_code}"
+            return self._answer("quit", "process", proof)
+        situation = await self._look_around("quit")
+        answer = await self._by_bridge(situation, "quit", {})
+        if answer is None:
+            raise CommandRefusedError(
+                f"this Webots was not started by this server, and no controller can be asked to "
+                f"end it. {self._told()}. Close its window (Ctrl+Q)"
+            )
+        if answer.outcome == "done":
+            answer.proof = await self._gone(situation.address)
+        return answer
+
+    async def _look_around(self, action: str) -> Situation:
+        return await to_thread.run_sync(look_around, self.recording, self.robot, action)
+
+    async def _by_bridge(
+        self, situation: Situation, action: str, params: dict[str, Any]
+    ) -> CommandAnswer | None:
+        """What the controller made of it; None where it did not take it."""
+        if situation.silent is not None:
+            self.tried["bridge"] = situation.silent
+            return None
+        wait_s = min(self._left_s, CLAIMING_S)
+        answer = await self.dispatcher.ask(self.robot, action, wait_s, params)
+        if answer.outcome in UNCLAIMED:
+            self.tried["bridge"] = answer.hint or answer.error or "it did not take the command"
+            return None
+        if answer.outcome == "claimed" and answer.command_id is not None:
+            answer = await self.dispatcher.wait(answer.command_id, self._left_s)
+        answer.waited_s = self._waited_s
+        answer.route = "bridge" if answer.outcome == "done" else None
+        return answer
+
+    async def _by_websocket(self, situation: Situation, world: Path) -> str:
+        """Webots' own word.
+
+        Raises:
+            CommandRefusedError: It cannot be asked so, or does not obey.
+        """
+        try:
+            await to_thread.run_sync(self._require_beside, situation, world)
+            address = situation.address or await to_thread.run_sync(self._address)
+            reply = await to_thread.run_sync(load_world, address, world.name, ANSWER_S)
+            if reply.heard is None:
+                raise CommandRefusedError(no_obedience(address, reply))
+        except CommandRefusedError as error:
+            self.tried["websocket"] = str(error)
+            raise CommandRefusedError(
+                f"no way to open {world.name} works. {self._told()}. Open it in Webots (File, Open "
+                "World); or end Webots and start it with that world (webots_quit and "
+                "webots_launch_world, with stream=true for the next time)"
+            ) from error
+        return f"Webots said {reply.heard!r}"
+
+    def _require_beside(self, situation: Situation, world: Path) -> None:
+        """Webots looks for it in the folder of the present world, and there alone."""
+        present = self._present_world(situation)
+        if present is not None and present.parent != world.parent:
+            raise CommandRefusedError(
+                f"Webots opens only worlds of the folder of the present one, {present.parent}"
+            )
+
+    def _present_world(self, situation: Situation) -> Path | None:
+        if situation.robot is not None:
+            with self.recording.view(situation.robot) as view:
+                known = view.run.world if view.run else None
+            return Path(known).resolve() if known else None
+        return self.launcher.running.world if self.launcher.running else None
+
+    def _address(self) -> Address:
+        """Of the Webots that this server has started, else of the only one that runs."""
+        ours = self.launcher.running
+        return (ours.webots.address if ours else None) or only_webots()
+
+    async def _proven(
+        self, answer: CommandAnswer, situation: Situation, said: str, world: Path, before: int
+    ) -> CommandAnswer:
+        """The answer with the run that began in the world, or what else there is to say."""
+        begun = await self._wait(lambda: self._begun_in(situation, world, before))
+        if begun is None:
+            answer.proof, answer.hint = said, _NOBODY_YET
+        else:
+            answer = answer.model_copy(update=await to_thread.run_sync(self._header, begun.robot))
+            answer.proof = f"{said}; run {begun.run_id} of {begun.robot} began in {world.name}"
+        if self.launcher.running is not None:
+            self.launcher.running.world = world
+        answer.waited_s = self._waited_s
+        return answer
+
+    def _begun_in(self, situation: Situation, world: Path, before: int) -> Beginning | None:
+        for each in begun_since(self.recording, before):
+            here = situation.address in (None, address_of(each.instance))
+            if here and each.run_id and each.world and Path(each.world).resolve() == world:
+                return each
+        return None
+
+    async def _wait(self, look: Callable[[], Beginning | None]) -> Beginning | None:
+        while True:
+            found = await to_thread.run_sync(look)
+            if found is not None or self._left_s <= _POLL_S:
+                return found
+            await anyio.sleep(_POLL_S)
+
+    async def _gone(self, address: Address | None) -> str:
+        """What shows that Webots has ended."""
+        if address is None:
+            return "its controller has ended"
+        until_s = time.monotonic() + _GONE_S
+        while await to_thread.run_sync(instance_at, address.port) is not None:
+            if time.monotonic() > until_s:
+                return f"its controller has ended; Webots still listens at port {address.port}"
+            await anyio.sleep(_POLL_S)
+        return f"no Webots listens at port {address.port} any more"
+
+    def _header(self, robot: str) -> dict[str, Any]:
+        with self.recording.view(robot) as view:
+            return view.header()
+
+    def _answer(self, action: str, route: str, proof: str) -> CommandAnswer:
+        waited_s = self._waited_s
+        return CommandAnswer(
+            action=action, outcome="done", waited_s=waited_s, route=route, proof=proof
+        )
+
+    def _told(self) -> str:
+        return "; ".join(f"{route}: {why}" for route, why in self.tried.items())
+
+    @property
+    def _waited_s(self) -> float:
+        return round(time.monotonic() - self.started_s, 3)
+
+    @property
+    def _left_s(self) -> float:
+        return max(self.timeout_s - (time.monotonic() - self.started_s), _POLL_S)

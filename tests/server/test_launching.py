@@ -23,6 +23,8 @@ from tests.webots.conftest import (
     write_project,
 )
 from webots_mcp.server import create_server
+from webots_mcp.setup.files import apply
+from webots_mcp.setup.observing import controller_change, with_observer
 
 __all__ = ["start_webots", "webots"]
 pytestmark = pytest.mark.anyio
@@ -158,6 +160,24 @@ async def test_without_stream_it_is_said_how_to_have_another_world(begin: Begin)
     assert "bridge: load_world needs a Supervisor" in text
     assert "was started without --stream" in text
     assert "Open it in Webots (File, Open World); or end Webots and start it with that" in text
+
+
+async def test_an_observer_opens_another_world_for_a_robot_that_is_no_supervisor(
+    begin: Begin, project: Path
+) -> None:
+    async with begin(PLAIN) as client:
+        for world in (project / "worlds").iterdir():
+            world.write_bytes(with_observer(world.read_bytes()))
+        apply(controller_change(project))
+        await ask(client, "webots_launch_world", world="arena.wbt")
+        with anyio.fail_after(60):
+            while len((await ask(client, "webots_list_robots"))["robots"]["rows"]) < 2:
+                await anyio.sleep(0.05)
+        loaded = await ask(
+            client, "webots_load_world", world="field.wbt", robot="rover", timeout_s=60
+        )
+        assert (loaded["route"], loaded["outcome"]) == ("observer", "done")
+        assert "its controller has ended; run " in loaded["proof"]
 
 
 @pytest.mark.parametrize("controller", [CONTROLLER, PLAIN])

@@ -149,11 +149,11 @@ class Attempt:
         if observer is None or observer == situation.robot:
             return None
         try:
-            answer = await self._sent(observer, _CLAIMING_S)
+            answer = await self._sent(observer, CLAIMING_S)
         except CommandRefusedError as error:
             self.tried["observer"] = str(error)
             return None
-        if answer.outcome in _UNCLAIMED:
+        if answer.outcome in UNCLAIMED:
             self.tried["observer"] = f"robot {observer!r} did not take the command: {answer.why}"
             return None
         answer.route = "observer" if answer.outcome == "done" else None

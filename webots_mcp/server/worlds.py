@@ -61,7 +61,7 @@ class WorldRequest:
         """
         situation = await self._look_around("load_world")
         before = await to_thread.run_sync(newest_in, self.recording)
-        answer = await self._by_bridge(situation, "load_world", {"world": str(world)})
+        answer = await self._by_controller(situation, "load_world", {"world": str(world)})
         if answer is not None and answer.outcome != "done":
             return answer
         said = "its controller has ended"
@@ -83,7 +83,7 @@ class WorldRequest:
             proof = f"its processes have ended, exit code {ours.webots.exit_code}"
             return self._answer("quit", "process", proof)
         situation = await self._look_around("quit")
-        answer = await self._by_bridge(situation, "quit", {})
+        answer = await self._by_controller(situation, "quit", {})
         if answer is None:
             raise CommandRefusedError(
                 f"this Webots was not started by this server, and no controller can be asked to "
@@ -96,22 +96,32 @@ class WorldRequest:
     async def _look_around(self, action: str) -> Situation:
         return await to_thread.run_sync(look_around, self.recording, self.robot, action)
 
-    async def _by_bridge(
+    async def _by_controller(
         self, situation: Situation, action: str, params: dict[str, Any]
     ) -> CommandAnswer | None:
-        """What the controller made of it; None where it did not take it."""
-        if situation.silent is not None:
+        """What the robot's controller made of it, or the observer; None where neither took it."""
+        if situation.silent is None:
+            answer = await self._sent("bridge", self.robot, action, params)
+            if answer is not None:
+                return answer
+        else:
             self.tried["bridge"] = situation.silent
+        if situation.observer in (None, situation.robot):
             return None
+        return await self._sent("observer", situation.observer, action, params)
+
+    async def _sent(
+        self, route: str, robot: str | None, action: str, params: dict[str, Any]
+    ) -> CommandAnswer | None:
         wait_s = min(self._left_s, CLAIMING_S)
-        answer = await self.dispatcher.ask(self.robot, action, wait_s, params)
+        answer = await self.dispatcher.ask(robot, action, wait_s, params)
         if answer.outcome in UNCLAIMED:
-            self.tried["bridge"] = answer.hint or answer.error or "it did not take the command"
+            self.tried[route] = answer.hint or answer.error or "it did not take the command"
             return None
         if answer.outcome == "claimed" and answer.command_id is not None:
             answer = await self.dispatcher.wait(answer.command_id, self._left_s)
         answer.waited_s = self._waited_s
-        answer.route = "bridge" if answer.outcome == "done" else None
+        answer.route = route if answer.outcome == "done" else None
         return answer
 
     async def _by_websocket(self, situation: Situation, world: Path) -> str:

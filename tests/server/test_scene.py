@@ -8,12 +8,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import anyio
 import pytest
 
 from tests.bridge.conftest import Recording
+from tests.observer.conftest import OBSERVER
 from tests.recordings.rows import Recorded
 from tests.server.conftest import STEP_MS, Connect, Driver, ask, fail
 from webots_mcp import MCPBridge
+from webots_mcp.observer.observe import observe
 from webots_mcp.standin import InProcessRobot, InProcessSimulation, InProcessSupervisor
 
 pytestmark = pytest.mark.anyio
@@ -188,3 +191,35 @@ async def test_where_nothing_was_recorded_it_says_how_to_record(connect: Connect
     async with connect() as client:
         answer = await ask(client, "webots_get_scene")
         assert answer["status"] == "never seen"
+
+
+async def test_an_observer_sees_and_changes_a_world_whose_robots_know_nothing_of_it(
+    connect: Connect, file: Path
+) -> None:
+    """Also while a person has paused it: the observer's loop turns all the same."""
+    world = file.parent / "crowd.wbt"
+    world.write_text(WORLD.read_text("utf-8") + OBSERVER, "utf-8")
+    simulation = InProcessSimulation(world)
+    simulation.resume()
+    robot = InProcessSupervisor("mcp_observer", world=simulation)
+    observing = threading.Thread(target=observe, args=(robot, 100), kwargs={"database": file})
+    rover = InProcessRobot("rover", world=simulation)
+    observing.start()
+    try:
+        async with connect() as client:
+            with anyio.fail_after(30):
+                while "robot" not in await ask(client, "webots_list_robots"):
+                    rover.step(STEP_MS)
+                    await anyio.sleep(0.01)
+            simulation.pause()
+            robots = await ask(client, "webots_get_scene", types=["Robot"])
+            assert {"rover", "rider"} < {row[3] for row in robots["result"]["rows"]}
+            path, value = "rover.translation", [3.0, 0.0, 0.0]
+            answer = await ask(client, "webots_set_field", path=path, value=value)
+            assert (answer["robot"], answer["result"]["to"]) == ("mcp_observer", value)
+            told = await ask(client, "webots_get_field", path=path)
+            assert told["result"]["value"] == value
+    finally:
+        simulation.quit()
+        await anyio.to_thread.run_sync(observing.join, 10)
+    assert not observing.is_alive()

@@ -31,6 +31,9 @@ _FIELDS: Final[dict[str, tuple[str, ...]]] = {
     "Slot": ("endPoint",),
     "Track": ("device", *_CHILDREN),
 }
+WALKED: Final = frozenset(_FIELDS)
+"""Base types of the nodes that a walk gives without being told to give everything."""
+_GROUPS: Final = ("Group", "Pose", "Transform")  # which hold nodes as children only
 _NO_SOLIDS: Final = ("Group", "Pose", "Transform", "Billboard", "Fluid")
 SOLIDS: Final = frozenset(
     name for name, fields in _FIELDS.items() if "children" in fields and name not in _NO_SOLIDS
@@ -155,7 +158,7 @@ def _nodes_in(
 def node_fields(node: Any, *, inside: bool = True, everything: bool = False) -> Iterator[NodeField]:
     """The fields of a node in which nodes can stand; of a PROTO node those inside it come last."""
     base_type: str = node.getBaseTypeName()
-    if node.isProto() or everything:
+    if node.isProto() or (everything and base_type not in _GROUPS):
         yield from _all_node_fields(node)
     elif base_type in _FIELDS:
         for name in _FIELDS[base_type]:
@@ -176,7 +179,7 @@ def _all_node_fields(node: Any) -> Iterator[NodeField]:
 
 def holds_solids(node: Any) -> bool:
     """Whether a walk gives it without being told to give everything."""
-    return node.getBaseTypeName() in _FIELDS
+    return node.getBaseTypeName() in WALKED
 
 
 def find_inner_field(node: Any, name: str) -> Any | None:

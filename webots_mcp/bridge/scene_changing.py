@@ -215,7 +215,7 @@ def remove_node(context: Context, command: Command) -> _Progress:
         "type": str(node.getTypeName()),
         "node": label(node),
     }
-    removal = _removal(robot, place, node_id)
+    removal = yield from _removal(robot, place, node_id)
     node.remove()
     if robot.getFromId(node_id) is not None:
         yield from _until_stepped(context)
@@ -256,9 +256,9 @@ def _require_removable(robot: Any, place: Place) -> None:
         each = each.getParentNode()
 
 
-def _removal(robot: Any, place: Place, node_id: int) -> Removal | None:
+def _removal(robot: Any, place: Place, node_id: int) -> Generator[None, None, Removal | None]:
     """How to bring it back; None where its place is not found, or Webots cannot write it out."""
-    found = spot_of(robot, place.node)
+    found = yield from spot_of(robot, place.node)
     export = getattr(place.node, "exportString", None)
     if found is None or export is None:
         return None

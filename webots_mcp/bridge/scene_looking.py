@@ -12,7 +12,7 @@ from typing import Any, Final, cast
 
 from webots_mcp.bridge.commands import Command
 from webots_mcp.bridge.context import Context
-from webots_mcp.bridge.scene import DEEPEST, SceneNode, find_field, holds_solids, walk
+from webots_mcp.bridge.scene import DEEPEST, WALKED, SceneNode, find_field, holds_solids, walk
 from webots_mcp.bridge.scene_path import Pace, Place, children, fields_of, find, find_node, label
 from webots_mcp.bridge.scene_values import read, read_entries
 from webots_mcp.bridge.text import cut
@@ -40,7 +40,8 @@ def get_scene(context: Context, command: Command) -> _Progress:
     place = (yield from find_node(robot, path)) if path else None
     around = robot.getRoot() if place is None else place.node
     inside = bool(place or types or names)  # of PROTO nodes
-    tree = walk(around, deepest=depth, inside=inside, everything=bool(types))
+    everything = not WALKED.issuperset(types)
+    tree = walk(around, deepest=depth, inside=inside, everything=everything)
     rows, pace = _Rows(["depth", "path", "type", "name", *wanted]), Pace()
     shown, looked, definitions = list[tuple[tuple[int, ...], list[Any]]](), 0, set[str]()
     keys: dict[int, tuple[int, ...]] = {}
@@ -57,15 +58,20 @@ def get_scene(context: Context, command: Command) -> _Progress:
     told = rows.told([row for _, row in sorted(shown)]) | {"looked_at": looked}
     if place is not None:
         return told | {"below": place.path}
-    return told if types or names else told | {"also_at_the_top": _others_at_the_top(around)}
+    if types or names:
+        return told
+    return told | {"also_at_the_top": (yield from _others_at_the_top(around, pace))}
 
 
-def _others_at_the_top(root: Any) -> list[str]:
+def _others_at_the_top(root: Any, pace: Pace) -> Generator[None, None, list[str]]:
     """The types of the nodes that are neither solids nor groups of them: WorldInfo, lights."""
-    field = children(root)
-    found = (field.getMFNode(index) for index in range(min(field.getCount(), _MOST_AT_THE_TOP)))
-    others = (str(node.getTypeName()) for node in found if not holds_solids(node))
-    return list(dict.fromkeys(others))
+    field, others = children(root), dict[str, None]()
+    for index in range(min(field.getCount(), _MOST_AT_THE_TOP)):
+        yield from pace.rest()
+        node = field.getMFNode(index)
+        if node is not None and not holds_solids(node):
+            others[str(node.getTypeName())] = None
+    return [*others]
 
 
 class _Rows:

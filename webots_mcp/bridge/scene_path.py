@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -261,10 +261,10 @@ def field_names(node: Any) -> list[str]:
     return [field.getName() for field in fields_of(node)]
 
 
-def fields_of(node: Any) -> list[Any]:
+def fields_of(node: Any) -> Iterator[Any]:
     """The fields of a node; of a PROTO node its own."""
     found = (node.getFieldByIndex(i) for i in range(min(node.getNumberOfFields(), MOST_FIELDS)))
-    return [field for field in found if field is not None]
+    return (field for field in found if field is not None)
 
 
 def _entry_of(place: Place, index: int) -> Place:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from typing import Any, Final
 
 from webots_mcp.bridge.scene import entries
 from webots_mcp.bridge.scene_edits import FieldEdit, Removal
-from webots_mcp.bridge.scene_path import children
+from webots_mcp.bridge.scene_path import Pace, children, fields_of
 from webots_mcp.bridge.scene_values import is_same, read, write
 
 # Where a body is, it was moved on since it was put there, and a reset brings it back by itself.
@@ -123,23 +123,21 @@ def import_node(field: Any, text: str, index: int | None = None) -> Any | None:
     return field.getMFNode(place) if field.getCount() > before else None
 
 
-def spot_of(robot: Any, node: Any) -> _Spot | None:
+def spot_of(robot: Any, node: Any) -> Generator[None, None, _Spot | None]:
     """Where a node stands: the number of its parent (None: the top), the field, and the entry.
 
     Returns:
         None where it is not found.
     """
-    parent, wanted = node.getParentNode(), node.getId()
-    if parent is None or parent.getId() == robot.getRoot().getId():
-        return next(_spots_in(None, children(robot.getRoot()), wanted), None)
-    fields = (parent.getFieldByIndex(index) for index in range(parent.getNumberOfFields()))
-    spots = (_spots_in(int(parent.getId()), field, wanted) for field in fields if field is not None)
-    return next((spot for found in spots for spot in found), None)
-
-
-def _spots_in(parent_id: int | None, field: Any, wanted: int) -> Iterator[_Spot]:
-    if field.getTypeName() in ("SFNode", "MFNode"):
-        name = str(field.getName())
-        for index, node in entries(field):
-            if node.getId() == wanted:
-                yield parent_id, name, index
+    parent, root, wanted, pace = node.getParentNode(), robot.getRoot(), node.getId(), Pace()
+    parent_id, fields = None, iter((children(root),))
+    if parent is not None and parent.getId() != root.getId():
+        parent_id, fields = int(parent.getId()), fields_of(parent)
+    for field in fields:
+        if field.getTypeName() not in ("SFNode", "MFNode"):
+            continue
+        for index, each in entries(field):
+            if each.getId() == wanted:
+                return parent_id, str(field.getName()), index
+            yield from pace.rest()
+    return None

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.errors import InvalidInputError
 
-MOST_ENTRIES: Final = 1000  # of a field that are set at once
+MOST_ENTRIES: Final = 200  # of a field that are set at once: each is a request to Webots
 MOST_CHARACTERS: Final = 10_000  # of one text
 
 _LARGEST_FLOAT: Final = 3.4028234e38  # beyond it Webots refuses a number

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sqlite3
+import sys
 import time
 from collections.abc import Callable
 from contextlib import closing
 from math import pi
 from pathlib import Path
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
 
-from webots_mcp.standin import Simulation
+from webots_mcp.standin import InProcessRobot, Simulation
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -116,3 +119,42 @@ def test_the_mcp_configuration_is_the_documented_command() -> None:
     assert json.loads(text) == {
         "mcpServers": {"webots": {"command": "webots-mcp", "args": ["serve"]}}
     }
+
+
+def test_the_plugin_for_ros_2_records_what_was_asked_and_asks_for_velocities(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    class Twist:
+        def __init__(self) -> None:
+            self.linear, self.angular = SimpleNamespace(x=0.0), SimpleNamespace(z=0.0)
+
+    class Topic:
+        """One topic that delivers at once what is published."""
+
+        def __init__(self, *_: object, **__: object) -> None: ...
+
+        def create_publisher(self, *_: object) -> Topic:
+            return self
+
+        def create_subscription(self, kind: object, topic: str, callback: Any, depth: int) -> None:
+            self.publish = callback
+
+    rclpy = SimpleNamespace(init=Topic, create_node=Topic, spin_once=Topic)
+    monkeypatch.setitem(sys.modules, "rclpy", rclpy)
+    monkeypatch.setitem(sys.modules, "geometry_msgs", ModuleType("geometry_msgs"))
+    monkeypatch.setitem(sys.modules, "geometry_msgs.msg", SimpleNamespace(Twist=Twist))
+    monkeypatch.setenv("WEBOTS_MCP_DATA_DIR", str(tmp_path))
+    plugin = runpy.run_path(str(EXAMPLES / "ros2" / "rover_driver.py"))["RoverDriver"]()
+    robot = InProcessRobot()
+    plugin.init(SimpleNamespace(robot=robot), {})
+    done = Records(tmp_path).send(robot.getName(), "set_velocity", ahead=0.2)
+    while done() is None:
+        assert robot.step(16) != -1
+        plugin.step()
+    for _ in range(10):
+        robot.step(16)
+        plugin.step()
+    plugin.bridge.close()
+
+    assert done() == ("done", {"ahead_mps": 0.2, "turn_radps": 0.0})
+    assert Records(tmp_path).state(robot.getName())["asked"]["ahead_mps"] == 0.2

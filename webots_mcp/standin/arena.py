@@ -314,7 +314,7 @@ def _solids(node: Node, frame: Frame) -> Iterator[Part]:
     frame = frame.then(own_frame(node))
     if node.type_name == "Solid":
         yield from _parts_of(node, frame, _color_of(node))
-    elif node.type_name in ("Group", "Pose", "Transform", "HingeJoint"):
+    elif node.type_name in ("Group", "Pose", "Transform", "HingeJoint", "SliderJoint"):
         for child in children_of(node):
             yield from _solids(child, frame)
 

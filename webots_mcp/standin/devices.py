@@ -36,7 +36,8 @@ class Motor(Device):
             "min_position": fields["minPosition"],
             "max_position": fields["maxPosition"],
             "max_velocity": fields["maxVelocity"],
-            "max_torque": fields["maxTorque"],
+            "is_linear": self.node.type_name == "LinearMotor",
+            "max_torque": fields.get("maxTorque", 0.0),
             "acceleration": fields["acceleration"],
             "multiplier": fields["multiplier"],
             "position_sensor": names[0] if names else None,
@@ -56,7 +57,7 @@ class Motor(Device):
 
 
 class PositionSensor(Device):
-    """Says how far a joint has turned, in radians."""
+    """Says how far a joint has turned or slid, in radians or metres."""
 
     kind = "PositionSensor"
 
@@ -240,6 +241,7 @@ class Led(Device):
 
 _BY_NODE_TYPE: Final[dict[str, Callable[[int, Node, Site], Device]]] = {
     "RotationalMotor": Motor,
+    "LinearMotor": Motor,
     "PositionSensor": PositionSensor,
     "DistanceSensor": DistanceSensor,
     "GPS": Gps,

@@ -74,6 +74,13 @@ Sphere { SFFloat radius 0.1  SFInt32 subdivision 1  SFBool ico TRUE }
 Physics { SFFloat density 1000  SFFloat mass -1  MFVec3f centerOfMass [] }
 HingeJoint { SFNode jointParameters NULL  MFNode device []  SFNode endPoint NULL }
 HingeJointParameters { SFFloat position 0  SFVec3f axis 1 0 0  SFVec3f anchor 0 0 0 }
+SliderJoint { SFNode jointParameters NULL  MFNode device []  SFNode endPoint NULL }
+JointParameters { SFFloat position 0  SFVec3f axis 0 0 1 }
+LinearMotor {
+  SFString name "linear motor"  SFFloat acceleration -1  SFVec3f controlPID 10 0 0
+  SFFloat minPosition 0  SFFloat maxPosition 0  SFFloat maxVelocity 10  SFFloat maxForce 10
+  SFFloat multiplier 1
+}
 RotationalMotor {
   SFString name "rotational motor"  SFFloat acceleration -1  SFVec3f controlPID 10 0 0
   SFFloat minPosition 0  SFFloat maxPosition 0  SFFloat maxVelocity 10  SFFloat maxTorque 10
@@ -189,13 +196,21 @@ NODE_TYPES: Final = definitions_in(_DEFINITIONS)
 """Fields by node type."""
 
 DEVICE_TYPES: Final = (
-    *("RotationalMotor", "PositionSensor", "DistanceSensor", "Camera", "GPS", "InertialUnit"),
+    *(
+        "RotationalMotor",
+        "LinearMotor",
+        "PositionSensor",
+        "DistanceSensor",
+        "Camera",
+        "GPS",
+        "InertialUnit",
+    ),
     *("Lidar", "Accelerometer", "Compass", "Gyro", "LED", "LightSensor", "TouchSensor"),
 )
 
 DEFAULT_NAME_OF: Final = {
     **{"Altimeter": "altimeter", "Brake": "brake", "Connector": "connector"},
-    **{"Display": "display", "Emitter": "emitter", "LinearMotor": "linear motor", "Pen": "pen"},
+    **{"Display": "display", "Emitter": "emitter", "Pen": "pen"},
     **{"Radar": "radar", "RangeFinder": "range-finder", "Receiver": "receiver", "Skin": "skin"},
     **{"Speaker": "speaker", "VacuumGripper": "vacuum gripper"},
 }

@@ -9,10 +9,13 @@ from typing import Any
 from webots_mcp.standin.arena import Arena, Body
 from webots_mcp.standin.vrml import Node, descendants_of
 
+_MOTORS = ("RotationalMotor", "LinearMotor")
+_JOINTS = ("HingeJoint", "SliderJoint")
+
 
 @dataclass
 class Joint:
-    """A hinge, its motor and how far it has turned."""
+    """A hinge, its motor and how far it has turned; of a slider, metres in the place of radians."""
 
     node: Node
     max_velocity_radps: float
@@ -28,8 +31,8 @@ class Joint:
 
     @staticmethod
     def of(node: Node) -> Joint:
-        """The joint that a HingeJoint node describes; without a motor it stands still."""
-        motors = [n for n in node.fields["device"] if n.type_name == "RotationalMotor"]
+        """The joint that a node describes; without a motor it stands still."""
+        motors = [n for n in node.fields["device"] if n.type_name in _MOTORS]
         fields: dict[str, Any] = motors[0].fields if motors else {}
         parameters = node.fields["jointParameters"]
         joint = Joint(
@@ -164,13 +167,15 @@ class Vehicle:
 
 
 def joints_in(robot: Node) -> list[Joint]:
-    """All hinges of a robot, in the order of the scene tree."""
-    return [Joint.of(node) for node in descendants_of(robot) if node.type_name == "HingeJoint"]
+    """All joints of a robot, in the order of the scene tree."""
+    return [Joint.of(node) for node in descendants_of(robot) if node.type_name in _JOINTS]
 
 
 def _wheel_of(joint: Joint) -> Wheel | None:
     parameters, end = joint.node.fields["jointParameters"], joint.node.fields["endPoint"]
     if parameters is None or end is None or joint.max_velocity_radps == 0.0:
+        return None
+    if joint.node.type_name != "HingeJoint":
         return None
     axis, anchor = parameters.fields["axis"], parameters.fields["anchor"]
     middle = end.fields.get("translation", anchor)  # of the wheel, along the axis

@@ -14,9 +14,11 @@ from webots_mcp.standin.e_puck import E_PUCK, e_puck
 from webots_mcp.standin.nodes import NODE_TYPES, FieldDefinition, definitions_in
 from webots_mcp.standin.typed_fields import give_types
 from webots_mcp.standin.vrml import Node, Parser, descendants_of
+from webots_mcp.standin.youbot import YOUBOT, youbot
 
 _DEFINITIONS: Final = definitions_in(
     E_PUCK
+    + YOUBOT
     + """
 CircleArena {
   SFVec3f translation 0 0 0  SFRotation rotation 0 0 1 0  SFString name "circle arena"
@@ -119,6 +121,7 @@ PROTOS: Final[dict[str, Callable[[Mapping[str, Any]], str]]] = {
     "Wall": lambda fields: _box(fields, "0.8 0.8 0.75", middle_z_m=fields["size"][2] / 2.0),
     "WoodenBox": lambda fields: _box(fields, "0.6 0.45 0.3"),
     "E-puck": e_puck,
+    "Youbot": youbot,
     "CardboardBox": lambda fields: _box(fields, "0.7 0.55 0.4"),
 }
 """What a PROTO node is made of, written as in a world file, by its name and from its fields."""

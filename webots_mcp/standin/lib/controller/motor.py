@@ -154,12 +154,12 @@ class Motor(Device):
         return self.getMultiplier()
 
     def getType(self) -> int:
-        """`Motor.ROTATIONAL`."""
-        return self.ROTATIONAL
+        """`Motor.ROTATIONAL` or `Motor.LINEAR`."""
+        return self.LINEAR if self._description["is_linear"] else self.ROTATIONAL
 
     @property
     def type(self) -> int:
-        """`Motor.ROTATIONAL`."""
+        """`Motor.ROTATIONAL` or `Motor.LINEAR`."""
         return self.getType()
 
     def getBrake(self) -> None:

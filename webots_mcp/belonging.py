@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.contract import project_of
+from webots_mcp.contract import find_project, full_path
 from webots_mcp.errors import NoDatabaseError
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.robots import list_robots
@@ -46,7 +46,7 @@ def belongs(instance: Instance, recording: Recording) -> bool:
 
 
 def _is_in_project(world: Path, recording: Recording) -> bool:
-    project = project_of(recording.data_dir)
+    project = find_project(full_path(recording.data_dir))
     return project is not None and world.resolve().is_relative_to(project)
 
 

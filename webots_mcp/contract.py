@@ -247,16 +247,6 @@ def find_project(folder: Path) -> Path | None:
     return None
 
 
-def project_of(data_dir: Path) -> Path | None:
-    """The Webots project in which a data folder lies, where it lies as `choose_data_dir` puts it.
-
-    Raises:
-        OSError: The path cannot be followed.
-    """
-    folder = full_path(data_dir)
-    return folder.parent if folder.name == PROJECT_DATA_FOLDER else None
-
-
 def resolve_database(
     database: str | os.PathLike[str] | MemoryDatabase | None = None,
     data_dir: str | os.PathLike[str] | None = None,

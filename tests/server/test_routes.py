@@ -14,7 +14,7 @@ import pytest
 from mcp import Client
 
 from tests.recordings.rows import Recorded
-from tests.server.conftest import Connect, ask, fail
+from tests.server.conftest import Connect, Driver, ask, fail
 from tests.webots.conftest import (
     CONTROLLER,
     StartWebots,
@@ -128,15 +128,55 @@ async def test_without_stream_each_way_says_why_it_does_not_work(in_project: Any
 
 
 async def test_a_webots_without_any_controller_of_ours_is_found_and_steered(
-    tmp_path: Path, start_webots: StartWebots, connect: Connect, webots: Path
+    in_project: Any,
 ) -> None:
-    world = write_project(tmp_path / "project", "print('ready', flush=True)")
-    process = start_webots("--stdout", "--stream", f"--port={free_port()}", world)
-    wait_for_line(process, "ready")
-    async with connect() as client:
+    _, client = in_project("print('ready', flush=True)", "--stream")
+    async with client:
         answer = await control(client, "pause")
     assert (answer["route"], answer["outcome"]) == ("websocket", "done")
     assert "run_id" not in answer
+
+
+async def test_a_webots_of_another_project_is_steered_only_if_its_port_is_named(
+    tmp_path: Path, start_webots: StartWebots, connect: Connect
+) -> None:
+    world = write_project(tmp_path / "another", "print('ready', flush=True)")
+    port = free_port()
+    process = start_webots("--stdout", "--stream", f"--port={port}", world)
+    wait_for_line(process, "ready")
+    async with connect() as client:
+        text = await fail(client, "webots_simulation_control", command="pause", force=True)
+        for way in ("websocket", "keyboard"):
+            assert f"{way}: the Webots that runs here is not of this recording's project" in text
+        assert f"{world} at port {port}" in text
+        answer = await control(client, "pause", port=port)
+    assert (answer["route"], answer["outcome"]) == ("websocket", "done")
+
+
+async def test_a_webots_that_took_the_port_of_a_session_that_is_over_is_not_taken_for_it(
+    tmp_path: Path, start_webots: StartWebots, connect: Connect, recorded: Recorded
+) -> None:
+    world = write_project(tmp_path / "another", "print('ready', flush=True)")
+    port = free_port()
+    wait_for_line(start_webots("--stdout", "--stream", f"--port={port}", world), "ready")
+    robot = recorded.robot(instance=f"{host_name()}:{port}")
+    robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
+    async with connect() as client:
+        text = await fail(client, "webots_simulation_control", command="pause", timeout_s=5)
+    assert "is not of this recording's project" in text
+
+
+async def test_a_port_that_is_not_that_of_the_robot_is_not_steered_by_its_controller(
+    tmp_path: Path, start_webots: StartWebots, connect: Connect, driver: Driver
+) -> None:
+    world = write_project(tmp_path / "another", "print('ready', flush=True)")
+    port = free_port()
+    wait_for_line(start_webots("--stdout", "--stream", f"--port={port}", world), "ready")
+    async with connect() as client:
+        answer = await control(client, "pause", port=port)
+        state = await ask(client, "webots_get_world_info")
+    assert (answer["route"], state["status"]) == ("websocket", "running")
+    assert driver.is_alive()
 
 
 async def test_a_reset_that_webots_says_nothing_of_is_proven_by_the_run_that_begins(

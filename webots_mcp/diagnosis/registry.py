@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from webots_mcp.connection import is_damage, text_of
-from webots_mcp.contract import project_of
+from webots_mcp.contract import PROJECT_DATA_FOLDER, full_path
 from webots_mcp.diagnosis import (
     clients,
     machine,
@@ -78,5 +78,6 @@ def subject_of(recording: Recording, chosen_by: str) -> Subject:
 
 
 def _project(recording: Recording) -> Path:
-    """Where a project's recording lies, else the current folder."""
-    return project_of(recording.data_dir) or Path.cwd()
+    """The folder above `mcp_data/`, where a project's recording lies, else the current one."""
+    folder = full_path(recording.data_dir)
+    return folder.parent if folder.name == PROJECT_DATA_FOLDER else Path.cwd()

@@ -14,6 +14,7 @@ from typing import Any, Final, NamedTuple
 import anyio
 from anyio import to_thread
 
+from webots_mcp.belonging import belongs
 from webots_mcp.contract import HEARTBEAT_LATE_S
 from webots_mcp.errors import CommandRefusedError, NoDatabaseError, NothingRecordedError
 from webots_mcp.server.dispatch import Dispatcher
@@ -64,9 +65,11 @@ class Situation:
         robot: The robot as it is recorded; None where none was.
         can_command: Whether its controller can be sent a command, if only to wait for it.
         silent: Why a command would wait now; None where the controller's loop turns.
-        address: Where its session says that Webots listens.
+        address: Where its session says that Webots listens, or the caller.
         before: Where its recording was.
         observer: The name of the observer of its simulation, if one lives.
+        is_there: Whether the address is that of the Webots that is meant: who called has named it,
+            or a controller lives there. Another one may listen where one was.
     """
 
     robot: str | None
@@ -75,6 +78,7 @@ class Situation:
     address: Address | None
     before: Moment
     observer: str | None = None
+    is_there: bool = False
 
 
 @dataclass
@@ -82,6 +86,7 @@ class Attempt:
     """One request to steer, through all ways.
 
     Attributes:
+        port: Of the Webots that is meant; None for that of the robot.
         tried: Why each way did not work, by its name.
     """
 
@@ -92,6 +97,7 @@ class Attempt:
     params: Mapping[str, Any]
     timeout_s: float
     force: bool = False
+    port: int | None = None
     tried: dict[str, str] = field(default_factory=dict[str, str])
     started_s: float = field(default_factory=time.monotonic)
 
@@ -120,7 +126,12 @@ class Attempt:
         return await self._by_bridge()
 
     async def _look_around(self) -> Situation:
-        return await to_thread.run_sync(look_around, self.recording, self.robot, self.order)
+        found = await to_thread.run_sync(look_around, self.recording, self.robot, self.order)
+        named = None if self.port is None else Address("127.0.0.1", self.port)
+        if named is None or (found.is_there and found.address == named):
+            return found
+        why = f"no controller that lives records from the Webots at port {self.port}"
+        return Situation(None, False, why, named, Moment(None, None), is_there=True)
 
     async def _by_bridge(self, claiming_s: float = math.inf) -> CommandAnswer:
         """Send a command to the controller, and wait for it as long as there is time.
@@ -167,7 +178,7 @@ class Attempt:
 
     async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:
         try:
-            address = situation.address or await to_thread.run_sync(only_webots)
+            address = await to_thread.run_sync(webots_meant, self.recording, situation)
             reply, made = await self._give(address)
         except CommandRefusedError as error:
             self.tried["websocket"] = str(error)
@@ -217,7 +228,7 @@ class Attempt:
             self.tried["keyboard"] = _NO_FORCE
             return None
         try:
-            pid = await to_thread.run_sync(_window_owner, situation.address)
+            pid = await to_thread.run_sync(_window_owner, self.recording, situation)
             await to_thread.run_sync(keyboard.press, self.order, pid)
         except CommandRefusedError as error:
             self.tried["keyboard"] = str(error)
@@ -305,7 +316,8 @@ def _situation(view: View, *, can_command: bool, silent: str | None) -> Situatio
     address = address_of(view.session.instance) if view.session else None
     observer = live_observer(view.connection, view.session, view.now_s)
     name = observer.name if observer else None
-    return Situation(view.robot.name, can_command, silent, address, moment, name)
+    is_there = view.robot.live
+    return Situation(view.robot.name, can_command, silent, address, moment, name, is_there)
 
 
 def _why_silent(view: View) -> str | None:
@@ -353,29 +365,46 @@ _SIGNS: Final[dict[Order, Callable[[Moment, View], str | None]]] = {
 }
 
 
-def only_webots() -> Address:
-    """The Webots that runs here, where no session names it."""
-    return _only(instances()).address
+def webots_meant(recording: Recording, situation: Situation) -> Address:
+    """Where the Webots listens that is meant; where that is not known, the only one of ours.
+
+    Raises:
+        CommandRefusedError: There is none, or several, or only those of others.
+    """
+    address = situation.address
+    if address is not None and situation.is_there:
+        return address
+    running = instances()
+    if address is not None and not running:  # the system may not show it
+        return address
+    ours = [each for each in running if belongs(each, recording)]
+    same = [each for each in ours if each.address == address]
+    return _only(same or ours, running).address
 
 
-def _window_owner(address: Address | None) -> int | None:
-    """The process whose window gets the keys; None where the system does not tell."""
-    if address is None:
-        return _only(instances()).pid
+def _window_owner(recording: Recording, situation: Situation) -> int:
+    """The process whose window gets the keys."""
+    address = webots_meant(recording, situation)
     found = instance_at(address.port)
     if found is not None and found.address == address:  # another machine may use the same port
         return found.pid
     raise CommandRefusedError(f"no Webots of this machine listens at {address}")
 
 
-def _only(running: list[Instance]) -> Instance:
-    if len(running) == 1:
-        return running[0]
+def _only(ours: list[Instance], running: list[Instance]) -> Instance:
+    if len(ours) == 1:
+        return ours[0]
     if not running:
         raise CommandRefusedError("no Webots runs on this machine")
-    ports = ", ".join(str(each.port) for each in running)
+    worlds = ", ".join(f"{each.world or 'a world'} at port {each.port}" for each in running)
+    if ours:
+        raise CommandRefusedError(
+            f"{len(ours)} Webots run ({worlds}), and no live session tells which is meant: name "
+            "its port"
+        )
     raise CommandRefusedError(
-        f"{len(running)} Webots run (ports {ports}), and no live session tells which is meant"
+        f"the Webots that runs here is not of this recording's project ({worlds}): name its port "
+        "if it is meant all the same"
     )
 
 

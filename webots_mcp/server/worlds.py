@@ -21,7 +21,7 @@ from webots_mcp.server.routes import (
     UNCLAIMED,
     Situation,
     look_around,
-    only_webots,
+    webots_meant,
 )
 from webots_mcp.store.beginnings import Beginning
 from webots_mcp.store.recording import Recording
@@ -132,7 +132,7 @@ class WorldRequest:
         """
         try:
             await to_thread.run_sync(self._require_beside, situation, world)
-            address = situation.address or await to_thread.run_sync(self._address)
+            address = await to_thread.run_sync(self._address, situation)
             reply = await to_thread.run_sync(load_world, address, world.name, ANSWER_S)
             if reply.heard is None:
                 raise CommandRefusedError(no_obedience(address, reply))
@@ -160,10 +160,15 @@ class WorldRequest:
             return Path(known).resolve() if known else None
         return self.launcher.running.world if self.launcher.running else None
 
-    def _address(self) -> Address:
-        """Of the Webots that this server has started, else of the only one that runs."""
+    def _address(self, situation: Situation) -> Address:
+        """Of the robot's Webots, else of that which this server has started, else of the only one.
+
+        Raises:
+            CommandRefusedError: It is not known which one is meant, or it is not of this project.
+        """
         ours = self.launcher.running
-        return (ours.webots.address if ours else None) or only_webots()
+        started = ours.webots.address if ours and not situation.is_there else None
+        return started or webots_meant(self.recording, situation)
 
     async def _proven(
         self, answer: CommandAnswer, situation: Situation, said: str, world: Path, before: int

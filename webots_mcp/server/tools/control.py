@@ -19,6 +19,10 @@ from webots_mcp.server.target import find_target
 from webots_mcp.store.recording import Recording, look
 from webots_mcp.webots.stream import Order
 
+Port = Annotated[
+    Annotated[int, Field(ge=1, le=65535)] | None,
+    Field(description="Of a Webots of another project."),
+]
 Force = Annotated[bool, Field(description="Press Webots' own keys where nothing else works.")]
 
 _WAIT_S: Final = 10.0
@@ -35,6 +39,7 @@ async def webots_simulation_control(
         Field(description="For step, by default 1: rounds of the controller's loop, then paused."),
     ] = None,
     force: Force = False,
+    port: Port = None,
     robot: RobotName = None,
     timeout_s: Annotated[
         float | None,
@@ -61,7 +66,8 @@ async def webots_simulation_control(
         _usual_wait_s, recording, command, steps, robot
     )
     dispatcher = Dispatcher(recording, ctx.report_progress)
-    return await Attempt(recording, dispatcher, robot, command, params, waiting_s, force).steer()
+    attempt = Attempt(recording, dispatcher, robot, command, params, waiting_s, force, port)
+    return await attempt.steer()
 
 
 @tool("Reload the world", RESTARTS)

@@ -213,3 +213,17 @@ def test_who_reads_no_longer_ends_it(launch: Launch, project: Callable[..., Path
     assert process.stdout is not None
     process.stdout.close()
     assert process.wait(60) == 0
+
+
+def test_what_webots_says_is_recorded_also_where_no_controller_ever_recorded(
+    launch: Launch, project: Callable[..., Path], tmp_path: Path
+) -> None:
+    process = launch(project(FAILING), "--mode", "fast", "--patience", "0")
+    _told(process, "no controller has recorded")
+    asking = [sys.executable, "-m", "webots_mcp", "logs", "--source", "console"]
+    asking += ["--data-dir", str(tmp_path / "project" / "mcp_data")]
+
+    def told() -> str:
+        return subprocess.run(asking, capture_output=True, text=True, check=False).stdout
+
+    wait_until(lambda: "console: ValueError: no arm" in told())

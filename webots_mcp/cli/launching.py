@@ -7,6 +7,7 @@ import math
 import os
 import sys
 import time
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.cli.command import argument, command
@@ -62,14 +63,16 @@ def launch(arguments: argparse.Namespace) -> int:
     port = arguments.port or free_port()
     start = Start(world, arguments.mode, arguments.headless, arguments.stream, port)
     environment = {DATA_DIR_VARIABLE: str(recording.data_dir)}
+    recording.create()  # also a controller that fails before it records has its words recorded
     console = _Console()
     launched = Launch(recording, start, environment, console.show)
-    try:
-        return _follow(launched, arguments.patience_s, console)
-    finally:
-        if not launched.webots.is_over:
-            _say("ending Webots")
-        launched.webots.end()
+    with _Recorder(launched, recording) as recorder:
+        try:
+            return _follow(launched, arguments.patience_s, console, recorder)
+        finally:
+            if not launched.webots.is_over:
+                _say("ending Webots")
+            launched.webots.end()
 
 
 def _recording(arguments: argparse.Namespace, project: Path) -> Recording:
@@ -81,7 +84,7 @@ def _recording(arguments: argparse.Namespace, project: Path) -> Recording:
     return Recording(*resolve_database(None, named or project / PROJECT_DATA_FOLDER), asker="cli")
 
 
-def _follow(launched: Launch, patience_s: float, console: _Console) -> int:
+def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _Recorder) -> int:
     """Until Webots has ended; its exit code."""
     webots, first = launched.webots, None
     until_s = time.monotonic() + patience_s
@@ -91,6 +94,7 @@ def _follow(launched: Launch, patience_s: float, console: _Console) -> int:
             until_s = math.inf
             _say(f"no controller has recorded within {patience_s:g} s: {launched.silence()}")
         console.require_reader()
+        recorder.begin()
         time.sleep(_LOOK_EVERY_S)
     webots.wait_for_last_words()
     if first is None and _told(launched) is None:
@@ -124,6 +128,26 @@ class _Console:
         """Raise what was raised where nobody reads it any more."""
         if self._broken is not None:
             raise self._broken
+
+
+class _Recorder(ExitStack):
+    """Records Webots' console, from when it listens."""
+
+    def __init__(self, launched: Launch, recording: Recording) -> None:
+        super().__init__()
+        self._launched = launched
+        self._recording = recording
+        self._begun = False
+
+    def begin(self) -> None:
+        """Unless it has begun, or Webots does not listen yet."""
+        from webots_mcp.console.following import follow_console
+        from webots_mcp.webots.instances import instance_at
+
+        address = None if self._begun else self._launched.webots.address
+        if address is not None and (instance := instance_at(address.port)) is not None:
+            self._begun = True
+            self.enter_context(follow_console(instance, self._recording))
 
 
 def _say(text: str) -> None:

@@ -202,6 +202,16 @@ def test_a_node_that_cannot_be_added_is_said_to_be_none(
     assert not scene.events("add_node")
 
 
+def test_a_long_value_is_told_by_its_beginning_and_put_back_whole(scene: Scene) -> None:
+    before, long = scene.get("WorldInfo.title"), "long " * 1500
+    answer = scene.ask("set_field", path="WorldInfo.title", value=long)
+    assert answer["to"].startswith('"long long')
+    assert len(str(answer)) < 2000
+    assert scene.get("WorldInfo.title").startswith("long long")
+    scene.reset()
+    assert scene.get("WorldInfo.title") == before
+
+
 def test_brackets_in_texts_and_comments_are_no_brackets(scene: Scene) -> None:
     odd = 'DEF ODD Solid { # { in a comment\n name "a { and a \\" [" }'
     assert scene.ask("add_node", vrml=odd)["path"] == "ODD"

@@ -6,6 +6,7 @@ is an event, and is remembered, so that a reset puts it back.
 
 from __future__ import annotations
 
+import json
 import re
 import time
 from collections.abc import Generator
@@ -24,6 +25,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 _Progress = Generator[None, None, object]
 
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
+_LONGEST_SHOWN: Final = 1_000  # characters of a value
 _LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
 _STAY: Final = ("WorldInfo", "Viewpoint")
 _ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
@@ -42,19 +44,29 @@ def set_field(context: Context, command: Command) -> _Progress:
     if params.get("stop") is True:
         place.node.resetPhysics()
     facts: dict[str, Any] = {"path": place.path, "type": place.type_name}
-    facts |= {"from": before, "to": value}
+    facts |= {"from": _shown(before), "to": _shown(value)}
     is_stepped = yield from _until_stepped(context)
     now = _read_again(robot, place)
     if not is_stepped and not is_same(place.type_name, now, value):
-        facts["now"], facts["when"] = now, "it is set with the next step: time stands still"
+        facts["now"] = _shown(now)
+        facts["when"] = "it is set with the next step: time stands still"
     elif not is_nearer(place.type_name, now, value, before) and not is_same(
         place.type_name, before, value
     ):
-        raise CommandRefusedError(f"{place.path} is {now!r:.200} after it was set; {_SAYS}")
+        raise CommandRefusedError(
+            f"{place.path} is {now!r:.200} after it was set; {_SAYS}. What is inside a PROTO "
+            "cannot be set"
+        )
     elif not is_same(place.type_name, now, value):
-        facts["now"] = now  # the simulation has moved it on
+        facts["now"] = _shown(now)  # the simulation has moved it on
     context.journal.event("set_field", facts | _asked_by(command), place.path)
     return facts | {"sim_time_s": context.clock.sim_time_s} | _told_of_reset(is_remembered)
+
+
+def _shown(value: Any) -> Any:
+    """A value as it is, or the beginning of its text where it is long."""
+    text = json.dumps(value, ensure_ascii=False)
+    return value if len(text) <= _LONGEST_SHOWN else cut(text, _LONGEST_SHOWN)
 
 
 def _edit(place: Place, before: Any, value: Any) -> FieldEdit:

@@ -21,6 +21,7 @@ FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer
 
 WORLD: Final = "world"  # the branch in which an observer publishes where each robot is
 SOLIDS: Final = "solid"  # the one of other bodies
+SEEN_SPEED: Final = "speed_mps"  # how fast it sees each to be
 _BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
 # Words of what is no place, or the place of something else.
 _ELSEWHERE: Final = frozenset((
@@ -181,6 +182,12 @@ def find_targets(name: str, names: Iterable[str]) -> tuple[str | None, str | Non
 def _subject_words(name: str) -> frozenset[str]:
     """The words of all parts of a name, one of several being the same as one alone."""
     return frozenset(word.rstrip("s") for word in _branch_words(name))
+
+
+def is_seen_speed(name: str) -> bool:
+    """Whether it is how fast an observer sees a body to be, which nobody was told to be."""
+    branch, _, rest = name.partition(".")
+    return branch in (WORLD, SOLIDS) and rest.endswith(f".{SEEN_SPEED}")
 
 
 def find_mode(texts: Collection[str]) -> str | None:

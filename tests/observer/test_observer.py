@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,9 @@ def test_what_there_is_is_told_once_as_an_event(watching: Watching) -> None:
         "key": "e_puck", "type": "E-puck", "name": "e-puck", "controller": "<none>"
     }  # fmt: skip
     assert (robots["RIDER"]["on_robot"], robots["turret"]["on_robot"]) == ("rover", "e-puck")
-    assert {solid["key"] for solid in world["solids"]} >= {"CRATE", "PILLAR"}
+    solids = {solid["key"]: solid for solid in world["solids"]}
+    assert set(solids) == {"FLOOR", "CRATE", "PILLAR"}
+    assert (solids["PILLAR"]["x_m"], solids["PILLAR"]["y_m"]) == (3.0, 3.0)
 
 
 def test_a_solid_is_recorded_from_when_it_moves(watching: Watching) -> None:
@@ -161,6 +164,44 @@ def test_it_looks_at_one_body_on_request(watching: Watching) -> None:
     assert "contact points" in told["not_told"]
     with pytest.raises(InvalidInputError, match=r"one of .*ROVER"):
         look_at({"params": {"of": "nobody"}})
+
+
+class Touching:
+    """What Webots tells of a Solid that touches the floor."""
+
+    def __init__(self, node: Any) -> None:
+        self.getVelocity, self.getPosition = node.getVelocity, node.getPosition
+
+    def getContactPoints(self, _: bool) -> list[Touching]:
+        return [self]
+
+    def getPoint(self) -> list[float]:
+        return [0.1, 0.2, 0.0]
+
+    def getNodeId(self) -> int:
+        return 3
+
+    def getCenterOfMass(self) -> list[float]:
+        return [0.1, 0.2, 0.05]
+
+    def getStaticBalance(self) -> bool:
+        return True
+
+
+def test_contact_points_and_balance_are_told_where_webots_tells_them(
+    watching: Watching, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watching.go_on(20)
+
+    def find_floor(_: int) -> Any:
+        return floor
+
+    crate, floor = watching.observer.world.bodies["CRATE"], watching.robot.getFromDef("FLOOR")
+    crate.scene = replace(crate.scene, node=Touching(crate.scene.node))
+    monkeypatch.setattr(watching.robot, "getFromId", find_floor)
+    told = watching.observer.look_at({"params": {"of": "CRATE"}})
+    assert told["contacts"] == [[0.1, 0.2, 0.0, "FLOOR"]]
+    assert (told["center_of_mass_m"], told["is_balanced"]) == ([0.1, 0.2, 0.05], True)
 
 
 def test_the_world_does_not_wait_for_it(watching: Watching) -> None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.bridge.scene import SceneNode, read_value
+from webots_mcp.naming import SEEN_SPEED
 
 _DIGITS: Final = 6  # of metres and radians that are recorded
 _MOVED_M: Final = 0.001
@@ -90,29 +91,40 @@ class Body:
             return {}
         _, x, y, z, heading = (round(value, _DIGITS) for value in self.place)
         speed = None if self.speed_mps is None else round(self.speed_mps, _DIGITS)
-        return {"x_m": x, "y_m": y, "z_m": z, "heading_rad": heading, "speed_mps": speed}
+        return {"x_m": x, "y_m": y, "z_m": z, "heading_rad": heading, SEEN_SPEED: speed}
 
     def describe(self) -> dict[str, object]:
-        """What does not change of it."""
-        inside = self.scene.parent
-        while inside is not None and inside.base_type != "Robot":
-            inside = inside.parent
+        """What does not change of it: where it is, too, as long as it has not moved."""
+        carrier = robot_around(self.scene)
         told = {
             "key": self.key,
             "type": self.scene.type_name,
-            "def": self.scene.definition or None,
-            "name": self.name or None,
+            "def": _other_than(self.key, self.scene.definition),
+            "name": _other_than(self.key, self.name),
             "controller": self.controller or None,
-            "on_robot": inside.name if inside else None,
+            "on_robot": carrier.name if carrier else None,
         }
-        return {what: value for what, value in told.items() if value is not None}
+        place = {} if self.is_told else self.signals() | {SEEN_SPEED: None}
+        return {what: value for what, value in (told | place).items() if value is not None}
 
 
 def is_followed(scene: SceneNode) -> bool:
-    """Robots, and solids with a DEF name; what is inside a PROTO node has none to be seen."""
-    if scene.base_type == "Robot":
-        return True
-    return scene.base_type == "Solid" and bool(scene.definition) and not scene.hidden
+    """Robots, and solids with a DEF name that are no part of a robot nor of a PROTO node."""
+    if scene.base_type != "Solid":
+        return scene.base_type == "Robot"
+    return bool(scene.definition) and not scene.hidden and robot_around(scene) is None
+
+
+def robot_around(scene: SceneNode) -> SceneNode | None:
+    """The robot that a node is a part of, or stands on."""
+    around = scene.parent
+    while around is not None and around.base_type != "Robot":
+        around = around.parent
+    return around
+
+
+def _other_than(key: str, name: str) -> str | None:
+    return name if name and name != key else None
 
 
 def body_of(scene: SceneNode, key: str) -> Body:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+import time
 from typing import Any, Final
 
 from webots_mcp.bridge.mcp_bridge import MCPBridge
@@ -14,6 +15,7 @@ from webots_mcp.observer.pace import Pace
 from webots_mcp.observer.world import World
 
 PERIOD_MS: Final = 100
+_TELL_AGAIN_S: Final = 3600.0  # of wall time: old events are purged
 _MOST_CONTACTS: Final = 30
 _DIGITS: Final = 6
 _NO_RIGHTS: Final = (
@@ -100,6 +102,7 @@ class Observer:
         self._pace = Pace(robot, self._period_ms)
         self._due_s = -math.inf
         self._mode = -1
+        self._tell_again_s = math.inf
         self.bridge.register_command(LOOK_AT, self.look_at)
 
     def __enter__(self) -> Observer:
@@ -125,15 +128,21 @@ class Observer:
         if self.bridge.detect_reload():
             self.world.begin_run()
             self._due_s = -math.inf
-        if (mode := int(self._robot.simulationGetMode())) != self._mode:
-            self._mode = mode
-            self.bridge.record_mode()
-        self.world.go_on()
-        if self.world.is_new:
-            self.bridge.record_world(self.world.describe())
+        self._tell()
         if sim_time_s >= self._due_s and (seen := self.world.look(sim_time_s)):
             self._due_s = sim_time_s + self._period_ms / 1000 - 1e-6
             self.bridge.publish(seen)
+
+    def _tell(self) -> None:
+        """Record the mode and what there is where they are others than before, or long untold."""
+        is_due, mode = time.monotonic() > self._tell_again_s, int(self._robot.simulationGetMode())
+        if mode != self._mode or is_due:
+            self._mode = mode
+            self.bridge.record_mode()
+        self.world.go_on()
+        if self.world.is_new or is_due:
+            self._tell_again_s = time.monotonic() + _TELL_AGAIN_S
+            self.bridge.record_world(self.world.describe())
 
     def _warn(self, text: str) -> None:
         self.bridge.log(text, "warning")
@@ -164,15 +173,16 @@ def _looked_at(body: Body, robot: Any) -> dict[str, Any]:
 
 def _standing(node: Any, robot: Any) -> dict[str, Any]:
     """What Webots tells of a Solid that stands on its own, as far as this one does."""
-    if not hasattr(node, "getContactPoints"):
-        return {"not_told": "contact points and balance: this simulator does not have them"}
-    contacts = node.getContactPoints(True)
-    return {
-        "contacts": [_contact(contact, robot) for contact in contacts[:_MOST_CONTACTS]],
-        "contacts_in_all": len(contacts),
-        "center_of_mass_m": [round(float(value), _DIGITS) for value in node.getCenterOfMass()],
-        "is_balanced": bool(node.getStaticBalance()),
-    }
+    try:
+        contacts = node.getContactPoints(True)
+        return {
+            "contacts": [_contact(contact, robot) for contact in contacts[:_MOST_CONTACTS]],
+            "contacts_in_all": len(contacts),
+            "center_of_mass_m": [round(float(value), _DIGITS) for value in node.getCenterOfMass()],
+            "is_balanced": bool(node.getStaticBalance()),
+        }
+    except (AttributeError, TypeError, ValueError) as error:  # a null pointer is a ValueError
+        return {"not_told": f"contact points, centre of mass and balance: {error}"}
 
 
 def _contact(contact: Any, robot: Any) -> list[Any]:

@@ -88,6 +88,8 @@ class World:
     def describe(self) -> dict[str, object]:
         """What there is, without where it is."""
         self._is_new = False
+        for body in self.bodies.values():
+            body.look(float(self._robot.getTime()))
         bodies = self.bodies.values()
         told: dict[str, object] = {
             "title": self._title(),

@@ -109,6 +109,19 @@ def test_wheels_that_rest_speak_against_being_stuck(empty: sqlite3.Connection) -
     assert stuck.details["against"] == "wheels rest"
 
 
+@pytest.mark.parametrize("other", ["TWO", "LEFT_WHEEL"])
+def test_how_fast_an_observer_sees_a_robot_is_nothing_that_it_was_told(
+    empty: sqlite3.Connection, other: str
+) -> None:
+    def seen(time_s: float) -> dict[str, Any]:
+        one = {"x_m": min(5.0, time_s), "y_m": 0.0, "speed_mps": float(time_s < 5)}
+        return {"world": {"ONE": one}, "solid": {other: {"x_m": time_s, "speed_mps": 1.0}}}
+
+    (still,) = ask(empty, seen).events
+    assert still.kind == "still"
+    assert still.details["not_stuck"].startswith("nothing that is published shows that it should")
+
+
 def test_a_command_that_was_in_force_for_a_moment_is_no_evidence(
     empty: sqlite3.Connection,
 ) -> None:

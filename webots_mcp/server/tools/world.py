@@ -22,7 +22,7 @@ from webots_mcp.store.states import real_time_factor
 
 _SHOWN_ROBOTS: Final = 50
 _SHOWN_IN_WORLD: Final = 40
-_TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")
+_TOLD_IN_WORLD: Final = ("key", "type", "def", "name", "controller", "on_robot")  # as they differ
 _PLACE: Final = ("x_m", "y_m", "z_m", "heading_rad", "speed_mps")
 _SHOWN_DEVICES: Final = 60
 _LONGEST_NAME: Final = 100

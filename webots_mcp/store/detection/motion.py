@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.naming import FARTHEST_M, find_mode, find_position
+from webots_mcp.naming import FARTHEST_M, find_mode, find_position, is_seen_speed
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
@@ -94,11 +94,12 @@ def find_motion(
     """
     own = known if here is None else {name: known[name] for name in known if name in here}
     mode = _named(known, options.mode) or _mode(own)
-    commanded = _named(known, options.commanded) or _first(own, _COMMANDED)
-    speed = None if commanded else _first(own, _SPEED, _is_no_wheel)
+    moved = {name: signal for name, signal in own.items() if not is_seen_speed(name)}
+    commanded = _named(known, options.commanded) or _first(moved, _COMMANDED)
+    speed = None if commanded else _first(moved, _SPEED, _is_no_wheel)
     wheels = tuple(
         signal
-        for name, signal in own.items()
+        for name, signal in moved.items()
         if signal.kind == "num" and not _is_no_wheel(name)
         if not _NO_SPEED.search(in_snake_case(name))
         if signal.unit not in _PLACES and signal not in (commanded, speed)

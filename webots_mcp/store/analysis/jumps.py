@@ -23,6 +23,8 @@ SWING_PERIOD_S: Final = 5.0  # of a longer one no single step is as a jump
 BESIDE_SWINGS_S: Final = 20.0  # before and after jumps: so long six half swings of it last
 SWING_HEIGHTS: Final = 2.6  # amplitudes: from one turn to the other it is 2, and noise adds some
 SWING_STEP: Final = 1.3  # of the largest step of a sine
+SWING_STEPS: Final = 3  # of one swing there are at least so many, none of them much smaller
+MUCH_SMALLER: Final = 0.25  # between two turns of a swing the largest steps are at least half alike
 SWITCHED_SHARE: Final = 0.5  # of the half swings: so many have a jump where a swing is switched
 
 
@@ -150,6 +152,8 @@ def _without_swings(jumps: Sequence[Jump], times: Array, values: Array) -> list[
         return []
     ends_s = jumps[0].sim_time_s - BESIDE_SWINGS_S, jumps[-1].sim_time_s + BESIDE_SWINGS_S
     part = slice(*np.searchsorted(times, ends_s))
+    if not any(_has_its_like(jump, values[part]) for jump in jumps):
+        return list(jumps)
     interval_s = usual_interval_s(times[part]) or 0.0
     left = list(jumps)
     for swing in find_swings(
@@ -165,6 +169,12 @@ def _without_swings(jumps: Sequence[Jump], times: Array, values: Array) -> list[
             own = [jump for jump in own if abs(jump.after - jump.before) < limit]
         left = [jump for jump in left if jump not in own]
     return left
+
+
+def _has_its_like(jump: Jump, values: Array) -> bool:
+    """Whether there are as many steps about as large as the least of swings has, its own too."""
+    alike = np.abs(np.diff(values)) >= MUCH_SMALLER * abs(jump.after - jump.before)
+    return int(np.count_nonzero(alike)) >= SWING_STEPS
 
 
 def _may_be_of(swing: Swing, jump: Jump) -> bool:

@@ -38,13 +38,13 @@ def jump_events(search: Search) -> Iterator[Event]:
     for index, signal in enumerate(signals):
         if search.is_over("jump", signals[index:]):
             break
-        jumps = [
-            jump
-            for course in search.view.courses(signal, search.options.jump_score)
-            for jump in find_jumps(
-                course.times, course.numbers, search.options.jump_score, course.usual
-            )
-        ]
+        score = search.options.jump_score
+        found = {  # two courses may show the same
+            jump.sim_time_s: jump
+            for course in search.view.courses(signal, score)
+            for jump in find_jumps(course.times, course.numbers, score, course.usual)
+        }
+        jumps = [found[time_s] for time_s in sorted(found)]
         if are_usual(jumps, search.view.summary(signal).present):
             many = f"not in {signal.name}: {len(jumps)} large steps are how it is"
             search.not_searched("jump", many)

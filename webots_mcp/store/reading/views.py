@@ -8,16 +8,15 @@ from __future__ import annotations
 import functools
 import math
 import sqlite3
-from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import accumulate, groupby, pairwise
+from itertools import groupby, pairwise
 from typing import Final, Protocol
 
-from webots_mcp.store.analysis.arrays import Array, np
+from webots_mcp.store.analysis.arrays import Array, Flags, np
 from webots_mcp.store.analysis.jumps import least_jump
 from webots_mcp.store.analysis.rhythm import usual_interval_s
-from webots_mcp.store.analysis.summary import Summary, merge, summarise_numbers
+from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.intervals import (
@@ -31,7 +30,8 @@ from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rollups import Pieces, read_pieces, rows_after
 from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of, read_columns
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
-from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, buckets, totals
+from webots_mcp.store.reading.steps import BucketSteps, read_steps
+from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, totals
 from webots_mcp.store.rollup.swings import (
     ACROSS_S,
     LONGEST_PERIOD_S,
@@ -54,9 +54,9 @@ _OF_SIGNAL: Final = (
     "FROM all_rollup WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ?"
 )
 _COUNTS: Final = {"rows": "sum", "present": "sum", "changes": "sum"}
-_STEPS: Final = (  # older rollups know no largest step; it is no larger than the whole range
-    "SELECT bucket, rows, coalesce(largest_step, max - min), first, last "
-    f"{_OF_SIGNAL} AND first IS NOT NULL ORDER BY bucket"
+_STEPS: Final = (
+    f"SELECT bucket, present, largest_step, first, last {_OF_SIGNAL} AND first IS NOT NULL "
+    "ORDER BY bucket"
 )
 _ROWS_IN: Final = (
     "SELECT count(*) FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
@@ -370,19 +370,33 @@ class LongView:
         """The buckets with a step that may be a jump, each with the rows before and after it."""
         self._note_late()
         self._note_purged()
-        values = (self._span[0], signal.id, *self._span[1:])
-        found = self._connection.execute(_STEPS, values).fetchall()
-        usual = self._sample.numbers(signal.name)[1]
-        limit = least_jump(usual, score)
-        wide = sorted(_steps_above(found, limit), reverse=True)
-        rows = list(accumulate(rows for _, _, rows in wide))
-        taken = wide[: max(1, bisect_right(rows, JUMP_ROWS))]
-        if len(taken) < len(wide):
+        times, usual = self._sample.numbers(signal.name)
+        limit, span = least_jump(usual, score), range(*self._span[1:])
+        steps = read_steps(self._connection, self._span[0], signal.id or 0, span, limit)
+        if limit:
+            yield from self._courses_in(signal, steps, steps.largest > limit, usual, score)
+            return
+        # It rests in the sample: what leaves and comes back at once is looked for everywhere.
+        interval_s = usual_interval_s(times) or math.inf
+        yield from self._courses_in(signal, steps, steps.excursions(interval_s), usual, score)
+        seldom = steps.usual() if steps.seldom else usual
+        if limit := least_jump(seldom, score):
+            yield from self._courses_in(signal, steps, steps.largest > limit, seldom, score)
+
+    def _courses_in(
+        self, signal: Signal, steps: BucketSteps, wide: Flags, usual: Array, score: float
+    ) -> Iterator[Course]:
+        """Some of the buckets; where they are too many those with the largest steps."""
+        limit, places = least_jump(usual, score), np.flatnonzero(wide)
+        largest = places[np.argsort(-steps.largest[places], kind="stable")]
+        rows = np.cumsum(steps.rows[largest])
+        taken = largest[: max(1, int(np.searchsorted(rows, JUMP_ROWS, "right")))]
+        if len(taken) < len(places):
             self.notes.append(
-                f"of {signal.name} only in {len(taken)} of {len(wide)} stretches of 10 s, those "
+                f"of {signal.name} only in {len(taken)} of {len(places)} stretches of 10 s, those "
                 "with the largest steps: ask for less time to see the others"
             )
-        for together in _runs_of(sorted(bucket for _, bucket, _ in taken)):
+        for together in _runs_of(sorted(steps.buckets[taken].tolist())):
             if self._deadline.passed:
                 self._cut()
                 return
@@ -450,14 +464,14 @@ class LongView:
         rows = self._connection.execute(_ROWS_IN, (part.run_id, *ends_s)).fetchone()[0]
         steps: list[dict[int, float]] = []
         for signal in signals:
-            found = list(buckets(self._connection, part.run_id, signal.id or 0, span))
-            whole = merge([Summary(), *(summary for _, summary in found)])
-            if whole.present != rows or whole.largest_step is None:
+            asked = (part.run_id, signal.id, span.start, span.stop)
+            found = self._connection.execute(_STEPS, asked).fetchall()
+            known = all(step is not None or present < 2 for _, present, step, *_ in found)
+            if not known or sum(present for _, present, *_ in found) != rows:
                 return None
-            own = {bucket: each.largest_step or 0.0 for bucket, each in found}
-            for (_, before), (bucket, after) in pairwise(found):
-                step = abs((after.first or 0.0) - (before.last or 0.0))
-                own[bucket] = max(own[bucket], step)
+            own = {bucket: step or 0.0 for bucket, _, step, *_ in found}
+            for (*_, last), (bucket, _, _, first, _) in pairwise(found):
+                own[bucket] = max(own[bucket], abs(first - last))
             steps.append(own)
         return steps
 
@@ -477,6 +491,10 @@ class LongView:
             return kept
         wanted = list({each.name: each for each in (*signals, *self._through)}.values())
         columns = read_columns(self._connection, part, wanted, self._deadline)
+        if columns.cut:
+            reached_s = columns.times[-1] if columns.times else part.start_s
+            span = f"start_s={reached_s:.3f}, end_s={part.end_s:.3f}"
+            self.notes.append(f"not from {reached_s:.3f} s on, the time was over; ask {span}")
         numbers = numbers_of(columns, wanted)
         held = sum(len(each.times) * len(each.values) for each in self._kept.values())
         if not columns.cut and held < MOST_KEPT:
@@ -557,19 +575,6 @@ def _above(
         if step > limit and bucket not in outside
     ]
     return range(min(large), max(large) + 1) if large else _NOTHING
-
-
-def _steps_above(
-    found: Sequence[tuple[int, int, float, float, float]], limit: float
-) -> list[tuple[float, int, int]]:
-    """The largest step of each bucket, also that from the bucket before; its number and rows."""
-    if not found:
-        return []
-    inside: Array = np.array([each[2] for each in found], np.float64)
-    first: Array = np.array([each[3] for each in found], np.float64)
-    last: Array = np.array([each[4] for each in found], np.float64)
-    steps: Array = np.fmax(inside, np.abs(first - np.concatenate((first[:1], last[:-1]))))
-    return [(float(steps[at]), *found[at][:2]) for at in np.flatnonzero(steps > limit).tolist()]
 
 
 def _runs_of(buckets: Sequence[int]) -> Iterator[range]:

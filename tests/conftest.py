@@ -7,7 +7,9 @@ import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
+import psutil
 import pytest
 from hypothesis import settings
 
@@ -22,6 +24,18 @@ settings.load_profile("repeatable")
 
 # A script's background jobs ignore Ctrl-C and hand that down to the processes that they start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture(autouse=True)
+def no_webots_but_ours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Webots that somebody runs beside the tests is neither found nor steered by them."""
+    everywhere = psutil.process_iter
+
+    def begun_here(*arguments: Any, **options: Any) -> Iterator[psutil.Process]:
+        ours = set(psutil.Process().children(recursive=True))
+        return (each for each in everywhere(*arguments, **options) if each in ours)
+
+    monkeypatch.setattr(psutil, "process_iter", begun_here)
 
 
 @pytest.fixture(scope="session")

@@ -22,6 +22,7 @@ from tests.webots.conftest import (
     write_project,
 )
 from webots_mcp.contract import ENDED_BY
+from webots_mcp.contract import host_name
 from webots_mcp.diagnosis.finding import Finding
 from webots_mcp.liveness import process_identity
 
@@ -95,6 +96,26 @@ def test_where_nobody_computes_it_was_most_likely_paused_by_hand(
     assert found.verdict == "wrong"
     assert "paused by hand" in found.seen
     assert found.fix == "press play in Webots"
+
+
+@pytest.mark.parametrize("options", [(), ("--stream",)])
+def test_that_webots_obeys_by_its_websocket_is_named_where_it_does(
+    look: Look,
+    recorded: Recorded,
+    start: Start,
+    start_webots: StartWebots,
+    world: Path,
+    options: tuple[str, ...],
+) -> None:
+    port = free_port()
+    wait_for_line(start_webots("--stdout", *options, f"--port={port}", world), "ready")
+    silent(recorded, start(WAITS), instance=f"{host_name()}:{port}")
+    recorded.connection.execute("UPDATE run SET world = '/nowhere.wbt'")
+    obeys = "; or webots_simulation_control('resume'): this Webots obeys it by its WebSocket"
+    found = look("Simulation")
+    while "another controller computes" in found.seen:  # it is still starting
+        found = look("Simulation")
+    assert found.fix == "press play in Webots" + obeys * bool(options)
 
 
 def test_a_controller_that_computes_holds_itself_up(

@@ -9,7 +9,6 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 from mcp import Client
 from mcp.types import CallToolResult, ImageContent, TextContent
@@ -35,18 +34,6 @@ DATA_TOOLS = (  # that read the present
 @pytest.fixture
 def anyio_backend() -> str:
     return "asyncio"
-
-
-@pytest.fixture(autouse=True)
-def no_webots_but_ours(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A Webots that somebody runs beside the tests is neither found nor steered by them."""
-    everywhere = psutil.process_iter
-
-    def begun_here(*arguments: Any, **options: Any) -> Iterator[psutil.Process]:
-        ours = set(psutil.Process().children(recursive=True))
-        return (each for each in everywhere(*arguments, **options) if each in ours)
-
-    monkeypatch.setattr(psutil, "process_iter", begun_here)
 
 
 @pytest.fixture

@@ -36,6 +36,7 @@ _LARGEST_WORLD_BYTES: Final = 50_000_000
 _ENDED_BADLY: Final = ("crashed", "reload")
 _PRESS_PLAY: Final = "press play in Webots"
 _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
+_OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by its WebSocket"
 
 
 def simulation(subject: Subject) -> Finding:
@@ -96,17 +97,24 @@ def _narrowed(subject: Subject, view: View, session: Session) -> Finding:
     if busy:
         others = ", ".join(f"{what} (process {pid})" for pid, what in busy.items())
         seen = f"{head}; another controller computes and holds the step up: {others}"
-        return Finding("wrong", seen, _RELOAD)
+        return Finding("wrong", seen, _also_by_websocket(_RELOAD, "reload", webots))
     if missing := _missing_externs(subject, view, webots):
         fix = "start it: 'webots-controller --robot-name=NAME FILE', or press play if it is paused"
         return Finding("wrong", f"{head}; {missing}", fix)
+    press_play = _also_by_websocket(_PRESS_PLAY, "resume", webots)
     if busy is None:
-        return Finding("wrong", f"{head} ({view.status.why})", _PRESS_PLAY)
+        return Finding("wrong", f"{head} ({view.status.why})", press_play)
     seen = (
         f"{head}; no controller computes and none is known to be missing: most likely it was "
         "paused by hand in Webots"
     )
-    return Finding("wrong", seen, _PRESS_PLAY)
+    return Finding("wrong", seen, press_play)
+
+
+def _also_by_websocket(fix: str, order: str, webots: Instance | None) -> str:
+    """What a person can do, and what a client can where Webots was started with `--stream`."""
+    is_open = webots is not None and webots.streams and webots.is_listening
+    return _OBEYS.format(fix, order) if is_open else fix
 
 
 def _webots_of(subject: Subject, session: Session) -> Instance | None:

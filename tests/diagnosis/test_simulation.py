@@ -21,8 +21,7 @@ from tests.webots.conftest import (
     world,
     write_project,
 )
-from webots_mcp.contract import ENDED_BY
-from webots_mcp.contract import host_name
+from webots_mcp.contract import ENDED_BY, host_name
 from webots_mcp.diagnosis.finding import Finding
 from webots_mcp.liveness import process_identity
 

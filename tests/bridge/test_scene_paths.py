@@ -177,3 +177,33 @@ def test_a_scene_that_is_asked_for_wrongly_is_refused(
     crowd: Scene, params: dict[str, object], said: str
 ) -> None:
     assert said in crowd.fail("get_scene", **params)
+
+
+ODD = (
+    *(None, True, 0, -1, 1.5, 10**30, "x", "#5", "#" + "9" * 30, '"', "[0]", ".", "..", "root"),
+    *(
+        "root.x",
+        "root.children",
+        [],
+        ["a"],
+        {},
+        {"a": 1},
+        "\0",
+        "\u00e9.\u00fc",
+        "DEF",
+        "USE ",
+        "{}",
+    ),
+    *("ROVER." + "a" * 400, "ROVER[", "ROVER]", "ROVER.children[-99]", "Solid { } }", float("nan")),
+)
+
+
+@pytest.mark.parametrize("action", ["get_scene", "get_field", "set_field", "add_node"])
+def test_whatever_is_sent_is_answered_in_our_own_words(crowd: Scene, action: str) -> None:
+    names = {"get_scene": "types", "get_field": "start", "set_field": "value", "add_node": "vrml"}
+    for odd in ODD:
+        for params in ({"path": odd}, {"path": "PILLAR.name", names[action]: odd}):
+            status, _, error = crowd.fate(action, **params)
+            told = (action, params, error)
+            assert (status == "done") == (error is None), told
+            assert error is None or not any(word in error for word in ("Error:", ".py, ")), told

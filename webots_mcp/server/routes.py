@@ -115,7 +115,7 @@ class Attempt:
                 return answer
             situation = await self._look_around()
         if situation.silent is None:
-            return await self._by_bridge()
+            return await self._by_bridge(situation)
         self.tried["bridge"] = situation.silent
         for way in (self._by_observer, self._by_websocket, self._by_keyboard):
             answer = await way(situation)
@@ -123,7 +123,7 @@ class Attempt:
                 return answer
         if not situation.can_command:
             raise CommandRefusedError(_no_way(self.order, self.tried))
-        return await self._by_bridge()
+        return await self._by_bridge(situation)
 
     async def _look_around(self) -> Situation:
         found = await to_thread.run_sync(look_around, self.recording, self.robot, self.order)
@@ -133,14 +133,15 @@ class Attempt:
         why = f"no controller that lives records from the Webots at port {self.port}"
         return Situation(None, False, why, named, Moment(None, None), is_there=True)
 
-    async def _by_bridge(self, claiming_s: float = math.inf) -> CommandAnswer:
+    async def _by_bridge(self, situation: Situation, claiming_s: float = math.inf) -> CommandAnswer:
         """Send a command to the controller, and wait for it as long as there is time.
 
         Args:
             claiming_s: Nobody waits for longer until its loop takes the command.
         """
         answer = await self._sent(self.robot, claiming_s)
-        answer.route = "bridge" if answer.outcome == "done" else None
+        route = "observer" if situation.robot == situation.observer else "bridge"
+        answer.route = route if answer.outcome == "done" else None
         others = {name: why for name, why in self.tried.items() if name != "bridge"}
         if answer.outcome != "done" and others:
             answer.tried = others

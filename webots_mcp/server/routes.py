@@ -110,7 +110,7 @@ class Attempt:
         """
         situation = await self._look_around()
         if situation.silent is None:
-            answer = await self._by_bridge(CLAIMING_S)
+            answer = await self._by_bridge(situation, CLAIMING_S)
             if answer.outcome not in UNCLAIMED:
                 return answer
             situation = await self._look_around()
@@ -137,11 +137,13 @@ class Attempt:
         """Send a command to the controller, and wait for it as long as there is time.
 
         Args:
+            situation: As it was looked at.
             claiming_s: Nobody waits for longer until its loop takes the command.
         """
         answer = await self._sent(self.robot, claiming_s)
-        route = "observer" if situation.robot == situation.observer else "bridge"
-        answer.route = route if answer.outcome == "done" else None
+        if situation.robot is not None and situation.robot == situation.observer:
+            return await self._done_by_observer(situation, answer)
+        answer.route = "bridge" if answer.outcome == "done" else None
         others = {name: why for name, why in self.tried.items() if name != "bridge"}
         if answer.outcome != "done" and others:
             answer.tried = others
@@ -168,9 +170,16 @@ class Attempt:
         if answer.outcome in UNCLAIMED:
             self.tried["observer"] = f"robot {observer!r} did not take the command: {answer.why}"
             return None
-        answer.route = "observer" if answer.outcome == "done" else None
-        if answer.outcome == "done" and self.order not in ("pause", "step"):
+        return await self._done_by_observer(situation, answer)
+
+    async def _done_by_observer(self, situation: Situation, answer: CommandAnswer) -> CommandAnswer:
+        """It asks Webots for something that others may prevent: the recording shows it, or not."""
+        if answer.outcome != "done":
+            return answer
+        answer.route = "observer"
+        if self.order not in ("pause", "step"):
             answer.proof = await self._shown(situation, _PROOF_S)
+            answer.hint = answer.hint if answer.proof else NOTHING_SEEN
         return answer
 
     @property

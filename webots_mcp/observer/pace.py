@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from typing import Any, Final
 
-_ROUND_S: Final = 0.005  # of wall time
+_ROUND_S: Final = 0.01  # of wall time
 _TRIAL_S: Final = 1.0  # of wall time in which time ought to have moved
 
 

@@ -243,7 +243,7 @@ def usable_part(times: Array, numbers: Array) -> tuple[Array, Array]:
 
 
 def aligned_numbers(values: Sequence[Value]) -> Array:
-    """One number per value; NaN where it is none, or is too large for one."""
+    """One number per value; NaN where it is none, infinite where it is too large for one."""
     try:
         return np.array(values, np.float64)  # null becomes NaN
     except (OverflowError, TypeError, ValueError):
@@ -251,9 +251,12 @@ def aligned_numbers(values: Sequence[Value]) -> Array:
 
 
 def _number(value: Value) -> float:
-    if type(value) in _NUMBERS and -_LARGEST <= cast("float", value) <= _LARGEST:
+    if type(value) not in _NUMBERS:
+        return math.nan
+    try:
         return float(cast("float", value))
-    return math.nan
+    except OverflowError:
+        return math.inf
 
 
 def _usable(numbers: Sequence[float]) -> bool:

@@ -323,7 +323,8 @@ def _course(columns: Columns, heading: Signal | None) -> Array | None:
     if heading is None or heading.name not in columns.values:
         return None
     course: Array = np.array(_radians(columns, heading))
-    present = ~np.isnan(course)
+    present = np.isfinite(course)
+    course[~present] = np.nan
     course[present] = np.unwrap(course[present])
     return course
 

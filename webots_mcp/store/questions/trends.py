@@ -17,7 +17,7 @@ from webots_mcp.store.reading.changes import change_points, longest_values
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.reading.rollups import Pieces, piece_length_s, read_pieces
-from webots_mcp.store.reading.rows import Columns, exceeds, kept_columns, read_columns
+from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, kept_columns, read_numbers
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.registry import Signal
@@ -126,7 +126,7 @@ def _run_trends(
     """The trends of signals in one run."""
     numbers = [signal for signal in signals if signal.is_number]
     found: list[Trend | None]
-    columns: Columns | None = None
+    read: Numbers | None = None
     if exceeds(connection, segment):
         piece_s = piece_length_s(connection, segment, LEAST_PIECES)
         pieces = read_pieces(connection, segment, numbers, deadline, piece_s)
@@ -135,14 +135,14 @@ def _run_trends(
         rows = max((pieces.whole(signal.name).rows for signal in numbers), default=0)
         resolution_s, cut_at_s = piece_s, pieces.cut_at_s
     else:
-        columns = read_columns(connection, segment, numbers, deadline)
+        read = read_numbers(connection, segment, numbers, deadline)
         kept = None if segment.full_rate else kept_columns(connection, segment, numbers, deadline)
-        found = [_trend_of_rows(signal, columns, kept) for signal in numbers]
-        rows, resolution_s = len(columns.times), None
-        cut_at_s = (columns.times or [segment.start_s])[-1] if columns.cut else None
+        found = [_trend_of_rows(signal, read, kept) for signal in numbers]
+        rows, resolution_s = len(read.times), None
+        cut_at_s = [segment.start_s, *read.times.tolist()][-1] if read.cut else None
     held = sorted((trend for trend in found if trend), key=lambda trend: -trend.change)
     silent = [signal.name for signal, trend in zip(numbers, found, strict=True) if trend is None]
-    too_large = [] if columns is None else [each for each in silent if _has_number(columns, each)]
+    too_large = [] if read is None else [each for each in silent if _has_number(read, each)]
     return RunTrends(
         run_id=segment.run_id,
         start_s=segment.start_s,
@@ -164,16 +164,16 @@ def _with_kept(signal: Signal, summary: Summary, kept: Columns | None) -> Summar
     return with_extremes(summary, signal.summarise(kept.times, kept.values[signal.name]))
 
 
-def _has_number(columns: Columns, name: str) -> bool:
+def _has_number(read: Numbers, name: str) -> bool:
     """Whether a signal without a usable value has numbers, which are too large then."""
-    return any(isinstance(value, (int, float)) for value in columns.values[name])
+    return not np.isnan(read.values[name]).all()
 
 
-def _trend_of_rows(signal: Signal, columns: Columns, kept: Columns | None) -> Trend | None:
-    times, numbers = columns.numbers(signal.name)
+def _trend_of_rows(signal: Signal, read: Numbers, kept: Columns | None) -> Trend | None:
+    times, numbers = read.of(signal.name)
     if not len(numbers):
         return None
-    summary = summarise_numbers(times, numbers, rows=len(columns.times), turn=signal.turn)
+    summary = summarise_numbers(times, numbers, rows=len(read.times), turn=signal.turn)
     summary = _with_kept(signal, summary, kept)
     return judge(signal, summary, times, numbers, find_spikes(times, numbers, signal.turn))
 

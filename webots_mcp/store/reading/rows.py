@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import sqlite3
+from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Generator, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, Final
@@ -101,14 +103,16 @@ class Numbers:
     """Numeric signals of rows, in order: a quarter of the memory that `Columns` take.
 
     Attributes:
-        values: Per signal one number per row; NaN where the row has none that is usable.
+        values: Per signal one number per row; NaN where the row has none.
         stretch_rows: How many rows the stretch has in which only these may hold a large step; None
             where these are all of it.
+        cut: The deadline passed; the rows after the last one were not read.
     """
 
     times: Array
     values: dict[str, Array]
     stretch_rows: int | None = None
+    cut: bool = False
 
     def of(self, name: str) -> tuple[Array, Array]:
         """Times and numbers of a signal, of the rows that have a usable one."""
@@ -117,7 +121,8 @@ class Numbers:
 
 def numbers_of(columns: Columns, signals: Sequence[Signal]) -> Numbers:
     """The numbers of some signals."""
-    return Numbers(columns.moments, {each.name: columns.aligned(each.name) for each in signals})
+    values = {each.name: columns.aligned(each.name) for each in signals}
+    return Numbers(columns.moments, values, cut=columns.cut)
 
 
 def exceeds(connection: sqlite3.Connection, segment: Segment) -> bool:
@@ -159,24 +164,64 @@ def read_columns(
             segment at full rate, else for those that the throttle let through.
     """
     columns = Columns(segment.run_id, values={signal.name: [] for signal in signals})
-    decode = exact or len(signals) > MAX_EXTRACTED or any(signal.decoded for signal in signals)
-    read = _read_decoded if decode else _read_extracted
-    bounds = (segment.run_id, segment.start_s, segment.end_s)
-    after_id, place = (after, None) if isinstance(after, int) else (0, after)
-    parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id)
-    if tables is None:
-        tables = _EVERY_STATE if segment.full_rate and after_id == 0 else _STATES
-    asked = _Rows(tables, parameters, limit, place)
+    read = _read_decoded if exact or _are_decoded(signals) else _read_extracted
+    with _until(deadline, connection, columns):
+        read(connection, signals, _rows_of(segment, after, limit, tables), columns, deadline)
+    for signal in signals:
+        columns.values[signal.name] = cleaned(signal, columns.values[signal.name])
+    return columns
+
+
+def read_numbers(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    signals: Sequence[Signal],
+    deadline: Deadline,
+) -> Numbers:
+    """The numbers that `read_columns` reads of numeric signals, without their values as a list."""
+    if not signals or _are_decoded(signals) or any(signal.reduce for signal in signals):
+        return numbers_of(read_columns(connection, segment, signals, deadline), signals)
+    columns = Columns(segment.run_id)
+    parts: list[Array] = []
+    paths = tuple(signal.path for signal in signals)
+    with _until(deadline, connection, columns):
+        rows = _rows_of(segment)
+        for _, texts in _extracted_chunks(connection, paths, rows, columns, deadline):
+            parts.append(_numbers_at(signals, texts))
+    numbers = np.concatenate(parts, axis=1) if parts else np.empty((len(signals), 0))
+    values = {signal.name: row for signal, row in zip(signals, numbers, strict=True)}
+    return Numbers(columns.moments, values, cut=columns.cut)
+
+
+def _are_decoded(signals: Sequence[Signal]) -> bool:
+    return len(signals) > MAX_EXTRACTED or any(signal.decoded for signal in signals)
+
+
+@contextlib.contextmanager
+def _until(deadline: Deadline, connection: sqlite3.Connection, columns: Columns) -> Generator[None]:
+    """What is read inside ends at the deadline, and the columns are cut then."""
     try:
         with deadline.interrupting(connection):
-            read(connection, signals, asked, columns, deadline)
+            yield
     except sqlite3.OperationalError:
         if not deadline.passed:
             raise
         columns.cut = True
-    for signal in signals:
-        columns.values[signal.name] = cleaned(signal, columns.values[signal.name])
-    return columns
+
+
+def _rows_of(
+    segment: Segment,
+    after: int | State = 0,
+    limit: int = -1,
+    tables: Sequence[tuple[str, str]] | None = None,
+) -> _Rows:
+    """The rows that are asked of a segment, as `read_columns` explains them."""
+    bounds = (segment.run_id, segment.start_s, segment.end_s)
+    after_id, place = (after, None) if isinstance(after, int) else (0, after)
+    if tables is None:
+        tables = _EVERY_STATE if segment.full_rate and after_id == 0 else _STATES
+    parameters = (*bounds, segment.wall_start_s, segment.wall_end_s, after_id)
+    return _Rows(tables, parameters, limit, place)
 
 
 def kept_columns(
@@ -227,12 +272,8 @@ def _read_extracted(
 ) -> None:
     """Each path is extracted once, all of a row in one call."""
     paths = tuple(dict.fromkeys(signal.path for signal in signals))
-    extract, asked_paths = extracted("data", paths)
-    query, values = asked.query(f"sim_time_s, wall_time_s, odd, {extract}", asked_paths)
-    for chunk in _chunks(connection, query, values, columns, deadline):
-        read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
-        _extend(columns, read[:3])
-        by_path = values_at(paths, read[4])
+    for odds, texts in _extracted_chunks(connection, paths, asked, columns, deadline):
+        by_path = values_at(paths, texts)
         reduced = {
             path: [reductions(array) for array in by_path[path]]
             for path in {signal.path for signal in signals if signal.reduce}
@@ -243,7 +284,43 @@ def _read_extracted(
             else:
                 rows = reduced[signal.path]
                 columns.values[signal.name].extend([row.get(signal.reduce) for row in rows])
-        _count_odd(columns, signals, read[3])
+        _count_odd(columns, signals, odds)
+
+
+def _extracted_chunks(
+    connection: sqlite3.Connection,
+    paths: Sequence[str],
+    asked: _Rows,
+    columns: Columns,
+    deadline: Deadline,
+) -> Iterator[tuple[Sequence[str | None], Sequence[str]]]:
+    """Some rows each, which are added to the columns: what was odd, and what `extracted` said."""
+    extract, asked_paths = extracted("data", paths)
+    query, values = asked.query(f"sim_time_s, wall_time_s, odd, {extract}", asked_paths)
+    for chunk in _chunks(connection, query, values, columns, deadline):
+        read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
+        _extend(columns, read[:3])
+        yield read[3], read[4]
+
+
+def _numbers_at(signals: Sequence[Signal], texts: Sequence[str]) -> Array:
+    """A row for each signal, given what `extracted` said of their paths in each state."""
+    values = _all_values(texts)
+    width = len(values) // len(texts)
+    numbers = _as_numbers(values)
+    if numbers is not None:
+        table: Array = np.reshape(numbers, (len(texts), width))
+        return np.transpose(table)[: len(signals)]
+    columns = [cleaned(signal, values[at::width]) for at, signal in enumerate(signals)]
+    return np.stack([aligned_numbers(column) for column in columns])
+
+
+def _as_numbers(values: list[Any]) -> Array | None:
+    """The numbers, NaN for null; None where there is anything else, or too large an integer."""
+    for every in (lambda: values, lambda: [math.nan if v is None else v for v in values]):
+        with contextlib.suppress(TypeError, OverflowError):
+            return np.frombuffer(array("d", every()))
+    return None
 
 
 def extracted(data: str, paths: Sequence[str]) -> tuple[str, tuple[str, ...]]:
@@ -260,9 +337,14 @@ def values_at(paths: Sequence[str], texts: Sequence[str]) -> dict[str, list[Any]
     """The values of each path, given what `extracted` said of each row; all are decoded at once."""
     if not paths or not texts:
         return {path: [] for path in paths}
-    values = _decoded(f"[{','.join([text[1:-1] for text in texts])}]")
+    values = _all_values(texts)
     width = len(values) // len(texts)
     return {path: values[index::width] for index, path in enumerate(paths)}
+
+
+def _all_values(texts: Sequence[str]) -> list[Any]:
+    """The values of all rows one after the other."""
+    return _decoded(f"[{','.join([text[1:-1] for text in texts])}]")
 
 
 def _decoded(text: str) -> list[Any]:

@@ -7,6 +7,7 @@ from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, np
 
+SAME_TIME: Final = 1e-9  # of the length of a piece: what adding up intervals leaves
 # Times the period that seems right.
 TRIED_PERIODS: Final = (0.92, 0.94, 0.96, 0.98, 1.0, 1.02, 1.04, 1.06, 1.08)
 
@@ -42,16 +43,17 @@ def fit_sines(times: Array, values: Array, periods: Array, basis: Array) -> Fit:
     """Sines are fitted to what a course leaves of the values and of the sines themselves.
 
     Args:
-        times: One row per piece.
-        values: Alike.
+        times: One row per piece, or one for all.
+        values: One row per piece.
         periods: That are tried.
-        basis: What the course of each piece is made of: rows of length 1 at right angles.
+        basis: What the course of each piece, or of all, is made of: rows of length 1 at right
+            angles.
     """
     moments = times - times.mean(axis=1, keepdims=True)
     angles: Array = 2 * np.pi * moments[:, None, :] / periods[:, None]
-    waves = np.concatenate((np.sin(angles), np.cos(angles), values[:, None, :]), axis=1)
-    rest: Array = waves - (waves @ np.swapaxes(basis, 1, 2)) @ basis
-    sines, cosines, left = np.split(rest, [len(periods), 2 * len(periods)], axis=1)
+    waves = _beside(np.concatenate((np.sin(angles), np.cos(angles)), axis=1), basis)
+    sines, cosines = waves[:, : len(periods)], waves[:, len(periods) :]
+    left = _beside(values[:, None, :], basis)
     ss, cc, sc = (_products(*pair) for pair in ((sines,) * 2, (cosines,) * 2, (sines, cosines)))
     sy, cy, of_course = (_products(each, left) for each in (sines, cosines, left))
     determinant: Array = np.maximum(ss * cc - sc * sc, 1e-12)
@@ -70,10 +72,24 @@ def parabolas(times: Array) -> Array:
     return np.stack((level, straight, _of_length_one(bent)), axis=1)
 
 
+def alike_rows(times: Array) -> Array:
+    """One row for all pieces whose rows come after the same times; else those of each piece."""
+    after = times - times[:, :1]
+    alike = np.abs(after - after[0]).max() <= SAME_TIME * after[0, -1]
+    return times[:1] if alike else times
+
+
+def _beside(courses: Array, basis: Array) -> Array:
+    """What is left of courses beside those of the basis."""
+    return np.asarray(courses - (courses @ np.swapaxes(basis, 1, 2)) @ basis, np.float64)
+
+
 def _of_length_one(courses: Array) -> Array:
     return courses / np.sqrt(np.einsum("ij,ij->i", courses, courses))[:, None]
 
 
 def _products(one: Array, other: Array) -> Array:
-    """Sums along the rows, of as many courses or of many and one."""
-    return np.einsum("ijk,ijk->ij" if one.shape == other.shape else "ijk,ilk->ij", one, other)
+    """Sums along the rows, of as many courses or of many and one; of each piece or of all."""
+    if one.shape == other.shape:
+        return np.einsum("ijk,ijk->ij", one, other)
+    return np.asarray((one @ np.swapaxes(other, 1, 2))[:, :, 0], np.float64)

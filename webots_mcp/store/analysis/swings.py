@@ -18,7 +18,7 @@ from typing import Final
 from webots_mcp.store.analysis.arrays import Array, inner, median, np, sums_of
 from webots_mcp.store.analysis.noise import Roughness
 from webots_mcp.store.analysis.rhythm import gap_borders
-from webots_mcp.store.analysis.sines import TRIED_PERIODS, fit_sines, parabolas
+from webots_mcp.store.analysis.sines import TRIED_PERIODS, alike_rows, fit_sines, parabolas
 from webots_mcp.store.analysis.swings_on_bends import likely_swings, swings_on_bends
 
 LEAST_HALF_SWINGS: Final = 6  # four are made by a value that fell, rested, and rose again
@@ -306,6 +306,8 @@ def _regular(times: Array, band: Array, period_s: float, least: int) -> Iterator
     above = band >= 0
     above[0], above[-1] = above[1], above[-2]
     (before,) = (above[1:] != above[:-1]).nonzero()
+    if len(before) + 1 < least:
+        return
     share = band[before] / (band[before] - band[before + 1])
     crossed = times[before] + share * (times[before + 1] - times[before])
     moments = np.concatenate((times[:1], crossed, times[-1:]))
@@ -493,6 +495,7 @@ def _best_sine(
     shape = pieces, rows
     moments: Array = np.reshape(times[: pieces * rows], shape)
     parts: Array = np.reshape(values[: pieces * rows], shape)
+    moments = alike_rows(moments)
     basis = parabolas(moments)
     periods = period_s * np.array(TRIED_PERIODS)
     some = slice(None, None, -(-pieces // PIECES_TRIED))

@@ -67,10 +67,11 @@ def likely_swings(values: Array, noise: Array, period: float) -> Iterator[tuple[
         return
     sizes = sums_of(np.abs(bends), rows)[::hop]
     loud = sizes > LEAST_LOUD * rows * noise[lag + rows // 2 :: hop][: len(sizes)]
-    looked_at = np.flatnonzero(loud & (_turns(bends, rows, hop) >= LEAST_TURNS))
+    looked_at = np.flatnonzero(loud)
+    looked_at = looked_at[_turns(bends, hop * looked_at, rows) >= LEAST_TURNS]
     if not len(looked_at):
         return
-    windows = bends[hop * looked_at[:, None] + np.arange(rows)]
+    windows = np.lib.stride_tricks.sliding_window_view(bends, rows)[hop * looked_at]
     limits = CLIPPED * np.partition(np.abs(windows), rows // 2, axis=1)[:, rows // 2, None]
     clipped: Array = np.minimum(np.maximum(windows, -limits), limits)
     squares: Array = np.einsum("ij,ij->i", clipped, clipped)
@@ -86,12 +87,12 @@ def likely_swings(values: Array, noise: Array, period: float) -> Iterator[tuple[
                 yield int(part[0]) * hop, int(part[-1]) * hop + reach, periods[place]
 
 
-def _turns(values: Array, rows: int, hop: int) -> Indexes:
-    """How often the sign changes in each of the windows."""
+def _turns(values: Array, starts: Indexes, rows: int) -> Indexes:
+    """How often the sign changes in so many values from each start."""
     above = values > 0
-    (places,) = (above[1:] != above[:-1]).nonzero()
-    starts = np.arange(0, len(values) - rows + 1, hop)
-    return np.searchsorted(places, starts + rows - 1) - np.searchsorted(places, starts)
+    turns = np.zeros(len(values), np.intp)
+    np.cumsum(above[1:] != above[:-1], out=turns[1:])
+    return turns[starts + rows - 1] - turns[starts]
 
 
 def _explained(windows: Array, *periods: float) -> Array:
@@ -203,7 +204,7 @@ def _fitted(
 
 def _of_best_period(pieces: Array, period: float, noise: float) -> tuple[Array, Fit | None, float]:
     """Courses and sines of the period that explains most in the pieces that seem to swing."""
-    places = np.broadcast_to(np.arange(pieces.shape[1], dtype=np.float64), pieces.shape)
+    places: Array = np.arange(pieces.shape[1], dtype=np.float64)[None]
     tiny = np.finfo(np.float64).tiny
     tried, ratio, passes = np.array(TRIED_PERIODS), 1.0, 2
     while True:  # bends that were found beside a wrong period hide some of what is wrong

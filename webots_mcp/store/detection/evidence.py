@@ -293,7 +293,7 @@ def turns(columns: Columns, heading: Signal | None) -> Flags:
     if heading is None or heading.name not in columns.values:
         return none
     angles = _radians(columns, heading)
-    present = np.flatnonzero(~np.isnan(angles))
+    present = np.flatnonzero(np.isfinite(angles))
     if len(present) < 2:
         return none
     course = np.interp(np.arange(len(angles)), present, np.unwrap(angles[present]))

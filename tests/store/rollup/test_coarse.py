@@ -84,7 +84,7 @@ def check(
         assert found.keys() == by_piece.keys()
         for piece, some in by_piece.items():
             assert same(found[piece], summary_of(name, some)), (name, piece)
-        assert same(pieces.whole(name), summary_of(name, within)), name
+        assert same(pieces.summaries(name).whole(), summary_of(name, within)), name
 
 
 def read(connection: sqlite3.Connection, start_s: float, end_s: float) -> Pieces:
@@ -248,7 +248,7 @@ def test_purging_a_run_takes_its_coarse_rollups_and_purging_its_rows_does_not(
         finish(connection)
         prune(connection, tmp_path, Retention(state=Limit(rows=1), outlive=0), rest=False)
         assert connection.execute("SELECT count(*) FROM state").fetchone() == (1,)
-        whole = read(connection, 0.0, 3000.0).whole("time")
+        whole = read(connection, 0.0, 3000.0).summaries("time").whole()
         assert same(whole, summary_of("time", recorded))
         prune(connection, tmp_path, Retention(rollup=Limit(rows=10), outlive=0), rest=False)
         for table in ("rollup", "coarse_rollup", "change"):

@@ -17,7 +17,9 @@ from webots_mcp.store.analysis.arrays import Array, inner, np
 
 _NUMBERS: Final = frozenset({int, float, bool})
 _LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
-_LENGTH_DUST: Final = 1e-14  # what adding unit vectors leaves; less than 1.5e-7 rad
+COUNTS: Final = 3  # fields, the first ones of a summary, which are never None
+NO_LENGTH: Final = 1e-9  # of a resultant vector that means no direction
+LENGTH_DUST: Final = 1e-14  # what adding unit vectors leaves; less than 1.5e-7 rad
 _INTEGERS: Final = 2**63  # SQLite takes no larger ones: they become floats
 
 
@@ -101,7 +103,7 @@ class Summary(NamedTuple):
         if self.sines is None or self.cosines is None or self.present < 2:
             return None
         length = math.hypot(self.sines, self.cosines) / self.present
-        if length > 1 - _LENGTH_DUST:
+        if length > 1 - LENGTH_DUST:
             return 0.0
         return math.sqrt(-2 * math.log(length)) if length > 0 else None
 
@@ -119,7 +121,7 @@ def circular_mean(sines: float, cosines: float, count: int) -> float | None:
     K. V. Mardia, P. E. Jupp, Directional Statistics (2000), section 2.2.1. None where the vectors
     cancel out, because then no direction is meant.
     """
-    if count == 0 or math.hypot(sines, cosines) < 1e-9 * count:
+    if count == 0 or math.hypot(sines, cosines) < NO_LENGTH * count:
         return None
     return math.atan2(sines, cosines)
 

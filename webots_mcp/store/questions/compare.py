@@ -293,7 +293,7 @@ def _summarise(
     """Each signal that the run has over its compared stretch."""
     own = [part.known[signal.name] for signal in signals if signal.name in part.known]
     pieces = read_pieces(connection, part.segment, own, deadline, COARSE_S)
-    return {signal.name: pieces.whole(signal.name) for signal in own}
+    return {signal.name: pieces.summaries(signal.name).whole() for signal in own}
 
 
 def _groups(connection: sqlite3.Connection, groups: dict[str, list[int]]) -> tuple[Group, ...]:

@@ -17,6 +17,7 @@ from webots_mcp.store.analysis.features import (
     leaps_in,
     time_effect,
 )
+from webots_mcp.store.analysis.summaries import Summaries
 from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
 from webots_mcp.store.reading.moments import shown_time
@@ -97,7 +98,7 @@ def judge(
     spikes: list[Spike] | None,
     inner_variance: float = 0.0,
     resolution_s: float | None = None,
-    known: tuple[Array, Array] | None = None,
+    pieces: Summaries | None = None,
 ) -> Trend:
     """Put together what the summary tells and what the course of the numbers tells.
 
@@ -110,7 +111,7 @@ def judge(
         inner_variance: That of the values within the buckets. Where more of it lies there than
             between them, a course of their means is not that of the values (it may be an alias).
         resolution_s: The length of the buckets; None where the numbers are the values.
-        known: Times and values that are known beside the means of buckets: their ends and extremes.
+        pieces: The buckets, of which ends and extremes are known beside their means.
     """
     of_rows = spikes is not None
     turn = signal.turn if of_rows else summary.turn_of(signal.turn)
@@ -122,7 +123,10 @@ def judge(
     line = None if leaps else _of_all(fit_line(times, course, inner.mean or 0.0), slow)
     monotonic = None if fast else _monotonic(course)
     swings = () if fast or monotonic else _swings(times, course, resolution_s)
-    rest_s = None if fast else flat_since(*((times, course) if known is None or turn else known))
+    rest_s = None
+    if not fast:
+        known = (times, course) if pieces is None or turn else pieces.known_values()
+        rest_s = flat_since(*known)
     mean = _mean(signal, summary, inner, numbers)
     counted = course is not numbers and not fast
     deviation = summary.deviation_in(signal.turn)

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
-import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.features import find_spikes
+from webots_mcp.store.analysis.summaries import Summaries
 from webots_mcp.store.analysis.summary import Summary, summarise_numbers, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.questions.trend import Trend, judge
 from webots_mcp.store.reading.changes import change_points, longest_values
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
-from webots_mcp.store.reading.rollups import Pieces, piece_length_s, read_pieces
+from webots_mcp.store.reading.rollups import piece_length_s, read_pieces
 from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, kept_columns, read_numbers
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.signals.catalogue import signals_of
@@ -131,8 +132,12 @@ def _run_trends(
         piece_s = piece_length_s(connection, segment, LEAST_PIECES)
         pieces = read_pieces(connection, segment, numbers, deadline, piece_s)
         kept = kept_columns(connection, segment, numbers, deadline)
-        found = [_trend_of_pieces(signal, pieces, kept) for signal in numbers]
-        rows = max((pieces.whole(signal.name).rows for signal in numbers), default=0)
+        parts = [pieces.summaries(signal.name) for signal in numbers]
+        found = [
+            _trend_of_pieces(signal, of_signal, piece_s, kept)
+            for signal, of_signal in zip(numbers, parts, strict=True)
+        ]
+        rows = max((of_signal.rows for of_signal in parts), default=0)
         resolution_s, cut_at_s = piece_s, pieces.cut_at_s
     else:
         read = read_numbers(connection, segment, numbers, deadline)
@@ -178,42 +183,19 @@ def _trend_of_rows(signal: Signal, read: Numbers, kept: Columns | None) -> Trend
     return judge(signal, summary, times, numbers, find_spikes(times, numbers, signal.turn))
 
 
-def _trend_of_pieces(signal: Signal, pieces: Pieces, kept: Columns | None) -> Trend | None:
-    summary = pieces.whole(signal.name)
+def _trend_of_pieces(
+    signal: Signal, pieces: Summaries, piece_s: float, kept: Columns | None
+) -> Trend | None:
+    summary = pieces.whole()
     if summary.sum is None:
         return None
     summary = _with_kept(signal, summary, kept)
     turn = summary.turn_of(signal.turn)
-    middles: list[float] = []
-    means: list[float] = []
-    inner: list[float] = []
-    for _, part in pieces.of(signal.name):
-        centre = part.centre(turn)
-        if centre is not None and part.first_sim_time_s is not None:
-            middles.append((part.first_sim_time_s + (part.last_sim_time_s or 0.0)) / 2)
-            means.append(centre)
-            inner.append(part.deviation_in(turn) or 0.0)
-    variance = statistics.fmean(deviation**2 for deviation in inner)
-    course = np.array(middles), np.array(means)
-    known = _known_values([part for _, part in pieces.of(signal.name)])
-    return judge(signal, summary, *course, None, variance, pieces.piece_s, known)
-
-
-def _known_values(parts: Sequence[Summary]) -> tuple[Array, Array]:
-    """Times and values of the ends and extremes of each part, in order."""
-    points = {
-        (time_s, value)
-        for part in parts
-        for time_s, value in (
-            (part.first_sim_time_s, part.first),
-            (part.min_sim_time_s, part.min),
-            (part.max_sim_time_s, part.max),
-            (part.last_sim_time_s, part.last),
-        )
-        if time_s is not None and value is not None
-    }
-    course: Array = np.array(sorted(points), np.float64)
-    return course[:, 0], course[:, 1]
+    centres = pieces.centres(turn)
+    middles: Array = (pieces["first_sim_time_s"] + pieces["last_sim_time_s"]) / 2
+    held = ~np.isnan(centres) & ~np.isnan(middles)
+    variance = math.fsum(pieces.variances(turn)[held].tolist()) / int(held.sum())
+    return judge(signal, summary, middles[held], centres[held], None, variance, piece_s, pieces)
 
 
 def _state_trends(

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 import sqlite3
-from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import groupby
+from itertools import pairwise
 from typing import Final
 
-from webots_mcp.store.analysis.summary import Summary, merge
+from webots_mcp.store.analysis.arrays import Array, Indexes, np
+from webots_mcp.store.analysis.summaries import Summaries
+from webots_mcp.store.analysis.summary import COUNTS, Summary, merge
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.moments import shown_time
@@ -27,7 +28,7 @@ from webots_mcp.store.rollup.buckets import (
     FINE,
     Grain,
     bucket_of,
-    buckets,
+    bucket_table,
     by_grain,
 )
 from webots_mcp.store.rollup.tables import watermark
@@ -48,6 +49,10 @@ _ROW_IN: Final = (
 )
 
 
+_BEFORE_ALL: Final = -(2**62)
+_Part = tuple["Indexes", "Array"]  # the numbers of pieces, and a table of their summaries
+
+
 class Pieces:
     """A stretch of a run in pieces of equal length; parts of a piece are added in order of time.
 
@@ -60,22 +65,20 @@ class Pieces:
         self.piece_s = piece_s
         self.cut_at_s: float | None = None
         self._signals = signals
-        self._parts: dict[str, defaultdict[int, list[Summary]]] = {
-            signal.name: defaultdict(list) for signal in signals
-        }
+        nothing = np.empty(0, np.intp), Summaries.of([]).table
+        self._parts: dict[str, list[_Part]] = {signal.name: [nothing] for signal in signals}
 
     def add_rows(self, columns: Columns) -> None:
         """Add state rows."""
         if columns.cut:
             self._note_cut(columns.times[-1] if columns.times else math.inf)
-        start = 0
-        for piece, times in groupby(columns.times, self._piece_of):
-            end = start + len(list(times))
-            for signal in self._signals:
-                values = columns.values[signal.name][start:end]
-                summary = signal.summarise(columns.times[start:end], values)
-                self._parts[signal.name][piece].append(summary)
-            start = end
+        pieces: Indexes = (columns.moments // self.piece_s).astype(np.intp)
+        starts = np.flatnonzero(np.diff(pieces, prepend=_BEFORE_ALL))
+        spans = list(pairwise([*starts.tolist(), len(pieces)]))
+        for signal in self._signals:
+            values = columns.values[signal.name]
+            summaries = [signal.summarise(columns.times[a:b], values[a:b]) for a, b in spans]
+            self._parts[signal.name].append((pieces[starts], Summaries.of(summaries).table))
 
     def add_rollups(
         self,
@@ -96,29 +99,44 @@ class Pieces:
             if deadline.passed:
                 self._note_cut(span.start * grain.bucket_s)
                 return
-            parts = self._parts[signal.name]
-            missing = dict(rows)
-            for bucket, summary in buckets(connection, run_id, signal.id, span, grain):
-                whole = max(summary.rows, missing.pop(bucket, 0))
-                counted = summary if whole == summary.rows else summary._replace(rows=whole)
-                parts[self._piece_of(bucket * grain.bucket_s)].append(counted)
-            for bucket, lacking in missing.items():
-                parts[self._piece_of(bucket * grain.bucket_s)].append(Summary(lacking))
+            table = bucket_table(connection, run_id, signal.id, span, grain)
+            self._parts[signal.name].append(self._counted(table, rows, grain))
 
     def of(self, name: str) -> list[tuple[int, Summary]]:
         """The pieces of a signal that have rows, by their numbers, in order."""
-        return [(piece, merge(parts)) for piece, parts in sorted(self._parts[name].items())]
+        pieces, table = self._in_order(name)
+        return list(zip(pieces.tolist(), Summaries(table).as_list(), strict=True))
 
-    def whole(self, name: str) -> Summary:
-        """The summary of the whole stretch."""
-        parts = [summary for _, summary in self.of(name)]
-        return merge(parts) if parts else Summary()
+    def summaries(self, name: str) -> Summaries:
+        """The same without their numbers, as arrays."""
+        return Summaries(self._in_order(name)[1])
+
+    def _in_order(self, name: str) -> _Part:
+        """Each piece once."""
+        pieces = np.concatenate([pieces for pieces, _ in self._parts[name]])
+        table = np.concatenate([table for _, table in self._parts[name]])
+        order = np.argsort(pieces, kind="stable")
+        pieces, table = pieces[order], table[order]
+        starts = np.flatnonzero(np.diff(pieces, prepend=_BEFORE_ALL))
+        ends = np.append(starts[1:], len(pieces))
+        for at in np.flatnonzero(ends - starts > 1).tolist():
+            together = Summaries(table[starts[at] : ends[at]]).as_list()
+            table[starts[at]] = merge(together)
+        return pieces[starts], table[starts]
+
+    def _counted(self, found: Array, rows: dict[int, int], grain: Grain) -> _Part:
+        """Buckets of a signal, as those that are there have rows; with those that lack it."""
+        there: Array = np.array(list(rows), np.float64)
+        numbers = np.union1d(found[:, 0], there)
+        table = np.full((len(numbers), found.shape[1] - 1), np.nan)
+        table[:, :COUNTS] = 0
+        table[np.searchsorted(numbers, found[:, 0])] = found[:, 1:]
+        places = np.searchsorted(numbers, there)
+        table[places, 0] = np.maximum(table[places, 0], list(rows.values()))
+        return (numbers * grain.bucket_s // self.piece_s).astype(np.intp), table
 
     def _note_cut(self, at_s: float) -> None:
         self.cut_at_s = at_s if self.cut_at_s is None else min(self.cut_at_s, at_s)
-
-    def _piece_of(self, sim_time_s: float) -> int:
-        return bucket_of(sim_time_s, self.piece_s)
 
 
 def piece_length_s(

@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
+from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.summary import Summary
 
 BUCKET_S: Final = 10.0
@@ -61,6 +62,15 @@ def buckets(
     query = _BUCKETS.format(table=grain.table)
     rows = connection.execute(query, (run_id, signal_id, span.start, span.stop))
     return ((row[0], Summary._make(row[1:])) for row in rows)
+
+
+def bucket_table(
+    connection: sqlite3.Connection, run_id: int, signal_id: int, span: range, grain: Grain
+) -> Array:
+    """The same as rows of one array: the bucket, and the fields of its summary, NaN for None."""
+    query = _BUCKETS.format(table=grain.table)
+    rows = connection.execute(query, (run_id, signal_id, span.start, span.stop)).fetchall()
+    return np.reshape(np.array(rows, np.float64), (len(rows), 1 + len(Summary._fields)))
 
 
 def by_grain(connection: sqlite3.Connection, run_id: int, span: range) -> list[tuple[Grain, range]]:

@@ -276,10 +276,6 @@ class CoarseRollup(_Summary, table=True):
         "JSON, at the signal of x: where the robot stood still, and what shows whether it should "
         "have moved; null where that was not looked for",
     )
-    jumps: str | None = _text(
-        "JSON: the steps of a number that are much larger than it usually changes, and how it "
-        "usually changes; null where they were not looked for",
-    )
 
 
 class Change(SQLModel, table=True):

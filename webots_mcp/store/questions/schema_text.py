@@ -11,7 +11,14 @@ _OBJECTS: Final = (
     "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' ORDER BY type, rowid"
 )
 # What serves the recording itself: a question needs the names at most.
-_BOOKKEEPING: Final = ("lease", "watermark", "recording", "retention_limit", "kept_state")
+_BOOKKEEPING: Final = (
+    "console_line",
+    "lease",
+    "watermark",
+    "recording",
+    "retention_limit",
+    "kept_state",
+)
 _BOOKKEEPING_COLUMNS: Final = (
     "uuid",
     "process",
@@ -24,7 +31,6 @@ _BOOKKEEPING_COLUMNS: Final = (
     "last_since_sim_time_s",
     "swings",
     "standstills",
-    "jumps",
 )
 _COLUMNS: Final = "SELECT name FROM pragma_table_info(?) ORDER BY cid"
 # A column that was added later stands on the line of the last one, after a comma.

@@ -1,4 +1,4 @@
-"""The standstills and the jumps of 500 s; lines of Webots' console that wait for a run.
+"""The standstills of 500 s; lines of Webots' console that wait for a run.
 
 Revision ID: 0008
 Revises: 0007
@@ -10,23 +10,16 @@ from alembic import op
 revision = "0008"
 down_revision = "0007"
 
-FOUND = {
-    "standstills": (
-        "JSON, at the signal of x: where the robot stood still, and what shows whether it should "
-        "have moved; null where that was not looked for"
-    ),
-    "jumps": (
-        "JSON: the steps of a number that are much larger than it usually changes, and how it "
-        "usually changes; null where they were not looked for"
-    ),
-}
-# Merged again, what older versions merged gets them as well, where no row was deleted yet.
+STANDSTILLS = (
+    "JSON, at the signal of x: where the robot stood still, and what shows whether it should have "
+    "moved; null where that was not looked for"
+)
+# Merged again, what older versions merged gets it as well, where no row was deleted yet.
 MERGE_AGAIN = "UPDATE run SET coarse_end = NULL WHERE purged_rows = 0"
 
 
 def upgrade() -> None:
-    for name, comment in FOUND.items():
-        op.add_column("coarse_rollup", sa.Column(name, sa.Text(), comment=comment))
+    op.add_column("coarse_rollup", sa.Column("standstills", sa.Text(), comment=STANDSTILLS))
     op.execute(MERGE_AGAIN)
     create_console_line()
     if op.get_context().dialect.name == "sqlite":
@@ -52,5 +45,4 @@ def downgrade() -> None:
     if op.get_context().dialect.name == "sqlite":
         op.execute("PRAGMA user_version = 7")
     op.drop_table("console_line")
-    for name in FOUND:
-        op.drop_column("coarse_rollup", name)
+    op.drop_column("coarse_rollup", "standstills")

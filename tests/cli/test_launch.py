@@ -6,6 +6,7 @@ import contextlib
 import os
 import signal
 import socket
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -89,6 +90,26 @@ def test_it_says_who_records_and_leaves_nothing_running_however_it_ends(
         assert process.returncode == 128 + number
         assert "webots-mcp: ending Webots\n" in rest
         assert "Traceback" not in out + rest
+
+
+def test_what_the_console_says_is_recorded(
+    launch: Launch, project: Callable[..., Path], tmp_path: Path
+) -> None:
+    prints = CONTROLLER.replace("print(", "import sys\nprint('no arm', file=sys.stderr)\nprint(")
+    launch(project(prints), "--mode", "fast", "--headless")
+    file = tmp_path / "project" / "mcp_data" / "webots.db"
+
+    def is_recorded() -> bool:
+        if not file.exists():
+            return False
+        with contextlib.closing(sqlite3.connect(file)) as connection:
+            tables = "SELECT 1 FROM sqlite_master WHERE name = 'log'"
+            said = "SELECT 1 FROM log WHERE message LIKE '%no arm'"
+            return bool(
+                connection.execute(tables).fetchall() and connection.execute(said).fetchone()
+            )
+
+    wait_until(is_recorded)
 
 
 def test_webots_ends_by_itself_with_its_own_exit_code(

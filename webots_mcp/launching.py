@@ -75,7 +75,7 @@ class Launch:
 
     Raises:
         CommandRefusedError: There is no Webots, or no display.
-        DatabaseError: The recording cannot be read.
+        DatabaseError: Nothing can be recorded there.
     """
 
     def __init__(
@@ -84,9 +84,14 @@ class Launch:
         self.start = start
         self.world = start.world
         self._recording = recording
-        self._before = newest_in(recording)
         self.webots = LaunchedWebots(start, environment, show)
-        self.webots.start()
+        try:
+            recording.create()  # it has a console to record before any controller begins
+            self._before = newest_in(recording)
+            self.webots.start()
+        except BaseException:
+            self.webots.end()
+            raise
 
     def first_record(self) -> Beginning | None:
         """The first of its controllers that has recorded a state."""

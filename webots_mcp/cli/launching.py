@@ -46,7 +46,7 @@ def _port(text: str) -> int:
              help="say after S seconds why nobody has recorded yet (30)"),
 )  # fmt: skip
 def launch(arguments: argparse.Namespace) -> int:
-    """Start Webots on a world, show its console, and say when the first controller records.
+    """Start Webots on a world, show and record its console, say when the first controller records.
 
     Webots opens no dialogs and ends with this command, however that ends: by Ctrl-C, by SIGTERM,
     killed. If it ends by itself, the exit code is its own. Where there is no display, xvfb-run
@@ -63,7 +63,6 @@ def launch(arguments: argparse.Namespace) -> int:
     port = arguments.port or free_port()
     start = Start(world, arguments.mode, arguments.headless, arguments.stream, port)
     environment = {DATA_DIR_VARIABLE: str(recording.data_dir)}
-    recording.create()  # also a controller that fails before it records has its words recorded
     console = _Console()
     launched = Launch(recording, start, environment, console.show)
     with _Recorder(launched, recording) as recorder:
@@ -142,10 +141,9 @@ class _Recorder(ExitStack):
     def begin(self) -> None:
         """Unless it has begun, or Webots does not listen yet."""
         from webots_mcp.console.following import follow_console
-        from webots_mcp.webots.instances import instance_at
 
-        address = None if self._begun else self._launched.webots.address
-        if address is not None and (instance := instance_at(address.port)) is not None:
+        instance = None if self._begun else self._launched.webots.instance
+        if instance is not None:
             self._begun = True
             self.enter_context(follow_console(instance, self._recording))
 

@@ -38,6 +38,7 @@ class Launcher:
 
         Raises:
             CommandRefusedError: It runs already, or there is none, or no display.
+            DatabaseError: Nothing can be recorded.
         """
         with self._lock:
             if self.running is not None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import subprocess
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import IO, TYPE_CHECKING, Final
 
 from webots_mcp.webots.command_line import Start
-from webots_mcp.webots.instances import instances
+from webots_mcp.webots.instances import Instance, instances
 from webots_mcp.webots.kept_program import KeptProgram
 from webots_mcp.webots.stream import Address, ConsoleLine
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     import psutil
 
 _KEPT_LINES: Final = 200
+_LOOK_EVERY_S: Final = 0.5  # at all processes of this machine
 _LAST_WORDS_S: Final = 1.0  # a child that it left behind may hold its console open
 _KEEP_LAYOUT: Final = "WEBOTS_DISABLE_SAVE_SCREEN_PERSPECTIVE_ON_CLOSE"
 
@@ -42,7 +44,8 @@ class LaunchedWebots(KeptProgram):
         super().__init__(command, {**unseen, **environment}, subprocess.PIPE, subprocess.PIPE)
         self._show = show
         self._lines = deque[ConsoleLine](maxlen=_KEPT_LINES)
-        self._address: Address | None = None
+        self._instance: Instance | None = None
+        self._look_again_s = 0.0
         self._readers = [
             threading.Thread(target=self._read, args=(name, pipe), daemon=True)
             for name, pipe in (("stdout", self._process.stdout), ("stderr", self._process.stderr))
@@ -56,13 +59,19 @@ class LaunchedWebots(KeptProgram):
         return list(self._lines)
 
     @property
-    def address(self) -> Address | None:
-        """Where it listens; None before it does, and where the system does not tell."""
-        if self._address is None:
+    def instance(self) -> Instance | None:
+        """As the system sees it; None before it listens, and where the system does not tell."""
+        if self._instance is None and time.monotonic() > self._look_again_s:
+            self._look_again_s = time.monotonic() + _LOOK_EVERY_S
             pids = self.pids
             found = (each for each in instances() if each.is_listening and each.pid in pids)
-            self._address = next((each.address for each in found), None)
-        return self._address
+            self._instance = next(found, None)
+        return self._instance
+
+    @property
+    def address(self) -> Address | None:
+        """Where it listens; None before it does, and where the system does not tell."""
+        return self.instance.address if self.instance else None
 
     @property
     def pids(self) -> set[int]:

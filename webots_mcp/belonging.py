@@ -1,14 +1,14 @@
 """Which of the Webots that run here are of a recording: no other is followed or steered unasked.
 
-Of one that a living session names, and of one that has a world of the recording's project open, or
-one that was recorded here before.
+One of which a living session of the recording is; and one that was started with a world of the
+recording's project, or with one that was recorded here before, unless its controllers are told to
+record elsewhere.
 """
 
 from __future__ import annotations
 
 import sqlite3
 import time
-from pathlib import Path
 from typing import Final
 
 from webots_mcp.contract import find_project, full_path
@@ -36,24 +36,31 @@ def belongs(instance: Instance, recording: Recording) -> bool:
     Raises:
         DatabaseError: The recording cannot be read.
     """
-    if instance.world is not None and _is_in_project(instance.world, recording):
+    into = instance.data_dir  # that of a trial has one of its own
+    is_elsewhere = into is not None and full_path(into) != full_path(recording.data_dir)
+    if not is_elsewhere and _is_in_project(instance, recording):
         return True
     try:
         with recording.reader() as connection:
-            return _is_recorded(instance, connection)
+            is_known = not is_elsewhere and _has_known_world(instance, connection)
+            return is_known or _has_live_session(instance, connection)
     except NoDatabaseError:
         return False
 
 
-def _is_in_project(world: Path, recording: Recording) -> bool:
+def _is_in_project(instance: Instance, recording: Recording) -> bool:
     project = find_project(full_path(recording.data_dir))
-    return project is not None and world.resolve().is_relative_to(project)
+    if project is None or instance.world is None:
+        return False
+    return instance.world.resolve().is_relative_to(project)
 
 
-def _is_recorded(instance: Instance, connection: sqlite3.Connection) -> bool:
-    if instance.world is not None:
-        (is_known,) = connection.execute(_WORLD, (str(instance.world.resolve()),)).fetchone()
-        if is_known:
-            return True
+def _has_known_world(instance: Instance, connection: sqlite3.Connection) -> bool:
+    if instance.world is None:
+        return False
+    return bool(connection.execute(_WORLD, (str(instance.world.resolve()),)).fetchone()[0])
+
+
+def _has_live_session(instance: Instance, connection: sqlite3.Connection) -> bool:
     live = (robot.session for robot in list_robots(connection, time.time()) if robot.live)
     return any(session is not None and session.instance == instance.name for session in live)

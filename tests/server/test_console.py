@@ -23,8 +23,10 @@ from tests.webots.conftest import (
     webots,
     write_project,
 )
+from webots_mcp.belonging import belongs
 from webots_mcp.server import create_server
 from webots_mcp.store.recording import Recording
+from webots_mcp.webots.instances import instances
 
 __all__ = ["start_webots", "webots"]
 pytestmark = pytest.mark.anyio
@@ -92,6 +94,19 @@ async def test_without_a_webots_of_the_recording_it_is_said_that_no_console_is_f
     async with connect() as client:
         answer = await ask(client, "webots_get_logs", source="webots")
     assert "no Webots of this recording runs on this machine" in answer["hint"]
+
+
+async def test_a_webots_whose_controllers_record_elsewhere_is_not_followed(
+    tmp_path: Path, start_webots: StartWebots, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = write_project(tmp_path / "project", CONTROLLER)
+    data = tmp_path / "project" / "mcp_data"
+    monkeypatch.setenv("WEBOTS_MCP_DATA_DIR", str(tmp_path / "trial"))
+    wait_for_line(start_webots("--stdout", f"--port={free_port()}", world), "ready")
+    (elsewhere,) = instances()
+    for folder, is_its in ((data, False), (tmp_path / "trial", True)):
+        Recording(folder / "webots.db", folder).create()
+        assert belongs(elsewhere, Recording(folder / "webots.db", folder)) == is_its
 
 
 async def test_a_server_that_only_reads_follows_nothing_and_says_so(

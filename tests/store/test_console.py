@@ -109,6 +109,16 @@ def test_what_follows_the_start_of_a_controller_is_of_the_run_that_it_begins(
     ]
 
 
+def test_a_start_that_is_told_late_keeps_nothing_waiting(recorded: Recorded) -> None:
+    rover = robot(recorded)
+    rows = ConsoleRows(HERE, NOW - 10)
+    rows.write(recorded.connection, [said("INFO: rover_code: Starting controller: x")])
+    assert len(waiting(recorded)) == 1
+    recorded.connection.execute("UPDATE run SET last_wall_time_s = ?", (NOW + 1,))
+    rows.write(recorded.connection, [said("hello", NOW + 1)])
+    assert [row[0] for row in rows_of(recorded)] == [rover.run_id] * 2
+
+
 def test_the_start_of_a_controller_that_does_not_record_changes_nothing(
     recorded: Recorded,
 ) -> None:

@@ -27,11 +27,12 @@ class ConsoleLines:
     """Takes Webots' messages as they come, gives its lines.
 
     Args:
-        old: Whether the first ones were said long before they came.
+        old: Whether what waited until somebody listened may have been said long before.
     """
 
     def __init__(self, *, old: bool) -> None:
         self._is_old = old
+        self._is_first = True
         self._second = 0
         self._lines_in_second = 0
         self._left_out = 0
@@ -39,14 +40,24 @@ class ConsoleLines:
     def take(self, message: Message) -> Iterator[Said]:
         """The lines of a message; none of one that is about something else."""
         lines = list(console_lines(message.text))
-        if lines and self._is_old:
-            self._is_old = False
-            yield from _old_lines(lines)
+        if lines and self._is_first:
+            self._is_first = False
+            yield from self._that_waited(lines)
         else:
             for line in lines:
                 yield from self._within_limit(line)
         if lines and message.dropped_bytes:
             yield note(f"{message.dropped_bytes} bytes of the console that came at once")
+
+    def _that_waited(self, lines: list[ConsoleLine]) -> Iterator[Said]:
+        newest = lines[-MOST_OLD_LINES:]
+        told = f"the next {len(newest)} lines are from before somebody followed the console"
+        if len(newest) < len(lines):
+            told += f", the last of {len(lines)}"
+        if self._is_old or len(newest) < len(lines):
+            yield _about(f"({told}: when they were printed is not known)")
+        for line in newest:
+            yield _said(line)._replace(is_old=True)
 
     def idle(self) -> Iterator[Said]:
         """What is to be said although nothing came."""
@@ -69,16 +80,6 @@ class ConsoleLines:
             lost = f"{self._left_out} lines of the console"
             yield note(f"{lost}: more than {MOST_LINES_PER_S} in a second")
             self._left_out = 0
-
-
-def _old_lines(lines: list[ConsoleLine]) -> Iterator[Said]:
-    newest = lines[-MOST_OLD_LINES:]
-    told = f"the next {len(newest)} lines are from before somebody followed the console"
-    if len(newest) < len(lines):
-        told += f", the last of {len(lines)}"
-    yield _about(f"({told}: when they were printed is not known)")
-    for line in newest:
-        yield _said(line)._replace(is_old=True)
 
 
 def _said(line: ConsoleLine) -> Said:

@@ -36,7 +36,8 @@ _SESSIONS: Final = (
     f"AND id > coalesce((SELECT max(id) FROM session), 0) - {_MOST_SESSIONS}"
 )
 _RUNS: Final = (
-    "SELECT r.id, b.name, s.controller, r.started_wall_time_s, r.started_sim_time_s "
+    "SELECT r.id, b.name, s.controller, r.started_wall_time_s, r.started_sim_time_s, "
+    "r.last_wall_time_s "
     f"FROM ({_SESSIONS}) s JOIN run r ON r.session_id = s.id JOIN robot b ON b.id = s.robot_id "
     f"WHERE r.started_wall_time_s >= ? ORDER BY r.id DESC LIMIT {_MOST_RUNS}"
 )
@@ -88,6 +89,7 @@ class _Run(NamedTuple):
     controller: str | None
     started_wall_time_s: float
     started_sim_time_s: float
+    last_wall_time_s: float
 
 
 class ConsoleRows:
@@ -138,7 +140,13 @@ class ConsoleRows:
         return [_Run(*row) for row in found]
 
     def _fitting(self, runs: list[_Run]) -> list[_Run]:
-        return [run for run in runs if run.started_wall_time_s >= self._runs_since_s]
+        """Those that began since, and those that still go on: then the start was told late."""
+        since_s = self._runs_since_s
+        return [
+            run
+            for run in runs
+            if run.started_wall_time_s >= since_s or run.last_wall_time_s > since_s + _EARLY_S
+        ]
 
     def _notice_start(self, line: Said, runs: list[_Run]) -> None:
         """A controller that records is started: what follows is of the run that it begins."""

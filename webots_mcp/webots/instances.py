@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.contract import host_name
+from webots_mcp.contract import DATA_DIR_VARIABLE, host_name
 from webots_mcp.webots.stream import Address
 
 if TYPE_CHECKING:
@@ -47,6 +47,17 @@ class Instance:
     def name(self) -> str:
         """As the sessions of its controllers name it."""
         return f"{host_name()}:{self.port}"
+
+    @property
+    def data_dir(self) -> Path | None:
+        """Where its controllers record if its environment says so; None where it does not."""
+        import psutil
+
+        try:
+            named = psutil.Process(self.pid).environ().get(DATA_DIR_VARIABLE)
+        except (psutil.Error, OSError):
+            return None
+        return Path(named) if named else None
 
     @property
     def runs(self) -> bool:

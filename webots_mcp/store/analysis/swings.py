@@ -30,6 +30,8 @@ FINEST_SHARE: Final = 8  # of a band's period: what is shorter is smoothed away
 ROWS_PER_PERIOD: Final = 16  # of a band: of more, means are taken
 FITTED_PER_PERIOD: Final = 32  # the same where a sine is fitted; it loses 0.2 % of its height
 JOINED_PERIODS: Final = 1.5  # so near a gap a swing ends or begins that may go on across it
+LEAST_REST: Final = 0.6  # periods: the ends of swings are known to a quarter
+RESTING: Final = 0.5  # of the amplitude: while it swings, it is 0.7 away (root mean square)
 ALIKE: Final = (1.15, 1.5)  # ratio of periods and of amplitudes on both sides of a gap
 HALF_PERIODS: Final = (0.5 / 1.7, 0.5 * 1.5)  # of the band's period, that a half swing may last
 MOST_UNEVEN: Final = 1.8  # times as far as those before it may a half swing reach
@@ -187,7 +189,7 @@ def _in_stretch(
                     found.append(swing)
         rows *= SCALE_RATIO
     lasting = [each for each in found if _lasts(each, longest_period_s)]
-    return _connected(_best(lasting))
+    return _connected(_best(lasting), whole)
 
 
 def _lasts(swing: Swing, longest_period_s: float) -> bool:
@@ -198,16 +200,32 @@ def _lasts(swing: Swing, longest_period_s: float) -> bool:
     )
 
 
-def _connected(swings: list[Swing]) -> list[Swing]:
-    """Two that are alike and follow each other closely as one."""
+def _connected(swings: list[Swing], whole: _Stretch) -> list[Swing]:
+    """Two that are alike and follow each other closely as one, unless the value rests between."""
     connected: list[Swing] = []
     for swing in swings:
         before = connected[-1] if connected else None
-        if before and _follows(before, swing) and _is_alike(before, swing):
+        joined = before and _follows(before, swing) and _is_alike(before, swing)
+        if before and joined and not _rests_between(before, swing, whole):
             connected[-1] = _counted(_as_one(before, swing))
         else:
             connected.append(swing)
     return connected
+
+
+def _rests_between(before: Swing, after: Swing, whole: _Stretch) -> bool:
+    """Whether the value stays near the straight way from one swing's level to the other's."""
+    if after.start_s - before.end_s < LEAST_REST * before.period_s:
+        return False
+    times, values = whole.times, whole.values
+    last = (times > before.end_s - before.period_s) & (times <= before.end_s)
+    first = (times >= after.start_s) & (times < after.start_s + after.period_s)
+    between = (times > before.end_s) & (times < after.start_s)
+    moments = [float(times[part].mean()) for part in (last, first)]
+    levels = [float(values[part].mean()) for part in (last, first)]
+    away = values[between] - np.interp(times[between], moments, levels)
+    reach = RESTING * before.amplitude
+    return len(away) > 0 and inner(away, away) < len(away) * reach**2
 
 
 def _follows(before: Swing, after: Swing) -> bool:

@@ -272,7 +272,7 @@ def _on_bends(
     interval_s = float(moments[-1] - moments[0]) / (len(moments) - 1)
     for start, end, rows in likely_swings(means, noise, period):
         ends_s = float(moments[start]), float(moments[end - 1])
-        if not any(_covers(each, *ends_s, rows * interval_s) for each in found):
+        if not _are_covering(found, *ends_s, rows * interval_s, least):
             for bent in swings_on_bends(means, start, end, rows, least):
                 yield Swing(
                     float(moments[bent.start]),
@@ -284,14 +284,20 @@ def _on_bends(
                 )
 
 
-def _covers(swing: Swing, start_s: float, end_s: float, period_s: float) -> bool:
-    """Whether what seems to swing there is that swing, with what surrounds it."""
+def _are_covering(
+    swings: list[Swing], start_s: float, end_s: float, period_s: float, least: int
+) -> bool:
+    """Whether what seems to swing there is such swings, with what surrounds them.
+
+    What lies between two of them is too short for another one.
+    """
     near_s = JOINED_PERIODS * period_s
-    return (
-        swing.start_s - near_s <= start_s
-        and end_s <= swing.end_s + near_s
-        and _ratio(swing.period_s, period_s) < SCALE_RATIO
-    )
+    alike = [each for each in swings if _ratio(each.period_s, period_s) < SCALE_RATIO]
+    reached_s = -math.inf
+    for swing in sorted(alike, key=lambda each: each.start_s):
+        if swing.start_s - near_s <= start_s or swing.start_s - reached_s < least * period_s / 2:
+            reached_s = max(reached_s, swing.end_s)
+    return reached_s >= end_s - near_s
 
 
 def _bends(slow: Array, rows: int, noise: Array) -> bool:

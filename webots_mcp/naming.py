@@ -117,8 +117,8 @@ def find_position(numeric: Collection[str]) -> tuple[str, str] | None:
     this order), or `x` and `y` at the top, or else the first branch by name that has an x and y:
     one with such a word in its name before others (`currentPosition.x`, `posX`, `robotPose.0`), and
     none of what is elsewhere (`goal`, `ball`) or no place (`velocity`). The views robot_now and
-    robot_trajectory have the same rule, row by row, but for names in camelCase and for a `pos_x`.
-    Of several robots that an observer sees none is meant.
+    robot_trajectory have the same rule, row by row. Of several robots that an observer sees none
+    is meant.
     """
     for x, y in USUAL_POSITIONS:
         if x in numeric and y in numeric:
@@ -190,14 +190,20 @@ def is_seen_speed(name: str) -> bool:
     return branch in (WORLD, SOLIDS) and rest.endswith(f".{SEEN_SPEED}")
 
 
-def find_mode(texts: Collection[str]) -> str | None:
+def find_mode(texts: Collection[str], choices: Collection[str] = ()) -> str | None:
     """The name of what a robot is doing, among those of its texts; None without any.
+
+    Where no text tells it, a choice does: a whole number of which there are few values.
 
     It is `mode`, `behaviour`, `behavior`, `action`, `task` or `phase` (in this order), or else the
     shortest name that ends in one of these words, as `nav.mode` and `driveMode` do; then the same
     of `state` and `status`. What was or shall be (`lastAction`, `next_state`) is none. The views
-    robot_now and robot_trajectory have the same rule, row by row, for whole parts of a name.
+    robot_now and robot_trajectory have the same rule, row by row.
     """
+    return _mode_among(texts) or _mode_among(choices)
+
+
+def _mode_among(texts: Collection[str]) -> str | None:
     last_words = {name: words_of(name.rpartition(".")[2]) for name in texts}
     for words in (_MODES, _STATES):
         ending = [

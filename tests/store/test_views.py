@@ -28,7 +28,7 @@ POSES: list[tuple[dict[str, Any], tuple[Any, ...]]] = [
     ({"pose": [1, 2, 9, 0.5]}, (1, 2, 0.5, None)),
     ({"pose": [1, 2, 9, 0, 0, 0.5]}, (1, 2, 0.5, None)),
     ({"pose": {"x": 1, "y": 2, "yaw": 0.5}, "state": "turn"}, (1, 2, 0.5, "turn")),
-    ({"pose": {"x": 1, "y": 2, "theta": 0.5}, "mode": 3}, (1, 2, 0.5, None)),
+    ({"pose": {"x": 1, "y": 2, "theta": 0.5}, "mode": 3}, (1, 2, 0.5, 3)),
     ({"position": [1, 2, 9], "heading": 0.5}, (1, 2, 0.5, None)),
     ({"position": {"x": 1, "y": 2}, "state": {"deep": 1}}, (1, 2, None, None)),
     ({"gps": [1, 2, 9], "yaw": 0.5}, (1, 2, 0.5, None)),
@@ -91,6 +91,16 @@ PLACES = [
     {"odom": [1, 2], "pos": {"x": 7}, "pose": {"x": "near", "y": "far"}},
     {"pose": [7], "position": {"y": 7}, "gps": [1, 2]},
     {"x": 7, "y": None, "a b": {"x": 1, "y": 2}, 'a"b': {"x": 7, "y": 8}},
+    {"positionX": 1, "positionY": 2},
+    {"odomX": 1, "odomY": 2, "goalX": 7, "goalY": 8},
+    {"pos_x": 1, "pos_y": 2},
+    {"currentPosX": 1, "currentPosY": 2, "targetPosX": 7, "targetPosY": 8},
+    {"robot": {"robot_x": 1, "robot_y": 2}},
+    {"goalPose": {"x": 7, "y": 8}, "myRover": {"x": 1, "y": 2}},
+    {"aim": {"x": 7, "y": 8}, "currentPosition": {"x": 1, "y": 2}},
+    {"robotPose": [1, 2]},
+    {"nav": {"xMm": 1, "yMm": 2}},
+    {"posXCm": 1, "posYCm": 2},
 ]
 MODES = [
     *({name: "go"} for name in ("mode", "behaviour", "behavior", "action", "task", "phase")),
@@ -100,10 +110,17 @@ MODES = [
     {"nav": {"mode": "wait"}, "behaviour": "go"},
     {"arm": {"state": "go"}, "gripper": {"status": "wait"}},
     {"mode": 3, "task": None, "steps": [{"action": "go"}, {"action": "wait"}]},
+    {"driveMode": "go", "lastMode": "wait"},
+    {"nav": {"currentState": "go"}, "nextState": "wait"},
+]
+CHOICES = [
+    {"mode": 7},
+    {"nav": {"driveMode": 7}, "speed": 3},
+    {"phase": 1.5, "armState": 7},
 ]
 
 
-@pytest.mark.parametrize("state", [*PLACES, *MODES], ids=json.dumps)
+@pytest.mark.parametrize("state", [*PLACES, *MODES, *CHOICES], ids=json.dumps)
 def test_the_views_and_the_tools_find_position_and_mode_under_the_same_names(
     recorder: Recorder, state: dict[str, Any]
 ) -> None:
@@ -114,7 +131,7 @@ def test_the_views_and_the_tools_find_position_and_mode_under_the_same_names(
     told = [*(motion.position or (None, None)), motion.mode]
     values = flatten(state)
     found = tuple(values[signal.name] if signal else None for signal in told)
-    assert found in ((1, 2, None), (None, None, "go"))
+    assert found in ((1, 2, None), (None, None, "go"), (None, None, 7))
     if motion.position:
         x, y = (in_metres(each, np.array([values[each.name]])) for each in motion.position)
         found = (x[0], y[0], None)

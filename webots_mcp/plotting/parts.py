@@ -189,6 +189,6 @@ def mode_signal(known: Known, wanted: str | None) -> str | None:
         mode = find_motion(known, EventOptions()).mode
         return mode.name if mode else None
     signal = one_signal(known, wanted)
-    if signal.is_number:
+    if signal.is_number and not signal.is_choice:
         raise InvalidInputError(f"{wanted!r} holds numbers: a text or a flag colours a picture")
     return signal.name

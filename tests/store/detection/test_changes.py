@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
+
+import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.signals.catalogue import known_signals
 
 
 def changes(connection: sqlite3.Connection) -> Events:
@@ -57,3 +62,24 @@ def test_of_a_mode_that_is_a_number_the_way_to_its_changes_is_named(
     options = EventOptions(kinds=("condition",), where="changed(betriebsart)")
     found = find_events(empty, find_range(empty, Scope(run_id=1)), options)
     assert [round(each.start_s, 1) for each in found.events] == [3.0, 6.0]
+
+
+@pytest.mark.parametrize("rolled_up", [True, False])
+def test_few_whole_numbers_that_are_named_like_a_mode_are_one(
+    empty: sqlite3.Connection, *, rolled_up: bool
+) -> None:
+    recorder = start_run(empty)
+    for step in range(90):
+        phase_rad, command = step * 0.25 % 6.25, max(-1.0, min(1.0, math.sin(step) * 2))
+        others = {"phase": phase_rad, "action": command, "loop_status": step}
+        recorder.publish(step * 0.1, {"arm": {"driveMode": step // 30}, **others})
+    if rolled_up:
+        roll(empty, 100_000)
+    found = changes(empty)
+    assert [(each.name, each.details["after"]) for each in found.events] == [
+        ("arm.driveMode", "1"),
+        ("arm.driveMode", "2"),
+    ]
+    known = known_signals(empty, find_range(empty, Scope(run_id=1)))
+    mode = find_motion(known, EventOptions()).mode
+    assert mode is not None and mode.name == "arm.driveMode"

@@ -182,7 +182,8 @@ def _in_stretch(
             for crossings in _regular(moments, band, rows * interval_s, least_half_swings):
                 if not any(_is_same(crossings, each) for each in found):
                     found += _fitted(whole, crossings)
-        if _bends(slow, round(rows / step), of_means):
+        is_slow = rows * interval_s > SLOW_PERIOD_S  # bends of a way come as often as its turns
+        if not is_slow and _bends(slow, round(rows / step), of_means):
             course = moments, means, of_means
             for swing in _on_bends(*course, rows / step, least_half_swings, found):
                 if _stands_out(whole, swing):

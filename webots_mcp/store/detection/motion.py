@@ -160,7 +160,8 @@ def _position(
 
 
 def _mode(known: dict[str, Signal]) -> Signal | None:
-    name = find_mode({name for name, signal in known.items() if signal.kind == "text"})
+    texts = {name for name, signal in known.items() if signal.kind == "text"}
+    name = find_mode(texts, {name for name, signal in known.items() if signal.is_choice})
     return known[name] if name else None
 
 

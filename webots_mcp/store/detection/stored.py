@@ -94,12 +94,12 @@ def gap_events(search: Search) -> Iterator[Event]:
 
 
 def change_events(search: Search) -> Iterator[Event]:
-    """Changes of text and flags, each as long as the new value lasted, up to the newest row."""
+    """Changes of text, flags and modes, each as long as the new value lasted."""
     segment, newest_s = _recorded(search), search.ended_s
-    states = [signal for signal in search.signals if not signal.is_number]
+    states = [each for each in search.signals if not each.is_number or each.is_choice]
     if not states:
         raise NotSearchableError(
-            "no text or flag was published, or none of these names; of a mode that is a number ask "
+            "no text, flag or mode was published, or none of these names; of another number ask "
             "where='changed(NAME)'"
         )
     around = Segment(segment.run_id, segment.start_s - AROUND_S, segment.end_s + AROUND_S)

@@ -103,8 +103,10 @@ def value_ended_s(
     connection: sqlite3.Connection, segment: Segment, signal: Signal, deadline: Deadline
 ) -> float | None:
     """When the value in force at the begin of a segment ended in it; None where it did not."""
-    stored = _stored(connection, segment, signal, deadline, segment.start_s, most=2)
-    stored = _from(stored, segment.start_s)
+    stored: list[Point] = []
+    if not signal.is_number:  # of numbers no change is stored
+        found = _stored(connection, segment, signal, deadline, segment.start_s, most=2)
+        stored = _from(found, segment.start_s)
     end_s = just_after(stored[1].sim_time_s) if len(stored) > 1 else segment.end_s
     first = Segment(segment.run_id, segment.start_s, end_s)
     points = change_points(connection, first, [signal], deadline, since=False)[signal.name]

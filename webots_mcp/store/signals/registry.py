@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.naming import Value
+from webots_mcp.naming import Value, find_mode
 from webots_mcp.store.analysis.summary import Summary, summarise, usable_numbers
 from webots_mcp.store.rollup.batch import BatchColumn
 from webots_mcp.store.signals.flatten import (
@@ -27,9 +27,15 @@ from webots_mcp.store.signals.flatten import (
 
 MAX_SIGNALS: Final = 2000  # of one robot: keys made of ids or times would grow without end
 
+MOST_CHOICES: Final = 20  # that a number which names a mode has
+
 _OF_ROBOT: Final = (
-    "SELECT id, robot_id, name, kind, unit, path, reduce FROM signal WHERE robot_id = ? "
+    "SELECT id, robot_id, name, kind, unit, path, reduce, max - min FROM signal WHERE robot_id = ? "
     "AND typeof(name) = 'text' AND typeof(path) = 'text' ORDER BY id"
+)
+_TYPE_IN_NEWEST: Final = (
+    "SELECT json_type(data, ?) FROM state WHERE json_valid(data) AND run_id = "
+    "(SELECT max(id) FROM run WHERE robot_id = ?) ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
 _ADD: Final = (
     "INSERT OR IGNORE INTO signal (robot_id, name, kind, unit, path, reduce, "
@@ -48,6 +54,7 @@ class Signal:
         reduce: None, or how the long array at `path` becomes one number.
         decoded: Rows must be decoded to read it: its array was at times long enough to be
             reduced, or its name holds what the paths of SQLite before 3.45 do not reach.
+        is_choice: Its whole numbers, of which there are few, name what a robot does.
     """
 
     id: int | None
@@ -58,6 +65,7 @@ class Signal:
     path: str
     reduce: str | None
     decoded: bool = False
+    is_choice: bool = False
 
     @property
     def is_plain(self) -> bool:
@@ -93,7 +101,26 @@ class Signal:
 def registered(connection: sqlite3.Connection, robot_id: int) -> dict[str, Signal]:
     """The signals of a robot in the register, by name."""
     rows = connection.execute(_OF_ROBOT, (robot_id,)).fetchall()
-    return by_name([Signal(*row) for row in rows])
+    return by_name([_as_registered(connection, Signal(*row), span) for *row, span in rows])
+
+
+def _as_registered(connection: sqlite3.Connection, signal: Signal, span: float | None) -> Signal:
+    if span is None or span > MOST_CHOICES or not _may_be_choice(signal.name, signal.kind):
+        return signal
+    asked = (signal.path, signal.robot_id)
+    newest = connection.execute(_TYPE_IN_NEWEST, asked).fetchone()
+    return replace(signal, is_choice=newest is not None and newest[0] == "integer")
+
+
+def _may_be_choice(name: str, kind: Kind) -> bool:
+    return kind == "num" and find_mode([name]) is not None
+
+
+def _are_choices(column: BatchColumn) -> bool:
+    """Whether the values are few whole numbers."""
+    values = {point[2] for point in column.points}
+    numbers = [value for value in values if type(value) is int]
+    return len(numbers) == len(values) and max(numbers) - min(numbers) <= MOST_CHOICES
 
 
 def by_name(signals: Sequence[Signal]) -> dict[str, Signal]:
@@ -158,7 +185,9 @@ def _unregistered(column: BatchColumn) -> Signal | None:
         return None
     kind = _seen_in(column)
     unit = unit_of(column.name, kind)
-    return Signal(None, column.robot_id, column.name, kind, unit, place.path, place.reduce)
+    is_choice = _may_be_choice(column.name, kind) and _are_choices(column)
+    found = Signal(None, column.robot_id, column.name, kind, unit, place.path, place.reduce)
+    return replace(found, is_choice=is_choice)
 
 
 def seen_now(signal: Signal | None, column: BatchColumn) -> Signal | None:

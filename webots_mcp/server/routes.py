@@ -43,7 +43,7 @@ UNCLAIMED: Final = ("cancelled", "expired")
 _PROOF_S: Final = 3.0  # a heartbeat tells within half a second that time goes on
 _RESTART_S: Final = 5.0  # until a controller that Webots starts again has recorded
 _LEAST_S: Final = 0.1
-NOTHING_SEEN: Final = (
+_NOTHING_SEEN: Final = (
     "the recording does not show it yet: a controller that hangs, or an extern one that is "
     "missing, stops the time of a simulation that runs"
 )
@@ -179,7 +179,7 @@ class Attempt:
         answer.route = "observer"
         if self.order not in ("pause", "step"):
             answer.proof = await self._shown(situation, _PROOF_S)
-            answer.hint = answer.hint if answer.proof else NOTHING_SEEN
+            answer.hint = answer.hint if answer.proof else _NOTHING_SEEN
         return answer
 
     @property
@@ -230,7 +230,7 @@ class Attempt:
         if made < self._wanted:
             answer.outcome = "failed"
         elif seen is None and self.order != "pause" and situation.robot is not None:
-            answer.hint = NOTHING_SEEN
+            answer.hint = _NOTHING_SEEN
         return answer
 
     async def _by_keyboard(self, situation: Situation) -> CommandAnswer | None:

@@ -19,7 +19,7 @@ from webots_mcp.contract import PAUSED, host_name
 from webots_mcp.diagnosis.finding import Finding, Subject, last_seen_s, worst
 from webots_mcp.store.recording import View
 from webots_mcp.store.sessions import Session, companions
-from webots_mcp.store.status import SILENT
+from webots_mcp.store.status import SEEN_PAUSED, SEEN_RUNNING, SILENT
 from webots_mcp.webots.stream import address_of
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ def _once_each(views: list[View]) -> list[View]:
     watched = dict[str, View]()
     others = list[View]()
     for view in views:
-        if view.session is not None and view.robot.live and view.status.why == SILENT:
+        if view.session is not None and view.robot.live and _is_unclear(view):
             watched.setdefault(view.session.instance, view)
         else:
             others.append(view)
@@ -74,9 +74,16 @@ def _judged(subject: Subject, view: View) -> Finding:
         return Finding("warning" if status.why else "ok", seen)
     if status.text == PAUSED:
         return Finding("warning", seen, f"webots-mcp resume --robot {name}")
-    if status.why != SILENT:
+    if (status.why or "").startswith(SEEN_PAUSED):
+        return Finding("warning", seen, "webots_simulation_control('resume'), or press play")
+    if not _is_unclear(view):
         return Finding("wrong", seen, "see docs/troubleshooting.md#simulation")
     return _narrowed(subject, view, session)
+
+
+def _is_unclear(view: View) -> bool:
+    """Whether only a look from outside can tell which controller holds up the world."""
+    return (view.status.why or "").startswith((SILENT, SEEN_RUNNING))
 
 
 def _ended(view: View, seen: str) -> Finding:
@@ -102,6 +109,9 @@ def _narrowed(subject: Subject, view: View, session: Session) -> Finding:
         fix = "start it: 'webots-controller --robot-name=NAME FILE', or press play if it is paused"
         return Finding("wrong", f"{head}; {missing}", fix)
     press_play = _also_by_websocket(_PRESS_PLAY, "resume", webots)
+    if (view.status.why or "").startswith(SEEN_RUNNING):
+        seen = f"{head} ({view.status.why})"
+        return Finding("wrong", seen, _also_by_websocket(_RELOAD, "reload", webots))
     if busy is None:
         return Finding("wrong", f"{head} ({view.status.why})", press_play)
     seen = (

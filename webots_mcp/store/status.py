@@ -82,11 +82,11 @@ _SEEN_MODE: Final = (
     "SELECT json_extract(data, '$.mode') FROM event WHERE run_id IN "
     f"(SELECT id FROM run WHERE session_id = ?) AND kind = '{MODE_EVENT}' ORDER BY id DESC LIMIT 1"
 )
-_SEEN_PAUSED: Final = (
-    "paused in Webots, as robot {!r} sees; webots_simulation_control('resume') goes on"
-)
+SEEN_PAUSED: Final = "paused in Webots, as robot"
+SEEN_RUNNING: Final = "not paused, as robot"
+_SEEN_PAUSED: Final = f"{SEEN_PAUSED} {{!r}} sees; webots_simulation_control('resume') goes on"
 _SEEN_RUNNING: Final = (
-    "not paused, as robot {!r} sees, and yet time stands still: a controller hangs, or an extern "
+    f"{SEEN_RUNNING} {{!r}} sees, and yet time stands still: a controller hangs, or an extern "
     "one is missing"
 )
 _STANDING: Final = (

@@ -72,9 +72,9 @@ def test_a_loop_that_was_quit_while_held_may_say_its_last_words(
     simulation = InProcessSimulation()
     robot = InProcessSupervisor("rover", world=simulation)
     bridge = MCPBridge(robot, throttle_interval=1, database=database)
-    bridge.register_command("quit", lambda _: simulation.quit())
+    bridge.register_command("close_window", lambda _: simulation.quit())
     recording.send("pause")
-    recording.send("quit")
+    recording.send("close_window")
     come_round(robot, bridge, 1)
     assert recording.rows("SELECT end_reason FROM session") == ["finished"]
     assert recording.rows("SELECT end_reason FROM run") == ["finished"]

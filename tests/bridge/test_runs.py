@@ -219,8 +219,8 @@ def test_a_quit_during_a_held_pause_reaches_the_loop_of_a_subclass_and_of_no_oth
     with MCPBridge(environment, throttle_interval=1, database=database) as bridge:
         assert environment.step("forward") == (0.5, False)
         pause = Recording(database).send("pause")
-        bridge.register_command("quit", lambda _: simulation.quit())
-        Recording(database).send("quit")
+        bridge.register_command("close_window", lambda _: simulation.quit())
+        Recording(database).send("close_window")
         bridge.get_command()
         assert Recording(database).fate(pause)[0] == "done"
         assert environment.step("forward") == (0.5, True)

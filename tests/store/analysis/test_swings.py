@@ -184,3 +184,28 @@ def test_what_is_switched_to_and_fro_swings(levels: tuple[float, ...]) -> None:
 def test_a_random_walk_that_looks_regular_for_a_while_does_not_swing(seed: int) -> None:
     steps = np.random.default_rng(seed).normal(0, 1, 6000)
     assert swings_of(np.linspace(0, 300, 6001)[:-1], np.cumsum(steps)) == []
+
+
+@pytest.mark.parametrize("rest_periods", [1.3, 2.0])
+@pytest.mark.parametrize("slope", [0.0, 0.05])
+def test_two_swings_with_a_rest_between_them_are_two(rest_periods: float, slope: float) -> None:
+    times, period_s = np.arange(0, 120, 0.16), 3.7
+    lasts_s = 4.5 * period_s
+    begins_s = 40.0, 40.0 + lasts_s + rest_periods * period_s
+    values = slope * times + np.random.default_rng(5).normal(0, 0.02, len(times))
+    for begin_s in begins_s:
+        inside = (times >= begin_s) & (times < begin_s + lasts_s)
+        values += inside * 0.25 * np.sin(2 * np.pi * (times - begin_s) / period_s)
+    found = swings_of(times, values)
+    assert [each.start_s for each in found] == pytest.approx(begins_s, abs=period_s / 2)
+    assert [each.end_s - each.start_s for each in found] == pytest.approx([lasts_s] * 2, rel=0.15)
+
+
+def test_a_slow_swing_counts_from_six_periods_on() -> None:
+    times = np.arange(0, 120, 0.1)
+    dither = np.random.default_rng(6).normal(0, 0.01, len(times))
+    for periods, count in ((5, 0), (8, 1)):
+        inside = (times >= 10) & (times < 10 + 10 * periods)
+        values = dither + inside * 0.3 * np.sin(2 * np.pi * (times - 10) / 10)
+        found = find_swings(times, values, least_half_swings=6, longest_period_s=20.0)
+        assert len(found) == count

@@ -110,6 +110,7 @@ def _asked(
         EventOptions(kinds=kinds),
         limit=_ALL,
         around=(),
+        group=False,
         deadline_s=UNHURRIED_S,
     )
     took_s = time.perf_counter() - started_s
@@ -142,7 +143,7 @@ def _claims(events: Iterable[Event], measure: Measure) -> Iterable[Claim]:
                 event.name.split(".")[0] if named and event.name else None,
                 event.details.get("period_s"),
                 event.details.get("amplitude"),
-                int(event.details.get("count", 1)),
+                event.count,
                 (event.kind, event.name),
             )
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import pytest
 
+from tests.recordings.fleet import build_fleet
 from tests.recordings.long import build
 from tests.server.conftest import text_of
 from tests.server.story import client_on
@@ -19,6 +20,7 @@ from webots_mcp.connection import connect
 pytestmark = pytest.mark.anyio
 
 TOKENS: Final = 2_000
+RICH_TOKENS: Final = 1_500
 ROWS: Final = 5_000
 LONG_RUN: Final = 2
 MORE_SIGNALS: Final = 30  # to the 39 of the long recording
@@ -63,6 +65,34 @@ def big(tmp_path_factory: pytest.TempPathFactory) -> Path:
         connection.execute("COMMIT")
     connection.close()
     return file
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("fleet") / "webots.db"
+    build_fleet(file, robots=2, seconds=900, interval_s=0.5)
+    return file
+
+
+async def test_robots_that_do_the_same_again_and_again_are_told_in_1500_tokens(
+    fleet: Path,
+) -> None:
+    async with client_on(fleet) as client:
+        for tool, arguments in (
+            ("webots_get_full_state", {}),
+            ("webots_list_signals", {}),
+            ("webots_query_history", {"signals": ["*"]}),
+            ("webots_query_history", {"signals": ["*"], "raw": True}),
+            ("webots_get_trends", {}),
+            ("webots_find_events", {}),
+            ("webots_find_events", {"kinds": ["still", "change", "command"]}),
+            ("webots_find_events", {"kinds": ["still"], "group": False}),
+            ("webots_get_timeline", {}),
+            ("webots_monitor", {"lookback_s": 900}),
+        ):
+            result = await client.call_tool(tool, {"robot": "rover0", **arguments})
+            assert not result.is_error, (tool, text_of(result))
+            assert len(text_of(result)) / 4 < RICH_TOKENS, (tool, arguments, len(text_of(result)))
 
 
 def _add_runs(connection: Any) -> None:

@@ -136,6 +136,8 @@ MOTION: Final[tuple[Argument, ...]] = (
     argument("--for", type=float, default=0.0, dest="for_s", metavar="S",
              help="for at least S simulated seconds"),
     *MOTION,
+    argument("--one-by-one", action="store_false", dest="group",
+             help="alike events too, many of which are told as one else"),
     count("-n", "at most N events", default=50),
     argument("--after", metavar="CURSOR", help="what an answer with that cursor left out"),
 )  # fmt: skip
@@ -146,14 +148,15 @@ def events(arguments: argparse.Namespace) -> None:
     with reading(arguments) as connection:
         found = find_events(
             connection, range_of(connection, arguments), _options(arguments), limit=arguments.limit,
-            after=arguments.after,
+            group=arguments.group, after=arguments.after,
         )  # fmt: skip
     if arguments.json:
         return print_json(found)
     several = len({event.run_id for event in found.events}) > 1
     rows = [
         [
-            event.run_id if several else None, event.start_s, event.duration_s or None, event.kind,
+            event.run_id if several else None, event.start_s,
+            (event.count == 1 and event.duration_s) or None, event.kind,
             event.name, event.details or None,
         ]
         for event in found.events

@@ -51,11 +51,11 @@ def _not_looked_for(verdicts: Verdicts) -> list[str]:
     """Where a picture shows no number, there is none to be judged: that is no news."""
     of_numbers = [kind.name for kind in drawn_kinds() if kind.of_numbers]
     told = {
-        kind: why
-        for kind, why in verdicts.not_searched.items()
+        kind: reasons
+        for kind, reasons in verdicts.reasons.items()
         if kind not in of_numbers or verdicts.unlooked(kind) is None
     }
-    gaps = replace(verdicts, not_searched=told).gaps
+    gaps = replace(verdicts, reasons=told).gaps
     return [f"not looked for: {kinds}: {why}" for kinds, why in gaps.items()]
 
 
@@ -80,6 +80,8 @@ def _within(interval: Interval, part: Part) -> Interval:
 def stuck_mark(connection: sqlite3.Connection, part: Part, position: tuple[str, str]) -> Lane:
     """When the robot was stuck."""
     options = EventOptions(kinds=("stuck",), signals=position, position=position)
-    found = find_events(connection, part.range, options, limit=MOST_EVENTS, around=(), exact=False)
+    found = find_events(
+        connection, part.range, options, limit=MOST_EVENTS, around=(), group=False, exact=False
+    )
     intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]
     return Lane(f"stuck over {options.stuck_s:g} s", intervals, ())

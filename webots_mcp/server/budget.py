@@ -20,7 +20,7 @@ from webots_mcp.server.shortening import (
 from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.recording import View, look, storage
 
-BUDGET: Final = 6_600  # characters of JSON, of the 8,000 that are 2,000 tokens; the header has 600
+BUDGET: Final = 5_000  # characters of JSON: 1,250 tokens; the header and the verdicts have 1,000
 LARGE_BUDGET: Final = 40_000  # where the asker said how much: clients put longer answers aside
 LONGEST_NAME: Final = 80
 _LONGEST_NOTE: Final = 300

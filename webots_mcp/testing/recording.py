@@ -129,7 +129,9 @@ class Recording:
         wanted = EventOptions(kinds=kinds, **options)
         with self._subject() as (connection, subject):
             whole = find_range(connection, Scope(), subject)
-            found = find_events(connection, whole, wanted, limit=sys.maxsize, deadline_s=math.inf)
+            found = find_events(
+                connection, whole, wanted, limit=sys.maxsize, group=False, deadline_s=math.inf
+            )
         for kind in kinds:
             if (why := found.verdicts.unlooked(kind)) is not None:
                 raise NothingRecordedError(f"{kind} could not be looked for: {why}")

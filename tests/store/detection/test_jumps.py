@@ -94,7 +94,7 @@ def test_dropouts_everywhere_in_a_long_range_are_found(
 ) -> None:
     record(empty, lambda t: {"front": 0.0 if round(10 * t) % 70 == 33 else 2 + 0.1 * math.sin(t)})
     (dropouts,) = jumps(empty)
-    assert dropouts.details["count"] == sum(step % 70 == 33 for step in range(2000))
+    assert dropouts.count == sum(step % 70 == 33 for step in range(2000))
 
 
 def test_what_of_a_long_range_is_too_much_to_be_read_for_jumps_is_told(

@@ -231,13 +231,13 @@ def test_standstills_of_a_long_run_that_are_told_begin_and_end_to_the_row(
     stopping: sqlite3.Connection,
 ) -> None:
     asked, options = find_range(stopping, Scope()), EventOptions(kinds=("still",))
-    found = find_events(stopping, asked, options, limit=3)
+    found = find_events(stopping, asked, options, limit=3, group=False)
     assert found.totals == {"still": 10}
     ends = [(each.start_s, each.end_s) for each in found.events]
     expected = [(60.0 * at + 29.9, 60.0 * at + 59.9) for at in (7, 8, 9)]
     assert ends == [pytest.approx(each, abs=0.11) for each in expected]
     assert all("within_s" not in each.details for each in found.events)
-    rough = find_events(stopping, asked, options, exact=False)
+    rough = find_events(stopping, asked, options, group=False, exact=False)
     assert [each.details["within_s"] for each in rough.events] == [0.6] * 10
 
 

@@ -112,13 +112,14 @@ def test_a_signal_that_never_had_a_value_is_not_said_to_be_silent_for_good(
         resolve_signals(known_signals(empty, find_range(empty, Scope())), ["frount"])
 
 
-def test_many_silences_are_one_event(empty: sqlite3.Connection) -> None:
+def test_many_silences_are_one_event_but_for_one_that_goes_on(empty: sqlite3.Connection) -> None:
     record(empty, lambda t: {"front": range_m(t) if t % 10 < 8 else None})
-    (event,) = ask(empty, "silent").events
-    assert event.details["count"] == 12
+    event, newest = ask(empty, "silent").events
+    assert (event.count, newest.count) == (11, 1)
     assert event.details["says"] == (
-        "12 times without a value, the first at 8 s, the last at 118 s"
+        "11 times without a value, the first at 8 s, the last at 108 s, each 1.9 s long"
     )
+    assert newest.ongoing and newest.start_s == pytest.approx(118.0)
 
 
 def test_what_comes_now_and_then_is_not_silent_meanwhile_and_the_answer_says_so(
@@ -155,7 +156,8 @@ def test_dropouts_are_told_however_many_there_are(
         return
     (event,) = answer.events
     assert event.details["says"] == (
-        f"{count} dropouts to 0 m, the first at 3.2 s, the last at {times_s[-1]:g} s"
+        f"{count} dropouts to 0 m, the first at 3.2 s, the last at {times_s[-1]:g} s, "
+        "each 0.1 s long"
     )
     for end_s in (3.25, 60.0, 100.0, 119.0):
         until = sum(time_s < end_s for time_s in times_s)
@@ -163,7 +165,7 @@ def test_dropouts_are_told_however_many_there_are(
 
 
 def counted(events: tuple[Event, ...]) -> int:
-    return sum(event.details.get("count", 1) for event in events)
+    return sum(event.count for event in events)
 
 
 def test_large_steps_that_are_how_a_signal_is_are_not_judged(empty: sqlite3.Connection) -> None:

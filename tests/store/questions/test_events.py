@@ -196,7 +196,7 @@ def test_what_happens_all_the_time_crowds_nothing_out_and_is_named_by_time(
     empty: sqlite3.Connection,
 ) -> None:
     record_a_busy_run(empty)
-    events = find_events(empty, find_range(empty, Scope()), limit=6)
+    events = find_events(empty, find_range(empty, Scope()), limit=6, group=False)
     told = [(event.kind, event.name) for event in events.events]
     assert told.count(("log", "warning")) == 3 and told.count(("run", None)) == 1
     changes = events.left_out["change"]

@@ -32,6 +32,7 @@ from webots_mcp.server.parameters import (
     TextCursor,
 )
 from webots_mcp.server.results import Table
+from webots_mcp.server.shortening import DETAIL_BUDGET, shorten
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold, both_of
 from webots_mcp.store.detection.threshold import thresholds_on
 from webots_mcp.store.detection.verdict import Verdicts
@@ -39,8 +40,11 @@ from webots_mcp.store.questions.events import Events, Found, search_events
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
-EVENT_COLUMNS: Final = ("kind", "run_id", "start_s", "duration_s", "ongoing", "name", "details")
+EVENT_COLUMNS: Final = (
+    "kind", "count", "run_id", "start_s", "duration_s", "ongoing", "name", "details",
+)  # fmt: skip
 DEFAULT_LIMIT: Final = 50
+_GROUP_BUDGET: Final = 640  # characters
 
 
 @tool("Find events", READS)
@@ -70,13 +74,14 @@ def webots_find_events(
     position: Position = None,
     mode: Mode = None,
     log_level: LogLevel = "warning",
+    group: Annotated[bool, Field(description="Tell many alike events as one.")] = True,
     limit: ShownLimit = None,
     cursor: TextCursor = "",
 ) -> EventsAnswer:
     """What went wrong, since when, how often: searches the values, by default of the whole run.
 
-    Many alike events are told as one, counted. verdicts: what was found, what
-    is absent, what was not looked for and why. What is not shown is counted; cursor shows it.
+    verdicts: what was found, what is absent, what was not looked for and why. What is not shown is
+    counted; cursor shows it.
     """
     thresholds = thresholds_on(signals or (), above, below, for_s)
     options = EventOptions(
@@ -94,7 +99,7 @@ def webots_find_events(
         return answer_about(
             view,
             EventsAnswer,
-            lambda: _found(view, range_in(view, scope), options, limit, cursor),
+            lambda: _found(view, range_in(view, scope), options, group, limit, cursor),
         )
 
 
@@ -109,12 +114,21 @@ def _kinds(
 
 
 def _found(
-    view: View, asked: TimeRange, options: EventOptions, limit: int | None, cursor: str
+    view: View,
+    asked: TimeRange,
+    options: EventOptions,
+    group: bool,
+    limit: int | None,
+    cursor: str,
 ) -> dict[str, Any]:
-    found = search_events(view.connection, asked, options, after=cursor or None)
+    found = search_events(view.connection, asked, options, group=group, after=cursor or None)
     budget = BUDGET if limit is None else LARGE_BUDGET
     told, events = fitting_events(found, limit or DEFAULT_LIMIT, budget, view)
     hints = ["ask again with this cursor for what is not shown"] if told.cursor else []
+    if any(event.count > 1 for event in told.events):
+        hints.append(
+            "group=false tells alike events one by one: name the kinds, or a shorter range"
+        )
     if cursor and found.verdicts.found and not events:
         hints.append("nothing was left out before that cursor")
     return {
@@ -167,15 +181,22 @@ def events_table(events: Sequence[Event], view: View) -> Table | None:
     rows = [
         [
             event.kind,
+            None if event.count == 1 else event.count,
             event.run_id if elsewhere else None,
             seconds(event.start_s),
-            seconds(event.duration_s) or None,
+            (event.count == 1 and seconds(event.duration_s)) or None,
             event.ongoing or None,
             short_name(event.name),
-            shown(event.details) or None,
+            _details_of(event) or None,
             *(shown(event.around.get(name)) for name in around),
         ]
         for event in events
     ]
     columns = [*EVENT_COLUMNS, *(f"@{short_name(name)}" for name in around)]
     return without_empty(columns, rows)
+
+
+def _details_of(event: Event) -> Any:
+    """What stands for many events may be longer: it stands once."""
+    budget = DETAIL_BUDGET if event.count == 1 else _GROUP_BUDGET
+    return shorten(event.details, budget).value

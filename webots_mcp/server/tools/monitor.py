@@ -136,8 +136,8 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
 def _unlooked(verdicts: Verdicts) -> Verdicts:
     """With the kinds that were not asked for because there is no row to look at."""
     others = [each.name for each in asked_kinds(EventOptions()) if each.name not in _ROWLESS.kinds]
-    why = dict.fromkeys(others, "no row was recorded in that time")
-    return replace(verdicts, not_searched=verdicts.not_searched | why)
+    why = dict.fromkeys(others, ("no row was recorded in that time",))
+    return replace(verdicts, reasons=verdicts.reasons | why)
 
 
 def _of_earlier(told: Sequence[RunTrends]) -> list[str]:

@@ -10,7 +10,7 @@ from webots_mcp.conditions.condition import POSITION
 from webots_mcp.errors import UnknownSignalError
 from webots_mcp.naming import NO_POSITION, Value
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.held import Held, recorded_share, where_held
 from webots_mcp.store.signals.catalogue import say_unknown
@@ -74,5 +74,6 @@ CONDITION: Final = EventKind(
     usual=_is_given,
     lasts=True,
     counted=False,
+    alike=Alike(lambda events, unit: "stretches"),
     effort=4,
 )

@@ -27,6 +27,7 @@ class Event:
         name: The signal, the action, the level or the device that it is about.
         details: What there is to say about it, by kind.
         around: Values of a few signals when it began.
+        count: How many alike events it stands for; it begins with the first, ends with the last.
         exactly: What all rows about it tell, where it was found in samples of a long run: mostly
             one event, which begins and ends to the row.
     """
@@ -40,6 +41,7 @@ class Event:
     details: dict[str, Any] = field(default_factory=dict[str, Any])
     ongoing: bool = False
     around: dict[str, Value] = field(default_factory=dict[str, Value])
+    count: int = 1
     exactly: Callable[[], Sequence[Event]] | None = field(default=None, repr=False, compare=False)
 
     @property

@@ -9,7 +9,7 @@ from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.frozen import FEWEST_ROWS, is_noisy, may_be_measured
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import Event
-from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.resting import is_limit, target_went_on, what_it_shows
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.intervals import MOSTLY, Flat, Span
@@ -129,7 +129,8 @@ def _note_longest(search: Search, signal: Signal, here: Summary, span: Span) -> 
     """What came nearest, where all rests are known and it is not how the signal is."""
     if _changes_otherwise(search, here, [span]):
         lasted_s = _length_s(span)
-        what = f"{signal.name} stayed at {span.key} for {lasted_s:.3g} s from {span.start_s:.6g} s"
+        at = f"{span.key:.4g}" if isinstance(span.key, float) else span.key
+        what = f"{signal.name} stayed at {at} for {lasted_s:.3g} s from {span.start_s:.6g} s"
         search.came_near("flat", lasted_s / search.options.flat_s, what)
 
 
@@ -165,6 +166,5 @@ FLAT: Final = EventKind(
     least_s=lambda options: options.flat_s,
     of_numbers=True,
     drawn=7,
-    says_alike=_alike,
-    of_arrays=True,
+    alike=Alike(_alike, of_arrays=True),
 )

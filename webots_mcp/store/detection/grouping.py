@@ -2,70 +2,115 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
-from itertools import groupby
-from typing import Final
+from statistics import median
+from typing import Any, Final
 
 from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.kind import Alike
 from webots_mcp.store.detection.registry import kind_named
 from webots_mcp.store.signals.registry import Signal
 
-MOST_SINGLE: Final = 3  # of one signal and sort that are told one by one
-MOST_TIMES: Final = 5  # of a group that are named
+MOST_TIMES: Final = 3  # of a group that are named
+_SAME_LENGTH: Final = 0.05  # of the longest: so near each other they last equally long
 
 
 def grouped(events: Sequence[Event], known: dict[str, Signal]) -> list[Event]:
     """The same events; what the items of an array did at once, and many alike, is one of them.
 
-    A group begins with its first event and ends with its last one; its details count them, name
-    their first times and say what they are.
+    A group begins with its first event and ends with its last one. Its details say what they are,
+    when, and what they have in common. What lasts and still goes on is told by itself.
     """
-    single = [event for event in events if not _may_be_grouped(event)]
-    rest = _of_arrays([event for event in events if _may_be_grouped(event)])
-    rest.sort(key=_sort)
-    for _, same in groupby(rest, _sort):
-        alike = sorted(same, key=lambda event: event.start_s)
-        single += alike if len(alike) <= MOST_SINGLE else [_as_one(alike, known)]
-    return single
-
-
-def _may_be_grouped(event: Event) -> bool:
-    return kind_named(event.kind).says_alike is not None
+    told: list[Event] = []
+    alike: dict[Hashable, list[Event]] = {}
+    for event in _of_arrays(events):
+        how = kind_named(event.kind).alike
+        if how is None or (event.ongoing and kind_named(event.kind).lasts):
+            told.append(event)
+        else:
+            sort = (event.run_id, event.kind, event.name, how.sort(event))
+            alike.setdefault(sort, []).append(event)
+    for some in alike.values():
+        how = kind_named(some[0].kind).alike
+        if how is None or len(some) <= how.most_single:
+            told += some
+        else:
+            told.append(_as_one(sorted(some, key=lambda each: each.start_s), how, known))
+    return told
 
 
 def _of_arrays(events: Iterable[Event]) -> list[Event]:
     """What several items of one array, or parts of one branch, did at once is told as one."""
     found: dict[tuple[object, ...], Event] = {}
+    alone: list[Event] = []
     for event in events:
-        branch = (event.name or "").rpartition(".")[0]
-        own = None if branch and kind_named(event.kind).of_arrays else event.name
-        key = (event.kind, event.run_id, branch, own, event.start_s, event.end_s)
-        if key in found:
-            found[key] = replace(found[key], name=f"{branch}.*", details={})
-        else:
-            found[key] = event
-    return list(found.values())
+        how, branch = kind_named(event.kind).alike, (event.name or "").rpartition(".")[0]
+        if how is None or not (how.of_arrays and branch):
+            alone.append(event)
+            continue
+        key = (event.kind, event.run_id, branch, event.start_s, event.end_s)
+        shared = replace(event, name=f"{branch}.*", details={})
+        found[key] = shared if key in found else event
+    return [*alone, *found.values()]
 
 
-def _sort(event: Event) -> tuple[object, ...]:
-    """Events that may be told as one: a value that came back is not one that stayed."""
-    is_back = event.end_s > event.start_s and not kind_named(event.kind).lasts
-    return event.run_id, event.kind, event.name or "", is_back
-
-
-def _as_one(alike: Sequence[Event], known: dict[str, Signal]) -> Event:
+def _as_one(alike: Sequence[Event], how: Alike, known: dict[str, Signal]) -> Event:
     first, last = alike[0], max(alike, key=lambda event: event.end_s)
-    kind, signal = kind_named(first.kind), known.get(first.name or "")
-    unit = f" {signal.unit}" if signal and signal.unit else ""
-    what = kind.says_alike(alike, unit) if kind.says_alike else first.kind
+    signal = known.get(first.name or "")
+    what = how.says(alike, f" {signal.unit}" if signal and signal.unit else "")
     times_s = [round(event.start_s, 3) for event in alike]
-    details: dict[str, object] = {
-        "count": len(alike),
-        "says": f"{len(alike)} {what}, the first at {times_s[0]:.6g} s, "
-        f"the last at {times_s[-1]:.6g} s",
+    says = (
+        f"{len(alike)} {what}, the first at {times_s[0]:.6g} s, the last at {times_s[-1]:.6g} s"
+        f"{_lengths(alike)}"
+    )
+    details = {
+        **_in_common([event.details for event in alike]),
+        **how.adds(alike),
+        "says": says,
         "first_times_s": times_s[:MOST_TIMES],
     }
-    if kind.lasts:
-        details["lasted_s"] = round(sum(event.duration_s for event in alike), 3)
-    return replace(first, end_s=last.end_s, ongoing=last.ongoing, details=details)
+    return replace(
+        first,
+        end_s=last.end_s,
+        ongoing=last.ongoing,
+        details=details,
+        count=len(alike),
+        exactly=None,
+    )
+
+
+def _lengths(alike: Sequence[Event]) -> str:
+    """How long they lasted, where they did."""
+    lengths_s = [event.duration_s for event in alike]
+    least_s, most_s, middle_s = min(lengths_s), max(lengths_s), median(lengths_s)
+    if not most_s:
+        return ""
+    if most_s - least_s <= _SAME_LENGTH * most_s:
+        return f", each {middle_s:.3g} s long"
+    return (
+        f", {least_s:.3g} to {most_s:.3g} s long (median {middle_s:.3g} s), "
+        f"{sum(lengths_s):.4g} s in all"
+    )
+
+
+def _in_common(all_details: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """What the details of all of them are, or lie between."""
+    first, *others = all_details
+    names = [name for name in first if all(name in other for other in others)]
+    shared = {name: _shared([details[name] for details in all_details]) for name in names}
+    return {name: value for name, value in shared.items() if value is not None}
+
+
+def _shared(values: Sequence[Any]) -> Any:
+    """The one value; of numbers the least and the greatest; of texts the clauses that all have."""
+    if all(value == values[0] for value in values):
+        return values[0]
+    if all(isinstance(value, (int, float)) and not isinstance(value, bool) for value in values):
+        return f"{min(values):.4g} to {max(values):.4g}"
+    if all(isinstance(value, dict) for value in values):
+        return _in_common(values) or None
+    if all(isinstance(value, str) for value in values):
+        clauses: list[list[str]] = [value.split("; ") for value in values]
+        return "; ".join(e for e in clauses[0] if all(e in each for each in clauses)) or None
+    return None

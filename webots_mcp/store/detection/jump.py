@@ -14,7 +14,7 @@ from webots_mcp.store.analysis.jumps import (
     find_leaps,
 )
 from webots_mcp.store.detection.event import Event
-from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.motion import in_metres
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.rows import Numbers
@@ -82,6 +82,11 @@ def _leaps_in(
     return dict(find_leaps(*places, at_least_m, numbers.stretch_rows))
 
 
+def _is_back(event: Event) -> bool:
+    """A value that came back is not one that stayed."""
+    return event.end_s > event.start_s
+
+
 def _alike(events: Sequence[Event], unit: str) -> str:
     """Dropouts, spikes or steps, and to where."""
     if "distance_m" in events[0].details:
@@ -105,6 +110,6 @@ JUMP: Final = EventKind(
     of_numbers=True,
     drawn=1,
     reads_through=lambda search: search.motion.position or (),
-    says_alike=_alike,
+    alike=Alike(_alike, sort=_is_back),
     effort=2,
 )

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from typing import Final
 
 from webots_mcp.store.detection.event import Event
-from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.kind import Alike, EventKind, but_for_numbers
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.images import count_kept_frames
 from webots_mcp.store.reading.kept import kept_stretches
@@ -26,6 +26,16 @@ def kept_events(search: Search) -> Iterator[Event]:
         yield Event("kept", *place, None, details, ongoing=ongoing)
 
 
+def _reason(event: Event) -> Hashable:
+    return but_for_numbers(event.details["reason"])
+
+
 KEPT: Final = EventKind(
-    "kept", "at full rate", kept_events, stored=True, routine=True, counted=False
+    "kept",
+    "at full rate",
+    kept_events,
+    stored=True,
+    routine=True,
+    counted=False,
+    alike=Alike(lambda events, unit: "kept stretches", sort=_reason),
 )

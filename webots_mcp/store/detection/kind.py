@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import re
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.store.detection.event import Event, EventOptions
@@ -12,6 +13,8 @@ from webots_mcp.store.detection.event import Event, EventOptions
 if TYPE_CHECKING:
     from webots_mcp.store.detection.search import Search
     from webots_mcp.store.signals.registry import Signal
+
+_NUMBER: Final = re.compile(r"\d+(\.\d+)?")
 
 
 class NotSearchableError(NothingRecordedError):
@@ -35,6 +38,38 @@ def only_if_named(options: EventOptions) -> bool:
     return False
 
 
+def but_for_numbers(text: object) -> str:
+    """What texts that differ in their numbers only have in common."""
+    return _NUMBER.sub("#", str(text))
+
+
+def _as_others(event: Event) -> Hashable:
+    return None
+
+
+def _nothing_more(events: Sequence[Event]) -> dict[str, Any]:
+    return {}
+
+
+@dataclass(frozen=True)
+class Alike:
+    """How alike events of a kind are told as one.
+
+    Attributes:
+        says: What they are, in the plural, given them in order and the unit of their signal.
+        sort: What they share besides the run and the signal.
+        adds: More of their details than what all of them have in common.
+        most_single: As many of a sort are told one by one.
+        of_arrays: What several items of one array did at once is one event.
+    """
+
+    says: Callable[[Sequence[Event], str], str]
+    sort: Callable[[Event], Hashable] = _as_others
+    adds: Callable[[Sequence[Event]], dict[str, Any]] = _nothing_more
+    most_single: int = 3
+    of_arrays: bool = False
+
+
 @dataclass(frozen=True)
 class EventKind:
     """A kind of event. One of these, entered in `registry.KINDS`, is all that a new kind takes.
@@ -53,9 +88,7 @@ class EventKind:
         routine: It happens all the time; it is shown in the room that all other kinds leave.
         counted: Comparisons of runs count it.
         drawn: Its place among the rows below a plot, the least first; None if it has none there.
-        says_alike: What many alike events of one signal are, given with the unit of the signal;
-            None where each is always told by itself.
-        of_arrays: What several items of one array did at once is one event.
+        alike: How many alike ones are told as one; None where each is told by itself.
         reads_through: Signals of which it reads all rows, also of a long segment.
         effort: Its rank by what it costs to look for: the least is searched first. Kinds of one
             rank find things together, and share their part of the time.
@@ -72,7 +105,6 @@ class EventKind:
     routine: bool = False
     counted: bool = True
     drawn: int | None = None
-    says_alike: Callable[[Sequence[Event], str], str] | None = None
-    of_arrays: bool = False
+    alike: Alike | None = None
     reads_through: Callable[[Search], Sequence[Signal]] = _nothing
     effort: int = 0

@@ -8,7 +8,7 @@ from typing import Final
 from webots_mcp.naming import listed
 from webots_mcp.store.analysis.swings import Swing, joined_swings
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.rollup.swings import LONGEST_PERIOD_S, may_swing, swings_in
 from webots_mcp.store.signals.registry import Signal
@@ -93,5 +93,6 @@ OSCILLATION: Final = EventKind(
     of_numbers=True,
     drawn=3,
     reads_through=_swinging,
+    alike=Alike(lambda events, unit: "stretches of swings"),
     effort=1,
 )

@@ -7,7 +7,7 @@ from typing import Final
 
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import Event
-from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.resting import replaced_value
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.intervals import MOSTLY, Silent, Span, common
@@ -106,10 +106,6 @@ def _least_silence_s(search: Search, signal: Signal, here: Summary, spans: Seque
     return 3 * usual_s
 
 
-def _alike(events: Sequence[Event], unit: str) -> str:
-    return "times without a value"
-
-
 SILENT: Final = EventKind(
     "silent",
     "no value",
@@ -118,6 +114,5 @@ SILENT: Final = EventKind(
     least_s=lambda options: options.silent_s,
     of_numbers=True,
     drawn=2,
-    says_alike=_alike,
-    of_arrays=True,
+    alike=Alike(lambda events, unit: "times without a value", of_arrays=True),
 )

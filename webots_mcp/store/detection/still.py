@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from typing import Final
 
 from webots_mcp.store.detection.event import Event, EventOptions
-from webots_mcp.store.detection.kind import EventKind
+from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.search import Search
 
 
@@ -32,8 +32,19 @@ def _least_s(options: EventOptions) -> float:
     return options.stuck_s
 
 
+def _mode(event: Event) -> Hashable:
+    return event.details.get("mode")
+
+
 STILL: Final = EventKind(
-    "still", "the robot stood", still_events, lasts=True, least_s=_least_s, drawn=8, effort=3
+    "still",
+    "the robot stood",
+    still_events,
+    lasts=True,
+    least_s=_least_s,
+    drawn=8,
+    alike=Alike(lambda events, unit: "standstills", sort=_mode),
+    effort=3,
 )
 STUCK: Final = EventKind(
     "stuck",
@@ -42,5 +53,6 @@ STUCK: Final = EventKind(
     lasts=True,
     least_s=_least_s,
     drawn=0,
+    alike=Alike(lambda events, unit: "times stuck", sort=_mode),
     effort=3,
 )

@@ -5,13 +5,19 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any, Final
 
 from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.detection.event import LEVELS, Event
-from webots_mcp.store.detection.kind import EventKind, NotSearchableError, only_if_named
+from webots_mcp.store.detection.kind import (
+    Alike,
+    EventKind,
+    NotSearchableError,
+    but_for_numbers,
+    only_if_named,
+)
 from webots_mcp.store.detection.search import Search, wall_time_at
 from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
 from webots_mcp.store.reading.gaps import rhythm_in, with_rows_around
@@ -21,6 +27,7 @@ from webots_mcp.store.signals.registry import Signal
 
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
 AROUND_S: Final = 10.0  # before and after: what changes all the time there, measures
+MOST_NAMED: Final = 3  # values of a signal that many changes are told of
 MOST_CHANGES: Final = 500  # newest change points of one signal that become events
 
 _IN_SEGMENT: Final = (
@@ -242,12 +249,74 @@ def _bounds(segment: Segment) -> tuple[float, ...]:
     return (segment.run_id, segment.holds_from_s, segment.holds_to_s, *walls)
 
 
+def _values(events: Sequence[Event]) -> dict[str, Any]:
+    """To which values it changed, the most frequent first, and for how long each was there."""
+    lasted_s: dict[str, list[float]] = {}
+    for event in events:
+        value = event.details["after"]
+        name = value if isinstance(value, str) else json.dumps(value)
+        lasted_s.setdefault(name, []).append(event.duration_s)
+    often = sorted(lasted_s, key=lambda name: -len(lasted_s[name]))
+    to: dict[str, Any] = {
+        name: f"{len(lasted_s[name])} times, {sum(lasted_s[name]):.4g} s"
+        for name in often[:MOST_NAMED]
+    }
+    rest = len(often) - MOST_NAMED
+    return {"to": to | ({"other values": rest} if rest > 0 else {})}
+
+
+def _outcome(event: Event) -> Hashable:
+    return event.details["status"], but_for_numbers(event.details.get("error"))
+
+
+def _line(event: Event) -> Hashable:
+    return event.details["source"], but_for_numbers(event.details["message"])
+
+
+def _first_line(events: Sequence[Event]) -> dict[str, Any]:
+    return {"message": events[0].details["message"]}
+
+
+def _what(event: Event) -> Hashable:
+    return event.details["what"]
+
+
 RUN: Final = EventKind("run", "began or ended", run_events, stored=True, counted=False)
-GAP: Final = EventKind("gap", "no rows", gap_events, stored=True)
-CHANGE: Final = EventKind("change", "of a text or flag", change_events, stored=True, routine=True)
-COMMAND: Final = EventKind("command", "", command_events, stored=True, drawn=5)
-LOG: Final = EventKind("log", "", log_events, stored=True, drawn=4)
-NOTICED: Final = EventKind("noticed", "by the bridge", noticed_events, stored=True, drawn=6)
+GAP: Final = EventKind(
+    "gap", "no rows", gap_events, stored=True, alike=Alike(lambda events, unit: "gaps")
+)
+CHANGE: Final = EventKind(
+    "change",
+    "of a text or flag",
+    change_events,
+    stored=True,
+    routine=True,
+    alike=Alike(lambda events, unit: "changes", adds=_values, most_single=10),
+)
+COMMAND: Final = EventKind(
+    "command",
+    "",
+    command_events,
+    stored=True,
+    drawn=5,
+    alike=Alike(lambda events, unit: "commands", sort=_outcome),
+)
+LOG: Final = EventKind(
+    "log",
+    "",
+    log_events,
+    stored=True,
+    drawn=4,
+    alike=Alike(lambda events, unit: "like lines", sort=_line, adds=_first_line),
+)
+NOTICED: Final = EventKind(
+    "noticed",
+    "by the bridge",
+    noticed_events,
+    stored=True,
+    drawn=6,
+    alike=Alike(lambda events, unit: f"times {events[0].details['what']}", sort=_what),
+)
 IMAGE: Final = EventKind(
     "image",
     "",

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
-from webots_mcp.store.detection.kind import EventKind, NotSearchableError
+from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.intervals import Beyond
 from webots_mcp.store.signals.catalogue import resolve_signals
@@ -68,6 +68,10 @@ def _extreme(search: Search, signal: Signal, threshold: Threshold) -> float | No
     return summary.max if threshold.above is not None else summary.min
 
 
+def _limit(event: Event) -> Hashable:
+    return event.details.get("above"), event.details.get("below")
+
+
 def _for_s(options: EventOptions) -> float:
     return max((threshold.for_s for threshold in options.thresholds), default=0.0)
 
@@ -80,4 +84,5 @@ THRESHOLD: Final = EventKind(
     lasts=True,
     least_s=_for_s,
     counted=False,
+    alike=Alike(lambda events, unit: "stretches", sort=_limit),
 )

@@ -10,6 +10,14 @@ from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import EventKind
 
 
+def count_by_kind(events: Iterable[Event]) -> Counter[str]:
+    """How many there are of each kind, where one may stand for many that are alike."""
+    counts = Counter[str]()
+    for event in events:
+        counts[event.kind] += event.count
+    return counts
+
+
 @dataclass(frozen=True)
 class Verdicts:
     """What the answer says of each kind that was asked for; none of them is passed over.
@@ -18,15 +26,20 @@ class Verdicts:
         found: How many there are.
         absent: Kinds that were looked for, be it in a part, and of which there is none, each with
             what came nearest, or with an empty text.
-        not_searched: Kinds that were not looked for, or not everywhere, with why, and with what to
-            ask to have them looked for. One that is also found or absent is so in what was.
+        reasons: Why kinds were not looked for, or not everywhere, and what to ask to have them
+            looked for. One that is also found or absent is so in what was.
 
     Shown are the properties, which name each kind that was not found once.
     """
 
     found: dict[str, int] = field(default_factory=dict[str, int])
     absent: dict[str, str] = field(default_factory=dict[str, str])
-    not_searched: dict[str, str] = field(default_factory=dict[str, str])
+    reasons: dict[str, tuple[str, ...]] = field(default_factory=dict[str, tuple[str, ...]])
+
+    @property
+    def not_searched(self) -> dict[str, str]:
+        """By kind, all reasons in one text."""
+        return {kind: "; ".join(reasons) for kind, reasons in self.reasons.items()}
 
     @property
     def far(self) -> list[str]:
@@ -40,19 +53,23 @@ class Verdicts:
 
     @property
     def gaps(self) -> dict[str, str]:
-        """What was not searched, with the kinds that share a reason under one key."""
+        """What was not searched: each reason once, with the kinds that share it as the key."""
         sharing: dict[str, list[str]] = {}
-        for kind, why in self.not_searched.items():
-            sharing.setdefault(why + self._searched(kind), []).append(kind)
-        return {", ".join(kinds): why for why, kinds in sharing.items()}
+        for kind, reasons in self.reasons.items():
+            for reason in (*reasons, *self._in_what_was_searched(kind)):
+                sharing.setdefault(reason, []).append(kind)
+        told: dict[str, list[str]] = {}
+        for reason, kinds in sharing.items():
+            told.setdefault(", ".join(kinds), []).append(reason)
+        return {kinds: "; ".join(reasons) for kinds, reasons in told.items()}
 
     @property
     def _nowhere(self) -> list[str]:
-        return [kind for kind in self.absent if kind not in self.not_searched]
+        return [kind for kind in self.absent if kind not in self.reasons]
 
-    def _searched(self, kind: str) -> str:
+    def _in_what_was_searched(self, kind: str) -> list[str]:
         near = self.absent.get(kind)
-        return "" if near is None else f"; none in what was searched{near and f' ({near})'}"
+        return [] if near is None else [f"none in what was searched{near and f' ({near})'}"]
 
     def unlooked(self, kind: str) -> str | None:
         """Why a kind was not looked for anywhere; None if it was, at least in a part."""
@@ -101,7 +118,7 @@ class Ledger:
 
     def verdicts(self, kinds: Sequence[EventKind], events: Iterable[Event]) -> Verdicts:
         """On each of the kinds, in their order, given all that was found."""
-        counts = Counter(event.kind for event in events)
+        counts = count_by_kind(events)
         names = [kind.name for kind in kinds]
         return Verdicts(
             {name: counts[name] for name in names if counts[name]},
@@ -110,5 +127,5 @@ class Ledger:
                 for name in names
                 if name in self.searched and not counts[name]
             },
-            {name: "; ".join(self._reasons[name]) for name in names if self._reasons.get(name)},
+            {name: tuple(self._reasons[name]) for name in names if self._reasons.get(name)},
         )

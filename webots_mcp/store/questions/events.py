@@ -19,7 +19,7 @@ from webots_mcp.store.detection.grouping import grouped
 from webots_mcp.store.detection.kind import EventKind
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.detection.registry import asked_kinds, kind_named
-from webots_mcp.store.detection.verdict import Ledger, Verdicts
+from webots_mcp.store.detection.verdict import Ledger, Verdicts, count_by_kind
 from webots_mcp.store.questions.places import Place, placed, read_place
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import TimeRange
@@ -97,8 +97,8 @@ class Found:
         """The same of these events alone."""
         wanted = {id(event) for event in events}
         entries = tuple(entry for entry in self.entries if id(entry[1]) in wanted)
-        counts = dict(Counter(event.kind for event in events))
-        return replace(self, entries=entries, verdicts=replace(self.verdicts, found=counts))
+        counts = count_by_kind(events)
+        return replace(self, entries=entries, verdicts=replace(self.verdicts, found=dict(counts)))
 
     def told(self, connection: sqlite3.Connection, limit: int, *, exact: bool = True) -> Events:
         """An answer of at most `limit` events: see `choose`.
@@ -113,8 +113,8 @@ class Found:
         rest = [entry for entry in self.entries if id(entry[1]) not in chosen]
         events = [each for _, event in told for each in (_exactly(event) if exact else (event,))]
         found = Counter(self.verdicts.found)
-        found.update(event.kind for event in events)
-        found.subtract(event.kind for _, event in told)
+        found.update(count_by_kind(events))
+        found.subtract(count_by_kind([event for _, event in told]))
         return Events(
             self.robot,
             tuple(_with_values(connection, event, self.context) for event in events),
@@ -304,7 +304,7 @@ def _left_out(events: Sequence[Event]) -> dict[str, LeftOut]:
     for event in events:
         by_kind.setdefault(event.kind, []).append(event)
     return {
-        kind: LeftOut(len(each), each[0].start_s, each[-1].start_s)
+        kind: LeftOut(sum(e.count for e in each), each[0].start_s, each[-1].start_s)
         for kind, each in by_kind.items()
     }
 
@@ -335,6 +335,8 @@ def _read_cursor(text: str) -> dict[str, Place | None]:
 
 
 def _with_values(connection: sqlite3.Connection, event: Event, context: Sequence[Signal]) -> Event:
+    if event.count > 1:
+        return event
     row = connection.execute(_ROW_AT, (event.run_id, event.start_s)).fetchone()
     leaves: dict[str, Value] = flatten(parse(row[0])) if row and context else {}
     return replace(event, around={signal.name: leaves.get(signal.name) for signal in context})

@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from tests.store.json_folder.test_import import Peer
+from tests.store.json_folder.conftest import Peer
 from webots_mcp.cli import main
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError

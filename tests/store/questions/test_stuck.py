@@ -10,7 +10,13 @@ import pytest
 
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from tests.store.questions.asking import ask, spans
-from webots_mcp.store.detection.event import Event
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.evidence import Counts, Observed, Part, weigh
+from webots_mcp.store.detection.habits import MovedIn
+from webots_mcp.store.detection.motion import find_motion
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.signals.catalogue import known_signals
 
 
 def publish_stuck(empty: sqlite3.Connection, **moving_and_standing: Any) -> tuple[Event, ...]:
@@ -112,3 +118,30 @@ def test_without_a_position_stuck_cannot_be_searched_and_the_answer_says_so(
     recorder.publish(0.0, {"mode": "drive", "range": 1.0})
     told = ask(empty, "stuck", bounds={"run_id": 1}).verdicts
     assert "no position is known" in told.not_searched["stuck"] and not told.absent
+
+
+def test_a_short_command_within_a_long_standstill_is_told_as_evidence(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    for step in range(2000):
+        told = 100 <= step * 0.1 < 110
+        state = {"gps": {"x": 1.0, "y": 0}, "commanded_m_s": 0.2 if told else 0.0}
+        recorder.publish(step * 0.1, state)
+    (stuck,) = ask(empty, "stuck").events
+    assert (stuck.start_s, stuck.end_s) == pytest.approx((100.0, 109.9))
+    assert stuck.details["evidence"] == "commanded_m_s 0.2"
+
+
+def test_a_mode_that_was_not_looked_at_in_time_is_not_said_to_be_one_in_which_it_stands(
+    empty: sqlite3.Connection,
+) -> None:
+    publish_stuck(empty, mode=("go", "go"))
+    asked = find_range(empty, Scope(run_id=1))
+    segment = asked.segments[0]
+    motion = find_motion(known_signals(empty, asked), EventOptions())
+    moved_in = MovedIn(empty, segment.run_id, motion, Deadline(0.0))
+    part = Part(10.0, 20.0, 100, "go", False, False, (None, 100), None)
+    observed = Observed([part], Counts(rows=100))
+    evidence = weigh(observed, motion, EventOptions(), moved_in)
+    assert evidence.against == ["whether it moves in mode go was not looked at: the time was over"]

@@ -137,14 +137,15 @@ def weigh(observed: Observed, motion: Motion, options: EventOptions, moved_in: M
     if not any(should_move) and not against:
         modeless = "" if motion.mode else "; a signal that holds a mode can be named: mode=NAME"
         against = [f"nothing that is published shows that it should have moved{modeless}"]
-    return Evidence(should_move, [*mode_why, *_shown_in(counts, motion)], against)
+    rows = sum(part.rows for part, should in zip(parts, should_move, strict=True) if should)
+    return Evidence(should_move, [*mode_why, *_shown_in(counts, motion, rows)], against)
 
 
-def _shown_in(counts: Counts, motion: Motion) -> list[str]:
-    """What commands and wheels show."""
+def _shown_in(counts: Counts, motion: Motion, rows: int) -> list[str]:
+    """What commands and wheels show of the rows in which it should have moved."""
     signal = motion.commanded or motion.speed
     said: list[str] = []
-    if signal and counts.told > TOLD_SHARE * counts.rows:
+    if signal and counts.told > TOLD_SHARE * (rows or counts.rows):
         said.append(f"{signal.name} {counts.told_m_s:.3g}")
     if counts.driving:
         unit = " rad/s" if all(wheel.unit == "rad/s" for wheel in motion.wheels) else ""
@@ -212,7 +213,9 @@ def _by_mode(
     reasons = {mode: _moves_in(said, options, moved_in) for mode, said in modes.items()}
     why = list(dict.fromkeys(reason for reason in reasons.values() if reason))
     against = [
-        f"not seen moving in mode {modes[mode]}"
+        f"whether it moves in mode {modes[mode]} was not looked at: the time was over"
+        if mode in moved_in.cut
+        else f"not seen moving in mode {modes[mode]}"
         for mode, reason in reasons.items()
         if reason is None and modes[mode] is not None
     ]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from operator import attrgetter
-from typing import Final
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
@@ -16,6 +16,9 @@ from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.signals.registry import Signal
+
+if TYPE_CHECKING:
+    from webots_mcp.store.detection.search import Habits
 
 FARTHER: Final = 8.0  # times as far is looked for the ends of what reaches out of a segment
 
@@ -35,6 +38,7 @@ class Detection:
     options: EventOptions
     deadline: Deadline
     ledger: Ledger
+    habits: Habits = field(default_factory=dict[Any, Any])
 
     def events_touching(self, segment: Segment) -> list[Event]:
         """The events that lie in the segment, or reach into it.
@@ -73,8 +77,9 @@ class Detection:
 
     def _search(self, segment: Segment, kinds: Sequence[EventKind]) -> Search:
         return Search(
-            self.connection, segment, self.known, kinds, self.options, self.deadline, self.ledger
-        )
+            self.connection, segment, self.known, kinds, self.options, self.deadline, self.ledger,
+            habits=self.habits,
+        )  # fmt: skip
 
     def _whole(self, cut: Sequence[Event], segment: Segment) -> list[Event]:
         """Events of the same kinds and signals in a longer segment; what it lacks is known."""

@@ -41,7 +41,11 @@ class Seen:
 
 
 class MovedIn:
-    """Looks for a mode's visits until one of them shows that the robot moved in it."""
+    """Looks for a mode's visits until one of them shows that the robot moved in it.
+
+    Attributes:
+        cut: Modes whose visits were not all looked at before the time was over.
+    """
 
     def __init__(
         self, connection: sqlite3.Connection, run_id: int, motion: Motion, deadline: Deadline
@@ -50,23 +54,27 @@ class MovedIn:
         self.run_id = run_id
         self._motion = motion
         self._deadline = deadline
+        self.cut: set[Value] = set()
         self._points: dict[int, list[Point]] = {}
         self._seen: dict[Value, Seen | None] = {}
 
     def seen(self, mode: Value) -> Seen | None:
         """None where none of the looked at visits shows that it moved."""
-        if mode not in self._seen:
+        if mode not in self._seen or mode in self.cut:
             self._seen[mode] = self._look(mode) if isinstance(mode, str) else None
         return self._seen[mode]
 
     def _look(self, mode: str) -> Seen | None:
+        self.cut.discard(mode)
         runs = self._connection.execute(_EARLIER, (self.run_id, self.run_id, EARLIER_RUNS))
         for run_id in (self.run_id, *(run_id for (run_id,) in runs.fetchall())):
             for window in self._windows(run_id, mode):
                 if self._deadline.passed:
-                    return None
+                    break
                 if speed_m_s := self._speed_in(window):
                     return Seen(speed_m_s, run_id)
+        if self._deadline.passed:
+            self.cut.add(mode)
         return None
 
     def _windows(self, run_id: int, mode: str) -> list[Segment]:
@@ -86,12 +94,13 @@ class MovedIn:
         if bounds is None or signal is None:
             return
         whole = Segment(run_id, bounds[0], just_after(bounds[1]))
-        if run_id not in self._points:
+        points = self._points.get(run_id)
+        if points is None:
             found = change_points(self._connection, whole, [signal], self._deadline)
-            self._points[run_id] = found[signal.name]
-        for at, (point, after) in enumerate(
-            pairwise([*self._points[run_id], Point(whole.end_s, None)])
-        ):
+            points = found[signal.name]
+            if not self._deadline.passed:
+                self._points[run_id] = points
+        for at, (point, after) in enumerate(pairwise([*points, Point(whole.end_s, None)])):
             if point.value == mode:
                 yield point.sim_time_s + (ROLLS_OUT_S if at else 0.0), after.sim_time_s
 

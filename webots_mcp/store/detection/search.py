@@ -22,7 +22,10 @@ from webots_mcp.store.signals.flatten import parse
 from webots_mcp.store.signals.registry import Signal
 
 if TYPE_CHECKING:
+    from webots_mcp.store.detection.habits import MovedIn
     from webots_mcp.store.detection.standing import Standings
+
+    Habits = dict[tuple[int, Motion], MovedIn]
 
 _ENDS: Final = (
     "SELECT data FROM state WHERE id IN ("
@@ -48,6 +51,8 @@ class Search:
         only: Names of the signals that matter, where it is about the ends of some events; else
             None.
         ledger: What could not be looked at, and what came near to an event.
+        habits: By run and motion, in which modes the robot moves: searches of one question share
+            what they have seen of that.
     """
 
     connection: sqlite3.Connection
@@ -58,6 +63,7 @@ class Search:
     deadline: Deadline
     ledger: Ledger = field(default_factory=Ledger)
     only: frozenset[str] | None = None
+    habits: Habits = field(default_factory=dict[Any, Any])
 
     @cached_property
     def bounds(self) -> tuple[float, float] | None:
@@ -166,6 +172,16 @@ class Search:
         from webots_mcp.store.detection.standing import find_standings
 
         return find_standings(self)
+
+    @property
+    def moved_in(self) -> MovedIn:
+        """In which modes the robot moves; numpy is imported here."""
+        from webots_mcp.store.detection.habits import MovedIn
+
+        asked = (self.segment.run_id, self.motion)
+        if asked not in self.habits:
+            self.habits[asked] = MovedIn(self.connection, *asked, self.deadline)
+        return self.habits[asked]
 
     def event(
         self, kind: str, start_s: float, end_s: float, name: str | None, **details: Any

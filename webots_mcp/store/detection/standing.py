@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from typing import TYPE_CHECKING, Any, Final
 
-from webots_mcp.naming import NAME_POSITION
+from webots_mcp.naming import NAME_POSITION, listed
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.evidence import Evidence, Part, turned_rad, usual, weigh
 from webots_mcp.store.detection.habits import MovedIn
@@ -22,6 +22,7 @@ from webots_mcp.store.detection.standstills import (
 )
 from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.rollup.standstills import StretchStandings, in_all, stored_standstills
+from webots_mcp.store.signals.flatten import shown
 
 if TYPE_CHECKING:
     from webots_mcp.store.detection.search import Search
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 BRIDGED_S: Final = 0.5  # evidence that is missing for less goes on
 READ_WHOLE_S: Final = 60.0  # of a longer standstill in a long range both ends are read
 MARGIN_S: Final = 8.0  # before and after it that are read
+MOST_NAMED: Final = 3
 
 
 @dataclass(frozen=True)
@@ -37,11 +39,13 @@ class Standings:
 
     Attributes:
         not_searched: What could not be looked at.
+        not_weighed: Why one of them may be `stuck` that is told as `still`.
         nearest: What came near to a standstill: its share of the shortest, and in words.
     """
 
     events: list[Event]
     not_searched: list[str]
+    not_weighed: list[str]
     nearest: tuple[float, str] | None = None
 
 
@@ -50,7 +54,7 @@ def find_standings(search: Search) -> Standings:
     if search.motion.position is None:
         raise NotSearchableError(NAME_POSITION)
     found = _found(search)
-    moved_in = MovedIn(search.connection, search.segment.run_id, search.motion, search.deadline)
+    moved_in = search.moved_in
     events = [event for each in found.standings for event in _weighed(search, each, moved_in)]
     notes = search.view.taken_notes()
     if found.seen_s > search.options.stuck_s / NEARLY:
@@ -58,7 +62,11 @@ def find_standings(search: Search) -> Standings:
             f"none of less than {found.seen_s:.2g} s: the position's noise of {found.noise_m:.2g} "
             "m hides slow motion"
         )
-    return Standings(events, notes, None if found.standings else _told_nearest(search, found))
+    modes = listed([shown(mode) or "null" for mode in sorted(moved_in.cut, key=str)], MOST_NAMED)
+    unknown = f"the time was over before it was known whether it moves in mode {modes}"
+    not_weighed = [unknown] if moved_in.cut else []
+    nearest = None if found.standings else _told_nearest(search, found)
+    return Standings(events, notes, not_weighed, nearest)
 
 
 def _found(search: Search) -> StretchStandings:

@@ -23,6 +23,8 @@ def still_events(search: Search) -> Iterator[Event]:
 def _of_kind(search: Search, kind: str) -> Iterator[Event]:
     found = search.standings
     search.not_searched(kind, *found.not_searched)
+    if kind == "stuck":
+        search.not_searched(kind, *found.not_weighed)
     if found.nearest is not None:
         search.came_near(kind, *found.nearest)
     return (event for event in found.events if event.kind == kind)

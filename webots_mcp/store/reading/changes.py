@@ -94,8 +94,9 @@ def _of_numbers(
     columns = read_columns(connection, replace(segment, start_s=from_s), signals, deadline)
     points: dict[str, list[Point]] = {each.name: [] for each in signals}
     for name, found in points.items():
-        texts = [shown(value) for value in columns.values[name]]
-        _append_changes(found, zip(columns.times, texts, strict=True))
+        values = columns.values[name]
+        texts = {value: shown(value) for value in set(values)}  # there are mostly few
+        _append_changes(found, zip(columns.times, map(texts.__getitem__, values), strict=True))
     return points
 
 

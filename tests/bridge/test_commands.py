@@ -271,7 +271,7 @@ def test_a_handlers_docstring_never_stops_the_registration(
 def test_a_name_that_is_built_in_or_empty_cannot_be_registered(
     bridge: MCPBridge, name: str
 ) -> None:
-    with pytest.raises(ValueError, match="choose a name"):
+    with pytest.raises(ValueError, match="choose another name"):
         bridge.register_command(name, lambda _: None)
 
 

@@ -235,7 +235,8 @@ def test_a_node_that_was_removed_is_brought_back_by_each_reset(scene: Scene) -> 
 
 def test_what_was_added_and_removed_again_stays_away(scene: Scene) -> None:
     scene.ask("add_node", vrml=PILL)
-    scene.ask("remove_node", path="PILL")
+    removed = scene.ask("remove_node", path="PILL")
+    assert removed["a_reset"] == "does not bring it back: it was added in this run"
     scene.reset()
     assert scene.robot.getFromDef("PILL") is None
     assert not scene.events("put_back")

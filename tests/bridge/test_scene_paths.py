@@ -147,6 +147,17 @@ def test_the_scene_is_asked_for_types_and_names_at_any_depth(crowd: Scene) -> No
     assert inside["rows"][0][2] == "Box, inside a PROTO"
 
 
+def test_types_and_names_are_found_whatever_their_case_and_else_the_nearest_are_told(
+    crowd: Scene,
+) -> None:
+    assert crowd.ask("get_scene", types=["robot"])["rows"]
+    assert crowd.ask("get_scene", names=["CRATE"]) == crowd.ask("get_scene", names=["crate"])
+    mistyped = crowd.ask("get_scene", types=["Robto"])
+    assert not mistyped["rows"] and mistyped["nearest"][0] == "Robot"
+    assert crowd.ask("get_scene", names=["ridr"])["nearest"][0] in ("RIDER", "rider")
+    assert "nearest" not in crowd.ask("get_scene", names=["rider"])
+
+
 def test_a_scene_that_is_too_large_is_given_in_parts(crowd: Scene) -> None:
     for i in range(60):
         crowd.ask("add_node", vrml=f'DEF PIECE_{i:02} Solid {{ name "the piece number {i}" }}')

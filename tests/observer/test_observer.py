@@ -122,6 +122,21 @@ def test_what_is_added_is_found_at_once_and_what_is_removed_is_followed_no_more(
     assert capfd.readouterr().err == ""
 
 
+def test_what_is_removed_and_put_back_keeps_its_name_in_signals(watching: Watching) -> None:
+    watching.go_on(20)
+    top = watching.robot.getRoot().getField("children")
+    assert top is not None
+    for _ in range(2):
+        top.importMFNodeFromString(-1, 'DEF BARREL Solid { name "barrel" }')
+        watching.go_on(5)
+        assert "BARREL" in watching.observer.world.bodies
+        barrel = watching.robot.getFromDef("BARREL")
+        assert barrel is not None
+        barrel.remove()
+        watching.go_on(5)
+    assert "BARREL" not in watching.observer.world.bodies
+
+
 def test_where_tracked_poses_do_not_come_they_are_asked_for(
     watching: Watching, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -70,6 +70,19 @@ def test_a_node_that_is_removed_is_gone_for_good(robot: InProcessSupervisor) -> 
     assert robot.getFromDef("BALL") is None
 
 
+def test_what_is_used_elsewhere_too_stays_when_the_node_that_defines_it_is_removed(
+    robot: InProcessSupervisor,
+) -> None:
+    wall = node(robot, "WALL_EAST")
+    shape_id = node(robot, "WALL_X_SHAPE").getId()
+    wall.remove()
+    children = field(robot, "WALL_WEST", "children")
+    shape = children.getMFNode(0)
+    assert shape is not None and shape.getId() == shape_id
+    around = shape.getParentNode()
+    assert around is not None and around.getDef() == "WALL_WEST"
+
+
 def test_what_a_node_says_of_itself_makes_the_same_node_again(robot: InProcessSupervisor) -> None:
     for definition in ("BALL", "CRATE", "OBSTACLE_PILLAR"):
         written = node(robot, definition).exportString()

@@ -43,7 +43,7 @@ def test_two_live_robots_are_listed_instead_of_guessed(recorded: Recorded) -> No
 def test_two_robots_of_the_past_are_listed_instead_of_guessed(recorded: Recorded) -> None:
     ended(recorded, "a")
     ended(recorded, "b")
-    with pytest.raises(AmbiguousRobotError, match="none is live"):
+    with pytest.raises(AmbiguousRobotError, match=r"none is live: .*; start the simulation, or"):
         resolve_robot(recorded.connection, None, time.time())
 
 

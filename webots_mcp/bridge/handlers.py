@@ -90,9 +90,10 @@ def _require_name(action: object) -> None:
     if not isinstance(action, str):
         raise TypeError(f"the name of an action is a text, not {type(action).__name__} {action!r}")
     if not action or action in BUILT_IN_ACTIONS:
+        why = "is built in, and the bridge would run its own" if action else "is empty"
         raise ValueError(
-            f"action {action!r} cannot be registered: choose a name that is not empty and "
-            f"not built in ({', '.join(BUILT_IN_ACTIONS)})"
+            f"action {action!r} cannot be registered, as it {why}: choose another name, such as "
+            f"{'my_' + (action or 'action')!r}; built in are {', '.join(BUILT_IN_ACTIONS)}"
         )
     if len(action) > _MOST_NAME_CHARACTERS or not action.isprintable():
         raise ValueError(

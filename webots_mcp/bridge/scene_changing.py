@@ -29,6 +29,7 @@ _LONGEST_SHOWN: Final = 1_000  # characters of a value
 _LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
 _STAY: Final = ("WorldInfo", "Viewpoint")
 _ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
+_ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
 _SAYS: Final = "Webots' console (webots_get_logs, if it is recorded) says why"
 
 
@@ -54,8 +55,8 @@ def set_field(context: Context, command: Command) -> _Progress:
         place.type_name, before, value
     ):
         raise CommandRefusedError(
-            f"{place.path} is {now!r:.200} after it was set; {_SAYS}. What is inside a PROTO "
-            "cannot be set"
+            f"{place.path} is {now!r:.200} after it was set: a controller set it again, or Webots "
+            f"did not take the value; {_SAYS}. What is inside a PROTO cannot be set"
         )
     elif not is_same(place.type_name, now, value):
         facts["now"] = _shown(now)  # the simulation has moved it on
@@ -228,6 +229,7 @@ def remove_node(context: Context, command: Command) -> _Progress:
         "node": label(node),
     }
     removal = yield from _removal(robot, place, node_id)
+    was_added = node_id in context.scene.added
     node.remove()
     if robot.getFromId(node_id) is not None:
         yield from _until_stepped(context)
@@ -235,7 +237,7 @@ def remove_node(context: Context, command: Command) -> _Progress:
         raise CommandRefusedError(f"Webots did not remove {place.path}; {_SAYS}")
     is_remembered = removal is not None and context.scene.remember_removed(removal)
     context.journal.event("remove_node", facts | _asked_by(command), place.path)
-    reset = _brought_back(removal, is_remembered)
+    reset = _ADDED_BEFORE if was_added else _brought_back(removal, is_remembered)
     return facts | {"sim_time_s": context.clock.sim_time_s, "a_reset": reset}
 
 

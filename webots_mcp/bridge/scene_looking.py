@@ -17,6 +17,7 @@ from webots_mcp.bridge.scene_path import Pace, Place, children, fields_of, find,
 from webots_mcp.bridge.scene_values import read, read_entries
 from webots_mcp.bridge.text import cut
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.naming import nearest_first
 
 _Progress = Generator[None, None, object]
 
@@ -27,12 +28,14 @@ _LONGEST_TEXT: Final = 80  # of a field among others
 _USUAL_DEPTH: Final = 2
 _MOST_AT_THE_TOP: Final = 200
 _MOST_PATTERNS: Final = 20
+_MOST_NEAR: Final = 10  # types or names that are told where none matches
 
 
 def get_scene(context: Context, command: Command) -> _Progress:
     """The nodes of the tree, or below a `path`, that match `types` and `names`."""
     params, robot = command.params, context.simulation.robot
     types, names = _patterns(params, "types"), _patterns(params, "names")
+    seen: dict[str, None] = {}
     wanted, after = _patterns(params, "fields"), _whole(params, "cursor", 0, 0, 10**9)
     usual = DEEPEST if types or names else _USUAL_DEPTH
     depth = _whole(params, "depth", usual, 1, DEEPEST)
@@ -50,12 +53,15 @@ def get_scene(context: Context, command: Command) -> _Progress:
         before = keys.get(found.parent.id, ()) if found.parent else ()
         keys[found.id] = (*before, looked)
         row = _row(found, definitions, wanted)
-        if looked <= after or not _matches(found, row[3], types, names):
+        seen |= dict.fromkeys(_called(found) if names else _kinds(found))
+        if looked <= after or not _matches(found, types, names):
             continue
         if not rows.fits(row):
             return rows.told([row for _, row in sorted(shown)]) | {"cursor": looked - 1}
         shown.append((keys[found.id], row))
     told = rows.told([row for _, row in sorted(shown)]) | {"looked_at": looked}
+    if (types or names) and not shown and not after:
+        told["nearest"] = nearest_first((names or types)[0], filter(None, seen))[:_MOST_NEAR]
     if place is not None:
         return told | {"below": place.path}
     if types or names:
@@ -102,14 +108,22 @@ def _row(found: SceneNode, definitions: set[str], wanted: list[str]) -> list[Any
     return [found.depth + 1, path or f"#{found.id}", kind, found.name or None, *values]
 
 
-def _matches(found: SceneNode, name: str | None, types: list[str], names: list[str]) -> bool:
-    kinds = (found.type_name, found.base_type)
-    called = (found.definition, name or "")
-    return (not types or _any_match(kinds, types)) and (not names or _any_match(called, names))
+def _matches(found: SceneNode, types: list[str], names: list[str]) -> bool:
+    of_type = not types or _any_match(_kinds(found), types)
+    return of_type and (not names or _any_match(_called(found), names))
+
+
+def _kinds(found: SceneNode) -> tuple[str, str]:
+    return found.type_name, found.base_type
+
+
+def _called(found: SceneNode) -> tuple[str, str]:
+    return found.definition, found.name or ""
 
 
 def _any_match(texts: Iterable[str], patterns: list[str]) -> bool:
-    return any(fnmatchcase(text, pattern) for text in texts for pattern in patterns)
+    """Whether one of the texts is as one of the patterns says, whatever their case."""
+    return any(fnmatchcase(text.lower(), each.lower()) for text in texts for each in patterns)
 
 
 def get_field(context: Context, command: Command) -> _Progress:

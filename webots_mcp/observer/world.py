@@ -152,12 +152,18 @@ class World:
         if key in self.bodies:
             return
         if key is None:
-            key = word_of(scene.definition or scene.name or scene.type_name, self._keys.values())
-            self._keys[scene.id] = key
+            key = self._name(scene)
         self.bodies[key] = body_of(scene, key)
         if self._is_tracking:
             scene.node.enablePoseTracking(self._period_ms)
         self._is_new = True
+
+    def _name(self, scene: SceneNode) -> str:
+        """A word that no other body has now: what was put back is called as before."""
+        key = word_of(scene.definition or scene.name or scene.type_name, self.bodies)
+        self._keys = {node: word for node, word in self._keys.items() if word != key}
+        self._keys[scene.id] = key
+        return key
 
     def _lose(self, key: str) -> None:
         """Nothing is asked of its node: it may not be there any more."""

@@ -158,9 +158,19 @@ class World:
                 items[:] = [item for item in items if item is not node]
             else:
                 continue
-            self._forget([node, *descendants_of(node)])
+            self._forget_all_but_used(node)
             return parent, name
         return None
+
+    def _forget_all_but_used(self, node: Node) -> None:
+        """Forget a node and what is in it, but for what stands elsewhere too, by a USE."""
+        there = {self.root: None, **dict.fromkeys(descendants_of(self.root))}
+        gone = {each for each in (node, *descendants_of(node)) if each not in there}
+        self._forget([*gone])
+        for parent in there:
+            for child in children_of(parent):
+                if self._parents.get(child) in gone:
+                    self._parents[child] = parent
 
     def _forget(self, nodes: list[Node]) -> None:
         gone = set(nodes)

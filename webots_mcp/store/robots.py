@@ -71,8 +71,10 @@ def resolve_robot(connection: sqlite3.Connection, name: str | None, now_s: float
     if len(candidates) == 1:
         return candidates[0]
     state = "are live" if live else "were recorded and none is live"
+    start = "" if live else "start the simulation, or for what was recorded "
     raise AmbiguousRobotError(
-        f"{len(candidates)} robots {state}: {_listed(candidates)}; say which one with robot=..."
+        f"{len(candidates)} robots {state}: {_listed(candidates)}; "
+        f"{start}say which one with robot=..."
     )
 
 

@@ -54,6 +54,19 @@ def test_who_only_climbs_is_said_to_have_climbed(empty: sqlite3.Connection) -> N
     assert found.verdicts.absent["still"].endswith("but climbed or sank")
 
 
+@pytest.mark.parametrize("turns", [0.2, 5.0])  # beyond half a turn it is counted on
+@pytest.mark.parametrize("name", ["odom", "odometry", "robotPose", "pose"])
+def test_the_third_of_odometry_is_where_it_looks_and_no_height(
+    empty: sqlite3.Connection, name: str, turns: float
+) -> None:
+    def turning(time_s: float) -> dict[str, Any]:
+        heading = turns * math.sin(math.tau * time_s / 20)
+        return {name: [0.2 * min(time_s, 30.0), 0.0, heading]}
+
+    (still,) = ask(empty, turning).events
+    assert (still.start_s, still.end_s) == pytest.approx((29.9, 59.9), abs=0.2)
+
+
 @pytest.mark.parametrize("name", ["altitude", "altitudeM", "alt_m"])
 def test_an_altitude_is_a_height(empty: sqlite3.Connection, name: str) -> None:
     def climbs(time_s: float) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
+from webots_mcp.store.signals.flatten import may_be_yaw
 from webots_mcp.store.signals.registry import Signal
 from webots_mcp.units import METRES, in_snake_case, metres_in, unit_in, words_of
 
@@ -117,11 +118,11 @@ def _is_no_wheel(name: str) -> bool:
 def _height(known: dict[str, Signal], position: tuple[Signal, Signal] | None) -> Signal | None:
     """The third of the position's numbers, or an altitude beside it or at the top.
 
-    The third of a pose of three is where it looks.
+    The third of a pose or odometry of three is where it looks.
     """
     branch, _, axis = position[0].name.rpartition(".") if position else ("", "", "")
     name = f"{branch}.{_THIRD_AXES.get(axis, '')}".removeprefix(".")
-    if name == "pose.2" and "pose.3" not in known:
+    if may_be_yaw(name) and f"{branch}.3" not in known:
         name = ""
     altitudes = [each for each in known if position and _is_altitude(each, branch)]
     signals = (known.get(each) for each in (name, *altitudes))

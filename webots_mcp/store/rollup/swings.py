@@ -27,8 +27,8 @@ MOST_SIGNALS: Final = 20  # of which swings are stored
 
 # Sensors swing by nature while a robot drives.
 _SWINGING: Final = re.compile(
-    r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|position"
-    r"|left|right|cmd|command\w*|error)([._]|$)",
+    r"(^|[._])(heading|yaw|roll|pitch|theta|bearing|steer\w*|wheels?|motors?|speed|velocity|pose|pos"
+    r"|position|odom|odometry|left|right|cmd|command\w*|error)([._]|$)",
     re.IGNORECASE,
 )
 

@@ -8,14 +8,14 @@ import re
 from typing import Any, Final, Literal, NamedTuple, cast
 
 from webots_mcp.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, reduce_array
-from webots_mcp.units import angle_unit, unit_in
+from webots_mcp.units import angle_unit, in_snake_case, unit_in
 
 Kind = Literal["num", "bool", "text", "angle", "null"]
 MAX_TEXT: Final = 200  # characters of a text value that are kept and compared
 MAX_ANGLE_RAD: Final = 6.3  # a value beyond is in degrees, or turns were counted
 MAX_YAW_RAD: Final = 3.2  # the third item of a pose that goes beyond is no yaw
 
-_THIRD_OF_POSE: Final = re.compile(r"(^|\.)pose\.2$", re.IGNORECASE)
+_THIRD_OF_POSE: Final = re.compile(r"(^|[._])(pose|odom|odometry)\.2$")
 
 
 class Place(NamedTuple):
@@ -106,8 +106,8 @@ def turn_of(name: str, kind: Kind) -> float | None:
 
 
 def may_be_yaw(name: str) -> bool:
-    """Whether it is the third item of a `pose`; of three items it is the yaw, of more z."""
-    return bool(_THIRD_OF_POSE.search(name))
+    """Whether it is the third item of a pose or of odometry; of three it is the yaw, of more z."""
+    return bool(_THIRD_OF_POSE.search(in_snake_case(name)))
 
 
 def widen(known: Kind, seen: Kind) -> Kind:

@@ -28,8 +28,10 @@ def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, 
     """The file of a world, and the project that it lies in.
 
     Args:
-        path: Absolute, or from the current folder or the project's.
-        project: It has to lie in this one; None for any.
+        path: Absolute, or from the current folder or the project's; a name alone is that of one of
+            the project's worlds too.
+        project: It has to lie in this one; None for any, then a name is one of the project around
+            the current folder.
 
     Raises:
         InvalidInputError: There is no such world, or it lies in no project, or in another one.
@@ -49,14 +51,16 @@ def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, 
 
 
 def _found(path: Path, project: Path | None) -> Path:
-    """The file that is meant: in the project, a name alone is that of one of its worlds."""
-    folders = [Path()] if project is None else [project, project / "worlds"]
+    """The file that is meant: in a project, a name alone is that of one of its worlds."""
+    around = project or find_project(Path.cwd())
+    folders = [project or Path(), *([] if around is None else [around / "worlds"])]
     places = [full_path(folder / path) for folder in folders]
     for place in places:
         if place.is_file():
             return place
-    there = [world.name for world in sorted(places[-1].parent.glob(f"*{WORLD_ENDING}"))]
-    beside = f"; in {places[-1].parent} there is {', '.join(there[:20])}" if there else ""
+    folder = next((each.parent for each in reversed(places) if each.parent.is_dir()), Path())
+    there = [world.name for world in sorted(folder.glob(f"*{WORLD_ENDING}"))]
+    beside = f"; in {folder} there is {', '.join(there[:20])}" if there else ""
     raise InvalidInputError(f"there is no world {places[0]}{beside}")
 
 

@@ -16,6 +16,7 @@ import pytest
 
 from tests.trials.test_killed import wait_until
 from tests.webots.conftest import CONTROLLER, free_port, webots, write_project
+from webots_mcp.launching import require_world
 
 __all__ = ["webots"]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the program `webots` is a script")
@@ -171,9 +172,18 @@ def test_without_a_free_port_webots_says_so_and_ends(
     assert f"Could not initialize TCP server on port {first}" in said
 
 
+def test_a_name_alone_is_that_of_a_world_of_the_project_around_here(
+    project: Callable[..., Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world = project()
+    monkeypatch.chdir(world.parent.parent / "controllers")
+    assert require_world("arena.wbt") == (world, world.parent.parent)
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (["arna.wbt"], "arna.wbt; in {}/worlds there is arena.wbt"),
         (["worlds/arna.wbt"], "arna.wbt; in {}/worlds there is arena.wbt"),
         (["controllers/rover/rover.py"], "is no world: its name does not end with .wbt"),
         (["../lonely.wbt"], "lies in no Webots project: that is a folder with worlds/ and"),

@@ -12,6 +12,7 @@ import psutil
 import pytest
 from mcp import Client
 
+from tests.recordings.rows import Recorded
 from tests.server.conftest import ask, fail
 from tests.webots.conftest import (
     CONTROLLER,
@@ -63,6 +64,15 @@ def _family(answer: dict[str, Any]) -> list[psutil.Process]:
     return [process, *process.children(recursive=True)]
 
 
+def _two_robots_of_the_past(data: Path) -> None:
+    data.mkdir()
+    recorded = Recorded(data / "webots.db")
+    for name in ("hunter", "runner"):
+        robot = recorded.robot(name)
+        robot.beat(ended_wall_time_s=robot.now, end_reason="finished")
+    recorded.close()
+
+
 async def test_a_world_is_started_changed_and_ended(begin: Begin, project: Path) -> None:
     async with begin() as client:
         answer = await ask(client, "webots_launch_world", world="worlds/arena.wbt", mode="fast")
@@ -103,6 +113,31 @@ async def test_where_nobody_records_the_answer_comes_in_time_and_says_why(begin:
         assert "run_id" not in answer
         ended = await ask(client, "webots_quit")
         assert ended["route"] == "process"
+
+
+async def test_a_start_in_pause_says_how_to_go_on_also_beside_robots_of_the_past(
+    begin: Begin, project: Path
+) -> None:
+    async with begin() as client:
+        _two_robots_of_the_past(project / "mcp_data")
+        start = {"world": "arena.wbt", "mode": "pause", "timeout_s": 2}
+        alone = await ask(client, "webots_launch_world", **start)
+        assert "webots_quit and start it in another mode or with stream" in alone["hint"]
+        await ask(client, "webots_quit")
+        answer = await ask(client, "webots_launch_world", **start, stream=True)
+        assert answer["hint"].endswith('. webots_simulation_control("resume") plays it')
+        played = await ask(client, "webots_simulation_control", command="resume", timeout_s=30)
+        assert (played["outcome"], played["route"]) == ("done", "websocket")
+
+
+async def test_a_robot_of_the_webots_that_was_started_here_names_what_is_to_end(
+    begin: Begin,
+) -> None:
+    async with begin(PLAIN) as client:
+        family = _family(await ask(client, "webots_launch_world", world="arena.wbt"))
+        ended = await ask(client, "webots_quit", robot="rover")
+        assert (ended["outcome"], ended["route"]) == ("done", "process")
+        await _ends(family)
 
 
 async def test_webots_that_ends_at_its_start_is_an_error_with_what_it_said(
@@ -194,7 +229,7 @@ async def test_a_webots_that_somebody_else_started_is_ended_by_a_supervisor_alon
                 await anyio.sleep(0.05)
         if controller == PLAIN:
             text = await fail(client, "webots_quit")
-            assert "was not started by this server" in text
+            assert "no Webots that was started by this server runs" in text
             assert "bridge: quit needs a Supervisor" in text and "(Ctrl+Q)" in text
             assert process.poll() is None
             return

@@ -16,12 +16,18 @@ from anyio import to_thread
 
 from webots_mcp.belonging import belongs
 from webots_mcp.contract import HEARTBEAT_LATE_S
-from webots_mcp.errors import CommandRefusedError, NoDatabaseError, NothingRecordedError
+from webots_mcp.errors import (
+    AmbiguousRobotError,
+    CommandRefusedError,
+    NoDatabaseError,
+    NothingRecordedError,
+)
 from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.target import find_target
 from webots_mcp.store.observers import live_observer
 from webots_mcp.store.recording import Recording, View, look
+from webots_mcp.store.robots import list_robots
 from webots_mcp.store.sessions import Session
 from webots_mcp.store.status import find_holder
 from webots_mcp.webots import keyboard
@@ -47,6 +53,7 @@ _NOTHING_SEEN: Final = (
     "the recording does not show it yet: a controller that hangs, or an extern one that is "
     "missing, stops the time of a simulation that runs"
 )
+_NONE_LIVES: Final = "no controller lives of the robots that were recorded"
 _NO_FORCE: Final = "force=true would press Webots' own keys"
 
 
@@ -299,6 +306,10 @@ def look_around(recording: Recording, robot: str | None, action: str) -> Situati
         with recording.reader() as connection:
             try:
                 view = find_target(connection, robot, action)
+            except AmbiguousRobotError:
+                if any(each.live for each in list_robots(connection, time.time())):
+                    raise
+                return Situation(None, False, _NONE_LIVES, None, Moment(None, None))
             except CommandRefusedError as error:
                 view = look(connection, robot)
                 _require_not_held_elsewhere(view, error)

@@ -12,7 +12,7 @@ import anyio
 from anyio import to_thread
 
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.launching import begun_since, newest_in
+from webots_mcp.launching import Launch, begun_since, newest_in
 from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.launcher import Launcher
 from webots_mcp.server.results import CommandAnswer
@@ -30,6 +30,10 @@ from webots_mcp.webots.stream import ANSWER_S, Address, address_of, load_world, 
 
 _POLL_S: Final = 0.1
 _GONE_S: Final = 5.0  # from the end of its controllers to that of Webots
+_NONE_IS_OURS: Final = "no Webots that was started by this server runs"
+_OURS_IS_ANOTHER: Final = (
+    "this robot is not in the Webots that was started by this server (without robot it is ended)"
+)
 _NOBODY_YET: Final = (
     "no controller has recorded in it yet: its robots may have no bridge, or the simulation is "
     "paused; webots_get_logs and webots_diagnose tell more"
@@ -78,7 +82,7 @@ class WorldRequest:
             CommandRefusedError: It is not ours, and no controller can be asked.
         """
         ours = self.launcher.running
-        if ours is not None and self.robot is None:
+        if ours is not None and await self._is_meant(ours):
             await to_thread.run_sync(self.launcher.stop)
             proof = f"its processes have ended, exit code {ours.webots.exit_code}"
             return self._answer("quit", "process", proof)
@@ -86,12 +90,19 @@ class WorldRequest:
         answer = await self._by_controller(situation, "quit", {})
         if answer is None:
             raise CommandRefusedError(
-                f"this Webots was not started by this server, and no controller can be asked to "
-                f"end it. {self._told()}. Close its window (Ctrl+Q)"
+                f"{_OURS_IS_ANOTHER if ours else _NONE_IS_OURS}, and no controller can be asked to "
+                f"end another. {self._told()}. Close its window (Ctrl+Q)"
             )
         if answer.outcome == "done":
             answer.proof = await self._gone(situation.address)
         return answer
+
+    async def _is_meant(self, ours: Launch) -> bool:
+        """Whether the Webots of this server is the one of the robot, where one is named."""
+        if self.robot is None:
+            return True
+        situation = await self._look_around("quit")
+        return situation.is_there and situation.address == ours.webots.address
 
     async def _look_around(self, action: str) -> Situation:
         return await to_thread.run_sync(look_around, self.recording, self.robot, action)

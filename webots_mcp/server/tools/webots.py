@@ -130,8 +130,17 @@ def _answer(
         result=_described(launched),
         route="process",
         proof=f"{first.robot} records: run {first.run_id}" if first else None,
-        hint=None if first else f"Webots runs, but {launched.silence()}",
+        hint=None if first else f"Webots runs, but {launched.silence()}{_then(launched)}",
     )
+
+
+def _then(launched: Launch) -> str:
+    """How a start in pause goes on."""
+    if launched.start.mode != "pause":
+        return ""
+    by_us = 'webots_simulation_control("resume") plays it'
+    alone = "press play in its window, or webots_quit and start it in another mode or with stream"
+    return f". {by_us if launched.start.streams else alone}"
 
 
 def _described(launched: Launch) -> dict[str, Any]:

@@ -112,6 +112,21 @@ def test_a_signal_that_never_had_a_value_is_not_said_to_be_silent_for_good(
         resolve_signals(known_signals(empty, find_range(empty, Scope())), ["frount"])
 
 
+@pytest.mark.parametrize("items", [8, 40])
+def test_a_lidar_that_sees_nothing_at_all_has_no_value(
+    empty: sqlite3.Connection, items: int
+) -> None:
+    recorder = start_run(empty)
+    replaced = {f"lidar.{item}": "inf" for item in range(items)}
+    for step in range(600):
+        blind = 200 <= step < 250
+        scan = [None if blind else 2.0 + 0.1 * math.sin(step + item) for item in range(items)]
+        recorder.publish(step * 0.1, {"lidar": scan}, replaced if blind else None)
+    (silent,) = ask(empty, "silent").events
+    assert (silent.start_s, silent.end_s) == pytest.approx((20.0, 24.9))
+    assert silent.details["value"] == "inf"
+
+
 def test_many_silences_are_one_event_but_for_one_that_goes_on(empty: sqlite3.Connection) -> None:
     record(empty, lambda t: {"front": range_m(t) if t % 10 < 8 else None})
     event, newest = ask(empty, "silent").events

@@ -41,7 +41,10 @@ def grouped(events: Sequence[Event], known: dict[str, Signal]) -> list[Event]:
 
 
 def _of_arrays(events: Iterable[Event]) -> list[Event]:
-    """What several items of one array, or parts of one branch, did at once is told as one."""
+    """What several items of one array, or parts of one branch, did at once is told as one.
+
+    Its details are those that all of them have.
+    """
     found: dict[tuple[object, ...], Event] = {}
     alone: list[Event] = []
     for event in events:
@@ -50,8 +53,10 @@ def _of_arrays(events: Iterable[Event]) -> list[Event]:
             alone.append(event)
             continue
         key = (event.kind, event.run_id, branch, event.start_s, event.end_s)
-        shared = replace(event, name=f"{branch}.*", details={})
-        found[key] = shared if key in found else event
+        if other := found.get(key):
+            same = dict(each for each in event.details.items() if each in other.details.items())
+            event = replace(event, name=f"{branch}.*", details=same)
+        found[key] = event
     return [*alone, *found.values()]
 
 

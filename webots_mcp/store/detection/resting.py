@@ -118,7 +118,11 @@ def _values(search: Search, signal: Signal, span: Span) -> Array:
 
 
 def replaced_value(search: Search, signal: Signal, at_s: float) -> str | None:
-    """What a row had that JSON cannot hold, such as inf; None where it had nothing at all."""
+    """What a row had that JSON cannot hold, such as inf; None where it had nothing at all.
+
+    Of a long array it is what the first of its items was.
+    """
     row = search.connection.execute(_REPLACED_AT, (search.segment.run_id, at_s)).fetchone()
     replaced: Mapping[str, str] = json.loads(row[0]) if row and row[0] else {}
-    return replaced.get(signal.name)
+    first = f"{signal.name.rpartition('.')[0]}.0"
+    return replaced.get(first if signal.reduce else signal.name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+from webots_mcp.naming import LONGEST_SPREAD_ARRAY
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
@@ -81,11 +82,15 @@ def _had_value(search: Search, signal: Signal, at_s: float) -> bool:
 
 
 def _is_shorter(search: Search, signal: Signal, span: Span) -> bool:
-    """Whether the array was there when it began, but so short or long that it has no such item."""
+    """Whether the array was there when it began, but so short or long that it has no such item.
+
+    A long one is reduced; whose items are all replaced (a lidar that sees nothing) has no number.
+    """
     array = signal.path if signal.reduce else signal.path.rpartition("[")[0]
     if not array:
         return False
-    asked = (array, signal.path, search.segment.run_id, span.start_s)
+    item = f"{array}[{LONGEST_SPREAD_ARRAY}]" if signal.reduce else signal.path
+    asked = (array, item, search.segment.run_id, span.start_s)
     types = search.connection.execute(_TYPES_AT, asked).fetchone()
     return types is not None and types[0] == "array" and types[1] != "null"
 

@@ -32,6 +32,8 @@ _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
 }
 # Signals that are never searched, and periods that are not drawn.
 _OTHERS: Final = re.compile(r"not in \d+ of |not with a period of more than 5 s ")
+# By how much a distance may be too short, of some runs or of all.
+_LONGER: Final = re.compile(r"(?:run ([\d, ]+): )?it may be up to ([\d.]+) (%|m) more")
 _OF_ROBOT: Final = frozenset[Measure]({"standstill", "stuck", "leap", "gap"})
 
 
@@ -154,11 +156,34 @@ def _is_one(one: Claim, other: Claim) -> bool:
     return alike and other.start_s <= one.end_s and one.start_s <= other.end_s
 
 
-def distances_m(connection: sqlite3.Connection, run_ids: Sequence[int]) -> list[float | None]:
-    """How far the robot travelled in each of the runs, 2 to 10 of them, over the same stretch."""
+@dataclass(frozen=True)
+class ToldDistance:
+    """How far a robot is said to have travelled, and by how much that may be too little."""
+
+    distance_m: float
+    longer_m: float
+
+
+def told_distances(
+    connection: sqlite3.Connection, run_ids: Sequence[int]
+) -> list[ToldDistance | None]:
+    """Of each of the runs, 2 to 10 of them, over the same stretch."""
     comparison = compare_runs(connection, run_ids, deadline_s=UNHURRIED_S)
     way = next((each for each in comparison.measures if each.name == "distance_m"), None)
-    return [spread and spread.median for spread in way.spread] if way else [None] * len(run_ids)
+    spread = way.spread if way else [None] * len(run_ids)
+    doubts = comparison.not_known.get("distance_m", "")
+    return [
+        each and ToldDistance(each.median, _longer_m(doubts, run_id, each.median))
+        for run_id, each in zip(run_ids, spread, strict=True)
+    ]
+
+
+def _longer_m(doubts: str, run_id: int, distance_m: float) -> float:
+    """What the sentence about a run says, or the one about all."""
+    for runs, figure, unit in _LONGER.findall(doubts):
+        if not runs or str(run_id) in runs.split(", "):
+            return float(figure) * (distance_m / 100 if unit == "%" else 1)
+    return 0.0
 
 
 def claimed_differences(connection: sqlite3.Connection) -> list[tuple[str, float]]:

@@ -85,6 +85,8 @@ def render_travelled(lines: Iterable[Travelled]) -> str:
         "runs",
         "at rest: worst m",
         "on the way: ratio",
+        "slowly: ratio",
+        "at most",
         "unknown",
         "below the goal",
     )
@@ -93,10 +95,15 @@ def render_travelled(lines: Iterable[Travelled]) -> str:
 
 def _travelled(each: Travelled) -> tuple[str, ...]:
     worst_m = f"{max(each.rest_m):.3f}" if each.rest_m else "-"
-    ratios = f"{min(each.ratios):.3f} to {max(each.ratios):.3f}" if each.ratios else "-"
-    runs = str(len(each.rest_m) + len(each.ratios) + each.unknown)
+    told, most = zip(*each.slow, strict=True) if each.slow else ((), ())
+    ratios = (_range(of) for of in (each.ratios, told, most))
+    runs = str(len(each.rest_m) + len(each.ratios) + len(each.slow) + each.unknown)
     noise = f"{1000 * each.noise_m:g}"
-    return noise, runs, worst_m, ratios, str(each.unknown), ", ".join(each.missed)
+    return noise, runs, worst_m, *ratios, str(each.unknown), ", ".join(each.missed)
+
+
+def _range(ratios: Sequence[float]) -> str:
+    return f"{min(ratios):.3f} to {max(ratios):.3f}" if ratios else "-"
 
 
 def render_pairs(pairs: Pairs) -> str:

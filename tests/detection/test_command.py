@@ -86,6 +86,7 @@ def test_a_robot_that_drives_without_noise_has_travelled_as_far_as_it_did() -> N
     exact = next(iter(measure_travelled(1, 1)))
     assert exact.noise_m == 0.0 and exact.missed == []
     assert exact.ratios == pytest.approx([1.0], abs=0.005)
+    assert exact.slow[0] == pytest.approx((1.0, 1.0), abs=0.005)
     assert exact.rest_m == pytest.approx([0.0])
 
 
@@ -95,6 +96,12 @@ def test_who_rested_and_travelled_misses_the_goal_of_its_noise() -> None:
         assert Travelled(noise_m, (1.1 * most_m,), (1.06,), 1).missed == [
             "rest", "distance", "unknown",
         ]  # fmt: skip
+
+
+def test_who_drove_slowly_went_about_as_far_as_told_or_as_said_to_be_possible() -> None:
+    told_and_most = {(0.95, 0.95): [], (0.6, 1.2): [], (0.6, 0.85): ["slow"], (1.2, 1.2): ["slow"]}
+    for slow, missed in told_and_most.items():
+        assert Travelled(0.03, (), (), 0, (slow,)).missed == missed
 
 
 def test_pairs_are_compared_across_an_edit() -> None:

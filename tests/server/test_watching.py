@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot
@@ -45,6 +46,17 @@ async def test_a_way_in_metres_that_no_robot_drives_is_doubted(
         answer = await ask(client, "webots_monitor", lookback_s=60)
     assert answer["movement"]["distance_m"] == 1000.0
     assert "pose.0 is taken as metres" in answer["movement"]["unit"]
+
+
+async def test_a_slow_way_under_noise_is_told_with_how_much_longer_it_may_be(
+    connect: Connect, rover: RecordedRobot
+) -> None:
+    noise = np.random.default_rng(1).normal(0, 0.03, (60, 2)).tolist()
+    drive(rover, *([0.015 * step + x, y] for step, (x, y) in enumerate(noise)))
+    async with connect() as client:
+        answer = await ask(client, "webots_monitor", lookback_s=60)
+    assert answer["movement"]["distance_m"] < 1.0
+    assert "it may be up to" in answer["movement"]["distance_note"]
 
 
 async def test_a_lost_position_does_not_count_as_a_way(

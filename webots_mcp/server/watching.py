@@ -11,6 +11,7 @@ from webots_mcp.server.bounds import newest_runs
 from webots_mcp.server.budget import figure, seconds
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import (
+    doubt_of_length,
     doubt_of_unit,
     find_motion,
     path_length,
@@ -99,10 +100,13 @@ def _way(part: Columns, position: tuple[Signal, Signal]) -> dict[str, Any] | Non
     times, x, y = places_of(part, position)
     if len(times) < 2:
         return None
+    way = path_length(part, position)
+    doubt = doubt_of_length(way)
     first, last = ((float(x[row]), float(y[row])) for row in (0, -1))
     return {
         "from_m": [figure(value) for value in first],
         "to_m": [figure(value) for value in last],
-        "distance_m": figure(path_length(part, position)),
+        "distance_m": figure(way.length_m),
+        **({"distance_note": doubt} if doubt else {}),
         "displacement_m": figure(math.dist(first, last)),
     }

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from tests.store.analysis.driving import noisy_track
 from webots_mcp.store.analysis.noise import noise_of, smooth
-from webots_mcp.store.analysis.track import path_length_m, track_of
+from webots_mcp.store.analysis.track import path_length, path_length_m, track_of
 
 DRIVE = [
     phase
@@ -108,3 +108,50 @@ def test_of_many_robots_at_rest_hardly_one_is_said_to_have_moved(noise_m: float)
     tracks = [noisy_track([(120.0, 0.0, 0.0)], 0.008, noise_m, seed)[0] for seed in range(15)]
     moved_m = [path_length_m(track) for track in tracks]
     assert np.count_nonzero(moved_m) <= 1
+
+
+@given(
+    seed=st.integers(0, 1000),
+    speed_m_s=st.floats(0.03, 0.4),
+    noise_m=st.sampled_from([0.002, 0.005, 0.01, 0.03]),
+    interval_s=st.sampled_from([0.032, 0.08, 0.16, 0.5]),
+)
+def test_a_way_is_nowhere_longer_than_told_to_be_possible(
+    seed: int, speed_m_s: float, noise_m: float, interval_s: float
+) -> None:
+    """Bends of 1.5 rad/s are 20 mm narrow at 0.03 m/s."""
+    bends = [(4.0, speed_m_s, turn) for turn in (0.0, 1.5, 0.5, -0.8, 0.0, -1.5)] * 5
+    track, length_m = noisy_track(bends, interval_s, noise_m, seed)
+    told = path_length(track)
+    assert told.length_m < 1.2 * length_m
+    assert told.length_m + told.longer_m > 0.85 * length_m
+
+
+@pytest.mark.parametrize("speed_m_s", [0.03, 0.05, 0.1, 0.2])
+@pytest.mark.parametrize("interval_s", [0.08, 0.5])
+def test_slow_ways_without_narrow_bends_are_as_long_as_they_were(
+    speed_m_s: float, interval_s: float
+) -> None:
+    turns = [(10.0, speed_m_s, turn) for turn in (0.0, 0.1, 0.0, -0.1)] * 3
+    track, length_m = noisy_track(turns, interval_s, 0.03)
+    assert path_length_m(track) == pytest.approx(length_m, rel=0.05)
+
+
+@pytest.mark.parametrize(("speed_m_s", "interval_s"), [(0.03, 0.08), (0.05, 0.08), (0.1, 0.5)])
+def test_most_of_the_bends_that_noise_hides_are_counted(
+    speed_m_s: float, interval_s: float
+) -> None:
+    """Circles with a radius of 20 to 67 mm at 30 mm of noise: places alone show 0.6 to 0.8."""
+    bends = [(5.0, speed_m_s, turn) for turn in (0.0, 1.5, 0.5, -1.5)] * 6
+    tracks = [noisy_track(bends, interval_s, 0.03, seed) for seed in range(8)]
+    ratios = [path_length_m(track) / length_m for track, length_m in tracks]
+    assert 0.85 < float(np.median(ratios)) < 1.05
+
+
+@pytest.mark.parametrize("interval_s", [0.08, 0.5])
+def test_who_drove_and_then_rested_travels_no_farther_meanwhile(interval_s: float) -> None:
+    phases = [(10.0, 0.3, 0.0), (110.0, 0.0, 0.0)]
+    tracks = [noisy_track(phases, interval_s, 0.03, seed)[0] for seed in range(15)]
+    lengths_m = [path_length_m(track) for track in tracks]
+    assert float(np.median(lengths_m)) == pytest.approx(3.0, rel=0.05)
+    assert max(lengths_m) < 3.5

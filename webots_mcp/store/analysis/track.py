@@ -8,6 +8,7 @@ from math import log, sqrt
 from typing import Final
 
 from webots_mcp.store.analysis.arrays import Array, Indexes, median, np
+from webots_mcp.store.analysis.hidden import hidden_motion
 from webots_mcp.store.analysis.noise import (
     FEWEST_SMOOTHED,
     kept_alike,
@@ -113,28 +114,66 @@ def _leg_noise(rows: int, smoothed_rows: int) -> float:
     return sqrt(4 * log(max(places, 2.0) / FALSE_LEGS))
 
 
-def path_length_m(track: Track) -> float:
+@dataclass(frozen=True)
+class PathLength:
+    """How long a way is.
+
+    Attributes:
+        longer_m: By how much the way may be longer, because of bends that its noise hides and of
+            where it ended.
+        noise_m: Standard deviation of the noise in each coordinate.
+    """
+
+    length_m: float
+    longer_m: float
+    noise_m: float
+
+
+def path_length(track: Track) -> PathLength:
     """Metres travelled: the sum of legs that are longer than noise makes them.
 
     From row to row a noise of 1 cm would add up to metres while the robot stands still. A leg ends
     where the smoothed position is 6.6 (of 200 independent places) to 8.9 (of a million) standard
     deviations of what is left of the noise away from where it began; within half a window of an
-    end, where more is left, of that. What is shorter at the end is left out. Across its direction
-    that noise makes a leg longer (along it the next one makes up for it), which is taken off
-    again; and the way is longer than a leg by as much as an arc is, that turns from one leg to the
-    next as they do.
+    end, where more is left, of that. What is shorter at the end is left out. Bends that are
+    narrower than a leg are in none: what the steps within legs that take long tell of them is
+    added, and how much more they may be is said. Of a robot that made no leg nothing is told.
     """
     corners = _corners(track)
+    shortest_m = _leg_noise(len(track.times), track.smoothed_rows) * track.left_m
+    legs_m = np.append(_leg_lengths(track, corners), 0.0)  # the last one, which is left out
+    length_m = float(legs_m.sum())
+    if len(corners) < 2 or track.noise_m == 0:
+        return PathLength(length_m, shortest_m, track.noise_m)
+    ends = [*corners.tolist(), len(track.times)]
+    within = hidden_motion(track.times, track.raw_x, track.raw_y, ends)
+    counted_m = float(legs_m[within.legs].sum())
+    least_m, most_m = (max(0.0, each - counted_m) for each in (within.least_m, within.most_m))
+    return PathLength(length_m + least_m, max(shortest_m, most_m - least_m), track.noise_m)
+
+
+def path_length_m(track: Track) -> float:
+    """Metres travelled, as `path_length` tells them."""
+    return path_length(track).length_m
+
+
+def _leg_lengths(track: Track, corners: Indexes) -> Array:
+    """How long the ways from corner to corner are.
+
+    Across its direction what is left of the noise makes a leg longer (along it the next one makes
+    up for it), which is taken off again; and the way is longer than a leg by as much as an arc is,
+    that turns from one leg to the next as they do.
+    """
     along, across = np.diff(track.x[corners]), np.diff(track.y[corners])
     alike = kept_alike(track.smoothed_rows)
     alike = alike[np.minimum(np.diff(corners), len(alike) - 1)]
     legs_m = np.sqrt(along**2 + across**2 - 2 * (1 - alike) * track.left_m**2)
     if len(legs_m) < 2:
-        return float(legs_m.sum())
+        return legs_m
     turns = np.pad(np.angle(np.exp(1j * np.diff(np.arctan2(across, along)))), 1)
     turns[np.abs(turns) > SHARPEST_ARC_RAD] = 0.0
     arcs = (turns[:-1] + turns[1:]) / 2
-    return float(np.sum(legs_m / np.sinc(arcs / (2 * np.pi))))
+    return legs_m / np.sinc(arcs / (2 * np.pi))
 
 
 def _corners(track: Track) -> Indexes:
@@ -155,7 +194,7 @@ def _corners(track: Track) -> Indexes:
     return np.array(corners, np.intp)
 
 
-def travelled_m(tracks: list[Track]) -> float:
+def travelled(tracks: list[Track]) -> PathLength:
     """Metres travelled along stretches one after the other, with the straight ways between them.
 
     How far it went in a recording gap is not known; it is at least the straight way.
@@ -164,5 +203,8 @@ def travelled_m(tracks: list[Track]) -> float:
         float(np.hypot(after.x[0] - before.x[-1], after.y[0] - before.y[-1]))
         for before, after in pairwise(tracks)
     ]
-    least_m = GAP_NOISE * max((track.noise_m for track in tracks), default=0.0)
-    return sum(map(path_length_m, tracks)) + sum(way_m for way_m in across_m if way_m > least_m)
+    noise_m = max((track.noise_m for track in tracks), default=0.0)
+    parts = [path_length(track) for track in tracks]
+    between_m = sum(way_m for way_m in across_m if way_m > GAP_NOISE * noise_m)
+    length_m = between_m + sum(part.length_m for part in parts)
+    return PathLength(length_m, sum(part.longer_m for part in parts), noise_m)

@@ -5,6 +5,7 @@ numpy is imported at the first use: the start of a server does not wait for it.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -20,8 +21,10 @@ from webots_mcp.store.signals.registry import Signal
 from webots_mcp.units import METRES, in_snake_case, metres_in, unit_in, words_of
 
 if TYPE_CHECKING:
-    from webots_mcp.store.analysis.track import Track
+    from webots_mcp.store.analysis.track import PathLength, Track
 
+TRUE_WITHIN: Final = 0.05  # a distance that may be short by less, or by less than so many metres,
+TRUE_WITHIN_M: Final = 0.1  # is told without a doubt
 IMPLAUSIBLE_M_S: Final = 50.0  # a mean speed beyond is hardly that of a robot
 
 _TAIL: Final = r"([._](x|vx|linear|speed|velocity|m_s|mps))*$"
@@ -209,17 +212,35 @@ def tracks_in(
 
 def path_length(
     columns: Columns, position: tuple[Signal, Signal], noise_m: float | None = None
-) -> float:
-    """Metres travelled, without what the noise of the position adds from row to row.
+) -> PathLength:
+    """The way travelled, without what the noise of the position adds from row to row.
 
     Args:
         columns: Rows, or samples of a long run.
         position: x and y.
         noise_m: Of samples that lie far apart, what neighbouring rows tell.
     """
-    from webots_mcp.store.analysis.track import travelled_m
+    from webots_mcp.store.analysis.track import travelled
 
-    return travelled_m(tracks_in(columns, position, noise_m))
+    return travelled(tracks_in(columns, position, noise_m))
+
+
+def doubt_of_length(way: PathLength) -> str | None:
+    """By how much a way may be longer than it is told; None where that is little."""
+    if way.longer_m <= max(TRUE_WITHIN * way.length_m, TRUE_WITHIN_M):
+        return None
+    noise_mm = float(f"{1000 * way.noise_m:.1g}")
+    return (
+        f"it may be up to {_more(way)} more: the position's noise of about {noise_mm:g} mm hides "
+        "short ways and narrow bends; more rows per second show them"
+    )
+
+
+def _more(way: PathLength) -> str:
+    """Roughly, so that like runs share a sentence; in metres where it is more than was told."""
+    if way.longer_m > way.length_m:
+        return f"{way.longer_m:.2g} m"
+    return f"{10 * math.ceil(10 * way.longer_m / way.length_m)} %"
 
 
 def position_noise(columns: Columns, position: tuple[Signal, Signal]) -> float | None:

@@ -6,7 +6,7 @@ import sqlite3
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from webots_mcp.naming import NAME_POSITION
 from webots_mcp.store.analysis.spread import (
@@ -17,7 +17,13 @@ from webots_mcp.store.analysis.spread import (
     verdicts_on,
 )
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.detection.motion import Motion, doubt_of_unit, path_length, position_noise
+from webots_mcp.store.detection.motion import (
+    Motion,
+    doubt_of_length,
+    doubt_of_unit,
+    path_length,
+    position_noise,
+)
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Collected, collect
 from webots_mcp.store.questions.runs import run_info
@@ -27,6 +33,9 @@ from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.rows import exceeds, read_columns
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.signals.registry import Signal
+
+if TYPE_CHECKING:
+    from webots_mcp.store.analysis.track import PathLength
 
 NOISE_ROWS: Final = 2000  # of a long run, that tell the noise of its position
 SAMPLE_S: Final = 0.5  # between the positions from which a long run's distance is summed
@@ -143,7 +152,7 @@ def _counted(kind: str, groups: Sequence[Sequence[_Outcome]], tests: int) -> Mea
 
 
 def _not_known(runs: Sequence[_Outcome]) -> dict[str, str]:
-    """Why figures are not known; those that share a reason under one key."""
+    """Why figures are not known: those that share a reason under one key, reasons in one text."""
     runs_by_reason: dict[tuple[str, str], list[str]] = {}
     for run in runs:
         for name, why in run.not_known.items():
@@ -152,7 +161,10 @@ def _not_known(runs: Sequence[_Outcome]) -> dict[str, str]:
     for (name, why), run_ids in runs_by_reason.items():
         where = "" if len(run_ids) == len(runs) else f"run {', '.join(run_ids)}: "
         sharing.setdefault(where + why, []).append(name)
-    return {", ".join(names): why for why, names in sharing.items()}
+    told: dict[str, list[str]] = {}
+    for why, names in sharing.items():
+        told.setdefault(", ".join(names), []).append(why)
+    return {names: "; ".join(reasons) for names, reasons in told.items()}
 
 
 class _Outcome(NamedTuple):
@@ -195,11 +207,13 @@ def _outcome(
     if part.motion.position is None:
         not_known["distance_m, mean_speed_m_s"] = NAME_POSITION
     else:
-        distance_m = None if purged else _distance(connection, part, deadline)
-        speed = None if distance_m is None else distance_m / duration_s
-        figures |= {"distance_m": distance_m, _SPEED: speed}
+        way = None if purged else _way(connection, part, part.motion.position, deadline)
+        speed = None if way is None else way.length_m / duration_s
+        figures |= {"distance_m": way and way.length_m, _SPEED: speed}
         if doubt := doubt_of_unit(part.motion.position, speed or 0.0):
             not_known["distance_m, mean_speed_m_s"] = doubt
+        elif way and (doubt := doubt_of_length(way)):
+            not_known["distance_m"] = doubt
     modes = _mode_times(connection, part, deadline)
     figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
     if not modes:
@@ -219,11 +233,13 @@ def _outcome(
     )
 
 
-def _distance(connection: sqlite3.Connection, part: RunPart, deadline: Deadline) -> float | None:
+def _way(
+    connection: sqlite3.Connection,
+    part: RunPart,
+    position: tuple[Signal, Signal],
+    deadline: Deadline,
+) -> PathLength:
     """Of a long run from samples, which cut corners a little; its newest rows show its noise."""
-    position = part.motion.position
-    if position is None:
-        return None
     if not exceeds(connection, part.segment) or not all(each.is_plain for each in position):
         columns = read_columns(connection, part.segment, position, deadline)
         return path_length(columns, position)

@@ -118,6 +118,10 @@ def record(file: Path) -> None:
     _add_trials(recorded.connection, robot)
     roll(recorded.connection)
     recorded.connection.execute("INSERT INTO lease VALUES ('maintenance', 'x', 1.0)")
+    insert(recorded.connection, "console_line", {
+        "instance": "webots-1", "wall_time_s": time.time(), "level": "error", "source": "console",
+        "message": "it waits for a run", "logger": "stderr",
+    })  # fmt: skip
     recorded.close()
 
 

@@ -22,7 +22,7 @@ pytestmark = pytest.mark.anyio
 TRIED = (b"\x00\xff\x01", '{"x": ', "[1, 2]", '{"x": "\\ud800"}')
 TABLES = ("robot", "session", "run", "state", "event", "command", "log", "image", "signal",
           "rollup", "change", "breakpoint", "trial_set", "trial",
-          "kept_stretch", "kept_state")  # fmt: skip
+          "kept_stretch", "kept_state", "console_line")  # fmt: skip
 
 
 @pytest.fixture(scope="module")

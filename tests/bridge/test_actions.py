@@ -305,4 +305,6 @@ def test_a_world_that_is_not_there_is_not_loaded(
 
 
 def test_each_action_that_the_server_offers_is_one_that_bridges_run() -> None:
-    assert list(actions._actions) == list(BUILT_IN_ACTIONS)  # pyright: ignore[reportPrivateUsage]
+    for name in BUILT_IN_ACTIONS:
+        assert actions.action_of(name).__name__ == name
+    assert list(actions._known) == list(BUILT_IN_ACTIONS)  # pyright: ignore[reportPrivateUsage]

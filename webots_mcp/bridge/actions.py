@@ -35,7 +35,7 @@ _RELOAD_TIMEOUT_S: Final = 30.0
 _DIALOG: Final = "a dialog may be open in Webots (start it with --batch)"
 _HIGHEST_STATUS: Final = 255
 
-_actions: Final[dict[str, Action]] = {}
+_known: Final[dict[str, Action]] = {}
 
 
 def begin(context: Context, command: Command) -> Progress:
@@ -46,12 +46,27 @@ def begin(context: Context, command: Command) -> Progress:
     """
     if BUILT_IN_ACTIONS[command.action].needs_supervisor:
         context.simulation.require_supervisor(command.action)
-    return _actions[command.action](context, command)
+    return action_of(command.action)(context, command)
+
+
+def action_of(name: str) -> Action:
+    """The function of a built-in action; those of the scene are seldom asked for."""
+    if name not in _known:
+        from webots_mcp.bridge import scene_changing, scene_looking
+
+        _known.update(
+            get_scene=scene_looking.get_scene,
+            get_field=scene_looking.get_field,
+            set_field=scene_changing.set_field,
+            add_node=scene_changing.add_node,
+            remove_node=scene_changing.remove_node,
+        )
+    return _known[name]
 
 
 def _built_in(action: Action) -> Action:
     assert action.__name__ in BUILT_IN_ACTIONS, "enter it there too: the server reads that list"
-    _actions[action.__name__] = action
+    _known[action.__name__] = action
     return action
 
 
@@ -280,46 +295,6 @@ def keep(context: Context, command: Command) -> Progress:
         raise CommandRefusedError(context.keeper.why_not)
     return {"run_id": context.clock.run.id, "kept_around_s": sim_time_s}
     yield
-
-
-@_built_in
-def get_scene(context: Context, command: Command) -> Progress:
-    """The nodes of the scene tree that are asked for."""
-    from webots_mcp.bridge import scene_looking  # these are seldom asked for
-
-    return scene_looking.get_scene(context, command)
-
-
-@_built_in
-def get_field(context: Context, command: Command) -> Progress:
-    """What a path of the scene tree leads to."""
-    from webots_mcp.bridge import scene_looking
-
-    return scene_looking.get_field(context, command)
-
-
-@_built_in
-def set_field(context: Context, command: Command) -> Progress:
-    """Set a field of a node; Webots does so with the next step."""
-    from webots_mcp.bridge import scene_changing
-
-    return scene_changing.set_field(context, command)
-
-
-@_built_in
-def add_node(context: Context, command: Command) -> Progress:
-    """Add a node to the scene tree."""
-    from webots_mcp.bridge import scene_changing
-
-    return scene_changing.add_node(context, command)
-
-
-@_built_in
-def remove_node(context: Context, command: Command) -> Progress:
-    """Remove a node from the scene tree."""
-    from webots_mcp.bridge import scene_changing
-
-    return scene_changing.remove_node(context, command)
 
 
 def _run_until(context: Context, command: Command, goal: Goal) -> Progress:

@@ -18,7 +18,7 @@ from webots_mcp.store.robots import list_robots
 from webots_mcp.store.sessions import Session
 from webots_mcp.store.status import find_holder
 
-SCENE_WAIT_S: Final = 15.0
+_WAIT_S: Final = 15.0  # of wall time
 _NOBODY: Final = (
     "no live controller may look at the scene of {}: set the field 'supervisor' of a Robot node to "
     "TRUE and create that robot with Supervisor(), or open the world with an observer in it, made "
@@ -39,7 +39,6 @@ async def ask_scene(
     params: Mapping[str, Any],
     *,
     robot: str | None = None,
-    timeout_s: float = SCENE_WAIT_S,
 ) -> CommandAnswer:
     """Have a Supervisor of the simulation look at its scene, or change it.
 
@@ -49,7 +48,6 @@ async def ask_scene(
         action: Built in, such as `get_field`.
         params: Of the action; None is left out.
         robot: In whose simulation; None where there is just one.
-        timeout_s: How long to wait, in wall time.
 
     Raises:
         InvalidInputError: There is no such robot, several simulations are possible, or this server
@@ -64,7 +62,7 @@ async def ask_scene(
         )
     name = await to_thread.run_sync(_find_supervisor, recording, robot)
     given = {key: value for key, value in params.items() if value is not None}
-    return await Dispatcher(recording, report).ask(name, action, timeout_s, given)
+    return await Dispatcher(recording, report).ask(name, action, _WAIT_S, given)
 
 
 def _find_supervisor(recording: Recording, robot: str | None) -> str:

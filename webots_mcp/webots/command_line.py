@@ -89,13 +89,9 @@ def _is_free(port: int) -> bool:
         return False
 
 
-def has_display(platform: str = sys.platform) -> bool:
-    """Whether Webots could show its window; on Linux it speaks to X11 alone."""
-    return platform != "linux" or bool(os.environ.get("DISPLAY"))
-
-
 def _virtual_display() -> list[str]:
-    if has_display():
+    """What gives Webots a display where it has none to show its window on; Linux' is X11 alone."""
+    if sys.platform != "linux" or os.environ.get("DISPLAY"):
         return []
     program = shutil.which("xvfb-run")
     if program is None:

@@ -37,7 +37,6 @@ DEFAULT_LIMIT: Final = 20
 MOST_SIGNALS: Final = 500
 _STATES_SHARE: Final = 0.25  # of the budget
 _LONGEST_SAYING: Final = 200
-_NO_ROW: Final = "no row in that range: leave the range out, or see notes"
 EMPTY: Final = '""'  # a name without a character
 _SHOWN_VALUES: Final = 6
 _SHOWN_CONSTANTS: Final = 20

@@ -186,7 +186,7 @@ def read_numbers(
     paths = tuple(signal.path for signal in signals)
     with _until(deadline, connection, columns):
         rows = _rows_of(segment)
-        for _, texts in _extracted_chunks(connection, paths, rows, columns, deadline):
+        for _, texts in _chunks(connection, rows, extracted("data", paths), columns, deadline):
             parts.append(_numbers_at(signals, texts))
     numbers = np.concatenate(parts, axis=1) if parts else np.empty((len(signals), 0))
     values = {signal.name: row for signal, row in zip(signals, numbers, strict=True)}
@@ -272,7 +272,7 @@ def _read_extracted(
 ) -> None:
     """Each path is extracted once, all of a row in one call."""
     paths = tuple(dict.fromkeys(signal.path for signal in signals))
-    for odds, texts in _extracted_chunks(connection, paths, asked, columns, deadline):
+    for odds, texts in _chunks(connection, asked, extracted("data", paths), columns, deadline):
         by_path = values_at(paths, texts)
         reduced = {
             path: [reductions(array) for array in by_path[path]]
@@ -285,22 +285,6 @@ def _read_extracted(
                 rows = reduced[signal.path]
                 columns.values[signal.name].extend([row.get(signal.reduce) for row in rows])
         _count_odd(columns, signals, odds)
-
-
-def _extracted_chunks(
-    connection: sqlite3.Connection,
-    paths: Sequence[str],
-    asked: _Rows,
-    columns: Columns,
-    deadline: Deadline,
-) -> Iterator[tuple[Sequence[str | None], Sequence[str]]]:
-    """Some rows each, which are added to the columns: what was odd, and what `extracted` said."""
-    extract, asked_paths = extracted("data", paths)
-    query, values = asked.query(f"sim_time_s, wall_time_s, odd, {extract}", asked_paths)
-    for chunk in _chunks(connection, query, values, columns, deadline):
-        read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
-        _extend(columns, read[:3])
-        yield read[3], read[4]
 
 
 def _numbers_at(signals: Sequence[Signal], texts: Sequence[str]) -> Array:
@@ -362,35 +346,33 @@ def _read_decoded(
     columns: Columns,
     deadline: Deadline,
 ) -> None:
-    query, values = asked.query("sim_time_s, wall_time_s, odd, data")
-    for chunk in _chunks(connection, query, values, columns, deadline):
-        read: list[tuple[Any, ...]] = list(zip(*chunk, strict=True))
-        states = [flatten(parse(data)) for data in read[4]]
-        _extend(columns, read[:3])
+    for odds, texts in _chunks(connection, asked, ("data", ()), columns, deadline):
+        states = [flatten(parse(data)) for data in texts]
         for signal in signals:
             name = signal.name
             columns.values[name].extend([row.get(name) for row in states])
-        _count_odd(columns, signals, read[3])
+        _count_odd(columns, signals, odds)
 
 
 def _chunks(
     connection: sqlite3.Connection,
-    query: str,
-    values: Sequence[object],
+    asked: _Rows,
+    wanted: tuple[str, Sequence[str]],
     columns: Columns,
     deadline: Deadline,
-) -> Iterator[list[Any]]:
-    cursor = connection.execute(query, values)
+) -> Iterator[tuple[Sequence[str | None], Sequence[str]]]:
+    """Some rows each, which are added to the columns: what was odd in them, and what is wanted."""
+    what, paths = wanted
+    cursor = connection.execute(*asked.query(f"sim_time_s, wall_time_s, odd, {what}", paths))
     while chunk := cursor.fetchmany(_CHUNK_ROWS):
-        yield chunk
+        ids, times, walls, odds, texts = zip(*chunk, strict=True)
+        columns.ids.extend(ids)
+        columns.times.extend(times)
+        columns.walls.extend(walls)
+        yield odds, texts
         if deadline.passed and len(chunk) == _CHUNK_ROWS:
             columns.cut = True
             return
-
-
-def _extend(columns: Columns, heads: Sequence[tuple[Any, ...]]) -> None:
-    for column, read in zip((columns.ids, columns.times, columns.walls), heads, strict=True):
-        column.extend(read)
 
 
 def _count_odd(columns: Columns, signals: Sequence[Signal], odds: Sequence[str | None]) -> None:

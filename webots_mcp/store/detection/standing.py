@@ -16,12 +16,13 @@ from webots_mcp.store.detection.motion import position_noise, tracks_in
 from webots_mcp.store.detection.standstills import (
     NEARLY,
     Standing,
-    nearest_in,
-    seen_from_s,
+    StretchStandings,
+    in_all,
     standings_in,
+    standings_of,
 )
 from webots_mcp.store.rollup.buckets import BUCKET_S
-from webots_mcp.store.rollup.standstills import StretchStandings, in_all, stored_standstills
+from webots_mcp.store.rollup.standstills import stored_standstills
 from webots_mcp.store.signals.flatten import shown
 
 if TYPE_CHECKING:
@@ -101,18 +102,7 @@ def _found_in_rows(search: Search, outside: range) -> StretchStandings:
         raise NotSearchableError(f"{missing[0]} is not in every row: ask for less time")
     sampled_s, sample = search.view.sampled_s, search.view.sample(position)
     tracks = tracks_in(columns, position, position_noise(sample, position) if sampled_s else None)
-    if not tracks:
-        return StretchStandings()
-    least_s = max(options.stuck_s - 2 * sampled_s, options.stuck_s / 2)
-    found = list(standings_in(columns, tracks, motion, options, least_s))
-    nearest = None if found else nearest_in(tracks, options)
-    seen_s = seen_from_s(sample, tracks[0].noise_m, options)
-    seen = [
-        replace(each, within_s=sampled_s)
-        for each in found
-        if each.end_s - each.start_s >= NEARLY * seen_s - sampled_s
-    ]
-    return StretchStandings(seen, seen_s, tracks[0].noise_m, nearest)
+    return standings_of(columns, tracks, motion, options, sample, sampled_s)
 
 
 def _weighed(search: Search, standing: Standing, moved_in: MovedIn) -> list[Event]:

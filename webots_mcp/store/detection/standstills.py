@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from bisect import bisect_left, bisect_right
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple
 
 from webots_mcp.store.analysis.arrays import median, np
@@ -55,6 +55,54 @@ class Nearest(NamedTuple):
     start_s: float
 
 
+@dataclass(frozen=True)
+class StretchStandings:
+    """The standstills of some rows.
+
+    Attributes:
+        seen_s: How long one has to last that the noise of the position does not feign.
+        noise_m: That noise; None where there is no position.
+        nearest: What came nearest, where there is none.
+    """
+
+    standings: list[Standing] = field(default_factory=list[Standing])
+    seen_s: float = 0.0
+    noise_m: float | None = None
+    nearest: Nearest | None = None
+
+
+def standings_of(
+    columns: Columns,
+    tracks: Sequence[Track],
+    motion: Motion,
+    options: EventOptions,
+    sample: Columns,
+    sampled_s: float = 0.0,
+) -> StretchStandings:
+    """The standstills on the ways of a robot that its noise does not feign.
+
+    Args:
+        columns: Rows, or samples of them.
+        tracks: Its ways in them.
+        motion: The signals that tell of them.
+        options: What counts as a standstill.
+        sample: Some rows one after the other, with that noise.
+        sampled_s: How far apart samples are; 0 for all rows.
+    """
+    if not tracks:
+        return StretchStandings()
+    least_s = max(options.stuck_s - 2 * sampled_s, options.stuck_s / 2)
+    found = list(standings_in(columns, tracks, motion, options, least_s))
+    noise_m = tracks[0].noise_m
+    seen_s = _seen_from_s(sample, noise_m, options)
+    seen = [
+        replace(each, within_s=sampled_s)
+        for each in found
+        if each.end_s - each.start_s >= NEARLY * seen_s - sampled_s
+    ]
+    return StretchStandings(seen, seen_s, noise_m, None if found else _nearest_in(tracks, options))
+
+
 def standings_in(
     columns: Columns,
     tracks: Iterable[Track],
@@ -98,20 +146,14 @@ def _rows(columns: Columns, start_s: float, end_s: float) -> Columns:
     )
 
 
-def seen_from_s(columns: Columns, noise_m: float, options: EventOptions) -> float:
-    """How long a standstill has to last that the noise of the position does not feign.
-
-    Args:
-        columns: All rows of some time.
-        noise_m: Of the position in them.
-        options: What counts as a standstill.
-    """
+def _seen_from_s(columns: Columns, noise_m: float, options: EventOptions) -> float:
+    """How long a standstill has to last that the noise of the position does not feign."""
     times = columns.moments
     interval_s = median(np.diff(times)) if len(times) > 1 else 0.0
     return shortest_seen_s(noise_m, interval_s, options.stuck_m, options.stuck_s)
 
 
-def nearest_in(tracks: Sequence[Track], options: EventOptions) -> Nearest | None:
+def _nearest_in(tracks: Sequence[Track], options: EventOptions) -> Nearest | None:
     """What came nearest on ways without a standstill; None on those that are too short."""
     short = [
         Nearest(float(track.times[each.last] - start_s), 0.0, float(start_s))
@@ -134,7 +176,20 @@ def _ways(track: Track, within_s: float) -> Iterator[Nearest]:
         yield Nearest(0.0, -float(way_m[least]), float(track.times[starts[least]]))
 
 
-def joined_standings(standings: Iterable[Standing]) -> list[Standing]:
+def in_all(stretches: Sequence[StretchStandings]) -> StretchStandings:
+    """The standstills of all stretches, which may overlap."""
+    standings = _joined(each for some in stretches for each in some.standings)
+    noises_m = [each.noise_m for each in stretches if each.noise_m is not None]
+    near = [each.nearest for each in stretches if each.nearest is not None]
+    return StretchStandings(
+        standings,
+        max((each.seen_s for each in stretches), default=0.0),
+        max(noises_m, default=None),
+        None if standings else max(near, default=None),
+    )
+
+
+def _joined(standings: Iterable[Standing]) -> list[Standing]:
     """Of parts of a run that overlap each standstill once, also one that several of them show."""
     found: list[Standing] = []
     for each in sorted(standings, key=lambda each: (each.start_s, each.end_s)):

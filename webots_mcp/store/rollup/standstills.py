@@ -9,55 +9,23 @@ from __future__ import annotations
 import json
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any, Final
 
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.evidence import Counts, Observed, Part
 from webots_mcp.store.detection.motion import Motion, tracks_in
 from webots_mcp.store.detection.standstills import (
-    NEARLY,
     Nearest,
     Standing,
-    joined_standings,
-    nearest_in,
-    seen_from_s,
-    standings_in,
+    StretchStandings,
+    in_all,
+    standings_of,
 )
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, stored_texts
 
 MOST_PARTS: Final = 2000  # of the standstills of 500 s; of more the rows are read
 _ASKED: Final = ("position", "mode", "commanded", "min_commanded", "stuck_m", "stuck_s")
-
-
-@dataclass(frozen=True)
-class StretchStandings:
-    """The standstills of some rows.
-
-    Attributes:
-        seen_s: How long one has to last that the noise of the position does not feign.
-        noise_m: That noise; None where there is no position.
-        nearest: What came nearest, where there is none.
-    """
-
-    standings: list[Standing] = field(default_factory=list[Standing])
-    seen_s: float = 0.0
-    noise_m: float | None = None
-    nearest: Nearest | None = None
-
-
-def in_all(stretches: Sequence[StretchStandings]) -> StretchStandings:
-    """The standstills of all stretches, which may overlap."""
-    standings = joined_standings(each for some in stretches for each in some.standings)
-    noises_m = [each.noise_m for each in stretches if each.noise_m is not None]
-    near = [each.nearest for each in stretches if each.nearest is not None]
-    return StretchStandings(
-        standings,
-        max((each.seen_s for each in stretches), default=0.0),
-        max(noises_m, default=None),
-        None if standings else max(near, default=None),
-    )
 
 
 class StandstillsToStore:
@@ -70,16 +38,9 @@ class StandstillsToStore:
 
     def add(self, columns: Columns) -> None:
         """Look in some rows one after the other."""
-        motion, options = self._motion, EventOptions()
+        motion = self._motion
         tracks = tracks_in(columns, motion.position) if motion.position else []
-        if not tracks:
-            return
-        found = list(standings_in(columns, tracks, motion, options, options.stuck_s))
-        nearest = None if found else nearest_in(tracks, options)
-        noise_m = tracks[0].noise_m
-        seen_s = seen_from_s(columns, noise_m, options)
-        seen = [each for each in found if each.end_s - each.start_s >= NEARLY * seen_s]
-        self._found.append(StretchStandings(seen, seen_s, noise_m, nearest))
+        self._found.append(standings_of(columns, tracks, motion, EventOptions(), columns))
 
     def stored(self) -> dict[int, str]:
         """What is stored, by the id of the signal."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import anyio
@@ -22,7 +22,7 @@ from webots_mcp.errors import (
     NoDatabaseError,
     NothingRecordedError,
 )
-from webots_mcp.server.dispatch import Dispatcher
+from webots_mcp.server.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.target import find_target
 from webots_mcp.store.observers import live_observer
@@ -44,11 +44,8 @@ from webots_mcp.webots.stream import (
 )
 
 _POLL_S: Final = 0.05
-CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # by then a loop that has just stopped is known as such
-UNCLAIMED: Final = ("cancelled", "expired")
 _PROOF_S: Final = 3.0  # a heartbeat tells within half a second that time goes on
 _RESTART_S: Final = 5.0  # until a controller that Webots starts again has recorded
-_LEAST_S: Final = 0.1
 _NOTHING_SEEN: Final = (
     "the recording does not show it yet: a controller that hangs, or an extern one that is "
     "missing, stops the time of a simulation that runs"
@@ -89,24 +86,17 @@ class Situation:
 
 
 @dataclass
-class Attempt:
-    """One request to steer, through all ways.
+class Attempt(Request):
+    """One request to steer.
 
     Attributes:
         port: Of the Webots that is meant; None for that of the robot.
-        tried: Why each way did not work, by its name.
     """
 
-    recording: Recording
-    dispatcher: Dispatcher
-    robot: str | None
     order: Order
     params: Mapping[str, Any]
-    timeout_s: float
     force: bool = False
     port: int | None = None
-    tried: dict[str, str] = field(default_factory=dict[str, str])
-    started_s: float = field(default_factory=time.monotonic)
 
     async def steer(self) -> CommandAnswer:
         """Go the first way that works.
@@ -129,7 +119,7 @@ class Attempt:
             if answer is not None:
                 return answer
         if not situation.can_command:
-            raise CommandRefusedError(_no_way(self.order, self.tried))
+            raise CommandRefusedError(_no_way(self.order, self._told()))
         return await self._by_bridge(situation)
 
     async def _look_around(self) -> Situation:
@@ -147,7 +137,7 @@ class Attempt:
             situation: As it was looked at.
             claiming_s: Nobody waits for longer until its loop takes the command.
         """
-        answer = await self._sent(self.robot, claiming_s)
+        answer = await self._sent(self.robot, self.order, self.params, claiming_s)
         if situation.robot is not None and situation.robot == situation.observer:
             return await self._done_by_observer(situation, answer)
         answer.route = "bridge" if answer.outcome == "done" else None
@@ -156,21 +146,13 @@ class Attempt:
             answer.tried = others
         return answer
 
-    async def _sent(self, robot: str | None, claiming_s: float) -> CommandAnswer:
-        wait_s = min(self._left_s(), claiming_s)
-        answer = await self.dispatcher.ask(robot, self.order, wait_s, self.params)
-        if answer.outcome == "claimed" and answer.command_id is not None:
-            answer = await self.dispatcher.wait(answer.command_id, self._left_s())
-        answer.waited_s = self._waited_s
-        return answer
-
     async def _by_observer(self, situation: Situation) -> CommandAnswer | None:
         """Its loop turns also where time stands still, so it is asked without a long wait."""
         observer = situation.observer
         if observer is None or observer == situation.robot:
             return None
         try:
-            answer = await self._sent(observer, CLAIMING_S)
+            answer = await self._sent(observer, self.order, self.params, CLAIMING_S)
         except CommandRefusedError as error:
             self.tried["observer"] = str(error)
             return None
@@ -188,10 +170,6 @@ class Attempt:
             answer.proof = await self._shown(situation, _PROOF_S)
             answer.hint = answer.hint if answer.proof else _NOTHING_SEEN
         return answer
-
-    @property
-    def _waited_s(self) -> float:
-        return round(time.monotonic() - self.started_s, 3)
 
     async def _by_websocket(self, situation: Situation) -> CommandAnswer | None:
         try:
@@ -213,8 +191,8 @@ class Attempt:
     async def _give(self, address: Address) -> tuple[Reply, int]:
         """Once, or as many steps as are asked for; the last reply, and how many were heard."""
         reply, made = Reply(None, is_alive=False), 0
-        while made < self._wanted and (made == 0 or self._left_s() > _LEAST_S):
-            timeout_s = min(ANSWER_S, self._left_s())
+        while made < self._wanted and (made == 0 or self._left_s > LEAST_S):
+            timeout_s = min(ANSWER_S, self._left_s)
             reply = await to_thread.run_sync(give_order, address, self.order, timeout_s)
             if reply.heard is None:
                 break
@@ -230,7 +208,7 @@ class Attempt:
         said = f"Webots said {reply.heard!r}" if reply.heard else "Webots obeyed"
         if self._wanted > 1:
             said = f"Webots made {made} of {self._wanted} basic time steps"
-        wait_s = self._left_s() if self.order in RESTARTING else _PROOF_S
+        wait_s = self._left_s if self.order in RESTARTING else _PROOF_S
         seen = None if self.order == "pause" else await self._shown(situation, wait_s)
         proof = f"{said}; {seen}" if seen else said
         answer = await self._answered(situation, "websocket", proof)
@@ -263,7 +241,7 @@ class Attempt:
         """What the recording shows of it, as soon as it does; None if nothing in that time."""
         if situation.robot is None:
             return None
-        until_s = time.monotonic() + min(wait_s, self._left_s())
+        until_s = time.monotonic() + min(wait_s, self._left_s)
         while True:
             sign = await to_thread.run_sync(self._sign, situation)
             if sign is not None or time.monotonic() > until_s:
@@ -286,13 +264,6 @@ class Attempt:
             route=route,
             proof=proof,
         )
-
-    def _header(self, robot: str) -> dict[str, Any]:
-        with self.recording.view(robot) as view:
-            return view.header()
-
-    def _left_s(self) -> float:
-        return max(self.timeout_s - (time.monotonic() - self.started_s), _LEAST_S)
 
 
 def look_around(recording: Recording, robot: str | None, action: str) -> Situation:
@@ -429,8 +400,7 @@ def _only(ours: list[Instance], running: list[Instance]) -> Instance:
     )
 
 
-def _no_way(order: Order, tried: Mapping[str, str]) -> str:
-    told = "; ".join(f"{route}: {why}" for route, why in tried.items())
+def _no_way(order: Order, told: str) -> str:
     return (
         f"no way to {order} the simulation works. {told}. Press {keyboard.KEYS[order].spoken} in "
         "Webots, start Webots with --stream, or open the world with an observer in it (made by "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,18 +13,11 @@ from anyio import to_thread
 
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.launching import Launch, begun_since, newest_in
-from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.launcher import Launcher
+from webots_mcp.server.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
 from webots_mcp.server.results import CommandAnswer
-from webots_mcp.server.routes import (
-    CLAIMING_S,
-    UNCLAIMED,
-    Situation,
-    look_around,
-    webots_meant,
-)
+from webots_mcp.server.routes import Situation, look_around, webots_meant
 from webots_mcp.store.beginnings import Beginning
-from webots_mcp.store.recording import Recording
 from webots_mcp.webots.instances import instance_at
 from webots_mcp.webots.stream import ANSWER_S, Address, address_of, load_world, no_obedience
 
@@ -41,20 +34,10 @@ _NOBODY_YET: Final = (
 
 
 @dataclass
-class WorldRequest:
-    """A request about the world as a whole, in the Webots that a recording knows.
+class WorldRequest(Request):
+    """A request about the world as a whole, in the Webots that a recording knows."""
 
-    Attributes:
-        tried: Why each way did not work, by its name.
-    """
-
-    recording: Recording
-    dispatcher: Dispatcher
     launcher: Launcher
-    robot: str | None
-    timeout_s: float
-    tried: dict[str, str] = field(default_factory=dict[str, str])
-    started_s: float = field(default_factory=time.monotonic)
 
     async def load(self, world: Path) -> CommandAnswer:
         """Open another world.
@@ -112,26 +95,22 @@ class WorldRequest:
     ) -> CommandAnswer | None:
         """What the robot's controller made of it, or the observer; None where neither took it."""
         if situation.silent is None:
-            answer = await self._sent("bridge", self.robot, action, params)
+            answer = await self._taken("bridge", self.robot, action, params)
             if answer is not None:
                 return answer
         else:
             self.tried["bridge"] = situation.silent
         if situation.observer in (None, situation.robot):
             return None
-        return await self._sent("observer", situation.observer, action, params)
+        return await self._taken("observer", situation.observer, action, params)
 
-    async def _sent(
+    async def _taken(
         self, route: str, robot: str | None, action: str, params: dict[str, Any]
     ) -> CommandAnswer | None:
-        wait_s = min(self._left_s, CLAIMING_S)
-        answer = await self.dispatcher.ask(robot, action, wait_s, params)
+        answer = await self._sent(robot, action, params, CLAIMING_S)
         if answer.outcome in UNCLAIMED:
             self.tried[route] = answer.hint or answer.error or "it did not take the command"
             return None
-        if answer.outcome == "claimed" and answer.command_id is not None:
-            answer = await self.dispatcher.wait(answer.command_id, self._left_s)
-        answer.waited_s = self._waited_s
         answer.route = route if answer.outcome == "done" else None
         return answer
 
@@ -206,7 +185,7 @@ class WorldRequest:
     async def _wait(self, look: Callable[[], Beginning | None]) -> Beginning | None:
         while True:
             found = await to_thread.run_sync(look)
-            if found is not None or self._left_s <= _POLL_S:
+            if found is not None or self._left_s <= LEAST_S:
                 return found
             await anyio.sleep(_POLL_S)
 
@@ -221,23 +200,8 @@ class WorldRequest:
             await anyio.sleep(_POLL_S)
         return f"no Webots listens at port {address.port} any more"
 
-    def _header(self, robot: str) -> dict[str, Any]:
-        with self.recording.view(robot) as view:
-            return view.header()
-
     def _answer(self, action: str, route: str, proof: str) -> CommandAnswer:
         waited_s = self._waited_s
         return CommandAnswer(
             action=action, outcome="done", waited_s=waited_s, route=route, proof=proof
         )
-
-    def _told(self) -> str:
-        return "; ".join(f"{route}: {why}" for route, why in self.tried.items())
-
-    @property
-    def _waited_s(self) -> float:
-        return round(time.monotonic() - self.started_s, 3)
-
-    @property
-    def _left_s(self) -> float:
-        return max(self.timeout_s - (time.monotonic() - self.started_s), _POLL_S)

@@ -66,7 +66,7 @@ async def webots_simulation_control(
         _usual_wait_s, recording, command, steps, robot
     )
     dispatcher = Dispatcher(recording, ctx.report_progress)
-    attempt = Attempt(recording, dispatcher, robot, command, params, waiting_s, force, port)
+    attempt = Attempt(recording, dispatcher, robot, waiting_s, command, params, force, port)
     return await attempt.steer()
 
 
@@ -79,7 +79,7 @@ async def webots_world_reload(
 ) -> CommandAnswer:
     """Load world and code anew: webots_simulation_control("reload") by another name."""
     dispatcher = Dispatcher(recording, ctx.report_progress)
-    return await Attempt(recording, dispatcher, robot, "reload", {}, timeout_s).steer()
+    return await Attempt(recording, dispatcher, robot, timeout_s, "reload", {}).steer()
 
 
 @tool("Reset the world", RESTARTS)
@@ -92,7 +92,7 @@ async def webots_world_reset(
 ) -> CommandAnswer:
     """Back to time 0: webots_simulation_control("reset"), and with force for a stuck controller."""
     dispatcher = Dispatcher(recording, ctx.report_progress)
-    return await Attempt(recording, dispatcher, robot, "reset", {}, timeout_s, force).steer()
+    return await Attempt(recording, dispatcher, robot, timeout_s, "reset", {}, force).steer()
 
 
 @tool("Reset the controller's state", ACTS)

@@ -91,7 +91,7 @@ def _request(
     recording: Recording, ctx: Context[Any], robot: str | None, timeout_s: float
 ) -> WorldRequest:
     dispatcher = Dispatcher(recording, ctx.report_progress)
-    return WorldRequest(recording, dispatcher, _companions(ctx).webots, robot, timeout_s)
+    return WorldRequest(recording, dispatcher, robot, timeout_s, _companions(ctx).webots)
 
 
 async def _wait(launched: Launch, ctx: Context[Any], until_s: float) -> Beginning | None:

@@ -1,0 +1,61 @@
+"""What a controller is asked to do with the simulation: sent, waited for, tried in other ways."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from webots_mcp.contract import HEARTBEAT_LATE_S
+from webots_mcp.server.dispatch import Dispatcher
+from webots_mcp.server.results import CommandAnswer
+from webots_mcp.store.recording import Recording
+
+CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # by then a loop that has just stopped is known as such
+UNCLAIMED: Final = ("cancelled", "expired")
+LEAST_S: Final = 0.1  # that each way gets
+
+
+@dataclass
+class Request:
+    """One request, through all ways.
+
+    Attributes:
+        robot: Whose simulation is meant; None where there is just one.
+        timeout_s: For all ways together.
+        tried: Why each way did not work, by its name.
+    """
+
+    recording: Recording
+    dispatcher: Dispatcher
+    robot: str | None
+    timeout_s: float
+    tried: dict[str, str] = field(default_factory=dict[str, str], init=False)
+    started_s: float = field(default_factory=time.monotonic, init=False)
+
+    async def _sent(
+        self, robot: str | None, action: str, params: Mapping[str, Any], claiming_s: float
+    ) -> CommandAnswer:
+        """What became of a command; nobody waits longer until the controller's loop takes it."""
+        wait_s = min(self._left_s, claiming_s)
+        answer = await self.dispatcher.ask(robot, action, wait_s, params)
+        if answer.outcome == "claimed" and answer.command_id is not None:
+            answer = await self.dispatcher.wait(answer.command_id, self._left_s)
+        answer.waited_s = self._waited_s
+        return answer
+
+    def _header(self, robot: str) -> dict[str, Any]:
+        with self.recording.view(robot) as view:
+            return view.header()
+
+    def _told(self) -> str:
+        return "; ".join(f"{route}: {why}" for route, why in self.tried.items())
+
+    @property
+    def _waited_s(self) -> float:
+        return round(time.monotonic() - self.started_s, 3)
+
+    @property
+    def _left_s(self) -> float:
+        return max(self.timeout_s - (time.monotonic() - self.started_s), LEAST_S)

@@ -26,6 +26,7 @@ _ROWS: Final = 2000
 _START_TIMEOUT_S: Final = 120
 _CHARACTERS_PER_TOKEN: Final = 4
 _TOKENS: Final = 2000
+_OF_WEBOTS: Final = ("webots_launch_world", "webots_load_world", "webots_quit")
 _PLOT: Final = "webots_plot"
 _ARGUMENTS: Final[dict[str, dict[str, Any]]] = {
     "webots_monitor": {"lookback_s": 10},
@@ -87,8 +88,13 @@ async def _ask_all(bench: Bench) -> list[_Answer]:
     server = create_server(bench.folder / DATABASE_NAME, bench.folder)
     async with Client(server) as client:
         tools = sorted((await client.list_tools()).tools, key=_order)
-        there = [tool for tool in tools if tool.name != _PLOT or find_spec("matplotlib")]
+        there = [tool for tool in tools if tool.name not in _without()]
         return [answer async for answer in _answers(bench, client, there)]
+
+
+def _without() -> tuple[str, ...]:
+    """The tools that need what is not there: Webots itself, perhaps matplotlib."""
+    return _OF_WEBOTS if find_spec("matplotlib") else (*_OF_WEBOTS, _PLOT)
 
 
 def _order(tool: Tool) -> tuple[bool, bool]:

@@ -33,7 +33,7 @@ _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
 # Signals that are never searched, and periods that are not drawn.
 _OTHERS: Final = re.compile(r"not in \d+ of |not with a period of more than 5 s ")
 # By how much a distance may be too short, of some runs or of all.
-_LONGER: Final = re.compile(r"(?:run ([\d, ]+): )?it may be up to ([\d.]+) (%|m) more")
+_LONGER: Final = re.compile(r"(?:run ([\d, ]+): )?the way may be up to ([\d.]+) (%|m) longer")
 _OF_ROBOT: Final = frozenset[Measure]({"standstill", "stuck", "leap", "gap"})
 
 
@@ -171,7 +171,7 @@ def told_distances(
     comparison = compare_runs(connection, run_ids, deadline_s=UNHURRIED_S)
     way = next((each for each in comparison.measures if each.name == "distance_m"), None)
     spread = way.spread if way else [None] * len(run_ids)
-    doubts = comparison.not_known.get("distance_m", "")
+    doubts = comparison.not_known.get("distance_m, mean_speed_m_s", "")
     return [
         each and ToldDistance(each.median, _longer_m(doubts, run_id, each.median))
         for run_id, each in zip(run_ids, spread, strict=True)

@@ -210,10 +210,9 @@ def _outcome(
         way = None if purged else _way(connection, part, part.motion.position, deadline)
         speed = None if way is None else way.length_m / duration_s
         figures |= {"distance_m": way and way.length_m, _SPEED: speed}
-        if doubt := doubt_of_unit(part.motion.position, speed or 0.0):
+        doubt = doubt_of_unit(part.motion.position, speed or 0.0)
+        if doubt := doubt or (way and doubt_of_length(way)):
             not_known["distance_m, mean_speed_m_s"] = doubt
-        elif way and (doubt := doubt_of_length(way)):
-            not_known["distance_m"] = doubt
     modes = _mode_times(connection, part, deadline)
     figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
     if not modes:

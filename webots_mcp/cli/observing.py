@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from webots_mcp.setup.files import Change
 
 _URL: Final = "WEBOTS_CONTROLLER_URL"
-_DEFAULT_PORT: Final = 1234
 
 
 @command(
@@ -50,8 +49,9 @@ def observe(arguments: argparse.Namespace) -> None:
 def _prepare(arguments: argparse.Namespace) -> None:
     """What Webots' library needs to find its simulator, where that is not set already."""
     from webots_mcp.webots.installations import HOME_VARIABLE, installations
+    from webots_mcp.webots.instances import DEFAULT_PORT
 
-    url = arguments.url or os.environ.get(_URL) or f"ipc://{_DEFAULT_PORT}"
+    url = arguments.url or os.environ.get(_URL) or f"ipc://{DEFAULT_PORT}"
     os.environ[_URL] = f"{url.rstrip('/')}/{arguments.robot}" if url.count("/") == 2 else url
     found = next((each for each in installations() if each.python_api), None)
     if found is not None and found.python_api is not None:

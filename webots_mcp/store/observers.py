@@ -50,12 +50,9 @@ def live_observer(
     robots = [robot for robot in list_robots(connection, now_s) if robot.live]
     found = [robot for robot in robots if robot.kind == OBSERVER and robot.session is not None]
     if session is not None:
-        found = [each for each in found if each.session and _is_beside(each.session, session)]
+        here = session.instance
+        found = [each for each in found if each.session and each.session.instance == here]
     return found[0] if len(found) == 1 or (found and session is not None) else None
-
-
-def _is_beside(observer: Session, session: Session) -> bool:
-    return observer.instance == session.instance
 
 
 def world_seen(connection: sqlite3.Connection, run: Run) -> WorldSeen | None:

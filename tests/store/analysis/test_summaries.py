@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -55,6 +56,21 @@ def test_centres_and_variances_are_those_of_each(
     assert together.centres(turn).tolist() == pytest.approx(centres, nan_ok=True, abs=1e-12)
     variances = [(part.deviation_in(turn) or 0.0) ** 2 for part in parts]
     assert together.variances(turn).tolist() == pytest.approx(variances, abs=1e-9)
+
+
+@given(stretches.filter(len), st.data())
+def test_groups_have_the_ends_and_the_extremes_of_all_in_them(
+    found: list[list[Value]], data: st.DataObject
+) -> None:
+    parts = [part for part in summaries_of(found, angle=False) if part.sum is not None]
+    borders = data.draw(st.sets(st.integers(1, max(1, len(parts) - 1)))) if len(parts) > 1 else ()
+    starts = [0, *sorted(borders)] if parts else []
+    groups = Summaries.of(parts).of_groups(np.array(starts, np.intp))
+    for place, (start, end) in enumerate(pairwise([*starts, len(parts)])):
+        one, whole = groups.one(place), merge(parts[start:end])
+        assert (one.first_sim_time_s, one.first) == (whole.first_sim_time_s, whole.first)
+        assert (one.last_sim_time_s, one.last) == (whole.last_sim_time_s, whole.last)
+        assert (one.min, one.max) == (whole.min, whole.max)
 
 
 @given(stretches)

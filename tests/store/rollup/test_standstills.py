@@ -117,6 +117,15 @@ def test_a_standstill_that_is_asked_for_otherwise_is_looked_for_in_the_rows(
     assert stuck == []
 
 
+def test_whoever_names_the_position_is_told_what_is_stored_of_it(
+    long: sqlite3.Connection,
+) -> None:
+    named = ("pose.0", "pose.1")
+    assert ask(long, position=named) == ask(long)
+    assert rows_read(long, position=named) == rows_read(long)
+    assert rows_read(long, position=named[::-1]) > rows_read(long)
+
+
 def test_stored_standstills_outlast_the_rows(long: sqlite3.Connection, tmp_path: Path) -> None:
     before = [(each.kind, each.start_s, each.end_s) for each in ask(long)]
     long.execute("UPDATE run SET ended_wall_time_s = last_wall_time_s")

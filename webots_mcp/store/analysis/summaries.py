@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from functools import cached_property
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import Array, Flags, np
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
 from webots_mcp.store.analysis.summary import COUNTS, LENGTH_DUST, NO_LENGTH, Summary, merge
 
 _EXTREMES_AND_ENDS: Final = ("first", "min", "max", "last")
@@ -45,6 +45,20 @@ class Summaries:
     def rows(self) -> int:
         """Of all of them."""
         return int(self["rows"].sum())
+
+    def one(self, place: int) -> Summary:
+        """That at a place."""
+        return _summary(self.table[place].tolist())
+
+    def of_groups(self, starts: Indexes) -> Summaries:
+        """Of each group of them, given where it begins, the ends and the extremes."""
+        lasts = np.append(starts, len(self.table))[1:] - 1
+        table = self.table[starts]
+        for name in ("last", "last_sim_time_s"):
+            table[:, Summary._fields.index(name)] = self[name][lasts]
+        for name, extreme in (("min", np.fmin), ("max", np.fmax)):
+            table[:, Summary._fields.index(name)] = extreme.reduceat(self[name], starts)
+        return Summaries(table)
 
     def whole(self) -> Summary:
         """The same as `merge`."""

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.analysis.arrays import median, np
 from webots_mcp.store.analysis.frozen import FEWEST_ROWS, is_noisy, may_be_measured
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
-from webots_mcp.store.detection.resting import is_limit, target_went_on, what_it_shows
+from webots_mcp.store.detection.resting import Resting
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.intervals import MOSTLY, Flat, Span
 from webots_mcp.store.signals.registry import Signal
@@ -37,7 +37,7 @@ def flat_events(search: Search) -> Iterator[Event]:
         why = f"not all of noisy signals for less than {shortest_s:g} s: ask for less time"
         search.not_searched("flat", why)
     resting: dict[str, list[Span]] = {}
-    sooner: list[tuple[Signal, Span]] = []
+    sooner: list[tuple[Resting, Span]] = []
     for index, signal in enumerate(signals):
         here = search.view.summary(signal)
         if here.changes >= here.present - 1:
@@ -46,42 +46,42 @@ def flat_events(search: Search) -> Iterator[Event]:
             continue
         if search.is_over("flat", signals[index:]):
             break
-        spans = search.view.spans(signal, Flat())
+        spans, rests = search.view.spans(signal, Flat()), Resting(search, signal)
         if _changes_otherwise(search, here, spans):
             resting[signal.name] = spans
         flat = [span for span in spans if _length_s(span) >= least_s]
         if flat and (_changes_otherwise(search, here, flat) or _is_lively(search, signal)):
-            yield from (_event(search, signal, span) for span in flat)
+            yield from (_event(search, rests, span) for span in flat)
         elif spans and not flat:
-            left_behind = _left_behind(search, signal, spans)
-            yield from (_event(search, signal, span) for span in left_behind)
+            left_behind = _left_behind(search, rests, spans)
+            yield from (_event(search, rests, span) for span in left_behind)
             frozen = _frozen(search, signal, [each for each in spans if each not in left_behind])
-            sooner += [(signal, span) for span in frozen]
+            sooner += [(rests, span) for span in frozen]
             if not frozen and not left_behind and not search.view.shortest_rest_s:
                 _note_longest(search, signal, here, max(spans, key=_length_s))
-    for signal, span in sooner:
-        if not _rests_with_others(signal, span, resting):
-            yield _event(search, signal, span)
+    for rests, span in sooner:
+        if not _rests_with_others(rests.signal, span, resting):
+            yield _event(search, rests, span)
         else:
-            _note_longest(search, signal, search.view.summary(signal), span)
+            _note_longest(search, rests.signal, search.view.summary(rests.signal), span)
 
 
-def _event(search: Search, signal: Signal, span: Span) -> Event:
-    says = what_it_shows(search, signal, span)
+def _event(search: Search, rests: Resting, span: Span) -> Event:
+    says = rests.shows(span)
     details = {"value": span.key} | ({"says": says} if says else {})
-    return search.event("flat", span.start_s, span.end_s, signal.name, **details)
+    return search.event("flat", span.start_s, span.end_s, rests.signal.name, **details)
 
 
-def _left_behind(search: Search, signal: Signal, spans: Sequence[Span]) -> list[Span]:
+def _left_behind(search: Search, rests: Resting, spans: Sequence[Span]) -> list[Span]:
     """The rests in which its target went on, or in which it was told to move."""
     least_s = FROZEN_SHARE * search.options.flat_s
-    if not _changes_otherwise(search, search.view.summary(signal), spans):
+    if not _changes_otherwise(search, search.view.summary(rests.signal), spans):
         return []
     return [
         span
         for span in spans
-        if _length_s(span) >= least_s and target_went_on(search, signal, span)
-        if not is_limit(search, signal, span)
+        if _length_s(span) >= least_s and rests.target_went_on(span)
+        if not rests.is_limit(span)
     ]
 
 
@@ -89,11 +89,9 @@ def _frozen(search: Search, signal: Signal, spans: Sequence[Span]) -> list[Span]
     """Of the rests of a signal those that noise never makes, if it is noisy but for them."""
     moved_with = (search.motion.commanded, search.motion.speed, *search.motion.wheels)
     times, values = search.view.sample([signal]).numbers(signal.name)
-    if signal in moved_with or not len(times):
+    if signal in moved_with or len(times) < 2:
         return []
-    least_s = max(
-        FROZEN_SHARE * search.options.flat_s, FEWEST_ROWS * float(np.median(np.diff(times)))
-    )
+    least_s = max(FROZEN_SHARE * search.options.flat_s, FEWEST_ROWS * median(np.diff(times)))
     held = [span for span in spans if _length_s(span) >= least_s]
     outside = np.ones(len(times), np.bool_)
     for span in held:

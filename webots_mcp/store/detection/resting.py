@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Final
 
 from webots_mcp.naming import find_targets
@@ -30,64 +31,83 @@ _REPLACED_AT: Final = (
 )
 
 
-def what_it_shows(search: Search, signal: Signal, span: Span) -> str | None:
-    """What there is to say of a value that a signal kept, but that it is frozen."""
-    value = f"{span.key:.6g}" if isinstance(span.key, (int, float)) else span.key
-    unit = f" {signal.unit}" if signal.unit else ""
-    why = target_went_on(search, signal, span)
-    if is_limit(search, signal, span):
-        return f"at its limit of {value}{unit}" + (f", though {why}" if why else "")
-    if why:
-        return f"frozen: {why}"
-    comes_back = _rows_there(search, signal, span) >= HABITUAL_ROWS
-    return f"at {value}{unit}, as at other times" if comes_back else None
+class Resting:
+    """A signal that rests at times, with what its rests are compared with."""
 
+    def __init__(self, search: Search, signal: Signal) -> None:
+        self.signal = signal
+        self._search = search
 
-def is_limit(search: Search, signal: Signal, span: Span) -> bool:
-    """Whether a signal was never beyond the value that it kept, and was there at other times too.
+    def shows(self, span: Span) -> str | None:
+        """What there is to say of a value that the signal kept, but that it is frozen."""
+        value = f"{span.key:.6g}" if isinstance(span.key, (int, float)) else span.key
+        unit = f" {self.signal.unit}" if self.signal.unit else ""
+        why = self.target_went_on(span)
+        if self.is_limit(span):
+            return f"at its limit of {value}{unit}" + (f", though {why}" if why else "")
+        if why:
+            return f"frozen: {why}"
+        comes_back = self._rows_there(span) >= HABITUAL_ROWS
+        return f"at {value}{unit}, as at other times" if comes_back else None
 
-    Only then it is where a sensor ends, or what a gate lets through: what counts or creeps is at
-    its extreme wherever it stops.
-    """
-    if span.key not in _extremes(search, signal):
-        return False
-    if _rows_there(search, signal, span):
-        return True
-    buckets = bucket_of(span.start_s), bucket_of(span.end_s)
-    asked = {"run": search.segment.run_id, "signal": signal.id, "value": span.key}
-    asked |= {"first": buckets[0], "last": buckets[1]}
-    return bool(search.connection.execute(_THERE_AT_OTHER_TIMES, asked).fetchone()[0])
+    def is_limit(self, span: Span) -> bool:
+        """Whether it was never beyond the value that it kept, and was there at other times too.
 
+        Only then it is where a sensor ends, or what a gate lets through: what counts or creeps is
+        at its extreme wherever it stops.
+        """
+        if span.key not in self._extremes:
+            return False
+        if self._rows_there(span):
+            return True
+        buckets = bucket_of(span.start_s), bucket_of(span.end_s)
+        asked = {"run": self._search.segment.run_id, "signal": self.signal.id, "value": span.key}
+        asked |= {"first": buckets[0], "last": buckets[1]}
+        found = self._search.connection.execute(_THERE_AT_OTHER_TIMES, asked)
+        return bool(found.fetchone()[0])
 
-def _rows_there(search: Search, signal: Signal, span: Span) -> int:
-    """How many of the rows that were read outside of the span have the same value."""
-    times, values = search.view.sample([signal]).numbers(signal.name)
-    outside = (times < span.start_s) | (times > span.end_s)
-    return int(np.count_nonzero(values[outside] == span.key))
+    def target_went_on(self, span: Span) -> str | None:
+        """That its target went on, or that it was told to move, while it stayed; None without that.
 
+        Of a position in the plane `stuck` tells that.
+        """
+        target, speed = self._targets
+        return (_went(self._search, target, span) if target else None) or (
+            _was_told(self._search, speed, span) if speed else None
+        )
 
-def _extremes(search: Search, signal: Signal) -> tuple[float | None, float | None]:
-    """Of the whole run as far as it is rolled up, and of what was read."""
-    rolled_up = search.extremes.get(signal.id or 0, (None, None))
-    here = search.view.summary(signal)
-    lows, highs = ((each for each in pair if each is not None) for pair in zip(
-        rolled_up, (here.min, here.max), strict=True
-    ))  # fmt: skip
-    return min(lows, default=None), max(highs, default=None)
+    def _rows_there(self, span: Span) -> int:
+        """How many of the rows that were read outside of the span have the same value."""
+        times, values = self._sample
+        end = int(np.searchsorted(times, span.end_s, "right"))
+        inside = values[int(np.searchsorted(times, span.start_s)) : end]
+        there = int(np.count_nonzero(values == span.key))
+        return there - int(np.count_nonzero(inside == span.key))
 
+    @cached_property
+    def _sample(self) -> tuple[Array, Array]:
+        """Times and numbers that were read."""
+        return self._search.view.sample([self.signal]).numbers(self.signal.name)
 
-def target_went_on(search: Search, signal: Signal, span: Span) -> str | None:
-    """That its target went on, or that it was told to move, while it stayed; None without that.
+    @cached_property
+    def _extremes(self) -> tuple[float | None, float | None]:
+        """Of the whole run as far as it is rolled up, and of what was read."""
+        rolled_up = self._search.extremes.get(self.signal.id or 0, (None, None))
+        here = self._search.view.summary(self.signal)
+        lows, highs = ((each for each in pair if each is not None) for pair in zip(
+            rolled_up, (here.min, here.max), strict=True
+        ))  # fmt: skip
+        return min(lows, default=None), max(highs, default=None)
 
-    Of a position in the plane `stuck` tells that.
-    """
-    if signal in (search.motion.position or ()):
-        return None
-    numbers = [name for name, each in search.known.items() if each.kind in ("num", "angle")]
-    target, speed = find_targets(signal.name, numbers)
-    return (_went(search, search.known[target], span) if target else None) or (
-        _was_told(search, search.known[speed], span) if speed else None
-    )
+    @cached_property
+    def _targets(self) -> tuple[Signal | None, Signal | None]:
+        """Its target, and its commanded speed; of a position in the plane none."""
+        known = self._search.known
+        if self.signal in (self._search.motion.position or ()):
+            return None, None
+        numbers = [name for name, each in known.items() if each.kind in ("num", "angle")]
+        target, speed = find_targets(self.signal.name, numbers)
+        return known.get(target or ""), known.get(speed or "")
 
 
 def _went(search: Search, target: Signal, span: Span) -> str | None:

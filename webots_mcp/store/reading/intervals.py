@@ -10,9 +10,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress, count, islice, pairwise
 from operator import ne
-from typing import Final, Literal, Protocol
+from typing import Final, Protocol
 
 from webots_mcp.naming import Value
+from webots_mcp.store.analysis.arrays import Array, Flags, Indexes, np
+from webots_mcp.store.analysis.summaries import Summaries
 from webots_mcp.store.analysis.summary import Summary, usable_numbers
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import Pieces
@@ -42,9 +44,6 @@ class Span:
     to_last: bool = False
 
 
-Verdict = Literal["all", "none", "some"]
-
-
 class Condition(Protocol):
     """What is looked for."""
 
@@ -57,8 +56,8 @@ class Condition(Protocol):
         """Per row None if it does not hold; else what holds, as a key."""
         ...
 
-    def of_bucket(self, summary: Summary) -> Verdict:
-        """Whether it holds in all, none, or some rows of a bucket, as far as that is known."""
+    def of_buckets(self, summaries: Summaries) -> tuple[Flags, Flags]:
+        """In which buckets it holds in all rows, and in which others it may hold in some."""
         ...
 
 
@@ -76,14 +75,14 @@ class Beyond:
             for value in values
         ]
 
-    def of_bucket(self, summary: Summary) -> Verdict:
-        """From the extremes."""
-        if summary.min is None or summary.max is None:
-            return "none"
-        ends = {self.holds(summary.min), self.holds(summary.max)}
-        if ends == {False}:
-            return "none"
-        return "all" if ends == {True} and summary.present == summary.rows else "some"
+    def of_buckets(self, summaries: Summaries) -> tuple[Flags, Flags]:
+        """From the extremes; of those that are not known it does not hold."""
+        low, high = (self._of_numbers(summaries[name]) for name in ("min", "max"))
+        whole = low & high & (summaries["present"] == summaries["rows"])
+        return whole, (low | high) & ~whole
+
+    def _of_numbers(self, numbers: Array) -> Flags:
+        return np.array([self.holds(number) for number in numbers.tolist()], np.bool_)
 
 
 class Silent:
@@ -95,11 +94,10 @@ class Silent:
         """True or None."""
         return [True if value is None else None for value in values]
 
-    def of_bucket(self, summary: Summary) -> Verdict:
+    def of_buckets(self, summaries: Summaries) -> tuple[Flags, Flags]:
         """From the counts."""
-        if summary.present == summary.rows:
-            return "none"
-        return "some" if summary.present else "all"
+        lacking, never = summaries["present"] < summaries["rows"], summaries["present"] == 0
+        return lacking & never, lacking & ~never
 
 
 class Flat:
@@ -111,10 +109,11 @@ class Flat:
         """The numbers."""
         return values
 
-    def of_bucket(self, summary: Summary) -> Verdict:
+    def of_buckets(self, summaries: Summaries) -> tuple[Flags, Flags]:
         """From the extremes; where it changed, its ends may still be flat."""
-        same = summary.min is not None and summary.min == summary.max
-        return "all" if same and summary.present == summary.rows else "some"
+        whole = summaries["min"] == summaries["max"]
+        whole &= summaries["present"] == summaries["rows"]
+        return whole, ~whole
 
 
 def spans_in_rows(
@@ -144,19 +143,30 @@ def spans_in_pieces(
     Flat buckets are looked for whole; of the others only those next to one are looked at, and read
     where older rollups do not tell up to when the first value lasted, and since when the last one.
     """
-    buckets = pieces.of(signal.name)
-    verdicts = [condition.of_bucket(summary) for _, summary in buckets]
-    for index, (bucket, summary) in enumerate(buckets):
-        near_whole = "all" in verdicts[max(0, index - 1) : index + 2]
-        if verdicts[index] == "all":
-            yield [_whole(segment, bucket, summary, condition)]
-        elif verdicts[index] != "some" or (condition.lasting and not near_whole):
+    numbers, summaries = pieces.numbered(signal.name)
+    whole, some = condition.of_buckets(summaries)
+    if condition.lasting:
+        some &= np.append(whole[1:], False) | np.append(False, whole[:-1])
+    starts = _groups(whole, some, summaries["last"])
+    groups = summaries.of_groups(starts)
+    for place, (start, end) in enumerate(pairwise([*starts.tolist(), len(numbers)])):
+        if whole[start]:
+            buckets = range(int(numbers[start]), int(numbers[end - 1]) + 1)
+            yield [_whole(segment, buckets, groups.one(place), condition)]
+        elif not some[start]:
             yield []
-        elif condition.lasting and (rests := rests_at_ends(summary)) is not None:
+        elif condition.lasting and (rests := rests_at_ends(groups.one(place))) is not None:
             yield rests
         else:
-            columns = read(_bucket_of(segment, bucket))
+            columns = read(_bucket_of(segment, int(numbers[start])))
             yield list(spans_in_rows(columns.times, columns.values[signal.name], condition))
+
+
+def _groups(whole: Flags, some: Flags, last: Array) -> Indexes:
+    """Where those begin that are one span, or in which it does not hold; any other is alone."""
+    alike = whole[1:] & whole[:-1] & (last[1:] == last[:-1])
+    alike |= ~(whole | some)[1:] & ~(whole | some)[:-1]
+    return np.flatnonzero(np.append(True, ~alike)[: len(whole)])
 
 
 def rests_at_ends(summary: Summary) -> list[Span] | None:
@@ -174,11 +184,11 @@ def rests_at_ends(summary: Summary) -> list[Span] | None:
     ]
 
 
-def _whole(segment: Segment, bucket: int, summary: Summary, condition: Condition) -> Span:
-    """Of a bucket in all rows of which it held; without a value, rows are known by bucket only."""
+def _whole(segment: Segment, buckets: range, summary: Summary, condition: Condition) -> Span:
+    """Of buckets in all rows of which it held; without a value, rows are known by bucket only."""
     first_s, last_s = summary.first_sim_time_s, summary.last_sim_time_s
-    start_s = max(segment.start_s, bucket * BUCKET_S) if first_s is None else first_s
-    end_s = min(segment.end_s, (bucket + 1) * BUCKET_S) if last_s is None else last_s
+    start_s = max(segment.start_s, buckets.start * BUCKET_S) if first_s is None else first_s
+    end_s = min(segment.end_s, buckets.stop * BUCKET_S) if last_s is None else last_s
     (key,) = condition.of_rows([summary.last])
     return Span(start_s, end_s, key, summary.min, summary.max, from_first=True, to_last=True)
 

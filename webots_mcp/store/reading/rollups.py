@@ -104,15 +104,15 @@ class Pieces:
 
     def of(self, name: str) -> list[tuple[int, Summary]]:
         """The pieces of a signal that have rows, by their numbers, in order."""
-        pieces, table = self._in_order(name)
-        return list(zip(pieces.tolist(), Summaries(table).as_list(), strict=True))
+        pieces, summaries = self.numbered(name)
+        return list(zip(pieces.tolist(), summaries.as_list(), strict=True))
 
     def summaries(self, name: str) -> Summaries:
         """The same without their numbers, as arrays."""
-        return Summaries(self._in_order(name)[1])
+        return self.numbered(name)[1]
 
-    def _in_order(self, name: str) -> _Part:
-        """Each piece once."""
+    def numbered(self, name: str) -> tuple[Indexes, Summaries]:
+        """Their numbers, and they as arrays; each piece once."""
         pieces = np.concatenate([pieces for pieces, _ in self._parts[name]])
         table = np.concatenate([table for _, table in self._parts[name]])
         order = np.argsort(pieces, kind="stable")
@@ -122,12 +122,13 @@ class Pieces:
         for at in np.flatnonzero(ends - starts > 1).tolist():
             together = Summaries(table[starts[at] : ends[at]]).as_list()
             table[starts[at]] = merge(together)
-        return pieces[starts], table[starts]
+        return pieces[starts], Summaries(table[starts])
 
     def _counted(self, found: Array, rows: dict[int, int], grain: Grain) -> _Part:
         """Buckets of a signal, as those that are there have rows; with those that lack it."""
         there: Array = np.array(list(rows), np.float64)
-        numbers = np.union1d(found[:, 0], there)
+        numbers: Array = np.sort(np.concatenate((found[:, 0], there)))
+        numbers = numbers[np.diff(numbers, prepend=-np.inf) > 0]
         table = np.full((len(numbers), found.shape[1] - 1), np.nan)
         table[:, :COUNTS] = 0
         table[np.searchsorted(numbers, found[:, 0])] = found[:, 1:]

@@ -318,8 +318,7 @@ class LongView:
     def summary(self, signal: Signal) -> Summary:
         """Counts from the rollups."""
         self._note_late()
-        rows = max((each.rows for each in self._totals.values()), default=0)
-        return self._totals.get(signal.id or 0, Summary(rows))
+        return self._totals.get(signal.id or 0, Summary(self._rows))
 
     def spans(self, signal: Signal, condition: Condition) -> list[Span]:
         """From rollups, and rows where they leave it open."""
@@ -508,6 +507,11 @@ class LongView:
         found = totals(self._connection, run_id, range(first, end), _COUNTS)
         rows = max((counted for counted, *_ in found.values()), default=0)
         return {signal_id: Summary(rows, *counts) for signal_id, (_, *counts) in found.items()}
+
+    @functools.cached_property
+    def _rows(self) -> int:
+        """Of the whole segment."""
+        return max((each.rows for each in self._totals.values()), default=0)
 
     @functools.cached_property
     def _sample(self) -> Columns:

@@ -25,7 +25,7 @@ from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, stored_texts
 
 MOST_PARTS: Final = 2000  # of the standstills of 500 s; of more the rows are read
-_ASKED: Final = ("position", "mode", "commanded", "min_commanded", "stuck_m", "stuck_s")
+_ASKED: Final = ("mode", "commanded", "min_commanded", "stuck_m", "stuck_s")
 
 
 class StandstillsToStore:
@@ -79,7 +79,7 @@ def stored_standstills(
         connection: Any.
         run_id: Of which run.
         span: Buckets of 10 s that lie inside of what is asked for.
-        motion: The signals that tell of them.
+        motion: The signals that tell of them; with others nothing is stored.
         options: What counts as one; only the usual are stored.
     """
     usual = EventOptions()

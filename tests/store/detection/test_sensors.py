@@ -112,6 +112,15 @@ def test_a_signal_that_never_had_a_value_is_not_said_to_be_silent_for_good(
         resolve_signals(known_signals(empty, find_range(empty, Scope())), ["frount"])
 
 
+@pytest.mark.parametrize("kind", ["flat", "jump", "oscillation"])
+def test_numbers_that_are_too_large_to_be_judged_are_said_to_be_so(
+    empty: sqlite3.Connection, kind: str, tier: str
+) -> None:
+    record(empty, lambda t: {"speed": 1e305 * math.sin(t), "left": range_m(t), "x": t})
+    answer = ask(empty, kind)
+    assert "not in speed, whose numbers are beyond 1e+100" in answer.verdicts.not_searched[kind]
+
+
 @pytest.mark.parametrize("items", [8, 40])
 def test_a_lidar_that_sees_nothing_at_all_has_no_value(
     empty: sqlite3.Connection, items: int

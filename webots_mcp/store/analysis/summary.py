@@ -16,7 +16,7 @@ from webots_mcp.naming import Value
 from webots_mcp.store.analysis.arrays import Array, inner, np
 
 _NUMBERS: Final = frozenset({int, float, bool})
-_LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
+LARGEST: Final = 1e100  # beyond it (a stray infinity, a huge integer) squares would overflow
 COUNTS: Final = 3  # fields, the first ones of a summary, which are never None
 NO_LENGTH: Final = 1e-9  # of a resultant vector that means no direction
 LENGTH_DUST: Final = 1e-14  # what adding unit vectors leaves; less than 1.5e-7 rad
@@ -233,14 +233,14 @@ def usable_numbers(
     pairs = [
         (time, float(cast("float", value)))
         for time, value in zip(times, values, strict=True)
-        if type(value) in _NUMBERS and -_LARGEST <= cast("float", value) <= _LARGEST
+        if type(value) in _NUMBERS and -LARGEST <= cast("float", value) <= LARGEST
     ]
     return [time for time, _ in pairs], [value for _, value in pairs]
 
 
 def usable_part(times: Array, numbers: Array) -> tuple[Array, Array]:
     """The usable ones of numbers that may be NaN, with their times."""
-    usable = np.abs(numbers) <= _LARGEST
+    usable = np.abs(numbers) <= LARGEST
     return (times, numbers) if usable.all() else (times[usable], numbers[usable])
 
 

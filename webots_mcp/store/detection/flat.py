@@ -33,6 +33,7 @@ def flat_events(search: Search) -> Iterator[Event]:
     """
     least_s = max(search.options.flat_s, search.view.shortest_rest_s)
     signals = search.required_quantities()
+    search.note_too_large("flat")
     if (shortest_s := search.view.shortest_rest_s) and search.only is None:
         why = f"not all of noisy signals for less than {shortest_s:g} s: ask for less time"
         search.not_searched("flat", why)

@@ -30,6 +30,7 @@ def jump_events(search: Search) -> Iterator[Event]:
     """Dropouts and spikes that come back, steps that stay, and leaps of the position."""
     position = search.motion.position or ()
     numbers = search.numbers if position else search.required_quantities()
+    search.note_too_large("jump")
     signals = [
         signal
         for signal in numbers

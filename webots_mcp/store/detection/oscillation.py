@@ -28,6 +28,7 @@ def oscillation_events(search: Search) -> Iterator[Event]:
             raise NotSearchableError(why)
         search.not_searched("oscillation", why)
     _note_periods(search)
+    search.note_too_large("oscillation")
     for name, swings in _found(search, signals).items():
         for swing in joined_swings(swings):
             details = {"period_s": swing.period_s, "amplitude": swing.amplitude}

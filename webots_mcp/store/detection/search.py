@@ -8,7 +8,8 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Final
 
-from webots_mcp.naming import flatten
+from webots_mcp.naming import flatten, listed
+from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
 from webots_mcp.store.detection.motion import Motion, find_motion
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from webots_mcp.store.detection.standing import Standings
 
     Habits = dict[tuple[int, Motion], MovedIn]
+
+MOST_NAMED: Final = 5
 
 _ENDS: Final = (
     "SELECT data FROM state WHERE id IN ("
@@ -195,6 +198,22 @@ class Search:
     def not_searched(self, kind: str, *reasons: str) -> None:
         """Note why a kind was not looked for, or where it was not."""
         self.ledger.not_searched(kind, *reasons)
+
+    def note_too_large(self, kind: str) -> None:
+        """Note which signals have numbers that are too large to be judged."""
+        if names := listed(self._too_large, MOST_NAMED):
+            self.not_searched(kind, f"not in {names}, whose numbers are beyond {LARGEST:g}")
+
+    @cached_property
+    def _too_large(self) -> list[str]:
+        """Of a long segment those in which most rows lack a usable number."""
+        share, found = (0.5 if self.view.is_long else 1.0), list[str]()
+        for signal in self.numbers:
+            here = self.view.summary(signal)
+            if here.present < share * here.rows:
+                values = self.view.sample([signal]).aligned(signal.name)  # NaN where is none
+                found += [signal.name] if (abs(values) > LARGEST).any() else []
+        return found
 
     def came_near(self, kind: str, share: float, what: str) -> None:
         """Note what came near to an event, as a share of what would be one."""

@@ -71,7 +71,7 @@ def purge_notes(connection: sqlite3.Connection, run_id: int, start_s: float) -> 
     if found is None or (found[0] is not None and start_s >= found[0]):
         return
     when = "" if found[0] is None else f" before {found[0]:g} s"
-    left = "of that time only 10 s summaries are left (no single rows, jumps, stuck or export)"
+    left = "of that time only 10 s summaries are left (no single rows, jumps or export)"
     yield f"the rows of run {run_id}{when} were purged: {left}"
 
 

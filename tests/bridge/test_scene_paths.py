@@ -158,6 +158,12 @@ def test_types_and_names_are_found_whatever_their_case_and_else_the_nearest_are_
     assert "nearest" not in crowd.ask("get_scene", names=["rider"])
 
 
+def test_the_name_of_a_node_is_shown_once(crowd: Scene) -> None:
+    shown = crowd.ask("get_scene", types=["Robot"], fields=["name", "translation"])
+    assert shown["columns"] == ["depth", "path", "type", "name", "translation"]
+    assert all(len(row) == len(shown["columns"]) for row in shown["rows"])
+
+
 def test_a_scene_that_is_too_large_is_given_in_parts(crowd: Scene) -> None:
     for i in range(60):
         crowd.ask("add_node", vrml=f'DEF PIECE_{i:02} Solid {{ name "the piece number {i}" }}')

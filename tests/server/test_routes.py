@@ -137,6 +137,17 @@ async def test_a_webots_without_any_controller_of_ours_is_found_and_steered(
     assert "run_id" not in answer
 
 
+async def test_a_reset_that_nothing_shows_is_not_told_as_a_start_without_stream(
+    in_project: Any,
+) -> None:
+    _, client = in_project("print('ready', flush=True)", "--stream")
+    async with client:
+        assert (await control(client, "pause"))["route"] == "websocket"
+        result = await client.call_tool("webots_simulation_control", {"command": "reset"})
+    assert "was started without --stream" not in str(result.content)
+    assert not result.is_error or "it was asked, and may have obeyed" in str(result.content)
+
+
 async def test_a_webots_of_another_project_is_steered_only_if_its_port_is_named(
     tmp_path: Path, start_webots: StartWebots, connect: Connect
 ) -> None:

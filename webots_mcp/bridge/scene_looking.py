@@ -36,7 +36,8 @@ def get_scene(context: Context, command: Command) -> _Progress:
     params, robot = command.params, context.simulation.robot
     types, names = _patterns(params, "types"), _patterns(params, "names")
     seen: dict[str, None] = {}
-    wanted, after = _patterns(params, "fields"), _whole(params, "cursor", 0, 0, 10**9)
+    wanted = [each for each in _patterns(params, "fields") if each != "name"]  # shown anyway
+    after = _whole(params, "cursor", 0, 0, 10**9)
     usual = DEEPEST if types or names else _USUAL_DEPTH
     depth = _whole(params, "depth", usual, 1, DEEPEST)
     path = params.get("path")

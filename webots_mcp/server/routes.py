@@ -184,7 +184,7 @@ class Attempt(Request):
         if self.order in RESTARTING:  # of which Webots need not say anything
             seen = await self._shown(situation, _RESTART_S)
         if seen is None:
-            self.tried["websocket"] = no_obedience(address, reply)
+            self.tried["websocket"] = await to_thread.run_sync(why_no_word, address, reply)
             return None
         return await self._answered(situation, "websocket", seen)
 
@@ -355,6 +355,17 @@ _SIGNS: Final[dict[Order, Callable[[Moment, View], str | None]]] = {
     "reset": _begun,
     "reload": _begun,
 }
+
+
+def why_no_word(address: Address, reply: Reply) -> str:
+    """Why Webots said nothing to an order: how it was started shows it, where it runs here."""
+    found = instance_at(address.port)
+    if reply.is_alive and found is not None and found.address == address and found.streams:
+        return (
+            f"Webots at {address} was started with --stream and hears: it was asked, and may have "
+            "obeyed, but neither its answer nor the recording shows it; webots_get_logs may"
+        )
+    return no_obedience(address, reply)
 
 
 def webots_meant(recording: Recording, situation: Situation) -> Address:

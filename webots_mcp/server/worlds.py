@@ -16,10 +16,10 @@ from webots_mcp.launching import Launch, begun_since, newest_in
 from webots_mcp.server.launcher import Launcher
 from webots_mcp.server.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
 from webots_mcp.server.results import CommandAnswer
-from webots_mcp.server.routes import Situation, look_around, webots_meant
+from webots_mcp.server.routes import Situation, look_around, webots_meant, why_no_word
 from webots_mcp.store.beginnings import Beginning
 from webots_mcp.webots.instances import instance_at
-from webots_mcp.webots.stream import ANSWER_S, Address, address_of, load_world, no_obedience
+from webots_mcp.webots.stream import ANSWER_S, Address, address_of, load_world
 
 _POLL_S: Final = 0.1
 _GONE_S: Final = 5.0  # from the end of its controllers to that of Webots
@@ -125,7 +125,7 @@ class WorldRequest(Request):
             address = await to_thread.run_sync(self._address, situation)
             reply = await to_thread.run_sync(load_world, address, world.name, ANSWER_S)
             if reply.heard is None:
-                raise CommandRefusedError(no_obedience(address, reply))
+                raise CommandRefusedError(await to_thread.run_sync(why_no_word, address, reply))
         except CommandRefusedError as error:
             self.tried["websocket"] = str(error)
             raise CommandRefusedError(

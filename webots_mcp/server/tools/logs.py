@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+import time
 from typing import Annotated, Final
 
 from pydantic import Field
 
 from webots_mcp.console.state import console_state
 from webots_mcp.contract import LogLevel, LogSource
-from webots_mcp.errors import NothingRecordedError
+from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import Cursor, EndS, LastS, RobotName, RunId, StartS
 from webots_mcp.server.results import LogsAnswer, Table
@@ -25,6 +26,7 @@ from webots_mcp.store.logs import (
 )
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.robots import list_robots
 from webots_mcp.store.window import Window, window_of
 
 LOG_COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
@@ -69,10 +71,11 @@ def webots_get_logs(
             one_run = run.id if scope.in_one_run else None
             asked = LogFilter(one_run, window, filter_text, lowest, cursor, view.robot.id, source)
             return _answer(recording, view, asked, lines)
-    except NothingRecordedError:
+    except (NothingRecordedError, AmbiguousRobotError):
         asked = LogFilter(None, anytime, filter_text, lowest, source=source)
         with recording.reader() as connection:
-            waiting = waiting_lines(connection, asked, lines)
+            is_any_live = any(each.live for each in list_robots(connection, time.time()))
+            waiting = [] if is_any_live else waiting_lines(connection, asked, lines)
         if not waiting:
             raise
         return LogsAnswer(lines=_table(waiting), matching=len(waiting), hint=_NO_RUN_YET)

@@ -47,5 +47,7 @@ def test_a_field_is_shown_and_set(database: Path, capsys: pytest.CaptureFixture[
     assert main(["field", *where, "ROVER", "--json"]) == 0
     rows = json.loads(capsys.readouterr().out.splitlines()[-1])["rows"]
     assert ["customData", "SFString", "a text"] in rows
+    assert main(["field", *where, "ROVER.children"]) == 0
+    assert 'lidar"]' in capsys.readouterr().out, "all entries"
     assert main(["field", *where, "ROVER.nothing"]) == 2
     assert "has no field 'nothing'" in capsys.readouterr().err

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, JSON, ROBOT, argument, command, value_of
 from webots_mcp.cli.steering import require_done, show_progress, writable
-from webots_mcp.cli.tables import print_table, text_of
+from webots_mcp.cli.tables import print_table, printable, text_of
 
 if TYPE_CHECKING:
     from webots_mcp.server.results import CommandAnswer
@@ -63,7 +63,8 @@ def _show(arguments: argparse.Namespace, action: str, params: dict[str, Any]) ->
     if columns is not None:
         print_table(columns, rows)
     for name, value in result.items():
-        print(f"{name}: {text_of(value)}")
+        whole = json.dumps(value, ensure_ascii=False) if isinstance(value, list) else value
+        print(f"{name}: {printable(whole) if isinstance(whole, str) else text_of(whole)}")
 
 
 def _asked(arguments: argparse.Namespace, action: str, params: dict[str, Any]) -> dict[str, Any]:

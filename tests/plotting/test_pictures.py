@@ -115,6 +115,11 @@ def test_what_could_not_be_drawn_is_said(rover: sqlite3.Connection) -> None:
     assert "without a value in run 1: sensors.front" in blind.notes
 
 
+def test_numbers_too_large_to_draw_are_not_said_to_be_missing(record: Record) -> None:
+    connection = record(lambda time_s: {"big": 1e301, "x": time_s})
+    assert "beyond 1e100 in run 1: big" in ask(connection, signals=["*"]).notes
+
+
 def test_runs_are_laid_over_each_other_from_their_starts_and_named_by_their_labels(
     record: Record,
 ) -> None:

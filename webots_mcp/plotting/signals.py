@@ -164,8 +164,10 @@ def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
     notes = range_notes(parts)
     drawn = {(curve.run_id, curve.name) for curve in curves}
     for part in parts:
-        silent = [c.name for c in part.run.numbers if (part.run.run_id, c.name) not in drawn]
-        if silent:
+        left = [c for c in part.run.numbers if (part.run.run_id, c.name) not in drawn]
+        if too_large := [columns.name for columns in left if columns.whole.present]:
+            notes.append(f"beyond 1e100 in {part.name}: {listed(too_large)}")
+        if silent := [columns.name for columns in left if not columns.whole.present]:
             notes.append(f"without a value in {part.name}: {listed(silent)}")
         if part.run.cut_at_s is not None:
             notes.append(

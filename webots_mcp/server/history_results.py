@@ -47,7 +47,7 @@ class NumberSeries(BaseModel):
     whole: dict[str, float | None] | None = Field(default=None, description="Over the range.")
     silent: bool | None = Field(default=None, description="True: no value in the range.")
     replaced: dict[str, int] | None = Field(
-        default=None, description="How often nan, inf, ... stood there."
+        default=None, description="How often nan, inf, ... or too large a number stood there."
     )
 
 

@@ -10,7 +10,9 @@ from tests.recordings.rover import GAP_S, WALL_START_S
 from tests.server.conftest import ask
 from tests.server.history.conftest import EVERY, STORY, tell
 from tests.server.story import client_on, copy_of, rows_of
+from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
+from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.rollup.rolling import roll
 
 pytestmark = pytest.mark.anyio
@@ -79,6 +81,17 @@ async def test_rows_in_a_gap_are_null_and_modes_are_change_points(story: Path) -
 async def test_what_did_not_change_is_said_once(story: Path) -> None:
     answer = await tell(story, "webots_query_history", signals=["target"])
     assert answer["runs"][0]["numbers"]["target"] == {"constant": 3.0}
+
+
+async def test_numbers_too_large_to_reckon_with_are_not_called_silent(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    supervisor = InProcessSupervisor("rover")
+    with MCPBridge(supervisor, throttle_interval=1, database=file) as bridge:
+        for _ in range(5):
+            bridge.publish({"big": 1e301})
+            supervisor.step(8)
+    answer = await tell(file, "webots_query_history", signals=["big"])
+    assert answer["runs"][0]["numbers"]["big"] == {"replaced": {"beyond 1e100": 5}}
 
 
 async def test_raw_rows_come_in_pages_that_neither_repeat_nor_miss_one(story: Path) -> None:

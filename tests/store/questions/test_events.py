@@ -21,6 +21,7 @@ from webots_mcp.store.detection.verdict import Ledger
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.signals.catalogue import known_signals
 
 
@@ -82,6 +83,18 @@ def test_a_crossed_threshold_lasts_as_long_as_it_holds(
     assert ask(rover, "threshold", thresholds=(never,)).events == ()
     low = Threshold("battery_v", below=12.5)
     assert spans(ask(rover, "threshold", thresholds=(low,))) == [(100.1, 119.9)]
+
+
+def test_numbers_too_large_to_reckon_with_cross_a_threshold_and_are_not_silent(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    recorder = start_run(empty)
+    for step in range(300):
+        recorder.publish(step / 10, {"big": 1e301 if 100 <= step < 200 else 1.0})
+    roll(empty)
+    high = Threshold("big", above=5.0)
+    assert spans(ask(empty, "threshold", thresholds=(high,))) == [(10.0, 19.9)]
+    assert ask(empty, "silent").events == ()
 
 
 def test_a_jump_of_the_position_is_found(rover: sqlite3.Connection) -> None:

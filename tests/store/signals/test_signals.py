@@ -125,6 +125,19 @@ def test_rows_that_do_not_hold_a_signal_have_no_value_of_it(empty: sqlite3.Conne
     assert list_signals(empty).signals[0].missing == 30
 
 
+@pytest.mark.parametrize("rolled", [False, True])
+def test_numbers_too_large_to_reckon_with_are_values(
+    empty: sqlite3.Connection, rolled: bool
+) -> None:
+    recorder = start_run(empty)
+    for step in range(40):
+        recorder.publish(float(step), {"big": 1e301})
+    if rolled:
+        roll(empty)
+    (big,) = list_signals(empty).signals
+    assert (big.missing, big.first_s, big.last_s, big.last) == (0, 0.0, 39.0, 1e301)
+
+
 @pytest.mark.parametrize("course", ["tn", "nt", "_t", "_n", "bn"])
 def test_a_signal_that_changes_its_kind_is_told_the_same_before_and_after_rolling(
     empty: sqlite3.Connection, course: str

@@ -160,12 +160,13 @@ def _usual_counts(numbers: Sequence[NumberColumns]) -> list[int] | None:
 def _number_series(
     columns: NumberColumns, counts: list[int] | None, *, rows_only: bool
 ) -> NumberSeries:
-    replaced = columns.odd or None
-    if not columns.whole.present:
+    whole, replaced = columns.whole, columns.odd or None
+    if not whole.present:
         return NumberSeries(silent=True, replaced=replaced)
+    if whole.min is None:
+        return NumberSeries(replaced={**(replaced or {}), "beyond 1e100": whole.present})
     if rows_only:
         return NumberSeries(unit=columns.unit, value=figures(columns.last), replaced=replaced)
-    whole = columns.whole
     if whole.min == whole.max and columns.count == counts:
         return NumberSeries(unit=columns.unit, constant=figure(whole.min), replaced=replaced)
     return NumberSeries(

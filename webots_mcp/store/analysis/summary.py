@@ -28,7 +28,7 @@ class Summary(NamedTuple):
 
     Attributes:
         rows: State rows that held the signal; where rows were read as columns, all of them.
-        present: Of them with a value.
+        present: Of them with a value; where there are usable numbers, with one of these.
         changes: Values unlike the one before, within the stretch.
         squares: Sum of squared deviations from the mean.
         sines: Sum of sines, of an angle in whatever unit.
@@ -131,7 +131,8 @@ def summarise(times: Sequence[float], values: Sequence[Value], *, angle: bool = 
 
     The squares are summed in a second pass over the deviations from the mean (T. F. Chan, G. H.
     Golub, R. J. LeVeque, "Algorithms for computing the sample variance", The American
-    Statistician 37, 1983): no cancellation where the mean is large. Of text only the times.
+    Statistician 37, 1983): no cancellation where the mean is large. Of text, and of numbers that
+    are all too large, only how many there are and the times.
     """
     rows = len(values)
     number_times, numbers = usable_numbers(times, values)
@@ -215,10 +216,15 @@ def _at(times: Array, numbers: Array, index: int) -> tuple[float, float]:
 
 
 def _without_numbers(times: Sequence[float], values: Sequence[Value]) -> Summary:
-    held = [time for time, value in zip(times, values, strict=True) if type(value) is str]
+    held = [time for time, value in zip(times, values, strict=True) if _is_there(value)]
     if not held:
         return Summary(len(values))
     return Summary(len(values), len(held), first_sim_time_s=held[0], last_sim_time_s=held[-1])
+
+
+def _is_there(value: Value) -> bool:
+    """Whether it is a value, be it one that is not reckoned with; NaN is none."""
+    return value is not None and value == value
 
 
 def usable_numbers(

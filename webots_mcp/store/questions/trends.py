@@ -127,7 +127,6 @@ def _run_trends(
     """The trends of signals in one run."""
     numbers = [signal for signal in signals if signal.is_number]
     found: list[Trend | None]
-    read: Numbers | None = None
     if exceeds(connection, segment):
         piece_s = piece_length_s(connection, segment, LEAST_PIECES)
         pieces = read_pieces(connection, segment, numbers, deadline, piece_s)
@@ -137,17 +136,22 @@ def _run_trends(
             _trend_of_pieces(signal, of_signal, piece_s, kept)
             for signal, of_signal in zip(numbers, parts, strict=True)
         ]
+        has_values = [bool(of_signal["present"].any()) for of_signal in parts]
         rows = max((of_signal.rows for of_signal in parts), default=0)
         resolution_s, cut_at_s = piece_s, pieces.cut_at_s
     else:
         read = read_numbers(connection, segment, numbers, deadline)
         kept = None if segment.full_rate else kept_columns(connection, segment, numbers, deadline)
         found = [_trend_of_rows(signal, read, kept) for signal in numbers]
+        has_values = [not np.isnan(read.values[signal.name]).all() for signal in numbers]
         rows, resolution_s = len(read.times), None
         cut_at_s = [segment.start_s, *read.times.tolist()][-1] if read.cut else None
     held = sorted((trend for trend in found if trend), key=lambda trend: -trend.change)
-    silent = [signal.name for signal, trend in zip(numbers, found, strict=True) if trend is None]
-    too_large = [] if read is None else [each for each in silent if _has_number(read, each)]
+    silent = [
+        f"{signal.name} ({TOO_LARGE})" if has_value else signal.name
+        for signal, trend, has_value in zip(numbers, found, has_values, strict=True)
+        if trend is None
+    ]
     return RunTrends(
         run_id=segment.run_id,
         start_s=segment.start_s,
@@ -156,7 +160,7 @@ def _run_trends(
         rows=rows,
         numbers=tuple(held[:limit]),
         states=_state_trends(connection, segment, signals, deadline),
-        silent=tuple(f"{each} ({TOO_LARGE})" if each in too_large else each for each in silent),
+        silent=tuple(silent),
         total=len(held),
         cut_at_s=cut_at_s,
     )
@@ -167,11 +171,6 @@ def _with_kept(signal: Signal, summary: Summary, kept: Columns | None) -> Summar
     if kept is None:
         return summary
     return with_extremes(summary, signal.summarise(kept.times, kept.values[signal.name]))
-
-
-def _has_number(read: Numbers, name: str) -> bool:
-    """Whether a signal without a usable value has numbers, which are too large then."""
-    return not np.isnan(read.values[name]).all()
 
 
 def _trend_of_rows(signal: Signal, read: Numbers, kept: Columns | None) -> Trend | None:

@@ -76,10 +76,11 @@ class Beyond:
         ]
 
     def of_buckets(self, summaries: Summaries) -> tuple[Flags, Flags]:
-        """From the extremes; of those that are not known it does not hold."""
+        """From the extremes; numbers that are too large for those stand in the rows."""
         low, high = (self._of_numbers(summaries[name]) for name in ("min", "max"))
         whole = low & high & (summaries["present"] == summaries["rows"])
-        return whole, (low | high) & ~whole
+        too_large = np.isnan(summaries["min"]) & (summaries["present"] > 0)
+        return whole, (low | high | too_large) & ~whole
 
     def _of_numbers(self, numbers: Array) -> Flags:
         return np.array([self.holds(number) for number in numbers.tolist()], np.bool_)

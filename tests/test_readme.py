@@ -11,6 +11,7 @@ import anyio
 import webots_mcp
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.cli import COMMANDS
+from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.server import create_server
 
 CHECKOUT = Path(__file__).parent.parent
@@ -38,6 +39,11 @@ def test_it_names_every_method_of_the_bridge() -> None:
     for name, _ in inspect.getmembers(MCPBridge, inspect.isfunction):
         if not name.startswith("_"):
             assert f"bridge.{name}(" in README, name
+
+
+def test_it_names_every_action_that_is_built_in_and_no_other() -> None:
+    (listed,) = re.findall(r"actions that are built in [^:]*:([^.]*)\.", README)
+    assert re.findall(r"`(\w+)`", listed) == list(BUILT_IN_ACTIONS)
 
 
 def test_the_files_it_links_to_exist() -> None:

@@ -30,9 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for number, benchmark in enumerate(chosen, 1)
     ]
     _show("")
-    print(render(sections))
-    print(f"\n{_machine()}; load {load} before, {_load()} after")
-    print(f"{time.monotonic() - started_s:.0f} s" + (", --quick" if options.quick else ""))
+    lasted = f"{time.monotonic() - started_s:.0f} s" + (", --quick" if options.quick else "")
+    _print(f"{render(sections)}\n\n{_machine()}; load {load} before, {_load()} after\n{lasted}")
     return 0
 
 
@@ -44,6 +43,13 @@ def _run(benchmark: Benchmark, options: argparse.Namespace, number: str) -> Sect
     with tempfile.TemporaryDirectory(prefix="webots-mcp-bench-") as folder:
         effort = _QUICK if options.quick else 1.0
         return benchmark.run(Bench(Path(folder), effort, say, options.rows, options.kills))
+
+
+def _print(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:  # the reader of the pipe has seen enough: Python does not try again
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _show(text: str) -> None:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -22,6 +25,15 @@ def test_a_benchmark_yields_lines_with_figures(benchmark: Benchmark, tmp_path: P
     for line in section.lines:
         assert math.isfinite(line.measured)
         assert line.what in render([section])
+
+
+def test_who_reads_only_the_first_lines_sees_no_traceback() -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "tests.benchmarks", "--quick", "--only", "throttled"]
+    ended = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert (ended.returncode, ended.stderr) == (0, "")
 
 
 def test_contenders_take_turns_after_a_block_that_is_forgotten() -> None:

@@ -465,8 +465,8 @@ SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.
       WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
       LIMIT 1),
     (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN CAST(x.key AS TEXT) = upper(CAST(x.key AS TEXT)) THEN lower(CAST(x.key AS TEXT)) ELSE CAST(x.key AS TEXT) END AS x_key,
-          CASE WHEN CAST(y.key AS TEXT) = upper(CAST(y.key AS TEXT)) THEN lower(CAST(y.key AS TEXT)) ELSE CAST(y.key AS TEXT) END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
+          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
+          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
         FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
         WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
           AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
@@ -488,8 +488,8 @@ SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.
       WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
       LIMIT 1),
     (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN CAST(x.key AS TEXT) = upper(CAST(x.key AS TEXT)) THEN lower(CAST(x.key AS TEXT)) ELSE CAST(x.key AS TEXT) END AS x_key,
-          CASE WHEN CAST(y.key AS TEXT) = upper(CAST(y.key AS TEXT)) THEN lower(CAST(y.key AS TEXT)) ELSE CAST(y.key AS TEXT) END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
+          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
+          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
         FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
         WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
           AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
@@ -524,48 +524,19 @@ SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.
     CASE WHEN json_type(j, '$.action') = 'text' THEN json_extract(j, '$.action') END,
     CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
     CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j) WHERE type = 'text' AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase')),
-        s1 AS MATERIALIZED (SELECT *, CASE WHEN substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) = upper(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) THEN lower(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) ELSE substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) END AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') || '.' AS said FROM s3)
-      SELECT value FROM s4
-      WHERE (said LIKE '%.mode.' OR said LIKE '%.behaviour.' OR said LIKE '%.behavior.' OR said LIKE '%.action.' OR said LIKE '%.task.' OR said LIKE '%.phase.') AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(said, '.' || w.value || '.'))
-      ORDER BY length(name), name LIMIT 1),
-    CASE WHEN json_type(j, '$.state') = 'text' THEN json_extract(j, '$.state') END,
-    CASE WHEN json_type(j, '$.status') = 'text' THEN json_extract(j, '$.status') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j) WHERE type = 'text' AND (key LIKE '%state' OR key LIKE '%status')),
-        s1 AS MATERIALIZED (SELECT *, CASE WHEN substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) = upper(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) THEN lower(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) ELSE substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) END AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') || '.' AS said FROM s3)
-      SELECT value FROM s4
-      WHERE (said LIKE '%.state.' OR said LIKE '%.status.') AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(said, '.' || w.value || '.'))
-      ORDER BY length(name), name LIMIT 1),
-    CASE WHEN json_type(j, '$.mode') = 'integer' THEN json_extract(j, '$.mode') END,
-    CASE WHEN json_type(j, '$.behaviour') = 'integer' THEN json_extract(j, '$.behaviour') END,
-    CASE WHEN json_type(j, '$.behavior') = 'integer' THEN json_extract(j, '$.behavior') END,
-    CASE WHEN json_type(j, '$.action') = 'integer' THEN json_extract(j, '$.action') END,
-    CASE WHEN json_type(j, '$.task') = 'integer' THEN json_extract(j, '$.task') END,
-    CASE WHEN json_type(j, '$.phase') = 'integer' THEN json_extract(j, '$.phase') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j) WHERE type = 'integer' AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase')),
-        s1 AS MATERIALIZED (SELECT *, CASE WHEN substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) = upper(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) THEN lower(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) ELSE substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) END AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') || '.' AS said FROM s3)
-      SELECT value FROM s4
-      WHERE (said LIKE '%.mode.' OR said LIKE '%.behaviour.' OR said LIKE '%.behavior.' OR said LIKE '%.action.' OR said LIKE '%.task.' OR said LIKE '%.phase.') AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(said, '.' || w.value || '.'))
-      ORDER BY length(name), name LIMIT 1),
-    CASE WHEN json_type(j, '$.state') = 'integer' THEN json_extract(j, '$.state') END,
-    CASE WHEN json_type(j, '$.status') = 'integer' THEN json_extract(j, '$.status') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j) WHERE type = 'integer' AND (key LIKE '%state' OR key LIKE '%status')),
-        s1 AS MATERIALIZED (SELECT *, CASE WHEN substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) = upper(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) THEN lower(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) ELSE substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) END AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') || '.' AS said FROM s3)
-      SELECT value FROM s4
-      WHERE (said LIKE '%.state.' OR said LIKE '%.status.') AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(said, '.' || w.value || '.'))
-      ORDER BY length(name), name LIMIT 1)) AS mode,
+    (WITH s0 AS MATERIALIZED (SELECT value, type, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j)
+        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status')),
+        s1 AS MATERIALIZED (SELECT *, substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) AS last FROM s0),
+        s2 AS MATERIALIZED (SELECT value, type, name, CASE WHEN last = upper(last) THEN lower(last) ELSE last END AS last FROM s1),
+        s3 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s2),
+        s4 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s3),
+        s5 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') AS words FROM s4),
+        s6 AS MATERIALIZED (SELECT *, instr('.mode.behaviour.behavior.action.task.phase.state.status.', substr(words, length(rtrim(words, replace(words, '.', '')))) || '.') AS rank FROM s5)
+      SELECT value FROM s6
+      WHERE rank > 0 AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(words || '.', '.' || w.value || '.'))
+      ORDER BY type = 'integer', rank >= 43,
+        CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
+      LIMIT 1)) AS mode,
   data, odd
 FROM (
   SELECT r.name AS robot, u.id AS run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd,
@@ -587,8 +558,8 @@ SELECT (
       WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
       LIMIT 1),
     (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN CAST(x.key AS TEXT) = upper(CAST(x.key AS TEXT)) THEN lower(CAST(x.key AS TEXT)) ELSE CAST(x.key AS TEXT) END AS x_key,
-          CASE WHEN CAST(y.key AS TEXT) = upper(CAST(y.key AS TEXT)) THEN lower(CAST(y.key AS TEXT)) ELSE CAST(y.key AS TEXT) END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
+          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
+          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
         FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
         WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
           AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
@@ -610,8 +581,8 @@ SELECT (
       WHERE json_type(j, '$.' || p.key) IN ('integer', 'real') AND json_type(j, '$.' || p.value) IN ('integer', 'real')
       LIMIT 1),
     (WITH s0 AS MATERIALIZED (SELECT x.value AS x, y.value AS y, replace(replace(replace(x.fullkey, '"', ''), '[', '.'), ']', '') AS name,
-          CASE WHEN CAST(x.key AS TEXT) = upper(CAST(x.key AS TEXT)) THEN lower(CAST(x.key AS TEXT)) ELSE CAST(x.key AS TEXT) END AS x_key,
-          CASE WHEN CAST(y.key AS TEXT) = upper(CAST(y.key AS TEXT)) THEN lower(CAST(y.key AS TEXT)) ELSE CAST(y.key AS TEXT) END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
+          CASE WHEN x.key = upper(x.key) THEN lower(x.key) ELSE x.key END AS x_key,
+          CASE WHEN y.key = upper(y.key) THEN lower(y.key) ELSE y.key END AS y_key, replace(replace(replace(x.path, '"', ''), '[', '.'), ']', '') AS way
         FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
         WHERE x.type IN ('integer', 'real') AND y.type IN ('integer', 'real')
           AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')),
@@ -646,47 +617,18 @@ SELECT (
     CASE WHEN json_type(j, '$.action') = 'text' THEN json_extract(j, '$.action') END,
     CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
     CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j) WHERE type = 'text' AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase')),
-        s1 AS MATERIALIZED (SELECT *, CASE WHEN substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) = upper(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) THEN lower(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) ELSE substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) END AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') || '.' AS said FROM s3)
-      SELECT value FROM s4
-      WHERE (said LIKE '%.mode.' OR said LIKE '%.behaviour.' OR said LIKE '%.behavior.' OR said LIKE '%.action.' OR said LIKE '%.task.' OR said LIKE '%.phase.') AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(said, '.' || w.value || '.'))
-      ORDER BY length(name), name LIMIT 1),
-    CASE WHEN json_type(j, '$.state') = 'text' THEN json_extract(j, '$.state') END,
-    CASE WHEN json_type(j, '$.status') = 'text' THEN json_extract(j, '$.status') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j) WHERE type = 'text' AND (key LIKE '%state' OR key LIKE '%status')),
-        s1 AS MATERIALIZED (SELECT *, CASE WHEN substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) = upper(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) THEN lower(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) ELSE substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) END AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') || '.' AS said FROM s3)
-      SELECT value FROM s4
-      WHERE (said LIKE '%.state.' OR said LIKE '%.status.') AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(said, '.' || w.value || '.'))
-      ORDER BY length(name), name LIMIT 1),
-    CASE WHEN json_type(j, '$.mode') = 'integer' THEN json_extract(j, '$.mode') END,
-    CASE WHEN json_type(j, '$.behaviour') = 'integer' THEN json_extract(j, '$.behaviour') END,
-    CASE WHEN json_type(j, '$.behavior') = 'integer' THEN json_extract(j, '$.behavior') END,
-    CASE WHEN json_type(j, '$.action') = 'integer' THEN json_extract(j, '$.action') END,
-    CASE WHEN json_type(j, '$.task') = 'integer' THEN json_extract(j, '$.task') END,
-    CASE WHEN json_type(j, '$.phase') = 'integer' THEN json_extract(j, '$.phase') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j) WHERE type = 'integer' AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase')),
-        s1 AS MATERIALIZED (SELECT *, CASE WHEN substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) = upper(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) THEN lower(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) ELSE substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) END AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') || '.' AS said FROM s3)
-      SELECT value FROM s4
-      WHERE (said LIKE '%.mode.' OR said LIKE '%.behaviour.' OR said LIKE '%.behavior.' OR said LIKE '%.action.' OR said LIKE '%.task.' OR said LIKE '%.phase.') AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(said, '.' || w.value || '.'))
-      ORDER BY length(name), name LIMIT 1),
-    CASE WHEN json_type(j, '$.state') = 'integer' THEN json_extract(j, '$.state') END,
-    CASE WHEN json_type(j, '$.status') = 'integer' THEN json_extract(j, '$.status') END,
-    (WITH s0 AS MATERIALIZED (SELECT value, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j) WHERE type = 'integer' AND (key LIKE '%state' OR key LIKE '%status')),
-        s1 AS MATERIALIZED (SELECT *, CASE WHEN substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) = upper(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) THEN lower(substr(name, length(rtrim(name, replace(name, '.', ''))) + 1)) ELSE substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) END AS last FROM s0),
-        s2 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s1),
-        s3 AS MATERIALIZED (SELECT value, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s2),
-        s4 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') || '.' AS said FROM s3)
-      SELECT value FROM s4
-      WHERE (said LIKE '%.state.' OR said LIKE '%.status.') AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(said, '.' || w.value || '.'))
-      ORDER BY length(name), name LIMIT 1)) AS mode, s.odd
+    (WITH s0 AS MATERIALIZED (SELECT value, type, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j)
+        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status')),
+        s1 AS MATERIALIZED (SELECT *, substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) AS last FROM s0),
+        s2 AS MATERIALIZED (SELECT value, type, name, CASE WHEN last = upper(last) THEN lower(last) ELSE last END AS last FROM s1),
+        s3 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s2),
+        s4 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s3),
+        s5 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') AS words FROM s4),
+        s6 AS MATERIALIZED (SELECT *, instr('.mode.behaviour.behavior.action.task.phase.state.status.', substr(words, length(rtrim(words, replace(words, '.', '')))) || '.') AS rank FROM s5)
+      SELECT value FROM s6
+      WHERE rank > 0 AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(words || '.', '.' || w.value || '.'))
+      ORDER BY type = 'integer', rank >= 43,
+        CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
+      LIMIT 1)) AS mode, s.odd
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
 INSERT INTO alembic_version (version_num) VALUES ('0008');

@@ -97,8 +97,8 @@ def place(other: str) -> str:
     branches = json.dumps(BRANCHES)
     columns = "x y name x_key y_key way"
     pairs = f"""SELECT x.value AS x, y.value AS y, {NAME.format("x.fullkey")} AS name,
-          {no_capitals("CAST(x.key AS TEXT)")} AS x_key,
-          {no_capitals("CAST(y.key AS TEXT)")} AS y_key, {NAME.format("x.path")} AS way
+          {no_capitals("x.key")} AS x_key,
+          {no_capitals("y.key")} AS y_key, {NAME.format("x.path")} AS way
         FROM json_tree(j) x JOIN json_tree(j) y ON y.parent = x.parent
         WHERE x.type {IS_NUMBER} AND y.type {IS_NUMBER}
           AND (x.key = 0 AND y.key = 1 OR x.key GLOB '*[xX]*' AND y.key GLOB '*[yY]*')"""
@@ -142,26 +142,35 @@ def usual(words: tuple[str, ...], kind: str) -> str:
     )
 
 
-def word(words: tuple[str, ...], kind: str) -> str:
-    """The value at the first of these names, or else at the shortest name that ends in one."""
+def mode() -> str:
+    """The first text, or else whole number, at one of these names or at one that ends in it.
+
+    One query for all, as each connection that opens a database parses it. A text at a usual name
+    comes before all others, and is found without it.
+    """
+    names = [name for group in MODES for name in group]
+    listed = f".{'.'.join(names)}."
+    likely = " OR ".join(f"key LIKE '%{each}'" for each in names)
+    steps = [
+        f"""SELECT value, type, {NAME.format("fullkey")} AS name FROM json_tree(j)
+        WHERE type IN ('text', 'integer') AND ({likely})"""
+    ]
     last = f"substr(name, {HEAD_OF_NAME.format('name')} + 1)"
-    likely = " OR ".join(f"key LIKE '%{each}'" for each in words)
-    leaves = (
-        f"SELECT value, {NAME.format('fullkey')} AS name FROM json_tree(j)"
-        f" WHERE type = '{kind}' AND ({likely})"
-    )
-    steps = [leaves]
-    steps.append(f"SELECT *, {no_capitals(last)} AS last FROM {step(-1, steps)}")
-    replacing(steps, "value name last", "last", SMALL)
-    steps.append(f"SELECT *, '.' || replace(last, '_', '.') || '.' AS said FROM {step(-1, steps)}")
-    ends = " OR ".join(f"said LIKE '%.{each}.'" for each in words)
+    steps.append(f"SELECT *, {last} AS last FROM {step(-1, steps)}")
+    steps.append(f"SELECT value, type, name, {no_capitals('last')} AS last FROM {step(-1, steps)}")
+    replacing(steps, "value type name last", "last", SMALL)
+    steps.append(f"SELECT *, '.' || replace(last, '_', '.') AS words FROM {step(-1, steps)}")
+    end = "substr(words, length(rtrim(words, replace(words, '.', ''))))"
+    steps.append(f"SELECT *, instr('{listed}', {end} || '.') AS rank FROM {step(-1, steps)}")
     found = with_steps(
         steps,
         f"""SELECT value FROM {step(-1, steps)}
-      WHERE ({ends}) AND NOT {has_word("said", PAST_OR_FUTURE)}
-      ORDER BY length(name), name LIMIT 1""",
+      WHERE rank > 0 AND NOT {has_word("words || '.'", PAST_OR_FUTURE)}
+      ORDER BY type = 'integer', rank >= {listed.index(f".{MODES[1][0]}.") + 1},
+        CASE WHEN name = '$' || words THEN rank ELSE {len(listed)} END, length(name), name
+      LIMIT 1""",
     )
-    return f"{usual(words, kind)},\n    {found}"
+    return f"{usual(MODES[0], 'text')},\n    {found}"
 
 
 def former_word(words: tuple[str, ...]) -> str:
@@ -175,9 +184,8 @@ def former_word(words: tuple[str, ...]) -> str:
 
 def texts() -> dict[str, str]:
     """What the views had, and what takes its place."""
-    modes = [word(words, kind) for kind in ("text", "integer") for words in MODES]
     former = ",\n    ".join(map(former_word, MODES))
-    return {former: ",\n    ".join(modes)} | {former_place(each): place(each) for each in "xy"}
+    return {former: mode()} | {former_place(each): place(each) for each in "xy"}
 
 
 def upgrade() -> None:

@@ -117,6 +117,7 @@ CHOICES = [
     {"mode": 7},
     {"nav": {"driveMode": 7}, "speed": 3},
     {"phase": 1.5, "armState": 7},
+    {"armMode": 8, "phase": 7},
 ]
 
 

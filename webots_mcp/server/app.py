@@ -120,18 +120,18 @@ def _lifespan(
     @asynccontextmanager
     async def lifespan(_: MCPServer) -> AsyncGenerator[Companions]:
         companions = Companions(TrialWorkers(recording), Launcher(recording))
-        helpers = list[Maintainer | ConsoleWatch]()
+        watches = list[Maintainer | ConsoleWatch]()
         if isinstance(recording.database, Path) and not recording.read_only:
             maintainer = Maintainer(recording.database, "server", work=work)
-            helpers = [maintainer, ConsoleWatch(recording)]
-        for helper in helpers:
-            helper.start()
+            watches = [maintainer, ConsoleWatch(recording)]
+        for watch in watches:
+            watch.start()
         try:
             yield companions
         finally:
             with CancelScope(shield=True):
                 await to_thread.run_sync(companions.stop)
-            for helper in reversed(helpers):
-                await to_thread.run_sync(helper.stop, abandon_on_cancel=True)
+            for watch in reversed(watches):
+                await to_thread.run_sync(watch.stop, abandon_on_cancel=True)
 
     return lifespan

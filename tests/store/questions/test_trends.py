@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+import re
 import sqlite3
 import statistics
 from collections.abc import Callable
@@ -222,6 +223,19 @@ def test_a_step_is_told_with_its_time_and_without_a_slope(
 ) -> None:
     record(empty, rows=1000, interval_s=0.1, gear=lambda time_s: 1 if time_s < 80 else 2)
     assert one(empty, "gear").says == "steps from 1 to 2 at 80 s"
+
+
+def test_a_step_among_noise_is_told_as_one(empty: sqlite3.Connection) -> None:
+    noise = random.Random(5)
+
+    def level(time_s: float) -> float:
+        return (0.2 if time_s < 31.2 else 5.0) + noise.gauss(0.0, 0.01)
+
+    record(empty, rows=600, interval_s=0.1, pressure=level, drift=lambda time_s: time_s / 60.0)
+    says = one(empty, "pressure").says
+    step = re.match(r"steps from (\S+) to (\S+) at 31\.2 s", says)
+    assert step and [float(value) for value in step.groups()] == pytest.approx([0.2, 5.0], abs=0.05)
+    assert one(empty, "drift").says.startswith("rises")
 
 
 def test_what_grows_ever_faster_has_no_slope(empty: sqlite3.Connection) -> None:

@@ -35,6 +35,15 @@ class Spike:
     value: float
 
 
+@dataclass(frozen=True)
+class Step:
+    """The one change from row to row that makes most of the range; the values around it."""
+
+    sim_time_s: float
+    before: float
+    after: float
+
+
 def fit_line(times: Array, values: Array, mean: float) -> Line | None:
     """Least squares: slope = S_tv / S_tt, r2 = S_tv**2 / (S_tt * S_vv), sums about the means.
 
@@ -94,16 +103,29 @@ def flat_since(times: Array, values: Array) -> float | None:
     return since_s if span == 0 or times[-1] - since_s >= 0.1 * (times[-1] - times[0]) else None
 
 
+def find_step(times: Array, values: Array) -> Step | None:
+    """The step that parts the values in two, with nothing between for half of their range."""
+    row = _step_row(values)
+    if not row:
+        return None
+    return Step(float(times[row]), float(values[row - 1]), float(values[row]))
+
+
 def _last_step(rest: Array) -> int:
     """The row in which it goes over to another rest, which has no value of the one before; or 0."""
-    if len(rest) < 2 * LEAST_RESTING or np.ptp(rest) == 0:
+    row = _step_row(rest)
+    return row + _last_step(rest[row:]) if row else 0
+
+
+def _step_row(values: Array) -> int:
+    if len(values) < 2 * LEAST_RESTING or np.ptp(values) == 0:
         return 0
-    row = int(np.abs(np.diff(rest)).argmax()) + 1
-    before, after = rest[:row], rest[row:]
+    row = int(np.abs(np.diff(values)).argmax()) + 1
+    before, after = values[:row], values[row:]
     apart = max(after.min() - before.max(), before.min() - after.max())
-    if min(len(before), len(after)) < LEAST_RESTING or apart < STEP_SHARE * np.ptp(rest):
+    if min(len(before), len(after)) < LEAST_RESTING or apart < STEP_SHARE * np.ptp(values):
         return 0
-    return row + _last_step(after)
+    return row
 
 
 def time_effect(times: Array, values: Array, mean: float, squares: float) -> float:

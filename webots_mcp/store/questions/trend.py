@@ -11,6 +11,8 @@ from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.features import (
     Line,
     Spike,
+    Step,
+    find_step,
     fit_line,
     flat_since,
     is_monotonic,
@@ -57,6 +59,8 @@ class Trend:
         resolution_s: Length of the means in which swings were seen; None where rows were.
         flat_since_s: Since when it rests; None if it does not.
         spikes: Values that stand out from both neighbours; None where rows were not looked at.
+        step: The one change that makes most of its range; None where rows were not looked at, and
+            of an angle.
         missing: Of the rows, those without a value.
         change: How much it changed with time, 0 to 2: the share of its variance that is slow
             (`time_effect`) times its range in units of its largest magnitude. Free of units.
@@ -80,6 +84,7 @@ class Trend:
     resolution_s: float | None
     flat_since_s: float | None
     spikes: tuple[Spike, ...] | None
+    step: Step | None
     missing: int
     change: float
     says: str
@@ -152,6 +157,7 @@ def judge(
         resolution_s=resolution_s,
         flat_since_s=rest_s,
         spikes=None if spikes is None else tuple(spikes),
+        step=None if spikes is None or turn else find_step(times, numbers),
         missing=summary.rows - summary.present,
         change=time_effect(times, course, inner.mean or 0.0, inner.squares or 0.0)
         * slow
@@ -311,6 +317,9 @@ def _course(trend: Trend, unit: str) -> str:
         return f"constant at {summary.last or 0.0:.4g}{unit}"
     if any(_is_wide(each, summary) for each in trend.swings):
         return _swinging(trend, unit)
+    if trend.step is not None:
+        before, after = (_told(value, summary) for value in (trend.step.before, trend.step.after))
+        return f"steps from {before} to {after}{unit} at {trend.step.sim_time_s:.6g} s"
     if trend.shape in ("rising", "falling"):
         slope = f" ({_mean_rate(trend):.3g}{unit}/s)" if _is_straight(trend) else ""
         if trend.turned is not None:

@@ -128,7 +128,7 @@ async def test_steps_by_the_observer_are_counted_by_the_time_that_passed(begin: 
         await ask(client, "webots_simulation_control", command="pause")
         answer = await ask(client, "webots_simulation_control", command="step", steps=20)
         made = answer["result"]["steps"]
-        assert 20 <= made < 40  # the world does not wait for the observer
+        assert made >= 20  # the world does not wait for the observer
         assert answer["result"]["advanced_s"] == pytest.approx(made * 0.016)
 
 

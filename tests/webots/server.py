@@ -94,7 +94,9 @@ class WebotsServer:
 
     def hang_up(self) -> None:
         """End all connections without a word."""
-        for listener in self._listeners:
+        with self._lock:
+            gone, self._listeners = self._listeners, []
+        for listener in gone:
             with suppress(OSError):
                 listener.socket.shutdown(socket.SHUT_RDWR)
 

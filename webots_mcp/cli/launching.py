@@ -103,8 +103,9 @@ def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _R
 
 def _told(launched: Launch) -> Beginning | None:
     """The first controller that records, once there is one."""
-    first, address = launched.first_record(), launched.webots.address
+    first = launched.first_record()
     if first is not None:
+        address = launched.webots.address_now()
         where = f", Webots listens at port {address.port}" if address else ""
         _say(f"{first.robot} records: run {first.run_id}{where}")
     return first

@@ -73,6 +73,11 @@ class LaunchedWebots(KeptProgram):
         """Where it listens; None before it does, and where the system does not tell."""
         return self.instance.address if self.instance else None
 
+    def address_now(self) -> Address | None:
+        """The same, looked for at once."""
+        self._look_again_s = 0.0
+        return self.address
+
     @property
     def pids(self) -> set[int]:
         """All processes of it: programs and controllers."""

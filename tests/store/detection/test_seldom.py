@@ -93,7 +93,7 @@ def test_the_rest_of_a_stretch_that_is_being_read_when_time_ends_is_named(
     asked = find_range(empty, Scope())
     options = EventOptions(kinds=("oscillation",), signals=("level",), oscillation_turns=8)
     kinds, cut = asked_kinds(options), set[str]()
-    for limit in range(4, 60):
+    for limit in range(4, 120):
         ticks, ledger = count(), Ledger()
         deadline = Deadline(float(limit), lambda ticks=ticks: next(ticks))
         known = known_signals(empty, asked)

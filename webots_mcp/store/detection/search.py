@@ -206,14 +206,9 @@ class Search:
 
     @cached_property
     def _too_large(self) -> list[str]:
-        """Of a long segment those in which most rows lack a usable number."""
-        share, found = (0.5 if self.view.is_long else 1.0), list[str]()
-        for signal in self.numbers:
-            here = self.view.summary(signal)
-            if here.present < share * here.rows:
-                values = self.view.sample([signal]).aligned(signal.name)  # NaN where is none
-                found += [signal.name] if (abs(values) > LARGEST).any() else []
-        return found
+        """Those with such numbers in their newest rows."""
+        values = {each.name: self.view.sample([each]).aligned(each.name) for each in self.numbers}
+        return [name for name, found in values.items() if (abs(found) > LARGEST).any()]
 
     def came_near(self, kind: str, share: float, what: str) -> None:
         """Note what came near to an event, as a share of what would be one."""

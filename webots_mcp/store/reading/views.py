@@ -302,11 +302,13 @@ class LongView:
         return found
 
     def sample(self, signals: Sequence[Signal]) -> Columns:
-        """The newest rows, of the same signals read once."""
-        names = tuple(signal.name for signal in signals)
+        """The newest rows, read once of all numbers that were asked for."""
+        own = {signal.name for signal in self._signals}
+        wanted = self._signals if own.issuperset(each.name for each in signals) else signals
+        names = tuple(signal.name for signal in wanted)
         if names not in self._samples:
             part = newest_part(self._connection, self._segment, SAMPLE_ROWS)
-            self._samples[names] = read_columns(self._connection, part, signals, self._deadline)
+            self._samples[names] = read_columns(self._connection, part, wanted, self._deadline)
         return self._samples[names]
 
     def rows_between(self, start_s: float, end_s: float, signals: Sequence[Signal]) -> Columns:

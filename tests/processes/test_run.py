@@ -93,6 +93,8 @@ def test_a_killed_controller_leaves_no_run_behind(start: Start, filed: Recording
     simulation.wait_for(lambda: has_states(filed), timeout_s=30)
     command = filed.send("run", until="front_m > 2", reset=True)
     simulation.wait_for(lambda: filed.fate(command)[0] == "claimed", timeout_s=30)
+    begun_by_reset = "SELECT count(*) FROM run WHERE start_reason = 'reset'"
+    simulation.wait_for(lambda: filed.rows(begun_by_reset) == [1], timeout_s=30)
     simulation.controller("rover").kill()
     simulation.wait_for(lambda: not simulation.controller("rover").is_running, timeout_s=30)
     connection = connect(filed.database, "writer")

@@ -14,6 +14,8 @@ from mcp import Client
 from mcp.types import CallToolResult, ImageContent, TextContent
 
 from tests.recordings.rows import Recorded
+from tests.webots.conftest import start_webots as start_webots
+from tests.webots.conftest import webots as webots
 from webots_mcp import MCPBridge
 from webots_mcp.server import create_server
 from webots_mcp.standin import InProcessSupervisor

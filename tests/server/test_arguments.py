@@ -40,7 +40,7 @@ HUGE = 2**63
         ("query_sql", {"sql": "x" * 10**6}, "sql must have at most"),
         ("get_trends", {"since": [1]}, "since must be a valid number, not [1]"),
         ("get_logs", {"lines": 1e308}, "lines must be a smaller number, not 1e+308"),
-        ("get_logs", {"x" * 10**5: 1}, "no parameter 'xxx"),
+        ("get_logs", {"n" * 10**5: 1}, "no parameter 'nnn"),
         ("get_trends", {"signal": ["x"]}, "no parameter 'signal': there is signals, "),
         ("find_events", {"strt_s": 1}, "no parameter 'strt_s': there is start_s, "),
         ("find_events", {"for_s": 2.0}, "for_s=2 needs above or below"),
@@ -65,8 +65,8 @@ async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
     ("tool", "arguments", "told"),
     [
         ("get_timeline", {"cursor": "x"}, ": 'x' is no cursor: give the `cursor` of the page"),
-        ("get_trends", {"since": "x" * 10**5}, "xxx' is no time: give Unix seconds or ISO 8601"),
-        ("get_trends", {"signals": ["x" * 10**5]}, "no signal 'xxx"),
+        ("get_trends", {"since": "n" * 10**5}, "nnn' is no time: give Unix seconds or ISO 8601"),
+        ("get_trends", {"signals": ["n" * 10**5]}, "no signal 'nnn"),
     ],
 )
 async def test_what_a_question_refuses_is_told_briefly_in_the_words_of_the_tool(

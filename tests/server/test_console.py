@@ -19,9 +19,7 @@ from tests.webots.conftest import (
     CONTROLLER,
     StartWebots,
     free_port,
-    start_webots,
     wait_for_line,
-    webots,
     write_project,
 )
 from webots_mcp.belonging import belongs
@@ -29,7 +27,6 @@ from webots_mcp.server import create_server
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.instances import instances
 
-__all__ = ["start_webots", "webots"]
 pytestmark = pytest.mark.anyio
 
 FAILS = """

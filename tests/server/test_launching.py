@@ -18,16 +18,13 @@ from tests.webots.conftest import (
     CONTROLLER,
     StartWebots,
     free_port,
-    start_webots,
     wait_for_line,
-    webots,
     write_project,
 )
 from webots_mcp.server import create_server
 from webots_mcp.setup.files import apply
 from webots_mcp.setup.observing import controller_change, with_observer
 
-__all__ = ["start_webots", "webots"]
 pytestmark = pytest.mark.anyio
 
 PLAIN = CONTROLLER.replace("Supervisor", "Robot")

@@ -19,16 +19,13 @@ from tests.webots.conftest import (
     CONTROLLER,
     StartWebots,
     free_port,
-    start_webots,
     wait_for_line,
-    webots,
     write_project,
 )
 from tests.webots.server import WebotsServer
 from webots_mcp.contract import host_name
 from webots_mcp.server import create_server
 
-__all__ = ["start_webots", "webots"]
 pytestmark = pytest.mark.anyio
 
 HANGS = """

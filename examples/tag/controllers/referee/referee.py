@@ -48,7 +48,7 @@ class Referee:
 
     def caught(self) -> float | None:
         """The seconds of the round that just ended; None while it goes on."""
-        if self.distance_m > CAUGHT_M:
+        if not self.distance_m <= CAUGHT_M:  # also where Webots is ending and tells no place
             return None
         now_s = self.robot.getTime()
         round_s, self.round_since_s = now_s - self.round_since_s, now_s

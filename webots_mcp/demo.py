@@ -6,13 +6,14 @@ database), an MCP server runs beside it, and a real MCP client asks over stdio.
 
 from __future__ import annotations
 
+import base64
 import contextlib
 import json
 import os
 import shlex
 import sys
 import time
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,9 +21,12 @@ import anyio
 from mcp import Client, StdioServerParameters
 from mcp.types import CallToolResult, ImageContent, TextContent
 
+from webots_mcp.cli.answers import answer_lines
 from webots_mcp.connection import connect
-from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, PRIVATE_FILE
 from webots_mcp.errors import NothingRecordedError, WebotsMCPError
+from webots_mcp.setup.clients import server_command
+from webots_mcp.setup.interpreter import quoted
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.recording import Recording
@@ -30,10 +34,11 @@ from webots_mcp.store.recording import Recording
 DEFAULT_DATA_DIR: Final = Path.home() / ".webots-mcp" / "demo"
 _ROBOT: Final = "rover"
 _START_TIMEOUT_S: Final = 30.0
-_ANSWER_CHARACTERS: Final = 420
+_ANSWER_LINES: Final = 24
 
+Turn = tuple[str, str, dict[str, Any]]
 # What a person would say, and the tool call that an assistant makes of it.
-CONVERSATION: Final[tuple[tuple[str, str, dict[str, Any]], ...]] = (
+CONVERSATION: Final[tuple[Turn, ...]] = (
     ("What is the robot doing?", "webots_get_robot_state", {}),
     ("What do its sensors say?", "webots_get_sensors", {}),
     ("What does it see?", "webots_get_camera", {}),
@@ -65,12 +70,18 @@ CONVERSATION: Final[tuple[tuple[str, str, dict[str, Any]], ...]] = (
 )
 
 
-def run(data_dir: Path = DEFAULT_DATA_DIR, *, keep: bool = False) -> None:
+def run(
+    data_dir: Path = DEFAULT_DATA_DIR,
+    *,
+    keep: bool = False,
+    conversation: tuple[Turn, ...] = CONVERSATION,
+) -> None:
     """Run the demo; prints each question with its answer.
 
     Args:
         data_dir: Where the database and the pictures go.
         keep: Leave the robot running until Ctrl-C, so that another client can connect.
+        conversation: What is asked.
 
     Raises:
         DatabaseError: Nothing can be recorded there.
@@ -81,11 +92,12 @@ def run(data_dir: Path = DEFAULT_DATA_DIR, *, keep: bool = False) -> None:
     _say(f"Starting {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
     with Simulation(DEFAULT_WORLD, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
         _wait_for_rows(simulation, data_dir)
-        if not anyio.run(_converse, data_dir):
+        if not anyio.run(_converse, data_dir, conversation):
             raise WebotsMCPError("the demo's server answered with an error, see above")
         _tell_where(data_dir)
+        _tell_how_to_connect(data_dir, keep=keep)
         if keep:
-            _keep(simulation, data_dir)
+            _keep(simulation)
 
 
 def _wait_for_rows(simulation: Simulation, data_dir: Path) -> None:
@@ -107,17 +119,21 @@ def _newest_image(data_dir: Path) -> int:
         return int(connection.execute(sql).fetchone()[0]) if tables else 0
 
 
-async def _converse(data_dir: Path) -> bool:
+async def _converse(data_dir: Path, conversation: tuple[Turn, ...]) -> bool:
     """Ask everything; False at the first answer that is an error."""
     async with _client(data_dir) as client:
-        for question, tool, arguments in CONVERSATION:
-            _say(f"\n> {question}\n  {tool}({_compact(arguments) if arguments else ''})")
+        for question, tool, arguments in conversation:
+            given = ", ".join(f"{name}={_as_json(arguments[name])}" for name in arguments)
+            _say(f"\n> {question}\n  {tool}({given})")
             started_s = time.monotonic()
             result = await client.call_tool(tool, arguments, progress_callback=_show_progress)
             _clear_progress()
-            _show(result, time.monotonic() - started_s)
+            _show(result)
+            _say(f"  ({time.monotonic() - started_s:.2f} s)")
             if result.is_error:
                 return False
+            if tool == "webots_plot":
+                _save_plot(result, data_dir / f"{arguments.get('kind', 'signals')}.png")
     return True
 
 
@@ -143,28 +159,43 @@ def _clear_progress() -> None:
         print("\r\x1b[K", end="", flush=True)
 
 
-def _show(result: CallToolResult, duration_s: float) -> None:
-    """The answer as the assistant reads it: the structured content, else text and pictures."""
+def _show(result: CallToolResult) -> None:
+    """The answer as a person reads it; the assistant gets the same as JSON."""
     if result.structured_content is not None and not result.is_error:
-        _say(f"  {_cut(_compact(result.structured_content))}")
-    else:
-        for block in result.content:
-            if isinstance(block, TextContent):
-                _say(f"  {_cut(block.text)}")
-            elif isinstance(block, ImageContent):
-                _say(f"  [{block.mime_type}, {len(block.data) * 3 // 4} bytes]")
-    _say(f"  ({duration_s:.2f} s)")
+        _show_answer(result.structured_content)
+        return
+    for block in result.content:
+        if isinstance(block, TextContent) and not result.is_error and block.text.startswith("{"):
+            _show_answer(json.loads(block.text))
+        elif isinstance(block, TextContent):
+            _say(f"  {block.text}")
+        elif isinstance(block, ImageContent):
+            _say(f"  a picture for the assistant ({block.mime_type}, {len(_bytes(block))} bytes)")
 
 
-def _compact(value: object) -> str:
+def _show_answer(answer: Mapping[str, Any]) -> None:
+    """Its first lines, and how many more there are."""
+    lines = list(answer_lines(answer))
+    for line in lines[:_ANSWER_LINES]:
+        _say(f"    {line}")
+    if len(lines) > _ANSWER_LINES:
+        _say(f"    ... and {len(lines) - _ANSWER_LINES} more lines")
+
+
+def _save_plot(result: CallToolResult, file: Path) -> None:
+    """A plot is in its answer alone; what cameras saw and screenshots lie in files already."""
+    (image,) = (block for block in result.content if isinstance(block, ImageContent))
+    file.write_bytes(_bytes(image))
+    file.chmod(PRIVATE_FILE)
+    _say(f"  The plot is saved: {file}")
+
+
+def _bytes(image: ImageContent) -> bytes:
+    return base64.b64decode(image.data)
+
+
+def _as_json(value: object) -> str:
     return json.dumps(value, ensure_ascii=False)
-
-
-def _cut(text: str) -> str:
-    """The beginning of a long answer, and how long it is."""
-    if len(text) <= _ANSWER_CHARACTERS:
-        return text
-    return f"{text[:_ANSWER_CHARACTERS]} ... ({len(text)} characters)"
 
 
 def _tell_where(data_dir: Path) -> None:
@@ -178,18 +209,23 @@ def _tell_where(data_dir: Path) -> None:
         _say(f'  sqlite3 {database} "{sql}"')
 
 
-def _keep(simulation: Simulation, data_dir: Path) -> None:
-    command = shlex.join([_server_command(), "serve", "--data-dir", str(data_dir)])
-    _say("\nThe robot keeps running until Ctrl-C. Connect Claude Code from another terminal:")
-    _say(f"  claude mcp add webots -- {command}")
+def _tell_how_to_connect(data_dir: Path, *, keep: bool) -> None:
+    """As docs/clients.md says it, with this environment's full paths."""
+    command = server_command(data_dir)
+    entry = {"mcpServers": {"webots": {"command": command[0], "args": command[1:]}}}
+    _say("\nConnect an assistant to this recording. Claude Code by one line:")
+    _say(f"  {quoted(['claude', 'mcp', 'add', 'webots', '--', *command])}")
+    _say("Cursor and Claude Desktop by JSON (VS Code: servers instead of mcpServers):")
+    _say(f"  {_as_json(entry)}")
+    if not keep:
+        _say("With 'webots-mcp demo --keep' the robot goes on driving meanwhile.")
+    _say("In a Webots project of your own 'webots-mcp init' writes these entries.")
+
+
+def _keep(simulation: Simulation) -> None:
+    _say("\nThe robot keeps running until Ctrl-C.")
     while simulation.is_running:
         time.sleep(0.2)
-
-
-def _server_command() -> str:
-    """The console script of this environment, wherever the client is started."""
-    script = Path(sys.executable).with_name("webots-mcp")
-    return str(script) if script.exists() else "webots-mcp"
 
 
 def _say(text: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, is_dataclass
 from typing import Any, Final, TextIO, cast
 
@@ -16,15 +16,23 @@ _RIGHT: Final = (int, float)
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print rows under their column names; columns that are empty throughout are left out."""
+    for line in table_lines(columns, rows):
+        print(line)
+
+
+def table_lines(
+    columns: Sequence[str], rows: Sequence[Sequence[Any]], longest_cell: int = _LONGEST_CELL
+) -> Iterator[str]:
+    """The lines of a table; no cell is longer than so many characters."""
     kept = [index for index in range(len(columns)) if any(row[index] is not None for row in rows)]
     cells = [[columns[index] for index in kept]]
-    cells += [[text_of(row[index]) for index in kept] for row in rows]
+    cells += [[_shortened(text_of(row[index]), longest_cell) for index in kept] for row in rows]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     right = [all(isinstance(row[i], (*_RIGHT, type(None))) for row in rows) for i in kept]
     for line in cells:
         fields = zip(line, widths, right, strict=True)
         padded = (cell.rjust(width) if r else cell.ljust(width) for cell, width, r in fields)
-        print("  ".join(padded).rstrip())
+        yield "  ".join(padded).rstrip()
 
 
 def text_of(value: Any) -> str:
@@ -45,8 +53,11 @@ def printable(text: str) -> str:
 
 
 def _one_line(text: str) -> str:
-    line = printable(text)
-    return line if len(line) <= _LONGEST_CELL else f"{line[: _LONGEST_CELL - 1]}…"
+    return _shortened(printable(text), _LONGEST_CELL)
+
+
+def _shortened(line: str, longest: int) -> str:
+    return line if len(line) <= longest else f"{line[: longest - 1]}…"
 
 
 def _number_text(value: float) -> str:

@@ -1,0 +1,50 @@
+"""The answer of a tool as a person reads it."""
+
+from __future__ import annotations
+
+from webots_mcp.cli.answers import answer_lines
+
+HEAD = {"robot": "rover", "run_id": 3, "sim_time_s": 1.5, "age_s": 0.02, "status": "running"}
+
+
+def test_whom_and_when_it_is_about_stands_in_one_line() -> None:
+    assert list(answer_lines(HEAD)) == ["rover, run 3, at 1.5 s, running, 0.02 s old"]
+
+
+def test_short_members_stand_together_and_objects_by_themselves() -> None:
+    answer = {**HEAD, "outcome": "done", "steps": 5, "left_out": None, "route": "bridge",
+              "result": {"mode": "pause", "pose": {"x": 1.0, "y": -0.25}}}  # fmt: skip
+    assert list(answer_lines(answer))[1:] == [
+        "outcome done, steps 5, route bridge",
+        "result:",
+        "  mode pause",
+        "  pose: x 1, y -0.25",
+    ]
+
+
+def test_a_table_has_aligned_columns_and_says_how_many_rows_are_not_shown() -> None:
+    rows = [["speed", 5.0, None], ["near", 0.35, None]] * 5
+    answer = {"parameters": {"columns": ["name", "value", "unit"], "rows": rows}, "total": 10}
+    assert list(answer_lines(answer)) == [
+        "parameters:",
+        "  name   value",
+        *["  speed      5", "  near    0.35"] * 3,
+        "  ... and 4 more",
+        "total 10",
+    ]
+
+
+def test_a_long_text_is_whole_and_wrapped_and_obeyed_by_no_terminal() -> None:
+    words = " ".join(f"word{number}" for number in range(40))
+    lines = list(answer_lines({"verdict": f"{words} \x1b[2J end"}))
+    assert max(map(len, lines)) <= 100
+    assert " ".join(line.strip() for line in lines) == f"verdict {words} \\x1b[2J end"
+
+
+def test_each_of_several_objects_has_a_part_of_its_own() -> None:
+    runs = [{"run_id": 1, "rows": 4}, {"run_id": 2, "rows": 6}]
+    assert list(answer_lines({"runs": runs, "none": []})) == [
+        "runs: run_id 1, rows 4",
+        "runs: run_id 2, rows 6",
+        "none []",
+    ]

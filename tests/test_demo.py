@@ -1,0 +1,52 @@
+"""`webots-mcp demo`: what it prints can be read, and is enough to go on."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+
+import pytest
+
+from webots_mcp import demo
+from webots_mcp.setup.clients import can_be_started, is_ours, words_of
+
+TURNS = tuple(
+    turn for turn in demo.CONVERSATION if turn[1] in ("webots_get_parameters", "webots_plot")
+)
+CLIENTS = (Path(__file__).parents[1] / "docs" / "clients.md").read_text("utf-8")
+
+
+@pytest.fixture(scope="module")
+def printed(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """What two of its questions print."""
+    with redirect_stdout(StringIO()) as out:
+        demo.run(tmp_path_factory.mktemp("demo"), conversation=TURNS)
+    return out.getvalue()
+
+
+def test_answers_are_tables_for_people(printed: str) -> None:
+    assert re.search(r"(?m)^ +name +value +unit +default +low +high ", printed)
+    assert re.search(r"(?m)^ +speed +5 +rad/s +5 +0 +10 ", printed)
+    assert '"columns"' not in printed
+
+
+def test_the_plot_is_saved_where_it_says(printed: str) -> None:
+    (file,) = re.findall(r"The plot is saved: (.+)", printed)
+    assert Path(file).read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_last_lines_connect_a_client(printed: str) -> None:
+    end = printed[printed.index("Connect an assistant") :]
+    (entry,) = re.findall(r"(?m)^ +(\{.+\})$", end)
+    server = json.loads(entry)["mcpServers"]["webots"]
+    assert is_ours(server)
+    assert can_be_started(server)
+    (line,) = re.findall(r"(?m)^ +(claude mcp add .+)$", end)
+    shown, command = re.search(r"(?m)^claude mcp add \S+ -- ", CLIENTS), words_of(server)
+    assert shown is not None
+    assert line == shown[0] + shlex.join(command)
+    assert "webots-mcp init" in end.splitlines()[-1]

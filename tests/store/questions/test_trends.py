@@ -301,3 +301,21 @@ def test_numbers_too_large_to_reckon_with_are_not_called_missing(
     record(empty, rows=300, interval_s=0.1, big=lambda _: 1e308, x=lambda time_s: time_s)
     roll(empty)
     assert ask(empty).silent == ("big (its numbers are beyond 1e100)",)
+
+
+def test_whole_numbers_that_name_a_mode_have_times_and_no_slope(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    recorder = start_run(empty)
+    for step in range(1200):
+        mode = min(step // 250, 3)
+        named = {} if 300 <= step < 320 else {"drive_mode": 1 if step == 700 else mode}
+        recorder.publish(round(0.1 * step, 6), {"count": mode, **named})
+    roll(empty, 100_000)
+    told = ask(empty)
+    assert [each.name for each in told.numbers] == ["count"]
+    (mode,) = told.states
+    assert (mode.changes, mode.last, round(mode.since_s or 0.0, 3)) == (7, "3", 75.0)
+    assert mode.time_by_value_s == pytest.approx(
+        {"3": 44.9, "0": 25.0, "2": 24.9, "1": 23.1, "null": 2.0}
+    )

@@ -104,3 +104,13 @@ def test_the_numbers_of_a_signal_alone_are_those_among_others(empty: sqlite3.Con
     found = numbers_read(empty, [{"near": 1}, {"near": None}, {"near": 2}])
     assert found.values["near"].tolist() == pytest.approx([1, math.nan, 2], nan_ok=True)
     assert [each.tolist() for each in found.of("near")] == [[0.0, 0.2], [1.0, 2.0]]
+
+
+@pytest.mark.parametrize(("count", "cut"), [(5, False), (6, True), (10, True)])
+def test_rows_that_were_all_read_when_the_time_was_over_are_not_cut(
+    empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch, *, count: int, cut: bool
+) -> None:
+    monkeypatch.setattr(rows, "_CHUNK_ROWS", 5)
+    segment, known = recorded(empty, [{"near": step} for step in range(count)])
+    columns = read_columns(empty, segment, list(known.values()), Deadline(0))
+    assert (columns.values["near"], columns.cut) == (list(range(5)), cut)

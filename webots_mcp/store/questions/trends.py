@@ -29,7 +29,7 @@ LEAST_PIECES: Final = 100  # of a long range, whose means tell its course
 
 @dataclass(frozen=True)
 class StateTrend:
-    """A text or boolean signal over a range.
+    """A text or boolean signal over a range, or whole numbers that name a mode.
 
     Attributes:
         changes: How often it changed within the range.
@@ -125,7 +125,8 @@ def _run_trends(
     deadline: Deadline,
 ) -> RunTrends:
     """The trends of signals in one run."""
-    numbers = [signal for signal in signals if signal.is_number]
+    numbers = [signal for signal in signals if signal.is_number and not signal.is_choice]
+    states = [signal for signal in signals if signal not in numbers]
     found: list[Trend | None]
     if exceeds(connection, segment):
         piece_s = piece_length_s(connection, segment, LEAST_PIECES)
@@ -159,7 +160,7 @@ def _run_trends(
         resolution_s=resolution_s,
         rows=rows,
         numbers=tuple(held[:limit]),
-        states=_state_trends(connection, segment, signals, deadline),
+        states=_state_trends(connection, segment, states, deadline),
         silent=tuple(silent),
         total=len(held),
         cut_at_s=cut_at_s,
@@ -200,11 +201,10 @@ def _trend_of_pieces(
 def _state_trends(
     connection: sqlite3.Connection,
     segment: Segment,
-    signals: Sequence[Signal],
+    states: Sequence[Signal],
     deadline: Deadline,
 ) -> tuple[StateTrend, ...]:
-    """Text and flags, those that changed most often first."""
-    states = [signal for signal in signals if not signal.is_number]
+    """Text, flags and numbers that name a mode, those that changed most often first."""
     points = change_points(connection, segment, states, deadline)
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
     end_s = min(segment.end_s, bounds[1])

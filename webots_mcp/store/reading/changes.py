@@ -9,13 +9,14 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Final, NamedTuple
 
+from webots_mcp.naming import Value
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.intervals import NO_VALUE, OneValue, joined, spans_in_pieces
 from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment, just_after
-from webots_mcp.store.reading.rollups import rows_after
-from webots_mcp.store.reading.rows import read_columns
+from webots_mcp.store.reading.rollups import read_pieces, rows_after
+from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
 from webots_mcp.store.rollup.tables import watermark
-from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal
 
 MOST_VALUES: Final = 20
@@ -64,7 +65,8 @@ def change_points(
     Args:
         connection: Any.
         segment: Which stretch.
-        signals: Text and flags; of numbers, each counts as its text, and all rows are read.
+        signals: Text and flags; of numbers, each counts as its text, and of a long segment only the
+            rows of buckets in which they changed are read.
         deadline: For all reading.
         since: Whether it matters when the value in force at the begin began. Without it no rows
             before the segment are read, and that point may lie at any time before.
@@ -90,14 +92,37 @@ def _of_numbers(
     connection: sqlite3.Connection, segment: Segment, signals: Sequence[Signal], deadline: Deadline
 ) -> dict[str, list[Point]]:
     """Of numbers no change is stored; the one in force at the begin stands in the row before."""
-    from_s = _in_force_s(connection, segment)
-    columns = read_columns(connection, replace(segment, start_s=from_s), signals, deadline)
+    whole = replace(segment, start_s=_in_force_s(connection, segment))
+    if exceeds(connection, whole):
+        return _of_long(connection, whole, signals, deadline)
+    columns = read_columns(connection, whole, signals, deadline)
     points: dict[str, list[Point]] = {each.name: [] for each in signals}
     for name, found in points.items():
-        values = columns.values[name]
-        texts = {value: shown(value) for value in set(values)}  # there are mostly few
-        _append_changes(found, zip(columns.times, map(texts.__getitem__, values), strict=True))
+        texts = OneValue().of_rows(columns.values[name])
+        _append_changes(found, _points(zip(columns.times, texts, strict=True)))
     return points
+
+
+def _of_long(
+    connection: sqlite3.Connection, segment: Segment, signals: Sequence[Signal], deadline: Deadline
+) -> dict[str, list[Point]]:
+    """Of numbers in a segment that is too long to be read row by row."""
+    pieces = read_pieces(connection, segment, signals, deadline)
+
+    def read(part: Segment) -> Columns:
+        return read_columns(connection, part, signals, deadline)
+
+    found: dict[str, list[Point]] = {}
+    for signal in signals:
+        spans = joined(spans_in_pieces(segment, signal, pieces, OneValue(), read))
+        values = ((span.start_s, span.key) for span in spans)
+        _append_changes(found.setdefault(signal.name, []), _points(values))
+    return found
+
+
+def _points(texts: Iterable[tuple[float, Value]]) -> Iterable[tuple[float, Value]]:
+    """What `OneValue` says of no value is none."""
+    return ((time_s, None if text == NO_VALUE else text) for time_s, text in texts)
 
 
 def value_ended_s(

@@ -20,9 +20,11 @@ from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rollups import Pieces
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.rollup.buckets import BUCKET_S
+from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal
 
 MOSTLY: Final = 0.5  # of the rows
+NO_VALUE: Final = ""  # no number is told so
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,30 @@ class Flat:
         whole = summaries["min"] == summaries["max"]
         whole &= summaries["present"] == summaries["rows"]
         return whole, ~whole
+
+
+class OneValue:
+    """The same value as before, also where that is none: of numbers that name what a robot does."""
+
+    lasting = False
+
+    def of_rows(self, values: Sequence[Value]) -> Sequence[Value]:
+        """The values as texts; `NO_VALUE` where there is none."""
+        texts = {value: _text(value) for value in set(values)}  # there are mostly few
+        return [texts[value] for value in values]
+
+    def of_buckets(self, summaries: Summaries) -> tuple[Flags, Flags]:
+        """From the extremes."""
+        whole = summaries["min"] == summaries["max"]
+        whole &= summaries["present"] == summaries["rows"]
+        return whole, ~whole
+
+
+def _text(value: Value) -> str:
+    """A whole number is one however it was stored."""
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    return shown(value) or NO_VALUE
 
 
 def spans_in_rows(

@@ -361,16 +361,22 @@ def _chunks(
     columns: Columns,
     deadline: Deadline,
 ) -> Iterator[tuple[Sequence[str | None], Sequence[str]]]:
-    """Some rows each, which are added to the columns: what was odd in them, and what is wanted."""
+    """Some rows each, which are added to the columns: what was odd in them, and what is wanted.
+
+    The row after them is fetched first: without one, all was read whatever the time is.
+    """
     what, paths = wanted
     cursor = connection.execute(*asked.query(f"sim_time_s, wall_time_s, odd, {what}", paths))
-    while chunk := cursor.fetchmany(_CHUNK_ROWS):
+    ahead = cursor.fetchmany(1)
+    while ahead:
+        chunk = [*ahead, *cursor.fetchmany(_CHUNK_ROWS - 1)]
+        ahead = cursor.fetchmany(1)
         ids, times, walls, odds, texts = zip(*chunk, strict=True)
         columns.ids.extend(ids)
         columns.times.extend(times)
         columns.walls.extend(walls)
         yield odds, texts
-        if deadline.passed and len(chunk) == _CHUNK_ROWS:
+        if ahead and deadline.passed:
             columns.cut = True
             return
 

@@ -49,9 +49,12 @@ def test_a_branch_that_is_called_a_place_is_taken_before_others_in_camel_case_to
     )
 
 
-@pytest.mark.parametrize("name", ["driveMode", "nav.currentState", "drive_mode", "robotTask"])
+@pytest.mark.parametrize("name", [
+    "driveMode", "nav.currentState", "drive_mode", "robotTask", "state_name", "modeName",
+    "nav.STATE_STR", "current_state_label",
+])  # fmt: skip
 def test_a_mode_is_found_by_the_last_word_of_its_name(name: str) -> None:
-    others = {"lastAction", "next_state", "previousMode", "modest", "text"}
+    others = {"lastAction", "next_state_name", "previousMode", "modest", "text", "name", "x.str"}
     assert find_mode({name, *others}) == name
     assert find_mode(others) is None
 

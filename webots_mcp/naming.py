@@ -6,7 +6,7 @@ Recorded rows are read by these names, and so are the states that a controller p
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, Final, TypeAlias
 
 from webots_mcp.units import METRES, words_of
@@ -46,6 +46,7 @@ _MEASURED: Final = frozenset((
 _RATES: Final = frozenset(("speed", "velocity", "vel", "rate"))
 _MODES: Final = ("mode", "behaviour", "behavior", "action", "task", "phase")
 _STATES: Final = ("state", "status")  # of anything, often of an arm
+_SPELLINGS: Final = frozenset(("name", "label", "str"))  # after these words: of the same
 USUAL_POSITIONS: Final = (
     *((f"{branch}.{x}", f"{branch}.{y}") for branch in _BRANCHES for x, y in _AXES),
     *((f"{branch}_{unit}.0", f"{branch}_{unit}.1") for branch in _BRANCHES for unit in _LENGTHS),
@@ -196,15 +197,15 @@ def find_mode(texts: Collection[str], choices: Collection[str] = ()) -> str | No
     Where no text tells it, a choice does: a whole number of which there are few values.
 
     It is `mode`, `behaviour`, `behavior`, `action`, `task` or `phase` (in this order), or else the
-    shortest name that ends in one of these words, as `nav.mode` and `driveMode` do; then the same
-    of `state` and `status`. What was or shall be (`lastAction`, `next_state`) is none. The views
-    robot_now and robot_trajectory have the same rule, row by row.
+    shortest name that ends in one of these words, as `nav.mode`, `driveMode` and `mode_name` do;
+    then the same of `state` and `status`. What was or shall be (`lastAction`, `next_state`) is
+    none. The views robot_now and robot_trajectory have the same rule, row by row.
     """
     return _mode_among(texts) or _mode_among(choices)
 
 
 def _mode_among(texts: Collection[str]) -> str | None:
-    last_words = {name: words_of(name.rpartition(".")[2]) for name in texts}
+    last_words = {name: _without_spelling(words_of(name.rpartition(".")[2])) for name in texts}
     for words in (_MODES, _STATES):
         ending = [
             name
@@ -214,6 +215,10 @@ def _mode_among(texts: Collection[str]) -> str | None:
         if ending:
             return next((word for word in words if word in texts), min(ending, key=_shortest))
     return None
+
+
+def _without_spelling(words: Sequence[str]) -> Sequence[str]:
+    return words[:-1] if words[1:] and words[-1] in _SPELLINGS else words
 
 
 def _shortest(name: str) -> tuple[int, str]:

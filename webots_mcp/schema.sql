@@ -1,5 +1,5 @@
 PRAGMA application_id = 1463962947;
-PRAGMA user_version = 8;
+PRAGMA user_version = 9;
 CREATE TABLE alembic_version (
 	version_num VARCHAR(32) NOT NULL, 
 	CONSTRAINT alembic_version_pkc PRIMARY KEY (version_num)
@@ -525,12 +525,12 @@ SELECT robot, run_id, end_reason, sim_time_s, round((julianday('now') - 2440587.
     CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
     CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
     (WITH s0 AS MATERIALIZED (SELECT value, type, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j)
-        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status')),
+        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status' OR key LIKE '%name' OR key LIKE '%label' OR key LIKE '%str')),
         s1 AS MATERIALIZED (SELECT *, substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) AS last FROM s0),
         s2 AS MATERIALIZED (SELECT value, type, name, CASE WHEN last = upper(last) THEN lower(last) ELSE last END AS last FROM s1),
         s3 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s2),
         s4 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s3),
-        s5 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') AS words FROM s4),
+        s5 AS MATERIALIZED (SELECT *, CASE WHEN '.' || replace(last, '_', '.') IN ('.name', '.label', '.str') THEN '.' || replace(last, '_', '.') ELSE rtrim(replace(replace(replace('.' || replace(last, '_', '.') || '|', '.name|', '|'), '.label|', '|'), '.str|', '|'), '|') END AS words FROM s4),
         s6 AS MATERIALIZED (SELECT *, instr('.mode.behaviour.behavior.action.task.phase.state.status.', substr(words, length(rtrim(words, replace(words, '.', '')))) || '.') AS rank FROM s5)
       SELECT value FROM s6
       WHERE rank > 0 AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(words || '.', '.' || w.value || '.'))
@@ -618,12 +618,12 @@ SELECT (
     CASE WHEN json_type(j, '$.task') = 'text' THEN json_extract(j, '$.task') END,
     CASE WHEN json_type(j, '$.phase') = 'text' THEN json_extract(j, '$.phase') END,
     (WITH s0 AS MATERIALIZED (SELECT value, type, replace(replace(replace(fullkey, '"', ''), '[', '.'), ']', '') AS name FROM json_tree(j)
-        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status')),
+        WHERE type IN ('text', 'integer') AND (key LIKE '%mode' OR key LIKE '%behaviour' OR key LIKE '%behavior' OR key LIKE '%action' OR key LIKE '%task' OR key LIKE '%phase' OR key LIKE '%state' OR key LIKE '%status' OR key LIKE '%name' OR key LIKE '%label' OR key LIKE '%str')),
         s1 AS MATERIALIZED (SELECT *, substr(name, length(rtrim(name, replace(name, '.', ''))) + 1) AS last FROM s0),
         s2 AS MATERIALIZED (SELECT value, type, name, CASE WHEN last = upper(last) THEN lower(last) ELSE last END AS last FROM s1),
         s3 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'GPS', 'Gps'), 'IMU', 'Imu'), 'A', '_a'), 'B', '_b'), 'C', '_c'), 'D', '_d'), 'E', '_e'), 'F', '_f'), 'G', '_g'), 'H', '_h'), 'I', '_i'), 'J', '_j'), 'K', '_k'), 'L', '_l') AS last FROM s2),
         s4 AS MATERIALIZED (SELECT value, type, name, replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(replace(last, 'M', '_m'), 'N', '_n'), 'O', '_o'), 'P', '_p'), 'Q', '_q'), 'R', '_r'), 'S', '_s'), 'T', '_t'), 'U', '_u'), 'V', '_v'), 'W', '_w'), 'X', '_x'), 'Y', '_y'), 'Z', '_z') AS last FROM s3),
-        s5 AS MATERIALIZED (SELECT *, '.' || replace(last, '_', '.') AS words FROM s4),
+        s5 AS MATERIALIZED (SELECT *, CASE WHEN '.' || replace(last, '_', '.') IN ('.name', '.label', '.str') THEN '.' || replace(last, '_', '.') ELSE rtrim(replace(replace(replace('.' || replace(last, '_', '.') || '|', '.name|', '|'), '.label|', '|'), '.str|', '|'), '|') END AS words FROM s4),
         s6 AS MATERIALIZED (SELECT *, instr('.mode.behaviour.behavior.action.task.phase.state.status.', substr(words, length(rtrim(words, replace(words, '.', '')))) || '.') AS rank FROM s5)
       SELECT value FROM s6
       WHERE rank > 0 AND NOT EXISTS (SELECT 1 FROM json_each('["last", "previous", "prev", "old", "next", "desired", "target"]') w WHERE instr(words || '.', '.' || w.value || '.'))
@@ -631,4 +631,4 @@ SELECT (
         CASE WHEN name = '$' || words THEN rank ELSE 56 END, length(name), name
       LIMIT 1)) AS mode, s.odd
 FROM (SELECT *, CASE WHEN json_valid(data) THEN data END AS j FROM state) s;
-INSERT INTO alembic_version (version_num) VALUES ('0008');
+INSERT INTO alembic_version (version_num) VALUES ('0009');

@@ -112,12 +112,16 @@ MODES = [
     {"mode": 3, "task": None, "steps": [{"action": "go"}, {"action": "wait"}]},
     {"driveMode": "go", "lastMode": "wait"},
     {"nav": {"currentState": "go"}, "nextState": "wait"},
+    {"name": "rover", "state_name": "go", "next_state_name": "wait"},
+    {"nav": {"modeName": "go"}, "arm": {"state": "ready"}},
+    {"STATE_STR": "go", "label": "x", "last_mode_label": "wait"},
 ]
 CHOICES = [
     {"mode": 7},
     {"nav": {"driveMode": 7}, "speed": 3},
     {"phase": 1.5, "armState": 7},
     {"armMode": 8, "phase": 7},
+    {"name": 3, "modeLabel": 7},
 ]
 
 

@@ -49,6 +49,7 @@ ALLOWED["trials"] = STDLIB | {"store", "trials", "webots"}
 ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}
 ALLOWED["launching"] = STDLIB | {"store", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
+ALLOWED["charts"] = ALLOWED["plotting"] | {"charts", "plotting", "standin"}
 ALLOWED["belonging"] = STDLIB | {"store", "webots"}
 ALLOWED["console"] = ALLOWED["belonging"] | {"belonging", "console"}
 ALLOWED["server"] = STDLIB | {

@@ -124,7 +124,7 @@ def test_a_wider_picture_shows_more(record: Record) -> None:
     points = [
         len(
             only_curve(
-                compose_signals(connection, [whole(connection)], ["wave"], sheet=sheet)[0]
+                compose_signals(connection, [whole(connection)], ["wave"], room=sheet.room)[0]
             ).points
         )
         for sheet in (Sheet(500), Sheet(1600))

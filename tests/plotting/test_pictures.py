@@ -217,7 +217,7 @@ def test_no_text_leaves_the_picture_or_covers_another(
 ) -> None:
     connection = record(odd_names, 300)
     sheet = Sheet(*size)
-    axes, _ = compose_signals(connection, [whole(connection)], names, sheet=sheet)
+    axes, _ = compose_signals(connection, [whole(connection)], names, room=sheet.room)
     assert_readable(texts_of(lambda figure: paint_signals(figure, axes), sheet), size)
 
 

@@ -22,6 +22,7 @@ from webots_mcp.store.questions.series import MOST_POINTS
 ImageFormat = Literal["png", "svg"]
 
 MOST_PANELS: Final = 3
+MOST_LANES: Final = 4
 WIDTH_PX: Final = 900
 HEIGHT_PX: Final = 500
 LEAST_WIDTH_PX: Final = 400
@@ -80,6 +81,23 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Room:
+    """How much a picture holds.
+
+    Attributes:
+        points: How many buckets a curve is made of.
+        panels: How many panels are readable below each other.
+        lanes: How many rows of modes and flags have room below the panels.
+        rows: The same with the rows of events.
+    """
+
+    points: int
+    panels: int
+    lanes: int
+    rows: int
+
+
+@dataclass(frozen=True)
 class Sheet:
     """The form of a picture: its size in pixels (an SVG has 100 to the inch) and its format."""
 
@@ -100,19 +118,16 @@ class Sheet:
         return self.width_px - BESIDE_PX
 
     @property
-    def most_panels(self) -> int:
-        """How many panels are still readable below each other."""
-        return max(1, min(MOST_PANELS, (self.height_px - _TITLE_AND_LEGEND_PX) // _PANEL_PX))
-
-    @property
-    def most_rows(self) -> int:
-        """How many rows of modes, flags and events have room below the panels."""
-        return (self.height_px - _TITLE_AND_LEGEND_PX) // (2 * ROW_PX)
-
-    @property
-    def points(self) -> int:
-        """How many buckets a curve is made of."""
-        return min(self.axis_px // _BUCKET_PX, MOST_POINTS)
+    def room(self) -> Room:
+        """What is still readable on it."""
+        beside_panels_px = self.height_px - _TITLE_AND_LEGEND_PX
+        rows = beside_panels_px // (2 * ROW_PX)
+        return Room(
+            points=min(self.axis_px // _BUCKET_PX, MOST_POINTS),
+            panels=max(1, min(MOST_PANELS, beside_panels_px // _PANEL_PX)),
+            lanes=min(MOST_LANES, rows),
+            rows=rows,
+        )
 
 
 def _require_size(name: str, value: int, least: int) -> None:

@@ -65,7 +65,7 @@ def plot(
     scopes = [replace(asked, run_id=run_id) for run_id in several] or [asked]
     ranges = [find_range(connection, each) for each in scopes]
     if kind == "signals":
-        names = signals or _changed_most(connection, ranges[-1])
+        names = signals or changed_most(connection, ranges[-1])
         return plot_signals(connection, ranges, names, bands=bands, events=events, sheet=sheet)
     if kind != "trajectory":
         raise InvalidInputError(f"kind={kind!r}: there is {', '.join(get_args(PlotKind))}")
@@ -73,7 +73,8 @@ def plot(
     return plot_trajectory(connection, ranges, position, bands=bands, events=events, sheet=sheet)
 
 
-def _changed_most(connection: sqlite3.Connection, time_range: TimeRange) -> list[str]:
+def changed_most(connection: sqlite3.Connection, time_range: TimeRange) -> list[str]:
+    """The three numbers that changed most, which are drawn where none is named."""
     found = trends(connection, time_range, limit=_DEFAULT_SIGNALS).runs
     return [trend.name for run in found for trend in run.numbers] or ["*"]
 

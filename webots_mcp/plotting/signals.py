@@ -6,11 +6,10 @@ import sqlite3
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Final
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import listed
-from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Sheet, draw, media_type
+from webots_mcp.plotting.canvas import LEAST_HEIGHT_PX, Picture, Room, Sheet, draw, media_type
 from webots_mcp.plotting.curves import Curve, curve_of
 from webots_mcp.plotting.event_lanes import event_lanes
 from webots_mcp.plotting.intervals import Interval, Lane, lane_of, merged_notes
@@ -25,8 +24,6 @@ from webots_mcp.plotting.parts import (
 )
 from webots_mcp.plotting.signal_axes import SignalAxes, paint_signals
 from webots_mcp.store.reading.ranges import TimeRange
-
-MOST_LANES: Final = 4
 
 
 def plot_signals(
@@ -59,7 +56,7 @@ def plot_signals(
     """
     sheet = sheet or Sheet()
     plot, notes = compose_signals(
-        connection, ranges, names, bands=bands, events=events, sheet=sheet
+        connection, ranges, names, bands=bands, events=events, room=sheet.room
     )
     if not plot.panels:
         rows = len(plot.lanes) + len(plot.events)
@@ -75,25 +72,27 @@ def compose_signals(
     *,
     bands: str | None = None,
     events: bool = True,
-    sheet: Sheet | None = None,
+    room: Room | None = None,
 ) -> tuple[SignalAxes, tuple[str, ...]]:
-    """What `plot_signals` paints, and its notes; arguments and errors as there."""
-    sheet = sheet or Sheet()
+    """What `plot_signals` paints, and its notes; arguments and errors as there.
+
+    `room` is how much it may be; None for that of a PNG of 900 x 500 pixels.
+    """
+    room = room or Sheet().room
     mode = mode_signal(known_signals(connection, ranges), bands)
-    parts = parts_of(connection, ranges, [*names, *([mode] if mode else [])], sheet.points)
+    parts = parts_of(connection, ranges, [*names, *([mode] if mode else [])], room.points)
     overlaid = len(parts) > 1
     curves = [curve for part in parts for curve in _curves(part)]
-    panels, left_out = (by_signal if overlaid else by_scale)(curves, sheet.most_panels)
+    panels, left_out = (by_signal if overlaid else by_scale)(curves, room.panels)
     behind, below = _behind_and_below(parts, mode if panels else None)
     if not panels and not below:
         raise NothingRecordedError(_nothing(parts))
-    most_lanes = min(MOST_LANES, sheet.most_rows)
-    left_out += [lane.name for lane in below[most_lanes:]]
-    below = below[:most_lanes]
+    left_out += [lane.name for lane in below[room.lanes :]]
+    below = below[: room.lanes]
     marked, event_notes = ([], [])
     if events and not overlaid:
         drawn = [name for panel in panels for name in panel.names] or names
-        marked, event_notes = event_lanes(connection, parts[0], drawn, sheet.most_rows - len(below))
+        marked, event_notes = event_lanes(connection, parts[0], drawn, room.rows - len(below))
     plot = SignalAxes(
         title=title_of(parts),
         x_label=_x_label(parts),
@@ -107,7 +106,7 @@ def compose_signals(
     )
     notes = [*_notes(parts, curves), *merged_notes([*below, *([behind] if behind else [])])]
     if left_out:
-        notes.append(_left_out(left_out, sheet))
+        notes.append(_left_out(left_out, room))
     return plot, (*notes, *event_notes)
 
 
@@ -185,9 +184,8 @@ def _counted(odd: dict[str, int]) -> str:
     return ", ".join(f"{value} {count} times" for value, count in odd.items())
 
 
-def _left_out(names: Sequence[str], sheet: Sheet) -> str:
-    lanes = min(MOST_LANES, sheet.most_rows)
-    why = f"most that a picture of this size holds: panels {sheet.most_panels}, rows {lanes}"
+def _left_out(names: Sequence[str], room: Room) -> str:
+    why = f"most that a picture of this size holds: panels {room.panels}, rows {room.lanes}"
     return f"left out: {listed(dict.fromkeys(names))} ({why}); ask for them alone"
 
 

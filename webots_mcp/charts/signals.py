@@ -1,0 +1,332 @@
+"""Signals over time as figures: panels of curves over modes, rows of intervals below."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from bokeh.core.properties import field as of_column
+from bokeh.core.properties import value as the_text
+from bokeh.layouts import gridplot
+from bokeh.models import (
+    ColumnDataSource,
+    CrosshairTool,
+    FixedTicker,
+    LegendItem,
+    Range,
+    Range1d,
+    Span,
+    WheelZoomTool,
+)
+from bokeh.plotting import figure
+
+from webots_mcp.charts.chart import Chart, hover, legend, numbers, plain, style
+from webots_mcp.plotting.canvas import Room, short
+from webots_mcp.plotting.curves import Curve, Point
+from webots_mcp.plotting.intervals import Interval, Lane
+from webots_mcp.plotting.palette import FAINT, INK, LINES, Area, area_styles
+from webots_mcp.plotting.panels import Panel
+from webots_mcp.plotting.question import changed_most
+from webots_mcp.plotting.signal_axes import SignalAxes
+from webots_mcp.plotting.signals import compose_signals
+from webots_mcp.store.questions.series import MOST_POINTS
+from webots_mcp.store.reading.ranges import TimeRange
+
+ROOM: Final = Room(points=MOST_POINTS, panels=8, lanes=8, rows=16)
+DASHES: Final = ("solid", "dashed", "dotted", "dotdash")
+_PANEL_PX: Final = 120
+_ROW_PX: Final = 24
+_LETTER_PX: Final = 7
+_TOOLS: Final = "xpan,xbox_zoom,xzoom_in,xzoom_out,reset,save"
+_FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EFEFEF", dotted=False)}
+_WITH_NAMES: Final = 0.012  # of the range, for each letter: shorter intervals are not labelled
+
+
+@dataclass(frozen=True)
+class SignalsChart(Chart):
+    """Signals over time.
+
+    Attributes:
+        x_range: That of all figures.
+        curves: The data of each curve, by run and name: time_s, mean, low, high.
+        bands: The stretches of the mode behind them: start_s, end_s, value, colour, hatch.
+    """
+
+    x_range: Range
+    curves: dict[tuple[int, str], ColumnDataSource] = field(
+        default_factory=dict[tuple[int, str], ColumnDataSource]
+    )
+    bands: ColumnDataSource = field(default_factory=ColumnDataSource)
+
+
+def signals_chart(
+    connection: sqlite3.Connection,
+    ranges: Sequence[TimeRange],
+    names: Sequence[str] = (),
+    *,
+    bands: str | None = None,
+    events: bool = True,
+    room: Room = ROOM,
+) -> SignalsChart:
+    """Signals as lines in a band of extremes, a mode as their ground, rows of events below.
+
+    Args:
+        connection: Any.
+        ranges: From `find_range`; several runs are laid over each other, each beginning at 0.
+        names: Signals, with `*`; none for the three that changed most.
+        bands: The text signal behind the curves; None for the mode, where there is one; "" for
+            none.
+        events: Whether to mark what `find_events` finds; of several runs nothing is marked.
+        room: How much is drawn.
+
+    Raises:
+        UnknownSignalError: A name meets nothing; the text offers near ones.
+        InvalidInputError: `bands` is no text signal, or there are too many runs.
+        NothingRecordedError: None of the signals has a value in the range.
+    """
+    names = names or changed_most(connection, ranges[-1])
+    plot, notes = compose_signals(connection, ranges, names, bands=bands, events=events, room=room)
+    return draw_signals(plot, notes)
+
+
+def draw_signals(
+    plot: SignalAxes, notes: Sequence[str] = (), x_range: Range | None = None
+) -> SignalsChart:
+    """The figures of what `compose_signals` has gathered.
+
+    Args:
+        plot: That.
+        notes: Its notes.
+        x_range: Of all figures; None for that of the data.
+    """
+    x_range = x_range or Range1d(start=plot.x_range[0], end=plot.x_range[1])
+    drawing = _Drawing(plot, x_range)
+    figures = [drawing.panel(panel) for panel in plot.panels]
+    if plot.lanes or plot.events:
+        figures.append(drawing.lanes())
+    figures[-1].xaxis.visible = True
+    figures[-1].xaxis.axis_label = plot.x_label
+    layout = gridplot(
+        [[each] for each in figures],
+        merge_tools=True,
+        sizing_mode="stretch_width",
+        toolbar_location="right",
+        toolbar_options={"logo": None},
+    )
+    bands = drawing.bands if plot.bands else ColumnDataSource()
+    return SignalsChart(layout, plot.title, tuple(notes), x_range, drawing.curves, bands)
+
+
+class _Drawing:
+    """Draws figures that share a clock, a crosshair and a margin."""
+
+    def __init__(self, plot: SignalAxes, x_range: Range) -> None:
+        self._plot = plot
+        self._x_range = x_range
+        self._line = Span(dimension="height", line_color=FAINT, line_width=1, line_dash="dotted")
+        self._styles = _styles_of(plot)
+        named = [short(lane.name) for lane in (*plot.lanes, *plot.events)]
+        self._left_px = max([58, *(14 + _LETTER_PX * len(name) for name in named)])
+        self.curves: dict[tuple[int, str], ColumnDataSource] = {}
+        self.bands = ColumnDataSource(_areas(plot.bands, self._styles))
+        self._gaps = ColumnDataSource(_columns(plot.gaps))
+
+    def panel(self, panel: Panel) -> Any:
+        """Curves on one axis, with what happened behind them."""
+        fig = self._figure(_PANEL_PX)
+        self._ground(fig)
+        fig.xgrid.grid_line_color = None
+        items = [self._curve(fig, panel, index) for index in range(len(panel.curves))]
+        unit = f"[{panel.unit}]" if panel.unit else ""
+        if len(panel.names) == 1:
+            fig.title.text = plain(f"{panel.names[0]} {unit}".strip())
+        else:
+            fig.yaxis.axis_label = unit
+        if len(items) > 1:
+            fig.add_layout(legend(items), "above")
+        if panel is self._plot.panels[0] and self._plot.bands:
+            fig.add_layout(self._ground_legend(fig, self._plot.bands), "above")
+        return fig
+
+    def lanes(self) -> Any:
+        """Rows of texts, flags and events."""
+        states, events = self._plot.lanes, self._plot.events
+        count = len(states) + len(events)
+        fig = self._figure(count * _ROW_PX + 8, y_range=Range1d(start=count, end=0))
+        fig.grid.grid_line_color = None
+        for row, lane in enumerate(states):
+            self._states(fig, row, lane)
+        for row, lane in enumerate(events, len(states)):
+            self._events(fig, row, lane)
+        rows = [row + 0.5 for row in range(count)]
+        named = [plain(short(lane.name)) for lane in (*states, *events)]
+        fig.yaxis.ticker = FixedTicker(ticks=rows)
+        fig.yaxis.major_label_overrides = dict(zip(rows, named, strict=True))
+        fig.yaxis.major_tick_line_color = None
+        fig.yaxis.axis_line_color = None
+        fig.vstrip("start_s", "end_s", source=self._gaps, **_GAP)
+        return fig
+
+    def _figure(self, height: int, **options: Any) -> Any:
+        fig: Any = figure(
+            frame_height=height, x_range=self._x_range, tools=_TOOLS, min_border_left=self._left_px,
+            min_border_right=16, min_border_top=0, min_border_bottom=4, **options,
+        )  # fmt: skip
+        style(fig)
+        fig.add_tools(CrosshairTool(overlay=self._line, visible=False))
+        fig.add_tools(WheelZoomTool(dimensions="width", modifiers="ctrl"))
+        fig.xaxis.visible = False
+        return fig
+
+    def _ground(self, fig: Any) -> None:
+        """Modes, gaps and the moments of events, over the whole height behind the curves."""
+        if self._plot.bands:
+            fig.vstrip("start_s", "end_s", source=self.bands, name="ground", **_GROUND)
+        fig.vstrip("start_s", "end_s", source=self._gaps, **_GAP)
+        events = [interval for lane in self._plot.events for interval in lane.intervals]
+        moments = ColumnDataSource({"start_s": numbers([each.start_s for each in events])})
+        fig.vspan("start_s", source=moments, line_color=FAINT, line_dash="dotted", line_alpha=0.6)
+
+    def _ground_legend(self, fig: Any, bands: Lane) -> Any:
+        (ground,) = fig.select({"name": "ground"})
+        name = LegendItem(label=the_text(plain(f"{short(bands.name)}:")))
+        found = legend([name, LegendItem(label=of_column("value"), renderers=[ground])])
+        found.click_policy = "none"
+        return found
+
+    def _curve(self, fig: Any, panel: Panel, index: int) -> LegendItem:
+        curve = panel.curves[index]
+        colour, dash = self._pen(curve, index)
+        source = ColumnDataSource(_points(curve))
+        self.curves[curve.run_id, curve.name] = source
+        alpha = 0.28 / len(panel.curves) ** 0.5
+        band = fig.patch(*_outline(curve), color=colour, alpha=alpha, line_width=0)
+        line = fig.line(
+            "time_s", "mean", source=source, color=colour, line_dash=dash, line_width=1.6
+        )
+        name = self._name(curve)
+        told = [(name, "@mean{0.[0000]}"), ("at", "@time_s{0.000} s")]
+        if any(low != high for _, _, low, high in curve.points if low == low):
+            told.insert(1, ("extremes", "@low{0.[0000]} to @high{0.[0000]}"))
+        fig.add_tools(hover([line], told, mode="vline", line_policy="nearest"))
+        return LegendItem(label=the_text(name), renderers=[band, line, *_lone(fig, curve, colour)])
+
+    def _pen(self, curve: Curve, index: int) -> tuple[str, str]:
+        """Colour and dashes: by run where several are overlaid, else by signal."""
+        runs = list(self._plot.colour_by_run)
+        index = runs.index(curve.run_id) if runs else index
+        return LINES[index % len(LINES)], DASHES[index % len(DASHES)]
+
+    def _name(self, curve: Curve) -> str:
+        return plain(self._plot.colour_by_run.get(curve.run_id, curve.name))
+
+    def _states(self, fig: Any, row: int, lane: Lane) -> None:
+        data = _areas(lane, self._styles)
+        source = ColumnDataSource({**data, "row": np.full(len(lane.intervals), row + 0.5)})
+        bars = fig.hbar(
+            y="row", left="start_s", right="end_s", height=0.8, source=source, line_width=0,
+            fill_color="colour", hatch_pattern="hatch", hatch_color=INK, hatch_alpha=0.5,
+        )  # fmt: skip
+        fig.add_tools(hover([bars], [(lane.name, "@value"), *_WHEN]))
+        self._names(fig, row, [each for each in lane.intervals if self._has_room(each)])
+
+    def _has_room(self, interval: Interval) -> bool:
+        start_s, end_s = self._plot.x_range
+        least = _WITH_NAMES * len(short(interval.value)) * (end_s - start_s)
+        return interval.end_s - interval.start_s > least
+
+    def _names(self, fig: Any, row: int, intervals: Sequence[Interval]) -> None:
+        colours = ["white" if self._styles[each.value].colour == INK else INK for each in intervals]
+        data = {
+            "at_s": numbers([(each.start_s + each.end_s) / 2 for each in intervals]),
+            "row": np.full(len(intervals), row + 0.5),
+            "value": [plain(short(each.value)) for each in intervals],
+            "colour": colours,
+        }
+        fig.text(
+            "at_s", "row", text="value", source=ColumnDataSource(data), text_color="colour",
+            text_align="center", text_baseline="middle", text_font_size="11px",
+        )  # fmt: skip
+
+    def _events(self, fig: Any, row: int, lane: Lane) -> None:
+        data = {**_columns(lane.intervals), "row": np.full(len(lane.intervals), row + 0.5)}
+        source = ColumnDataSource(data)
+        fig.hbar(
+            y="row", left="start_s", right="end_s", height=0.8, source=source, line_width=0,
+            fill_color=LINES[1], fill_alpha=0.3,
+        )  # fmt: skip
+        marks = fig.scatter(
+            "start_s", "row", source=source, marker="diamond", size=11, color=LINES[1],
+            line_color="white",
+        )  # fmt: skip
+        fig.add_tools(hover([marks], [(lane.name, "@value"), *_WHEN]))
+
+
+_WHEN: Final = (("from", "@start_s{0.000} s"), ("to", "@end_s{0.000} s"))
+_GROUND: Final[dict[str, Any]] = {
+    "fill_color": "colour", "fill_alpha": 0.35, "line_width": 0, "hatch_pattern": "hatch",
+    "hatch_color": INK, "hatch_alpha": 0.25, "level": "underlay",
+}  # fmt: skip
+_GAP: Final[dict[str, Any]] = {
+    "fill_color": "white", "line_width": 0, "hatch_pattern": "/", "hatch_color": "#AAAAAA",
+    "hatch_weight": 0.5, "level": "underlay",
+}  # fmt: skip
+
+
+def _styles_of(plot: SignalAxes) -> dict[str, Area]:
+    """The same value has the same style in every row, and behind the panels."""
+    lanes = [*plot.lanes, *([plot.bands] if plot.bands else [])]
+    values = [value for lane in lanes for value in lane.values if value not in _FLAGS]
+    return area_styles(values) | _FLAGS
+
+
+def _points(curve: Curve) -> dict[str, Any]:
+    return dict(zip(("time_s", "mean", "low", "high"), _by_column(curve.points), strict=True))
+
+
+def _by_column(points: Sequence[Point]) -> Any:
+    """The points, a row for each of their four columns."""
+    return np.transpose(np.array(points, dtype=np.float64))
+
+
+def _outline(curve: Curve) -> tuple[Any, Any]:
+    """The band of extremes: along the least values and back along the largest, piece by piece."""
+    columns = _by_column(curve.points)
+    x: list[Any] = []
+    y: list[Any] = []
+    for piece in np.split(columns, np.flatnonzero(np.isnan(columns[0])), axis=1):
+        times, _, lows, highs = piece[:, ~np.isnan(piece[0])]
+        x += [times, times[::-1], [np.nan]]
+        y += [lows, highs[::-1], [np.nan]]
+    return np.concatenate(x), np.concatenate(y)
+
+
+def _lone(fig: Any, curve: Curve, colour: str) -> list[Any]:
+    """Points that a line does not show."""
+    lone = curve.lone_points
+    if not lone:
+        return []
+    times, means, _, _ = zip(*lone, strict=True)
+    return [fig.scatter(numbers(times), numbers(means), color=colour, size=5)]
+
+
+def _columns(intervals: Sequence[Interval]) -> dict[str, Any]:
+    return {
+        "start_s": numbers([each.start_s for each in intervals]),
+        "end_s": numbers([each.end_s for each in intervals]),
+        "value": [each.value for each in intervals],
+    }
+
+
+def _areas(lane: Lane | None, styles: dict[str, Area]) -> dict[str, Any]:
+    """The columns of coloured stretches."""
+    intervals = lane.intervals if lane else ()
+    areas = [styles[each.value] for each in intervals]
+    return {
+        **_columns(intervals),
+        "colour": [area.colour for area in areas],
+        "hatch": ["dot" if area.dotted else " " for area in areas],
+    }

@@ -1,5 +1,5 @@
-.PHONY: demo tests check benchmarks schema
-demo tests check benchmarks:
+.PHONY: demo tests check docs benchmarks schema
+demo tests check docs benchmarks:
 	./run $@
 
 schema:  ## generate webots_mcp/schema.sql from the migrations

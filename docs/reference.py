@@ -1,0 +1,192 @@
+"""What the code adds to the pages of the site: it is read from the code as it is today."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from typing import Any, Final
+
+import anyio
+
+import webots_mcp
+from webots_mcp import MemoryDatabase, pytest_plugin, testing
+from webots_mcp.cli import COMMANDS
+from webots_mcp.cli.command import Argument
+from webots_mcp.connection import connect
+from webots_mcp.schema import create_schema
+from webots_mcp.server import create_server
+
+_COMMENT: Final = re.compile(r"/\*(.*?)\*/", re.DOTALL)
+_TOC: Final = "```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{pages}\n```\n"
+
+
+def navigation(index: str) -> str:
+    """The tree of pages, from the lists of links of the first page."""
+    parts = re.findall(r"(?ms)^## (.+?)\n(.*?)(?=^## |\Z)", index)
+    return "\n".join(
+        _TOC.format(caption=caption, pages="\n".join(re.findall(r"(?m)^- \[.+?\]\((.+?)\)", part)))
+        for caption, part in parts
+    )
+
+
+def tools(_page: str = "") -> str:
+    """Each tool as it describes itself to a client."""
+    memory = MemoryDatabase()
+    try:
+        server = create_server(memory, memory.data_dir)
+        listed = sorted(anyio.run(server.list_tools), key=lambda tool: tool.name)
+    finally:
+        memory.close()
+    return "## Reference\n\n" + "\n".join(map(_tool, listed))
+
+
+def _tool(tool: Any) -> str:
+    required = tool.input_schema.get("required", ())
+    rows = [
+        [f"`{name}`", _kind(schema), _default(schema, name in required),
+         schema.get("description", "")]
+        for name, schema in tool.input_schema["properties"].items()
+    ]  # fmt: skip
+    table = _table(["parameter", "type", "default", "meaning"], rows) if rows else ""
+    return f"### {tool.name}\n\n{_as_markdown(tool.description)}\n\n{table}"
+
+
+def _kind(schema: dict[str, Any]) -> str:
+    if "enum" in schema:
+        return ", ".join(f"`{value}`" for value in schema["enum"])
+    if "anyOf" in schema:
+        return " or ".join(_kind(each) for each in schema["anyOf"])
+    kind = str(schema.get("type", "any"))
+    if "items" in schema:
+        kind = f"list of {_kind(schema['items'])}"
+    least, most = schema.get("minimum"), schema.get("maximum")
+    between = [f"from {least:g}"] if least is not None else []
+    between += [f"to {most:g}"] if most is not None else []
+    return " ".join([kind, *between])
+
+
+def _default(schema: dict[str, Any], required: bool) -> str:
+    if required:
+        return "required"
+    return f"`{schema['default']}`" if schema.get("default") is not None else ""
+
+
+def commands(_page: str = "") -> str:
+    """Each command with its arguments, as `--help` has them."""
+    return "## Reference\n\n" + "\n".join(
+        f"### {each.name}\n\n{_as_markdown(inspect.getdoc(each.run) or '')}\n\n"
+        + (_table(["argument", "meaning"], list(map(_argument, each.arguments))) or "")
+        for each in sorted(COMMANDS)
+    )
+
+
+def _argument(argument: Argument) -> list[str]:
+    flags, options = argument
+    if not flags[0].startswith("-"):
+        return [f"`{argument.value_name}`", _help(options)]
+    value = "" if options.get("action") == "store_true" else f" {_value(argument)}"
+    return [", ".join(f"`{flag}{value}`" for flag in flags), _help(options)]
+
+
+def _value(argument: Argument) -> str:
+    choices = argument.options.get("choices")
+    return "|".join(map(str, choices)) if choices else argument.value_name
+
+
+def _help(options: dict[str, Any]) -> str:
+    return str(options.get("help", "")).replace("%%", "%")
+
+
+def tables(_page: str = "") -> str:
+    """The tables and views of a new recording, with the comments that it carries."""
+    memory = MemoryDatabase()
+    with closing(connect(memory, "writer")) as connection:
+        create_schema(connection)
+        made = connection.execute(
+            "SELECT type, name, sql FROM sqlite_master WHERE type IN ('table', 'view') "
+            "AND name NOT LIKE 'sqlite%' AND name <> 'alembic_version' ORDER BY type, name"
+        ).fetchall()
+        columns = {name: connection.execute(f"PRAGMA table_info({name})").fetchall()
+                   for _, name, _ in made}  # fmt: skip
+    memory.close()
+    parts = ["## Reference\n"]
+    parts += [_relation(kind, name, sql, columns[name]) for kind, name, sql in made]
+    return "\n".join(parts)
+
+
+def _relation(kind: str, name: str, sql: str, columns: list[Any]) -> str:
+    if kind == "view":
+        said = _COMMENT.search(sql)
+        names = ", ".join(f"`{column[1]}`" for column in columns)
+        return f"### {name} (view)\n\n{said[1].strip() if said else ''}\n\nColumns: {names}.\n"
+    rows = [[f"`{column[1]}`", column[2] or "any", _comment(sql, column[1])] for column in columns]
+    return f"### {name}\n\n{_table(['column', 'type', 'meaning'], rows)}"
+
+
+def _comment(sql: str, column: str) -> str:
+    found = re.search(rf"(?m)[\s,(]{column} [A-Z][^,]*?/\*(.*?)\*/", sql)
+    return found[1].strip() if found else ""
+
+
+def interface(_page: str = "") -> str:
+    """Directives that read the docstrings of what may be imported."""
+    homes = ((webots_mcp, webots_mcp.__all__), (testing, testing.__all__))
+    classes = [
+        _class(f"{home.__name__}.{name}", getattr(home, name))
+        for home, names in homes
+        for name in sorted(names)
+        if inspect.isclass(getattr(home, name))
+    ]
+    return "\n".join([*classes, "## Fixtures of pytest\n", *_fixtures()])
+
+
+def _class(path: str, documented: type[Any]) -> str:
+    """The fields of a named tuple are told by its docstring."""
+    fields = ", ".join(getattr(documented, "_fields", ()))
+    left_out = f"   :exclude-members: {fields}\n" if fields else ""
+    directive = f".. autoclass:: {path}\n   :members:\n{left_out}"
+    return f"## {documented.__name__}\n\n```{{eval-rst}}\n{directive}```\n"
+
+
+def _fixtures() -> Iterator[str]:
+    members = vars(pytest_plugin)
+    for name, each in sorted(members.items()):
+        if isinstance(each, type(members["webots_robot"])):
+            yield f"### {name}\n\n{_as_markdown(inspect.getdoc(each) or '')}\n"
+
+
+def _as_markdown(text: str) -> str:
+    """A docstring: Markdown, but for brackets and stars; what is indented is to be copied."""
+    return "\n\n".join(
+        f"```sh\n{inspect.cleandoc(paragraph)}\n```"
+        if paragraph.startswith(" ")
+        else _escaped(paragraph)
+        for paragraph in text.split("\n\n")
+    )
+
+
+def _escaped(text: str) -> str:
+    """With what stands outside of backticks taken as it is."""
+    parts = text.split("`")
+    parts[::2] = [re.sub(r"([<>*\[\]])", r"\\\1", part) for part in parts[::2]]
+    return "`".join(parts)
+
+
+def _table(columns: list[str], rows: list[list[str]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    cells = (
+        [_as_markdown(cell).replace("|", "\\|").replace("\n", " ") for cell in line]
+        for line in lines
+    )
+    return "\n".join(f"| {' | '.join(line)} |" for line in cells) + "\n"
+
+
+ADDED: Final[dict[str, Callable[[str], str]]] = {
+    "docs/index": navigation,
+    "docs/tools": tools,
+    "docs/command-line": commands,
+    "docs/database": tables,
+    "docs/python": interface,
+}

@@ -1,0 +1,91 @@
+"""The pages name what is there, all of it and nothing else, and lead to each other."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from pathlib import Path
+
+import anyio
+import pytest
+
+import webots_mcp
+from webots_mcp import MCPBridge, MemoryDatabase, testing
+from webots_mcp.cli import COMMANDS
+from webots_mcp.contract import BUILT_IN_ACTIONS
+from webots_mcp.schema import SCHEMA_FILE
+from webots_mcp.server import create_server
+
+CHECKOUT = Path(__file__).parents[1]
+DOCS = CHECKOUT / "docs"
+INSTALLED = Path(webots_mcp.__file__).parents[1]
+PAGES = sorted([CHECKOUT / "README.md", CHECKOUT / "CHANGELOG.md", CHECKOUT / "CONTRIBUTING.md",
+                *DOCS.glob("*.md"), *CHECKOUT.glob("examples/*/README.md")])  # fmt: skip
+
+
+def page(name: str) -> str:
+    return (DOCS / name).read_text("utf-8")
+
+
+def test_the_page_of_the_tools_names_every_tool_and_no_other() -> None:
+    memory = MemoryDatabase()
+    try:
+        server = create_server(memory, memory.data_dir)
+        tools = {tool.name for tool in anyio.run(server.list_tools)}
+    finally:
+        memory.close()
+    assert set(re.findall(r"\bwebots_[a-z_]+\b", page("tools.md"))) == tools
+
+
+def test_the_page_of_the_command_line_names_every_command() -> None:
+    for command in COMMANDS:
+        assert re.search(rf"`{command.name}\b", page("command-line.md")), command.name
+
+
+def test_the_page_of_the_bridge_names_every_method() -> None:
+    for name, _ in inspect.getmembers(MCPBridge, inspect.isfunction):
+        if not name.startswith("_"):
+            assert f"bridge.{name}(" in page("bridge.md"), name
+
+
+def test_the_page_of_the_bridge_names_every_action_that_is_built_in_and_no_other() -> None:
+    (listed,) = re.findall(r"actions that are built in [^:]*:([^.]*)\.", page("bridge.md"))
+    assert re.findall(r"`(\w+)`", listed) == list(BUILT_IN_ACTIONS)
+
+
+def test_the_page_of_the_interface_names_all_that_may_be_imported() -> None:
+    names = re.findall(r"`([A-Z]\w+)`", page("python.md"))
+    assert set(names) == {*webots_mcp.__all__, *testing.__all__} - {"__version__"}
+    assert len(names) == len(set(names))
+
+
+def test_the_page_of_the_database_names_tables_and_views_that_there_are() -> None:
+    part = page("database.md").partition("## What is in it")[2].partition("\n## ")[0]
+    named = set(re.findall(r"`([a-z]+_?[a-z]+)`", part))
+    made = set(re.findall(r"(?m)^CREATE (?:TABLE|VIEW) (\w+)", SCHEMA_FILE.read_text()))
+    assert named == made - {"alembic_version"}
+
+
+def test_the_first_page_leads_to_each_other() -> None:
+    linked = {
+        (DOCS / link).resolve() for link in re.findall(r"(?m)^- \[.+?\]\((.+?)\)", page("index.md"))
+    }
+    assert linked == {*PAGES} - {DOCS / "index.md"}
+
+
+@pytest.mark.parametrize("file", PAGES, ids=lambda file: file.relative_to(CHECKOUT).as_posix())
+def test_what_a_page_links_to_is_there(file: Path) -> None:
+    text = re.sub(r"(?ms)^```.*?^```", "", file.read_text("utf-8"))
+    for target in re.findall(r"\]\(((?!https?:)[^)\s]+)\)", text):
+        name, _, part = target.partition("#")
+        there = (file.parent / name).resolve() if name else file
+        if not there.exists():  # the package may be installed, and lie elsewhere
+            there = INSTALLED / there.relative_to(CHECKOUT)
+        assert there.exists(), target
+        assert not part or part in anchors(there.read_text("utf-8")), target
+
+
+def anchors(text: str) -> set[str]:
+    """Of the headings, as code hosts make them."""
+    heads = re.findall(r"(?m)^#+ (.+)$", text)
+    return {re.sub(r"[^\w -]", "", head).lower().replace(" ", "-") for head in heads}

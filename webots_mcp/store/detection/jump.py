@@ -36,13 +36,13 @@ def jump_events(search: Search) -> Iterator[Event]:
         for signal in numbers
         if signal.kind != "angle" and not signal.is_index and signal not in position
     ]
-    for index, signal in enumerate(signals):
+    score = search.options.jump_score
+    for index, (signal, courses) in enumerate(search.view.courses(signals, score)):
         if search.is_over("jump", signals[index:]):
             break
-        score = search.options.jump_score
         found = {  # two courses may show the same
             jump.sim_time_s: jump
-            for course in search.view.courses(signal, score)
+            for course in courses
             for jump in find_jumps(course.times, course.numbers, score, course.usual)
         }
         jumps = [found[time_s] for time_s in sorted(found)]

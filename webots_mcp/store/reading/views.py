@@ -19,6 +19,7 @@ from webots_mcp.store.analysis.rhythm import usual_interval_s
 from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.intervals import (
     Condition,
     Span,
@@ -31,7 +32,7 @@ from webots_mcp.store.reading.rollups import Pieces, read_pieces, rows_after
 from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of, read_columns
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.reading.steps import BucketSteps, read_steps
-from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of, totals
+from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, bucket_of, totals
 from webots_mcp.store.rollup.swings import (
     ACROSS_S,
     LONGEST_PERIOD_S,
@@ -58,8 +59,9 @@ _STEPS: Final = (
     f"SELECT bucket, present, largest_step, first, last {_OF_SIGNAL} AND first IS NOT NULL "
     "ORDER BY bucket"
 )
-_ROWS_IN: Final = (
-    "SELECT count(*) FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
+_ROWS_IN: Final = (  # and the time of the one before some time
+    "SELECT count(*), coalesce(max(iif(sim_time_s < :before_s, sim_time_s, NULL)), :before_s) "
+    "FROM state WHERE run_id = :run AND sim_time_s >= :start_s AND sim_time_s < :end_s"
 )
 _FIRST_ROW: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
 _RESTING: Final = (
@@ -117,8 +119,10 @@ class View(Protocol):
         """Where the condition holds in every row; across a recording gap it is taken to go on."""
         ...
 
-    def courses(self, signal: Signal, score: float) -> Iterator[Course]:
-        """Where a jump may be."""
+    def courses(
+        self, signals: Sequence[Signal], score: float
+    ) -> Iterator[tuple[Signal, Iterator[Course]]]:
+        """Where a jump of each signal may be."""
         ...
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
@@ -218,9 +222,12 @@ class RowView:
         values = self._columns.values[signal.name]
         return list(spans_in_rows(self._columns.times, values, condition))
 
-    def courses(self, signal: Signal, score: float) -> Iterator[Course]:
-        """All of it."""
-        yield Course(*self._columns.numbers(signal.name))
+    def courses(
+        self, signals: Sequence[Signal], score: float
+    ) -> Iterator[tuple[Signal, Iterator[Course]]]:
+        """All of each."""
+        for signal in signals:
+            yield signal, iter([Course(*self._columns.numbers(signal.name))])
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """None: all rows are there to look in."""
@@ -266,9 +273,7 @@ class LongView:
         self.inside = range(int(start), int(end))
         self._span = (segment.run_id, bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
         late = rows_after(connection, segment, watermark(connection, segment.run_id))
-        self._late_s = None
-        if late is not None and segment.end_s - late.start_s > LATE_S:
-            self._late_s = late.start_s
+        self._rolled_until_s = math.inf if late is None else late.start_s
 
     def taken_notes(self) -> list[str]:
         """Each is told once."""
@@ -367,28 +372,42 @@ class LongView:
                 self._read[part] = kept
         return kept
 
-    def courses(self, signal: Signal, score: float) -> Iterator[Course]:
+    def courses(
+        self, signals: Sequence[Signal], score: float
+    ) -> Iterator[tuple[Signal, Iterator[Course]]]:
         """The buckets with a step that may be a jump, each with the rows before and after it."""
         self._note_late()
         self._note_purged()
+        suspects = [
+            [] if self._deadline.passed else list(self._suspects(signal, score))
+            for signal in signals
+        ]
+        alike: dict[range, list[Signal]] = {}  # what is asked of several signals is read at once
+        for signal, found in zip(signals, suspects, strict=True):
+            for _, stretches in found:
+                for buckets in stretches:
+                    alike.setdefault(buckets, []).append(signal)
+        for signal, found in zip(signals, suspects, strict=True):
+            yield signal, self._courses_in(signal, found, alike, score)
+
+    def _suspects(self, signal: Signal, score: float) -> Iterator[tuple[Array, list[range]]]:
+        """What the steps of a signal are compared with, and the buckets that may hold a jump."""
         times, usual = self._sample.numbers(signal.name)
         limit, span = least_jump(usual, score), range(*self._span[1:])
         steps = read_steps(self._connection, self._span[0], signal.id or 0, span, limit)
         if limit:
-            yield from self._courses_in(signal, steps, steps.largest > limit, usual, score)
+            yield usual, self._largest(signal, steps, steps.largest > limit)
             return
         # It rests in the sample: what leaves and comes back at once is looked for everywhere.
         interval_s = usual_interval_s(times) or math.inf
-        yield from self._courses_in(signal, steps, steps.excursions(interval_s), usual, score)
+        yield usual, self._largest(signal, steps, steps.excursions(interval_s))
         seldom = steps.usual() if steps.seldom else usual
         if limit := least_jump(seldom, score):
-            yield from self._courses_in(signal, steps, steps.largest > limit, seldom, score)
+            yield seldom, self._largest(signal, steps, steps.largest > limit)
 
-    def _courses_in(
-        self, signal: Signal, steps: BucketSteps, wide: Flags, usual: Array, score: float
-    ) -> Iterator[Course]:
+    def _largest(self, signal: Signal, steps: BucketSteps, wide: Flags) -> list[range]:
         """Some of the buckets; where they are too many those with the largest steps."""
-        limit, places = least_jump(usual, score), np.flatnonzero(wide)
+        places = np.flatnonzero(wide)
         largest = places[np.argsort(-steps.largest[places], kind="stable")]
         rows = np.cumsum(steps.rows[largest])
         taken = largest[: max(1, int(np.searchsorted(rows, JUMP_ROWS, "right")))]
@@ -397,13 +416,24 @@ class LongView:
                 f"of {signal.name} only in {len(taken)} of {len(places)} stretches of 10 s, those "
                 "with the largest steps: ask for less time to see the others"
             )
-        for together in _runs_of(sorted(steps.buckets[taken].tolist())):
-            if self._deadline.passed:
-                self._cut()
-                return
-            times, numbers = self._numbers(signal, together)
-            livelier = least_jump(numbers, score) > limit
-            yield Course(times, numbers, None if livelier else usual)
+        return list(_runs_of(sorted(steps.buckets[taken].tolist())))
+
+    def _courses_in(
+        self,
+        signal: Signal,
+        suspects: Sequence[tuple[Array, list[range]]],
+        alike: dict[range, list[Signal]],
+        score: float,
+    ) -> Iterator[Course]:
+        for usual, stretches in suspects:
+            limit = least_jump(usual, score)
+            for buckets in stretches:
+                if self._deadline.passed:
+                    self._cut()
+                    return
+                times, numbers = self._numbers(buckets, alike[buckets]).of(signal.name)
+                livelier = least_jump(numbers, score) > limit
+                yield Course(times, numbers, None if livelier else usual)
 
     def stored_swings(self, signals: Sequence[Signal]) -> tuple[range, dict[str, list[Swing]]]:
         """Those of the coarse rollups that lie inside."""
@@ -418,19 +448,21 @@ class LongView:
     ) -> Iterator[Numbers]:
         """What there is no time for is noted."""
         first_s = max(self._segment.start_s, self._purged_until_s or -math.inf)
+        steps = [] if least_steps is None else self._largest_steps(signals)
         for part in _around(self._segment, outside):
             if part.start_s < first_s:
                 self._note_purged()
-            yield from self._stretches(part, first_s, signals, least_steps, apart)
+            for whole in self._stretches(part, first_s):
+                if least_steps is None or (here := self._steps_in(whole, steps)) is None:
+                    yield self._stretch(whole, signals)
+                elif large := _above(here, least_steps):
+                    if apart and not _above(here, [each / apart for each in least_steps], large):
+                        yield self._part(whole, large, signals)
+                    else:
+                        yield self._stretch(whole, signals)
 
-    def _stretches(
-        self,
-        left: Segment,
-        first_s: float,
-        signals: Sequence[Signal],
-        least_steps: Sequence[float] | None,
-        apart: float,
-    ) -> Iterator[Numbers]:
+    def _stretches(self, left: Segment, first_s: float) -> Iterator[Segment]:
+        """The newest first, each with what reaches out of it, until the time is over."""
         end_of_all_s, first_s = left.end_s, max(first_s, left.start_s)
         while left.end_s > first_s:
             part = newest_part(self._connection, left, STRETCH_ROWS)
@@ -440,57 +472,57 @@ class LongView:
                     f"not before {reached_s:.3f} s, the time was over; ask end_s={reached_s:.3f}"
                 )
                 return
-            whole = replace(part, end_s=min(end_of_all_s, part.end_s + ACROSS_S))
-            steps = None if least_steps is None else self._largest_steps(whole, signals)
-            if steps is None or least_steps is None:
-                yield self._stretch(whole, signals)
-            elif large := _above(steps, least_steps):
-                if apart and not _above(steps, [each / apart for each in least_steps], large):
-                    yield self._part(whole, large, signals)
-                else:
-                    yield self._stretch(whole, signals)
+            yield replace(part, end_s=min(end_of_all_s, part.end_s + ACROSS_S))
             if part.start_s <= first_s:
                 return
             left = replace(left, end_s=part.start_s)
 
-    def _largest_steps(
-        self, part: Segment, signals: Sequence[Signal]
-    ) -> list[dict[int, float]] | None:
-        """By bucket the largest step of each signal, at its borders as well; None: not known.
+    def _largest_steps(self, signals: Sequence[Signal]) -> list[dict[int, float]]:
+        """By bucket the largest step of each signal, and the one into it; infinite: not known.
 
-        It is where all rows around the part are in the rollups, each with a number.
+        It is known where all rows of the bucket are in the rollups, each with a number.
         """
-        span = range(bucket_of(part.start_s), bucket_of(part.end_s) + 1)
-        ends_s = span.start * BUCKET_S, span.stop * BUCKET_S
-        rows = self._connection.execute(_ROWS_IN, (part.run_id, *ends_s)).fetchone()[0]
+        run_id, first, end = self._span
+        rows = rows_by_bucket(self._connection, run_id, FINE, range(first, end))
         steps: list[dict[int, float]] = []
         for signal in signals:
-            asked = (part.run_id, signal.id, span.start, span.stop)
-            found = self._connection.execute(_STEPS, asked).fetchall()
-            known = all(step is not None or present < 2 for _, present, step, *_ in found)
-            if not known or sum(present for _, present, *_ in found) != rows:
-                return None
-            own = {bucket: step or 0.0 for bucket, _, step, *_ in found}
-            for (*_, last), (bucket, _, _, first, _) in pairwise(found):
-                own[bucket] = max(own[bucket], abs(first - last))
+            found = self._connection.execute(_STEPS, (run_id, signal.id, first, end)).fetchall()
+            own = dict.fromkeys(rows, math.inf)
+            for bucket, present, step, *_ in found:
+                known = present == rows.get(bucket) and (step is not None or present < 2)
+                own[bucket] = (step or 0.0) if known else math.inf
+            for (*_, last), (bucket, _, _, first_number, _) in pairwise(found):
+                own[bucket] = max(own[bucket], abs(first_number - last))
             steps.append(own)
         return steps
 
+    def _steps_in(
+        self, part: Segment, steps: Sequence[dict[int, float]]
+    ) -> list[dict[int, float]] | None:
+        """Those of the buckets of a part; None where not all are known."""
+        span = range(bucket_of(part.start_s), bucket_of(part.end_s) + 1)
+        here = [{bucket: own.get(bucket, 0.0) for bucket in span} for own in steps]
+        is_late = self._rolled_until_s < part.end_s
+        return None if is_late or any(math.inf in own.values() for own in here) else here
+
     def _part(self, whole: Segment, large: range, signals: Sequence[Signal]) -> Numbers:
-        """The rows of some buckets of a stretch, and of those beside them."""
-        start_s = max(whole.start_s, (large.start - 1) * BUCKET_S)
-        end_s = min(whole.end_s, (large.stop + 1) * BUCKET_S)
-        bounds = (whole.run_id, whole.start_s, whole.end_s)
-        rows = self._connection.execute(_ROWS_IN, bounds).fetchone()[0]
-        part = replace(whole, start_s=start_s, end_s=end_s)
-        return replace(self._stretch(part, signals), stretch_rows=rows)
+        """The rows of some buckets of a stretch, and the one before them."""
+        bounds = {"run": whole.run_id, "start_s": whole.start_s, "end_s": whole.end_s}
+        bounds["before_s"] = large.start * BUCKET_S
+        rows, start_s = self._connection.execute(_ROWS_IN, bounds).fetchone()
+        part = replace(whole, start_s=start_s, end_s=min(whole.end_s, large.stop * BUCKET_S))
+        return replace(self._read_once(part, signals), stretch_rows=rows)
 
     def _stretch(self, part: Segment, signals: Sequence[Signal]) -> Numbers:
-        """Read with what other kinds will ask of the same rows, and kept for them."""
+        """Read with what other kinds will ask of the same rows."""
+        return self._read_once(part, [*signals, *self._through])
+
+    def _read_once(self, part: Segment, signals: Sequence[Signal]) -> Numbers:
+        """Read, and kept for who asks for the same."""
         kept = self._kept.get(part)
         if kept is not None and all(signal.name in kept.values for signal in signals):
             return kept
-        wanted = list({each.name: each for each in (*signals, *self._through)}.values())
+        wanted = list({each.name: each for each in signals}.values())
         columns = read_columns(self._connection, part, wanted, self._deadline)
         if columns.cut:
             reached_s = columns.times[-1] if columns.times else part.start_s
@@ -534,8 +566,8 @@ class LongView:
         found.add(read_columns(self._connection, part, signals, self._deadline))
 
     def _note_late(self) -> None:
-        if self._late_s is not None:
-            self.notes.append(f"not after {self._late_s:.3f} s, which is not rolled up yet")
+        if self._segment.end_s - self._rolled_until_s > LATE_S:
+            self.notes.append(f"not after {self._rolled_until_s:.3f} s, which is not rolled up yet")
 
     @functools.cached_property
     def _purged_until_s(self) -> float | None:
@@ -552,12 +584,12 @@ class LongView:
     def _cut(self) -> None:
         self.notes.append("the time was over before all was searched: ask for less time or kinds")
 
-    def _numbers(self, signal: Signal, buckets: range) -> tuple[Array, Array]:
+    def _numbers(self, buckets: range, signals: Sequence[Signal]) -> Numbers:
+        """The rows of some buckets, and a few before and after them."""
         before_s = BACK_INTERVALS * (usual_interval_s(self._sample.times) or 0.0)
         start_s = max(self._segment.start_s, buckets.start * BUCKET_S - before_s)
         end_s = min(self._segment.end_s, buckets.stop * BUCKET_S + before_s)
-        part = replace(self._segment, start_s=start_s, end_s=end_s)
-        return read_columns(self._connection, part, [signal], self._deadline).numbers(signal.name)
+        return self._read_once(replace(self._segment, start_s=start_s, end_s=end_s), signals)
 
 
 def _around(segment: Segment, buckets: range) -> list[Segment]:

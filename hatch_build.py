@@ -1,0 +1,40 @@
+"""How the README is shown on the package index, where links into the checkout lead nowhere."""
+
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from hatchling.metadata.plugin.interface import MetadataHookInterface
+
+_PICTURE = re.compile(r"(?m)^!\[[^\]]*\]\((?!https?:)([^)\s]+)\)\n+")
+_LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!https?:|#)([^)\s]+)\)")
+
+
+class Readme(MetadataHookInterface):
+    """Makes the links absolute, by `Source` of `[project.urls]`."""
+
+    def update(self, metadata: dict[str, Any]) -> None:
+        """Set the field `readme`."""
+        text = (Path(self.root) / "README.md").read_text("utf-8")
+        shown = with_absolute_links(text, metadata.get("urls", {}).get("Source"))
+        metadata["readme"] = {"content-type": "text/markdown", "text": shown}
+
+
+def with_absolute_links(text: str, source: str | None) -> str:
+    """The text with links that lead to a repository; without one they are texts, and pictures go.
+
+    Args:
+        text: Markdown with links relative to the checkout.
+        source: The address of the repository on GitHub.
+    """
+    if source is None:
+        return _LINK.sub(r"\1", _PICTURE.sub("", text))
+    at = source.rstrip("/")
+    text = _PICTURE.sub(partial(_moved, f"{at}/raw/HEAD/"), text)
+    return _LINK.sub(partial(_moved, f"{at}/blob/HEAD/"), text)
+
+
+def _moved(address: str, link: re.Match[str]) -> str:
+    whole, target = link[0], link[link.re.groups]
+    return whole.replace(f"]({target})", f"]({address}{target})")

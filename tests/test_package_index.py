@@ -1,0 +1,49 @@
+"""What the package index shows of the README leads somewhere."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("hatchling", reason="hatchling is not installed")
+from hatch_build import Readme, with_absolute_links
+
+CHECKOUT = Path(__file__).parents[1]
+SOURCE = "https://code.example/robots/webots-mcp"
+TEXT = "[a](docs/a.md#b) [c](https://c.example) [d](#e)\n\n![f](docs/f.png)\n\nend\n"
+
+
+def shown(urls: dict[str, str]) -> str:
+    metadata = {"name": "webots-mcp", "urls": urls}
+    Readme(str(CHECKOUT), {}).update(metadata)
+    return metadata["readme"]["text"]  # type: ignore[index]
+
+
+def targets(text: str) -> list[str]:
+    return re.findall(r"\]\(([^)\s]+)\)", text)
+
+
+def test_links_lead_to_the_repository_where_one_is_named() -> None:
+    assert targets(with_absolute_links(TEXT, f"{SOURCE}/")) == [
+        f"{SOURCE}/blob/HEAD/docs/a.md#b", "https://c.example", "#e",
+        f"{SOURCE}/raw/HEAD/docs/f.png",
+    ]  # fmt: skip
+
+
+def test_without_a_repository_links_are_texts_and_pictures_are_left_out() -> None:
+    assert with_absolute_links(TEXT, None) == "a [c](https://c.example) [d](#e)\n\nend\n"
+
+
+@pytest.mark.parametrize("urls", [{}, {"Source": SOURCE}])
+def test_no_link_of_the_readme_is_relative(urls: dict[str, str]) -> None:
+    found = targets(shown(urls))
+    assert all(target.startswith("https://") for target in found), found
+    assert any(target.startswith(SOURCE) for target in found) == bool(urls)
+
+
+def test_the_readme_is_whole_but_for_its_links() -> None:
+    plain = re.compile(r"\]\([^)]*\)|[\[\]!]")
+    readme = (CHECKOUT / "README.md").read_text("utf-8")
+    assert plain.sub("", shown({"Source": SOURCE})) == plain.sub("", readme)

@@ -17,6 +17,7 @@ from bokeh.resources import INLINE
 from tests.plotting.conftest import Record, whole
 from webots_mcp.charts import signals_chart, way_chart
 from webots_mcp.errors import NothingRecordedError, UnknownSignalError
+from webots_mcp.plotting.signals import compose_signals
 
 ARENA = Path(__file__).parents[2] / "examples" / "worlds" / "arena.wbt"
 
@@ -35,7 +36,7 @@ def test_a_curve_has_the_recorded_values_and_is_broken_where_there_are_none(
     rover: sqlite3.Connection,
 ) -> None:
     chart: Any = signals_chart(rover, [whole(rover)], ["pose.0"])
-    data = chart.curves[1, "pose.0"].data
+    data = chart.sources["curve", "pose.0", 1].data
     times, means = np.asarray(data["time_s"]), np.asarray(data["mean"])
     assert np.interp(20.0, times[:100], means[:100]) == pytest.approx(4.0, abs=0.05)
     assert np.isnan(times).sum() == 1
@@ -44,12 +45,12 @@ def test_a_curve_has_the_recorded_values_and_is_broken_where_there_are_none(
 
 def test_an_extreme_between_two_buckets_is_in_the_data(rover: sqlite3.Connection) -> None:
     chart: Any = signals_chart(rover, [whole(rover)], ["ir"])
-    assert np.nanmax(chart.curves[1, "ir"].data["high"]) == 5.0
+    assert np.nanmax(chart.sources["curve", "ir", 1].data["high"]) == 5.0
 
 
 def test_modes_are_the_ground_of_each_panel_with_their_names(rover: sqlite3.Connection) -> None:
     chart: Any = signals_chart(rover, [whole(rover)], ["pose.0", "battery_v"])
-    bands = chart.bands.data
+    bands = chart.sources["ground", "mode", 0].data
     assert list(bands["value"]) == ["cruise", "back_up", "avoid", "cruise"]
     grounds = [data for data in sources(chart.layout, VStrip) if "colour" in data]
     assert len(grounds) == 2
@@ -77,8 +78,8 @@ def test_events_and_commands_are_marks_that_tell_what_they_are(rover: sqlite3.Co
 
 def test_runs_over_each_other_begin_at_zero_each(rover: sqlite3.Connection) -> None:
     chart: Any = signals_chart(rover, [whole(rover, 1), whole(rover, 2)], ["pose.0"])
-    assert set(chart.curves) == {(1, "pose.0"), (2, "pose.0")}
-    assert [source.data["time_s"][0] < 1 for source in chart.curves.values()] == [True, True]
+    starts = [chart.sources["curve", "pose.0", run].data["time_s"][0] for run in (1, 2)]
+    assert max(starts) < 1
 
 
 def test_the_way_ends_where_the_robot_is_and_has_equal_scales(rover: sqlite3.Connection) -> None:
@@ -127,9 +128,9 @@ def test_a_recorded_name_is_no_formula_and_no_markup(record: Record) -> None:
 def test_a_single_row_is_seen(record: Record) -> None:
     connection = record(lambda t: {"n": 1.0}, 1)
     chart: Any = signals_chart(connection, [whole(connection)], ["n"])
-    data = chart.curves[1, "n"].data
+    data = chart.sources["curve", "n", 1].data
     assert [value for value in data["mean"] if not math.isnan(value)] == [1.0]
-    assert any(list(each.get("x", ())) for each in sources(chart.layout, Scatter))
+    assert list(chart.sources["lone", "n", 1].data["mean"]) == [1.0]
 
 
 def test_what_cannot_be_drawn_is_said(rover: sqlite3.Connection, record: Record) -> None:
@@ -138,3 +139,12 @@ def test_what_cannot_be_drawn_is_said(rover: sqlite3.Connection, record: Record)
     empty = record(lambda t: {"n": None}, 3)
     with pytest.raises(NothingRecordedError):
         signals_chart(empty, [whole(empty)], ["n"])
+
+
+def test_the_same_figures_show_what_has_come_since(rover: sqlite3.Connection) -> None:
+    chart: Any = signals_chart(rover, [whole(rover, end_s=30)], ["pose.0"], events=False)
+    later, _ = compose_signals(rover, [whole(rover, end_s=50)], ["pose.0"], events=False)
+    assert chart.refresh(later)
+    assert chart.sources["curve", "pose.0", 1].data["time_s"][-1] > 49
+    others, _ = compose_signals(rover, [whole(rover)], ["battery_v"], events=False)
+    assert not chart.refresh(others)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from bokeh.core.properties import field as of_column
@@ -45,21 +45,34 @@ _FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EFEFEF", dotte
 _WITH_NAMES: Final = 0.012  # of the range, for each letter: shorter intervals are not labelled
 
 
+Key: TypeAlias = "tuple[str, str, int]"  # what it is, its name, its run
+
+
 @dataclass(frozen=True)
 class SignalsChart(Chart):
     """Signals over time.
 
     Attributes:
+        plot: What is drawn.
         x_range: That of all figures.
-        curves: The data of each curve, by run and name: time_s, mean, low, high.
-        bands: The stretches of the mode behind them: start_s, end_s, value, colour, hatch.
+        sources: The data of what is drawn. A curve, `("curve", name, run)`, has time_s, mean, low
+            and high; the mode, `("ground", name, 0)`, start_s, end_s, value, colour and hatch.
     """
 
+    plot: SignalAxes
     x_range: Range
-    curves: dict[tuple[int, str], ColumnDataSource] = field(
-        default_factory=dict[tuple[int, str], ColumnDataSource]
-    )
-    bands: ColumnDataSource = field(default_factory=ColumnDataSource)
+    time_axis: Any
+    sources: dict[Key, ColumnDataSource]
+
+    def refresh(self, plot: SignalAxes) -> bool:
+        """Show other data in the same figures; False where those would have to be others."""
+        data = data_of(plot)
+        if _form(plot) != _form(self.plot):
+            return False
+        for key, source in self.sources.items():
+            source.data = data[key]
+        self.time_axis.axis_label = plot.x_label
+        return True
 
 
 def signals_chart(
@@ -103,12 +116,13 @@ def draw_signals(
         x_range: Of all figures; None for that of the data.
     """
     x_range = x_range or Range1d(start=plot.x_range[0], end=plot.x_range[1])
-    drawing = _Drawing(plot, x_range)
+    sources = {key: ColumnDataSource(data) for key, data in data_of(plot).items()}
+    drawing = _Drawing(plot, x_range, sources)
     figures = [drawing.panel(panel) for panel in plot.panels]
     if plot.lanes or plot.events:
         figures.append(drawing.lanes())
-    figures[-1].xaxis.visible = True
-    figures[-1].xaxis.axis_label = plot.x_label
+    axis = figures[-1].xaxis[0]
+    axis.visible, axis.axis_label = True, plot.x_label
     layout = gridplot(
         [[each] for each in figures],
         merge_tools=True,
@@ -116,23 +130,21 @@ def draw_signals(
         toolbar_location="right",
         toolbar_options={"logo": None},
     )
-    bands = drawing.bands if plot.bands else ColumnDataSource()
-    return SignalsChart(layout, plot.title, tuple(notes), x_range, drawing.curves, bands)
+    return SignalsChart(layout, plot.title, tuple(notes), plot, x_range, axis, sources)
 
 
 class _Drawing:
     """Draws figures that share a clock, a crosshair and a margin."""
 
-    def __init__(self, plot: SignalAxes, x_range: Range) -> None:
+    def __init__(
+        self, plot: SignalAxes, x_range: Range, sources: dict[Key, ColumnDataSource]
+    ) -> None:
         self._plot = plot
         self._x_range = x_range
+        self._sources = sources
         self._line = Span(dimension="height", line_color=FAINT, line_width=1, line_dash="dotted")
-        self._styles = _styles_of(plot)
         named = [short(lane.name) for lane in (*plot.lanes, *plot.events)]
         self._left_px = max([58, *(14 + _LETTER_PX * len(name) for name in named)])
-        self.curves: dict[tuple[int, str], ColumnDataSource] = {}
-        self.bands = ColumnDataSource(_areas(plot.bands, self._styles))
-        self._gaps = ColumnDataSource(_columns(plot.gaps))
 
     def panel(self, panel: Panel) -> Any:
         """Curves on one axis, with what happened behind them."""
@@ -167,7 +179,7 @@ class _Drawing:
         fig.yaxis.major_label_overrides = dict(zip(rows, named, strict=True))
         fig.yaxis.major_tick_line_color = None
         fig.yaxis.axis_line_color = None
-        fig.vstrip("start_s", "end_s", source=self._gaps, **_GAP)
+        fig.vstrip("start_s", "end_s", source=self._sources[_GAPS], **_GAP)
         return fig
 
     def _figure(self, height: int, **options: Any) -> Any:
@@ -184,11 +196,11 @@ class _Drawing:
     def _ground(self, fig: Any) -> None:
         """Modes, gaps and the moments of events, over the whole height behind the curves."""
         if self._plot.bands:
-            fig.vstrip("start_s", "end_s", source=self.bands, name="ground", **_GROUND)
-        fig.vstrip("start_s", "end_s", source=self._gaps, **_GAP)
-        events = [interval for lane in self._plot.events for interval in lane.intervals]
-        moments = ColumnDataSource({"start_s": numbers([each.start_s for each in events])})
-        fig.vspan("start_s", source=moments, line_color=FAINT, line_dash="dotted", line_alpha=0.6)
+            source = self._sources["ground", self._plot.bands.name, 0]
+            fig.vstrip("start_s", "end_s", source=source, name="ground", **_GROUND)
+        fig.vstrip("start_s", "end_s", source=self._sources[_GAPS], **_GAP)
+        line = {"line_color": FAINT, "line_dash": "dotted", "line_alpha": 0.6}
+        fig.vspan("start_s", source=self._sources[_MOMENTS], **line)
 
     def _ground_legend(self, fig: Any, bands: Lane) -> Any:
         (ground,) = fig.select({"name": "ground"})
@@ -200,19 +212,19 @@ class _Drawing:
     def _curve(self, fig: Any, panel: Panel, index: int) -> LegendItem:
         curve = panel.curves[index]
         colour, dash = self._pen(curve, index)
-        source = ColumnDataSource(_points(curve))
-        self.curves[curve.run_id, curve.name] = source
-        alpha = 0.28 / len(panel.curves) ** 0.5
-        band = fig.patch(*_outline(curve), color=colour, alpha=alpha, line_width=0)
-        line = fig.line(
-            "time_s", "mean", source=source, color=colour, line_dash=dash, line_width=1.6
+        curve_of, band_of, lone_of = (
+            self._sources[what, curve.name, curve.run_id] for what in ("curve", "band", "lone")
         )
+        alpha = 0.28 / len(panel.curves) ** 0.5
+        band = fig.patch("x", "y", source=band_of, color=colour, alpha=alpha, line_width=0)
+        pen = {"color": colour, "line_dash": dash, "line_width": 1.6}
+        line = fig.line("time_s", "mean", source=curve_of, **pen)
+        lone = fig.scatter("time_s", "mean", source=lone_of, color=colour, size=5)
         name = self._name(curve)
-        told = [(name, "@mean{0.[0000]}"), ("at", "@time_s{0.000} s")]
-        if any(low != high for _, _, low, high in curve.points if low == low):
-            told.insert(1, ("extremes", "@low{0.[0000]} to @high{0.[0000]}"))
+        extremes = ("extremes", "@low{0.[0000]} to @high{0.[0000]}")
+        told = [(name, "@mean{0.[0000]}"), extremes, ("at", "@time_s{0.000} s")]
         fig.add_tools(hover([line], told, mode="vline", line_policy="nearest"))
-        return LegendItem(label=the_text(name), renderers=[band, line, *_lone(fig, curve, colour)])
+        return LegendItem(label=the_text(name), renderers=[band, line, lone])
 
     def _pen(self, curve: Curve, index: int) -> tuple[str, str]:
         """Colour and dashes: by run where several are overlaid, else by signal."""
@@ -224,47 +236,33 @@ class _Drawing:
         return plain(self._plot.colour_by_run.get(curve.run_id, curve.name))
 
     def _states(self, fig: Any, row: int, lane: Lane) -> None:
-        data = _areas(lane, self._styles)
-        source = ColumnDataSource({**data, "row": np.full(len(lane.intervals), row + 0.5)})
         bars = fig.hbar(
-            y="row", left="start_s", right="end_s", height=0.8, source=source, line_width=0,
-            fill_color="colour", hatch_pattern="hatch", hatch_color=INK, hatch_alpha=0.5,
+            y=row + 0.5, left="start_s", right="end_s", height=0.8, line_width=0,
+            source=self._sources["lane", lane.name, 0], fill_color="colour",
+            hatch_pattern="hatch", hatch_color=INK, hatch_alpha=0.5,
         )  # fmt: skip
         fig.add_tools(hover([bars], [(lane.name, "@value"), *_WHEN]))
-        self._names(fig, row, [each for each in lane.intervals if self._has_room(each)])
-
-    def _has_room(self, interval: Interval) -> bool:
-        start_s, end_s = self._plot.x_range
-        least = _WITH_NAMES * len(short(interval.value)) * (end_s - start_s)
-        return interval.end_s - interval.start_s > least
-
-    def _names(self, fig: Any, row: int, intervals: Sequence[Interval]) -> None:
-        colours = ["white" if self._styles[each.value].colour == INK else INK for each in intervals]
-        data = {
-            "at_s": numbers([(each.start_s + each.end_s) / 2 for each in intervals]),
-            "row": np.full(len(intervals), row + 0.5),
-            "value": [plain(short(each.value)) for each in intervals],
-            "colour": colours,
-        }
         fig.text(
-            "at_s", "row", text="value", source=ColumnDataSource(data), text_color="colour",
-            text_align="center", text_baseline="middle", text_font_size="11px",
+            "at_s", row + 0.5, text="value", source=self._sources["names", lane.name, 0],
+            text_color="colour", text_align="center", text_baseline="middle",
+            text_font_size="11px",
         )  # fmt: skip
 
     def _events(self, fig: Any, row: int, lane: Lane) -> None:
-        data = {**_columns(lane.intervals), "row": np.full(len(lane.intervals), row + 0.5)}
-        source = ColumnDataSource(data)
+        source = self._sources["events", lane.name, 0]
         fig.hbar(
-            y="row", left="start_s", right="end_s", height=0.8, source=source, line_width=0,
+            y=row + 0.5, left="start_s", right="end_s", height=0.8, source=source, line_width=0,
             fill_color=LINES[1], fill_alpha=0.3,
         )  # fmt: skip
         marks = fig.scatter(
-            "start_s", "row", source=source, marker="diamond", size=11, color=LINES[1],
+            "start_s", row + 0.5, source=source, marker="diamond", size=11, color=LINES[1],
             line_color="white",
         )  # fmt: skip
         fig.add_tools(hover([marks], [(lane.name, "@value"), *_WHEN]))
 
 
+_GAPS: Final[Key] = ("gaps", "", 0)
+_MOMENTS: Final[Key] = ("moments", "", 0)
 _WHEN: Final = (("from", "@start_s{0.000} s"), ("to", "@end_s{0.000} s"))
 _GROUND: Final[dict[str, Any]] = {
     "fill_color": "colour", "fill_alpha": 0.35, "line_width": 0, "hatch_pattern": "hatch",
@@ -276,6 +274,39 @@ _GAP: Final[dict[str, Any]] = {
 }  # fmt: skip
 
 
+def _form(plot: SignalAxes) -> Any:
+    """What the figures are made for: the same form, the same figures."""
+    return (
+        [
+            (panel.unit, [(curve.name, curve.run_id) for curve in panel.curves])
+            for panel in plot.panels
+        ],
+        [lane.name for lane in plot.lanes],
+        [lane.name for lane in plot.events],
+        plot.bands.name if plot.bands else None,
+        plot.colour_by_run,
+    )
+
+
+def data_of(plot: SignalAxes) -> dict[Key, dict[str, Any]]:
+    """All that the figures show, by what it is."""
+    styles = _styles_of(plot)
+    events = [interval for lane in plot.events for interval in lane.intervals]
+    found: dict[Key, dict[str, Any]] = {_GAPS: _columns(plot.gaps), _MOMENTS: _columns(events)}
+    for curve in (curve for panel in plot.panels for curve in panel.curves):
+        found["curve", curve.name, curve.run_id] = _points(curve.points)
+        found["band", curve.name, curve.run_id] = _outline(curve.points)
+        found["lone", curve.name, curve.run_id] = _points(curve.lone_points)
+    if plot.bands:
+        found["ground", plot.bands.name, 0] = _areas(plot.bands, styles)
+    for lane in plot.lanes:
+        found["lane", lane.name, 0] = _areas(lane, styles)
+        found["names", lane.name, 0] = _names(lane, plot.x_range, styles)
+    for lane in plot.events:
+        found["events", lane.name, 0] = _columns(lane.intervals)
+    return found
+
+
 def _styles_of(plot: SignalAxes) -> dict[str, Area]:
     """The same value has the same style in every row, and behind the panels."""
     lanes = [*plot.lanes, *([plot.bands] if plot.bands else [])]
@@ -283,34 +314,26 @@ def _styles_of(plot: SignalAxes) -> dict[str, Area]:
     return area_styles(values) | _FLAGS
 
 
-def _points(curve: Curve) -> dict[str, Any]:
-    return dict(zip(("time_s", "mean", "low", "high"), _by_column(curve.points), strict=True))
+def _points(points: Sequence[Point]) -> dict[str, Any]:
+    return dict(zip(("time_s", "mean", "low", "high"), _by_column(points), strict=True))
 
 
 def _by_column(points: Sequence[Point]) -> Any:
     """The points, a row for each of their four columns."""
-    return np.transpose(np.array(points, dtype=np.float64))
+    rows: Any = np.array(points, dtype=np.float64)
+    return np.transpose(rows.reshape((-1, 4)))
 
 
-def _outline(curve: Curve) -> tuple[Any, Any]:
+def _outline(points: Sequence[Point]) -> dict[str, Any]:
     """The band of extremes: along the least values and back along the largest, piece by piece."""
-    columns = _by_column(curve.points)
+    columns = _by_column(points)
     x: list[Any] = []
     y: list[Any] = []
     for piece in np.split(columns, np.flatnonzero(np.isnan(columns[0])), axis=1):
         times, _, lows, highs = piece[:, ~np.isnan(piece[0])]
         x += [times, times[::-1], [np.nan]]
         y += [lows, highs[::-1], [np.nan]]
-    return np.concatenate(x), np.concatenate(y)
-
-
-def _lone(fig: Any, curve: Curve, colour: str) -> list[Any]:
-    """Points that a line does not show."""
-    lone = curve.lone_points
-    if not lone:
-        return []
-    times, means, _, _ = zip(*lone, strict=True)
-    return [fig.scatter(numbers(times), numbers(means), color=colour, size=5)]
+    return {"x": np.concatenate(x), "y": np.concatenate(y)}
 
 
 def _columns(intervals: Sequence[Interval]) -> dict[str, Any]:
@@ -321,12 +344,26 @@ def _columns(intervals: Sequence[Interval]) -> dict[str, Any]:
     }
 
 
-def _areas(lane: Lane | None, styles: dict[str, Area]) -> dict[str, Any]:
+def _areas(lane: Lane, styles: dict[str, Area]) -> dict[str, Any]:
     """The columns of coloured stretches."""
-    intervals = lane.intervals if lane else ()
-    areas = [styles[each.value] for each in intervals]
+    areas = [styles[each.value] for each in lane.intervals]
     return {
-        **_columns(intervals),
+        **_columns(lane.intervals),
         "colour": [area.colour for area in areas],
         "hatch": ["dot" if area.dotted else " " for area in areas],
+    }
+
+
+def _names(lane: Lane, x_range: tuple[float, float], styles: dict[str, Area]) -> dict[str, Any]:
+    """The values that have room in their stretches."""
+    length_s = x_range[1] - x_range[0]
+    shown = [
+        each
+        for each in lane.intervals
+        if each.end_s - each.start_s > _WITH_NAMES * len(short(each.value)) * length_s
+    ]
+    return {
+        "at_s": numbers([(each.start_s + each.end_s) / 2 for each in shown]),
+        "value": [plain(short(each.value)) for each in shown],
+        "colour": ["white" if styles[each.value].colour == INK else INK for each in shown],
     }

@@ -24,6 +24,7 @@ _FINE_S: Final = 0.005
 _WHEEL_RADIUS_M: Final = 0.05
 _FORMS: Final = ("pose", "position", "gps", "odom")
 _EVIDENCE: Final = ("commanded", "wheels", "mode", "measured", "none")
+_TOLD: Final = ("commanded", "wheels")  # these show that it was told to stand
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,7 @@ def driven(
         **_evidence(evidence, [phases[index] for index in at]),
         **_unrelated(rng, len(times)),
     }
-    incidents = _standstills(phases, interval_s, noise_m, known=evidence != "none")
+    incidents = _standstills(phases, interval_s, noise_m, evidence)
     return LabelledRun(times, columns, interval_s, tuple(incidents), noise_m, way_m)
 
 
@@ -166,12 +167,15 @@ def _unrelated(rng: np.random.Generator, rows: int) -> dict[str, Any]:
 
 
 def _standstills(
-    phases: Sequence[Phase], interval_s: float, noise_m: float, *, known: bool
+    phases: Sequence[Phase], interval_s: float, noise_m: float, evidence: str
 ) -> list[Incident]:
     """Where it stood, and where it was stuck, if what is published tells.
 
-    Standing while it turns is told or not, and is not stuck.
+    Standing while it turns is told or not, and is not stuck. Who stands at the end of a way in the
+    same mode is stuck or has come: where the mode is all that is published, nobody can tell.
     """
+    known = evidence != "none"
+    driven_in = set() if evidence in _TOLD else {each.mode for each in phases if each.speed_m_s}
     found: list[Incident] = []
     start_s = 0.0
     before: Phase | None = None
@@ -184,8 +188,10 @@ def _standstills(
             least_s = _least_error_s(before, interval_s, noise_m)
             stop = Incident("standstill", start_s, end_s, begin_error_s=least_s, optional=optional)
             found.append(stop)
-            if told or not known:
-                found.append(Incident("stuck", start_s, end_s, optional=optional or not known))
+            come = not told and any(each.mode in driven_in for each in part)
+            if told or come or not known:
+                unclear = optional or come or not known
+                found.append(Incident("stuck", start_s, end_s, optional=unclear))
         start_s, before = end_s, part[-1]
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import random
 import sqlite3
 from typing import Any
 
@@ -14,6 +15,7 @@ from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.evidence import Counts, Observed, Part, weigh
 from webots_mcp.store.detection.habits import MovedIn
 from webots_mcp.store.detection.motion import find_motion
+from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.signals.catalogue import known_signals
@@ -145,3 +147,19 @@ def test_a_mode_that_was_not_looked_at_in_time_is_not_said_to_be_one_in_which_it
     observed = Observed([part], Counts(rows=100))
     evidence = weigh(observed, motion, EventOptions(), moved_in)
     assert evidence.against == ["whether it moves in mode go was not looked at: the time was over"]
+
+
+def test_noise_is_no_motion_in_a_mode_of_which_there_are_few_rows(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder, noise = start_run(empty), random.Random(1)
+    x_m = 0.0
+    for step in range(240):  # every half second: 10 s of driving, then 5.5 s at the charger
+        charging = step % 31 >= 20
+        x_m += 0.0 if charging else 0.1
+        place = [x_m + noise.gauss(0, 0.01), noise.gauss(0, 0.01)]
+        recorder.publish(step * 0.5, {"pose": place, "mode": "charging" if charging else "drive"})
+    found = find_events(
+        empty, find_range(empty, Scope(run_id=1)), EventOptions(kinds=("still", "stuck"))
+    )
+    assert found.totals == {"still": 7}

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Final
 
@@ -12,11 +13,13 @@ import numpy as np
 
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.track import Track, path_length_m
-from webots_mcp.store.detection.motion import Motion, tracks_in
+from webots_mcp.store.detection.motion import Motion, position_noise, tracks_in
 from webots_mcp.store.reading.changes import Point, change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.rows import read_columns
+from webots_mcp.store.reading.sampling import newest_part
+from webots_mcp.store.signals.registry import Signal
 
 ROLLS_OUT_S: Final = 1.5  # after a mode began, the motion of the mode before may go on
 WINDOW_S: Final = 20.0  # at once is read
@@ -25,6 +28,8 @@ LEAST_MOVED_M: Final = 0.1
 LEAST_NOISE: Final = 4.0  # deviations of the position
 OVER_NOISE: Final = 20.0  # deviations of what is left of it: so far it goes while speed is measured
 EARLIER_RUNS: Final = 3
+NOISE_ROWS: Final = 100  # fewer tell the noise of their positions badly, under 12 not at all
+NEWEST_ROWS: Final = 1000  # of a run, which tell it then
 
 _EARLIER: Final = (
     "SELECT id FROM run WHERE robot_id = (SELECT robot_id FROM run WHERE id = ?) AND id < ? "
@@ -56,6 +61,7 @@ class MovedIn:
         self._deadline = deadline
         self.cut: set[Value] = set()
         self._points: dict[int, list[Point]] = {}
+        self._noises_m: dict[int, float | None] = {}
         self._seen: dict[Value, Seen | None] = {}
 
     def seen(self, mode: Value) -> Seen | None:
@@ -110,11 +116,21 @@ class MovedIn:
         if position is None:
             return None
         columns = read_columns(self._connection, window, position, self._deadline)
-        tracks = tracks_in(columns, position)
+        few = len(columns.times) < NOISE_ROWS
+        tracks = tracks_in(columns, position, self._noise_m(window, position) if few else None)
         way_m = sum(map(path_length_m, tracks))
         if way_m < max([LEAST_MOVED_M, *(LEAST_NOISE * track.noise_m for track in tracks)]):
             return None
         return max(map(_usual_m_s, tracks)) or None
+
+    def _noise_m(self, window: Segment, position: tuple[Signal, Signal]) -> float | None:
+        """That of the position in a run, whatever the mode; None where its rows do not tell it."""
+        if window.run_id not in self._noises_m:
+            run = replace(window, start_s=-math.inf, end_s=math.inf)
+            newest = newest_part(self._connection, run, NEWEST_ROWS)
+            columns = read_columns(self._connection, newest, position, self._deadline)
+            self._noises_m[window.run_id] = position_noise(columns, position)
+        return self._noises_m[window.run_id]
 
 
 def _steps(begin_s: float, end_s: float) -> Iterator[float]:

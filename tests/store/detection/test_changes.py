@@ -83,3 +83,23 @@ def test_few_whole_numbers_that_are_named_like_a_mode_are_one(
     known = known_signals(empty, find_range(empty, Scope(run_id=1)))
     mode = find_motion(known, EventOptions()).mode
     assert mode is not None and mode.name == "arm.driveMode"
+
+
+@pytest.mark.parametrize("group", [True, False])
+def test_all_changes_of_a_flag_that_flickers_are_counted(
+    empty: sqlite3.Connection, *, group: bool
+) -> None:
+    recorder = start_run(empty)
+    for step in range(1600):
+        recorder.publish(step * 0.1, {"contact": step % 4 == 1, "mode": "go"})
+    found = find_events(
+        empty, find_range(empty, Scope(run_id=1)), EventOptions(kinds=("change",)), group=group
+    )
+    (flickering,) = found.events
+    assert (flickering.count, found.totals) == (800, {"change": 800})
+    assert (flickering.start_s, flickering.details["to"]) == (
+        pytest.approx(0.1),
+        {"true": "400 times, 40 s", "false": "400 times, 119.8 s"},
+    )
+    assert "the first at 0.1 s, the last at 159.8 s" in flickering.details["says"]
+    assert found.verdicts.not_searched == {}

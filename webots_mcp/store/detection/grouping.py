@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import replace
-from statistics import median
-from typing import Any, Final
+from typing import Any
 
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike
 from webots_mcp.store.detection.registry import kind_named
+from webots_mcp.store.detection.together import told_together
 from webots_mcp.store.signals.registry import Signal
-
-MOST_TIMES: Final = 3  # of a group that are named
-_SAME_LENGTH: Final = 0.05  # of the longest: so near each other they last equally long
 
 
 def grouped(events: Sequence[Event], known: dict[str, Signal]) -> list[Event]:
@@ -64,16 +61,15 @@ def _as_one(alike: Sequence[Event], how: Alike, known: dict[str, Signal]) -> Eve
     first, last = alike[0], max(alike, key=lambda event: event.end_s)
     signal = known.get(first.name or "")
     what = how.says(alike, f" {signal.unit}" if signal and signal.unit else "")
-    times_s = [round(event.start_s, 3) for event in alike]
-    says = (
-        f"{len(alike)} {what}, the first at {times_s[0]:.6g} s, the last at {times_s[-1]:.6g} s"
-        f"{_lengths(alike)}"
-    )
     details = {
         **_in_common([event.details for event in alike]),
         **how.adds(alike),
-        "says": says,
-        "first_times_s": times_s[:MOST_TIMES],
+        **told_together(
+            what,
+            [event.start_s for event in alike],
+            [event.duration_s for event in alike],
+            max(event.details.get("within_s", 0.0) for event in alike),
+        ),
     }
     return replace(
         first,
@@ -82,20 +78,6 @@ def _as_one(alike: Sequence[Event], how: Alike, known: dict[str, Signal]) -> Eve
         details=details,
         count=len(alike),
         exactly=None,
-    )
-
-
-def _lengths(alike: Sequence[Event]) -> str:
-    """How long they lasted, where they did."""
-    lengths_s = [event.duration_s for event in alike]
-    least_s, most_s, middle_s = min(lengths_s), max(lengths_s), median(lengths_s)
-    if not most_s:
-        return ""
-    if most_s - least_s <= _SAME_LENGTH * most_s:
-        return f", each {middle_s:.3g} s long"
-    return (
-        f", {least_s:.3g} to {most_s:.3g} s long (median {middle_s:.3g} s), "
-        f"{sum(lengths_s):.4g} s in all"
     )
 
 

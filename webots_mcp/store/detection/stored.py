@@ -6,9 +6,11 @@ import json
 import math
 import sqlite3
 from collections.abc import Hashable, Iterator, Sequence
+from dataclasses import replace
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
+from webots_mcp.naming import Value
 from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.detection.event import LEVELS, Event
 from webots_mcp.store.detection.kind import (
@@ -19,6 +21,7 @@ from webots_mcp.store.detection.kind import (
     only_if_named,
 )
 from webots_mcp.store.detection.search import Search, wall_time_at
+from webots_mcp.store.detection.together import told_together
 from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
 from webots_mcp.store.reading.gaps import rhythm_in, with_rows_around
 from webots_mcp.store.reading.ranges import Segment, just_after
@@ -28,7 +31,7 @@ from webots_mcp.store.signals.registry import Signal
 MOST_OF_A_KIND: Final = 2000  # newest rows of a table that are looked at, per run
 AROUND_S: Final = 10.0  # before and after: what changes all the time there, measures
 MOST_NAMED: Final = 3  # values of a signal that many changes are told of
-MOST_CHANGES: Final = 500  # newest change points of one signal that become events
+MOST_CHANGES: Final = 500  # of one signal that become events; more become one
 
 _IN_SEGMENT: Final = (
     "WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ? AND wall_time_s >= ? "
@@ -116,24 +119,45 @@ def change_events(search: Search) -> Iterator[Event]:
         told = _without_measurements(points)
         ends_s = [*(point.sim_time_s for point in told[2:]), _last_ends_s(search, signal, told)]
         changes = [
-            (before, point, end_s)
+            _Change(before, point, newest_s if end_s is None else end_s, end_s is None)
             for (before, point), end_s in zip(pairwise(told), ends_s, strict=False)
             if segment.start_s <= point.sim_time_s < segment.end_s
         ]
         if len(told) < len(points):
             why = f"not from number to number of {name}, which measures: ask signals=['{name}']"
             search.not_searched("change", f"{why} of webots_query_history")
-        if len(changes) > MOST_CHANGES:
-            until_s = changes[-MOST_CHANGES][1].sim_time_s
-            why = (
-                f"{name} up to {until_s:.3f} s, where it changes too often: ask end_s={until_s:.3f}"
-            )
-            search.not_searched("change", why)
-        for before, point, end_s in changes[-MOST_CHANGES:]:
-            place = (segment.run_id, point.sim_time_s, newest_s if end_s is None else end_s)
-            wall_s = wall_time_at(search.connection, segment.run_id, point.sim_time_s)
-            details = {"before": before.value, "after": point.value}
-            yield Event("change", *place, wall_s, name, details, ongoing=end_s is None)
+        yield from _told(search, name, changes)
+
+
+class _Change(NamedTuple):
+    """From one value to another, which lasted until `end_s`, or goes on."""
+
+    before: Point
+    point: Point
+    end_s: float
+    ongoing: bool
+
+
+def _told(search: Search, name: str, changes: Sequence[_Change]) -> Iterator[Event]:
+    """Each change; of what flickers all as one."""
+    if len(changes) > MOST_CHANGES:
+        starts_s = [each.point.sim_time_s for each in changes]
+        lengths_s = [each.end_s - each.point.sim_time_s for each in changes]
+        to = _to(list(zip((each.point.value for each in changes), lengths_s, strict=True)))
+        together = to | told_together("changes", starts_s, lengths_s)
+        one = changes[-1]._replace(point=changes[0].point)
+        yield replace(_change(search, name, one, together), count=len(changes))
+        return
+    for each in changes:
+        details = {"before": each.before.value, "after": each.point.value}
+        yield _change(search, name, each, details)
+
+
+def _change(search: Search, name: str, change: _Change, details: dict[str, Any]) -> Event:
+    run_id, start_s = search.segment.run_id, change.point.sim_time_s
+    wall_s = wall_time_at(search.connection, run_id, start_s)
+    place = (run_id, start_s, change.end_s, wall_s)
+    return Event("change", *place, name, details, ongoing=change.ongoing)
 
 
 def _last_ends_s(search: Search, signal: Signal, told: Sequence[Point]) -> float | None:
@@ -250,12 +274,16 @@ def _bounds(segment: Segment) -> tuple[float, ...]:
 
 
 def _values(events: Sequence[Event]) -> dict[str, Any]:
-    """To which values it changed, the most frequent first, and for how long each was there."""
+    """To which values a signal changed."""
+    return _to([(event.details["after"], event.duration_s) for event in events])
+
+
+def _to(values: Sequence[tuple[Value, float]]) -> dict[str, Any]:
+    """The most frequent values first, and for how long each was there in all."""
     lasted_s: dict[str, list[float]] = {}
-    for event in events:
-        value = event.details["after"]
+    for value, duration_s in values:
         name = value if isinstance(value, str) else json.dumps(value)
-        lasted_s.setdefault(name, []).append(event.duration_s)
+        lasted_s.setdefault(name, []).append(duration_s)
     often = sorted(lasted_s, key=lambda name: -len(lasted_s[name]))
     to: dict[str, Any] = {
         name: f"{len(lasted_s[name])} times, {sum(lasted_s[name]):.4g} s"

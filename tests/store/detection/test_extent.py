@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import sys
 from contextlib import closing
@@ -21,7 +22,8 @@ GOES_ON_S = 300.0
 
 @pytest.fixture
 def standing(empty: sqlite3.Connection, tier: str) -> sqlite3.Connection:
-    """For 100 s the robot is stuck, its sensor silent, its battery low and its heading flat."""
+    """For 100 s the robot is stuck, its sensor silent, its battery low, its heading flat, and its
+    steering swings."""
     recorder = start_run(empty)
     for step in range(4000):
         time_s = round(step * 0.1, 6)
@@ -33,6 +35,7 @@ def standing(empty: sqlite3.Connection, tier: str) -> sqlite3.Connection:
             "battery_v": 3.0 if stands else 12.0,
             "heading_deg": 5.0 if stands else float(step % 90),
             "mode": "waits for help" if stands else "cruise",
+            "steering_rad": 0.3 * math.sin(math.pi * time_s) if stands else 0.0,
         }
         recorder.publish(time_s, state)
     recorder.end_run("finished")
@@ -42,12 +45,13 @@ def standing(empty: sqlite3.Connection, tier: str) -> sqlite3.Connection:
 
 def told(connection: sqlite3.Connection, kind: str, **bounds: Any) -> list[Event]:
     low = (Threshold("battery_v", below=5.0, for_s=2.0),)
-    name = {"silent": "front_m", "flat": "heading_deg", "change": "mode"}.get(kind, "*")
+    names = {"silent": "front_m", "flat": "heading_deg", "change": "mode"}
+    name = (names | {"oscillation": "steering_rad"}).get(kind, "*")
     options = EventOptions(kinds=(kind,), signals=(name,), thresholds=low)
     return list(find_events(connection, find_range(connection, Scope(**bounds)), options).events)
 
 
-@pytest.mark.parametrize("kind", ["stuck", "threshold", "silent", "flat"])
+@pytest.mark.parametrize("kind", ["stuck", "threshold", "silent", "flat", "oscillation"])
 @pytest.mark.parametrize(
     ("start_s", "end_s"), [(250.0, 255.0), (250.0, 250.5), (150.0, 250.0), (295.0, 350.0)]
 )

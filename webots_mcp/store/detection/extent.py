@@ -59,21 +59,29 @@ class Detection:
 
     def _with_ends(self, search: Search, segment: Segment) -> list[Event]:
         """The judged events that touch a recorded segment, as long as they are."""
-        reach_s = max((kind.least_s(self.options) for kind in search.kinds), default=0.0)
+        reaches_s = ((each.least_s, each.around_s) for each in search.kinds)
+        reach_s = max((of(self.options) for both in reaches_s for of in both), default=0.0)
         looked_at = _around(search, segment, reach_s)
         found = self._found(replace(search, segment=looked_at))
         events = [each for each in found if _reaches_into(each, segment)]
-        while cut := [each for each in events if self._is_cut(each, looked_at, search)]:
+        lost: list[Event] = []
+        while cut := [e for e in events if e not in lost and self._is_cut(e, looked_at, search)]:
             if self.deadline.passed:
-                for each in cut:
-                    why = f"the time was over: that of {each.start_s:.3f} s may be longer"
-                    self.ledger.not_searched(each.kind, why)
+                self._note_longer(cut, "the time was over")
                 break
             reach_s = FARTHER * max(reach_s, 1.0)
             looked_at = _around(search, segment, reach_s)
             whole = self._whole(cut, looked_at)
-            events = [_longer(each, whole) if each in cut else each for each in events]
+            longer = {id(each): _longer(each, whole) for each in cut}
+            lost += [each for each in cut if longer[id(each)] is each]
+            events = [longer.get(id(each), each) for each in events]
+        self._note_longer(lost, "it does not show in a longer range")
         return list({(*_subject(each), each.start_s): each for each in events}.values())
+
+    def _note_longer(self, events: Sequence[Event], why: str) -> None:
+        for each in events:
+            said = f"{why}: that of {each.start_s:.3f} s may be longer"
+            self.ledger.not_searched(each.kind, said)
 
     def _search(self, segment: Segment, kinds: Sequence[EventKind]) -> Search:
         return Search(
@@ -128,10 +136,12 @@ class Detection:
 
     def _is_cut(self, event: Event, looked_at: Segment, search: Search) -> bool:
         """Whether it reaches the first or last row that was looked at, and others follow there."""
-        if not kind_named(event.kind).lasts:
+        kind = kind_named(event.kind)
+        if not kind.lasts:
             return False
-        before = (event.run_id, looked_at.start_s, event.start_s)
-        after = (event.run_id, event.end_s, looked_at.end_s)
+        within_s = kind.ends_within_s(event)
+        before = (event.run_id, looked_at.start_s, event.start_s - within_s)
+        after = (event.run_id, event.end_s + within_s, looked_at.end_s)
         has_begin, has_end = self.connection.execute(
             _ROWS_BEFORE_AND_AFTER, (*before, *after)
         ).fetchone()

@@ -25,6 +25,10 @@ def _no_time(options: EventOptions) -> float:
     return 0.0
 
 
+def _to_the_row(event: Event) -> float:
+    return 0.0
+
+
 def _nothing(search: Search) -> Sequence[Signal]:
     return ()
 
@@ -84,6 +88,9 @@ class EventKind:
         usual: Whether it is looked for where no kinds are named.
         lasts: It has a begin and an end, which are followed out of the range.
         least_s: How long it has to last; a shorter range has to be widened by as much.
+        around_s: How far around a range it has to be looked for, where it may be shorter than that.
+        ends_within_s: How exactly its begin and end are known: nearer to the end of what was
+            looked at it may go on there.
         of_numbers: The numeric signals are looked at.
         routine: It happens all the time; it is shown in the room that all other kinds leave.
         counted: Comparisons of runs count it.
@@ -101,6 +108,8 @@ class EventKind:
     usual: Callable[[EventOptions], bool] = _always
     lasts: bool = False
     least_s: Callable[[EventOptions], float] = _no_time
+    around_s: Callable[[EventOptions], float] = _no_time
+    ends_within_s: Callable[[Event], float] = _to_the_row
     of_numbers: bool = False
     routine: bool = False
     counted: bool = True

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Final
 
 from webots_mcp.naming import listed
-from webots_mcp.store.analysis.swings import Swing, joined_swings
+from webots_mcp.store.analysis.swings import JOINED_PERIODS, Swing, joined_swings
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import Alike, EventKind, NotSearchableError
 from webots_mcp.store.detection.search import Search
@@ -33,7 +34,9 @@ def oscillation_events(search: Search) -> Iterator[Event]:
         for swing in joined_swings(swings):
             details = {"period_s": swing.period_s, "amplitude": swing.amplitude}
             ends = (swing.start_s, swing.end_s)
-            yield search.event("oscillation", *ends, name, turns=swing.half_swings, **details)
+            event = search.event("oscillation", *ends, name, turns=swing.half_swings, **details)
+            goes_on = search.ended_s - swing.end_s < _ends_within_s(event)
+            yield replace(event, ongoing=goes_on)
 
 
 def _note_periods(search: Search) -> None:
@@ -82,15 +85,21 @@ def _swinging(search: Search) -> list[Signal]:
     return [each for each in search.numbers if asked or may_swing(each)]
 
 
-def _least_s(options: EventOptions) -> float:
+def _around_s(options: EventOptions) -> float:
     return options.oscillation_turns * (options.oscillation_period_s or LONGEST_PERIOD_S) / 2
+
+
+def _ends_within_s(event: Event) -> float:
+    return JOINED_PERIODS * event.details["period_s"]
 
 
 OSCILLATION: Final = EventKind(
     "oscillation",
     "of heading, wheels, ...",
     oscillation_events,
-    least_s=_least_s,
+    lasts=True,
+    around_s=_around_s,
+    ends_within_s=_ends_within_s,
     of_numbers=True,
     drawn=3,
     reads_through=_swinging,

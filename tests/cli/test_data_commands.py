@@ -85,6 +85,27 @@ def test_export_of_parquet_can_be_read_back(say: Say, tmp_path: Path) -> None:
     assert set(parquet.read_table(file).column("mode").to_pylist()) == {"cruise"}
 
 
+def test_export_for_viewers_tells_what_the_file_holds_and_where_the_layout_is(
+    say: Say, tmp_path: Path
+) -> None:
+    file = tmp_path / "run.mcap"
+    said = say("export", "-o", str(file), "--run", "1", "--start", "0", "--end", "8")
+    layout = tmp_path / "run.layout.json"
+    assert said.startswith(f"{file}: 249 states, ")
+    assert said.endswith(f"; layout for Foxglove and Lichtblick: {layout}\n")
+    assert sorted(tmp_path.glob("run.*")) == [layout, file]
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [(("--format", "mcap"), "give a file with -o"), (("-o", "a.mcap", "--trials", "1"), "a table")],
+)
+def test_what_viewers_read_is_neither_for_a_pipe_nor_of_trials(
+    database: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], told: str
+) -> None:
+    assert told in complaint(capsys, "export", "--database", str(database), *more)
+
+
 def test_export_writes_the_trials_of_a_set(
     say: Say, database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -127,7 +148,7 @@ def test_a_name_without_a_format_is_bad_input(
     database: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = complaint(capsys, "export", "--database", str(database), "-o", "run.xlsx")
-    assert "end it in .csv, .jsonl or .parquet" in said
+    assert "end it in .csv, .jsonl, .parquet or .mcap" in said
 
 
 # -- import ---------------------------------------------------------------------------------------

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 @command(
     "export", DATA_DIR, DATABASE, *RANGE,
     argument("-o", "--output", metavar="FILE",
-             help="a .csv, .jsonl or .parquet file (default: CSV to stdout)"),
-    argument("--format", choices=("csv", "jsonl", "parquet"),
+             help="a .csv, .jsonl, .parquet or .mcap file (default: CSV to stdout)"),
+    argument("--format", choices=("csv", "jsonl", "parquet", "mcap"),
              help="where the file's name does not tell it"),
     argument("--safe-cells", action="store_true",
              help="in CSV, an apostrophe before texts that a spreadsheet would run as a formula "
@@ -46,13 +46,15 @@ if TYPE_CHECKING:
              help="the trials of that set instead, one row each, with score, rank and spread"),
 )  # fmt: skip
 def export(arguments: argparse.Namespace) -> None:
-    """Write recorded states as a table: one row per state, one column per value.
+    """Write recorded states as a table, or all of a run for Foxglove, Lichtblick or PlotJuggler.
 
-    The newest run is written, or a range; --since 0 writes all runs of a robot. Columns are run,
-    row, times, and the dotted names of what the controller published; NaN and infinity are kept.
-    Parquet needs pyarrow: pip install pyarrow.
+    The newest run is written, or a range; --since 0 writes all runs of a robot. A table has one row
+    per state; columns are run, row, times, and the dotted names of what the controller published;
+    NaN and infinity are kept. A .mcap file has states, poses, pictures, log lines, events and
+    commands, and a layout for Foxglove and Lichtblick beside it. Parquet and MCAP need extras:
+    pip install 'webots-mcp[parquet]' or 'webots-mcp[mcap]'.
     """
-    from webots_mcp.store.export import TrialTable, export_file, format_of
+    from webots_mcp.store.export import FOR_VIEWERS, TrialTable, export_file, format_of
     from webots_mcp.store.export import export as write
     from webots_mcp.store.reading.ranges import Scope
 
@@ -63,6 +65,8 @@ def export(arguments: argparse.Namespace) -> None:
     recording = open_recording(arguments)
     if file and isinstance(recording.database, Path) and file.resolve() == recording.database:
         raise InvalidInputError(f"{file} is the recording itself: choose another file")
+    if form in FOR_VIEWERS:
+        return _export_for_viewers(arguments, recording, file, form)
     if file is None and form == "parquet" and sys.stdout.isatty():
         raise InvalidInputError("Parquet is not for a terminal: give a file with -o")
 
@@ -82,6 +86,27 @@ def export(arguments: argparse.Namespace) -> None:
 
     # What went to stdout cannot be taken back: there each row is looked at first.
     past_unsound_rows(run) if file is None else past_wrong_values(run)
+
+
+def _export_for_viewers(
+    arguments: argparse.Namespace, recording: Recording, file: Path | None, form: str
+) -> None:
+    from webots_mcp.store.export import export_for_viewers, layout_file
+
+    if file is None:
+        raise InvalidInputError(f"{form} is not for stdout: give a file with -o")
+    if arguments.trial_set is not None:
+        raise InvalidInputError(f"trials are a table: choose csv, jsonl or parquet, not {form}")
+
+    def run() -> None:
+        with reading(arguments) as connection, shown_progress("exporting") as progress:
+            wanted = range_of(connection, arguments)
+            counts = export_for_viewers(connection, recording.data_dir, wanted, file, progress)
+        told = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+        print(f"{file}: {told}; layout for Foxglove and Lichtblick: {layout_file(file)}")
+        print_notes(wanted.notes, sys.stderr)
+
+    past_wrong_values(run)
 
 
 @command(

@@ -1,15 +1,21 @@
-"""Exporting states or trials as flat tables: CSV, JSON lines, Parquet; in constant memory."""
+"""Exporting in constant memory: states or trials as flat tables, all of a range for viewers."""
 
 from __future__ import annotations
 
+import json
 import os
 import sqlite3
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 from webots_mcp.contract import PRIVATE_FILE
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.export.contents import Contents
+from webots_mcp.store.export.layout import layout
+from webots_mcp.store.export.mcap import write_mcap
 from webots_mcp.store.export.parquet import write_parquet
 from webots_mcp.store.export.rows import Progress, Source, Table
 from webots_mcp.store.export.text import write_csv, write_json_lines
@@ -29,6 +35,7 @@ FORMATS: Final = {
     "jsonl": Format(write_json_lines, 1),
     "parquet": Format(write_parquet, 2),
 }
+FOR_VIEWERS: Final = ("mcap",)
 
 
 def export(
@@ -88,17 +95,64 @@ def export_file(
     Raises:
         InvalidInputError: Also where the file cannot be written.
     """
+    with _placed(file) as aside, aside.open("wb") as sink:
+        return export(connection, wanted, form, sink, progress, safe_cells=safe_cells)
+
+
+def export_for_viewers(
+    connection: sqlite3.Connection,
+    data_dir: Path,
+    wanted: TimeRange,
+    file: Path,
+    progress: Progress | None = None,
+) -> Counter[str]:
+    """Write all of a range as MCAP, with a layout for Foxglove and Lichtblick beside it.
+
+    The files are of their owner alone and appear when they are complete.
+
+    Args:
+        connection: Any; it is never kept busy for more than an instant.
+        data_dir: The folder of the pictures.
+        wanted: From `find_range`.
+        file: Where to; the layout is `layout_file` of it.
+        progress: Called now and then with the rows read so far and in all.
+
+    Returns:
+        How many there are of each kind: states, log lines, events, commands, pictures.
+
+    Raises:
+        InvalidInputError: The library is not installed, or a file cannot be written.
+    """
+    contents = Contents.of(connection, data_dir, wanted, 2, progress)
+    with _placed(file) as aside, aside.open("wb") as sink:
+        counts = write_mcap(contents, sink)
+    with _placed(layout_file(file)) as aside:
+        aside.write_text(json.dumps(layout(contents), indent=2), "utf-8")
+    return counts
+
+
+def layout_file(file: Path) -> Path:
+    """The layout beside a file for viewers."""
+    return file.with_suffix(".layout.json")
+
+
+@contextmanager
+def _placed(file: Path) -> Generator[Path]:
+    """A file beside it to write to, of its owner alone, which takes its place when it is whole.
+
+    Raises:
+        InvalidInputError: It cannot be written.
+    """
     aside = file.with_name(f"{file.name}.part")
     try:
-        with aside.open("wb") as sink:
-            aside.chmod(PRIVATE_FILE)
-            rows = export(connection, wanted, form, sink, progress, safe_cells=safe_cells)
+        aside.touch(PRIVATE_FILE)
+        aside.chmod(PRIVATE_FILE)
+        yield aside
         os.replace(aside, file)  # noqa: PTH105
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error
     finally:
         aside.unlink(missing_ok=True)
-    return rows
 
 
 def format_of(file: Path) -> str:
@@ -109,9 +163,9 @@ def format_of(file: Path) -> str:
     """
     ending = file.suffix.lower().lstrip(".")
     form = {"json": "jsonl", "ndjson": "jsonl", "pq": "parquet"}.get(ending, ending)
-    if form not in FORMATS:
+    if form not in (*FORMATS, *FOR_VIEWERS):
         raise InvalidInputError(
-            f"{file.name} does not tell its format: end it in .csv, .jsonl or .parquet, or give "
-            "the format"
+            f"{file.name} does not tell its format: end it in .csv, .jsonl, .parquet or .mcap, or "
+            "give the format"
         )
     return form

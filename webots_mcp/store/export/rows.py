@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Literal, NamedTuple, cast
 
-from webots_mcp.naming import LONGEST_SPREAD_ARRAY
+from webots_mcp.naming import LONGEST_SPREAD_ARRAY, flatten
 from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.signals.flatten import parse
@@ -48,6 +48,17 @@ _LARGEST_INT: Final = 2**63 - 1
 _PLAIN_KINDS: Final[dict[type[object], ColumnKind]] = {
     float: "num", str: "text", bool: "bool", type(None): "null",
 }  # fmt: skip
+
+
+class Recorded(NamedTuple):
+    """A state row as it is stored; the id of one that only a kept stretch has is below 0."""
+
+    run_id: int
+    state_id: int
+    sim_time_s: float
+    wall_time_s: float
+    data: str
+    odd: str | None
 
 
 class Row(NamedTuple):
@@ -142,12 +153,15 @@ class Source(Table):
 
     def rows(self, pass_number: int = 1) -> Iterator[Row]:
         """All of them, run by run, in the order of simulation time."""
+        return (flat_row(recorded) for recorded in self.recorded(pass_number))
+
+    def recorded(self, pass_number: int = 1) -> Iterator[Recorded]:
+        """The same rows as they are stored."""
         done = (pass_number - 1) * self.total
         for segment in self.segments:
             for chunk in self._chunks(segment):
-                for state_id, sim_time_s, wall_time_s, data, odd in chunk:
-                    head = (segment.run_id, state_id, sim_time_s, wall_time_s)
-                    yield _row(head, data, odd)
+                for stored in chunk:
+                    yield Recorded(segment.run_id, *stored)
                 done += len(chunk)
                 if self.progress is not None:
                     self.progress(done, self.total * self.passes)
@@ -167,7 +181,9 @@ class Source(Table):
             values["after_id"], values["start_s"], values["after_wall_s"] = chunk[-1][:3]
 
 
-def _row(head: tuple[int, int, float, float], data: str, odd_text: str | None) -> Row:
+def flat_row(recorded: Recorded) -> Row:
+    """A stored row as one value per dotted name."""
+    *head, data, odd_text = recorded
     state = parse(data)
     odd = cast("dict[str, str]", json.loads(odd_text)) if odd_text else {}
     for path, kind in odd.items():
@@ -177,7 +193,18 @@ def _row(head: tuple[int, int, float, float], data: str, odd_text: str | None) -
     _spread("", state.items(), values)
     for name in _RESERVED.intersection(values):
         values[f"state.{name}"] = values.pop(name)
-    return Row(head, values, odd)
+    return Row(tuple(head), values, odd)
+
+
+def value_at(state: dict[str, Any], name: str) -> Any:
+    """The value of that dotted name in a state; None where there is none."""
+    inner: Any = state
+    try:
+        for step in name.split("."):
+            inner = cast("Any", inner[int(step)] if isinstance(inner, list) else inner[step])
+    except (KeyError, IndexError, TypeError, ValueError):
+        return flatten(state).get(name)  # a key may hold a dot
+    return inner
 
 
 def _spread(prefix: str, items: Iterable[tuple[str, Any]], values: dict[str, Any]) -> None:

@@ -64,12 +64,16 @@ def write_json_lines(source: Table, sink: BinaryIO) -> None:
         sink.write(_line(line))
 
 
-def _line(line: dict[str, Any]) -> bytes:
+def json_text(value: dict[str, Any]) -> str:
+    """Strict JSON: null where a number is not finite."""
     try:
-        text = _encode(line)
+        return _encode(value)
     except ValueError:
-        text = _encode(_finite(line))
-    return f"{text}\n".encode()
+        return _encode(_finite(value))
+
+
+def _line(line: dict[str, Any]) -> bytes:
+    return f"{json_text(line)}\n".encode()
 
 
 def _finite(value: Any) -> Any:

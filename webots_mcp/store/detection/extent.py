@@ -137,7 +137,8 @@ class Detection:
     def _is_cut(self, event: Event, looked_at: Segment, search: Search) -> bool:
         """Whether it reaches the first or last row that was looked at, and others follow there."""
         kind = kind_named(event.kind)
-        if not kind.lasts:
+        before_it, after_it = looked_at.start_s > search.began_s, looked_at.end_s <= search.ended_s
+        if not kind.lasts or not (before_it or after_it):
             return False
         within_s = kind.ends_within_s(event)
         before = (event.run_id, looked_at.start_s, event.start_s - within_s)
@@ -145,9 +146,7 @@ class Detection:
         has_begin, has_end = self.connection.execute(
             _ROWS_BEFORE_AND_AFTER, (*before, *after)
         ).fetchone()
-        began_before = looked_at.start_s > search.began_s and not has_begin
-        goes_on = looked_at.end_s <= search.ended_s and not has_end
-        return began_before or goes_on
+        return (before_it and not has_begin) or (after_it and not has_end)
 
 
 def _too_short(kind: EventKind, search: Search) -> str:

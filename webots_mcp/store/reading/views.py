@@ -59,10 +59,10 @@ _STEPS: Final = (
     f"SELECT bucket, present, largest_step, first, last {_OF_SIGNAL} AND first IS NOT NULL "
     "ORDER BY bucket"
 )
-_ROWS_IN: Final = (  # and the time of the one before some time
-    "SELECT count(*), coalesce(max(iif(sim_time_s < :before_s, sim_time_s, NULL)), :before_s) "
-    "FROM state WHERE run_id = :run AND sim_time_s >= :start_s AND sim_time_s < :end_s"
+_ROWS_IN: Final = (
+    "SELECT count(*) FROM state WHERE run_id = ? AND sim_time_s >= ? AND sim_time_s < ?"
 )
+_LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 _FIRST_ROW: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
 _RESTING: Final = (
     "SELECT DISTINCT signal_id FROM all_rollup WHERE run_id = ? AND bucket >= ? AND bucket < ? "
@@ -448,10 +448,10 @@ class LongView:
     ) -> Iterator[Numbers]:
         """What there is no time for is noted."""
         first_s = max(self._segment.start_s, self._purged_until_s or -math.inf)
-        steps = [] if least_steps is None else self._largest_steps(signals)
         for part in _around(self._segment, outside):
             if part.start_s < first_s:
                 self._note_purged()
+            steps = [] if least_steps is None else self._largest_steps(part, signals)
             for whole in self._stretches(part, first_s):
                 if least_steps is None or (here := self._steps_in(whole, steps)) is None:
                     yield self._stretch(whole, signals)
@@ -477,22 +477,23 @@ class LongView:
                 return
             left = replace(left, end_s=part.start_s)
 
-    def _largest_steps(self, signals: Sequence[Signal]) -> list[dict[int, float]]:
+    def _largest_steps(self, part: Segment, signals: Sequence[Signal]) -> list[dict[int, float]]:
         """By bucket the largest step of each signal, and the one into it; infinite: not known.
 
         It is known where all rows of the bucket are in the rollups, each with a number.
         """
-        run_id, first, end = self._span
-        rows = rows_by_bucket(self._connection, run_id, FINE, range(first, end))
+        run_id, span = part.run_id, range(bucket_of(part.start_s), bucket_of(part.end_s) + 1)
+        rows = rows_by_bucket(self._connection, run_id, FINE, span)
         steps: list[dict[int, float]] = []
         for signal in signals:
-            found = self._connection.execute(_STEPS, (run_id, signal.id, first, end)).fetchall()
+            asked = (run_id, signal.id, span.start, span.stop)
+            found = self._connection.execute(_STEPS, asked).fetchall()
             own = dict.fromkeys(rows, math.inf)
             for bucket, present, step, *_ in found:
                 known = present == rows.get(bucket) and (step is not None or present < 2)
                 own[bucket] = (step or 0.0) if known else math.inf
-            for (*_, last), (bucket, _, _, first_number, _) in pairwise(found):
-                own[bucket] = max(own[bucket], abs(first_number - last))
+            for (*_, last), (bucket, _, _, first, _) in pairwise(found):
+                own[bucket] = max(own[bucket], abs(first - last))
             steps.append(own)
         return steps
 
@@ -507,10 +508,12 @@ class LongView:
 
     def _part(self, whole: Segment, large: range, signals: Sequence[Signal]) -> Numbers:
         """The rows of some buckets of a stretch, and the one before them."""
-        bounds = {"run": whole.run_id, "start_s": whole.start_s, "end_s": whole.end_s}
-        bounds["before_s"] = large.start * BUCKET_S
-        rows, start_s = self._connection.execute(_ROWS_IN, bounds).fetchone()
-        part = replace(whole, start_s=start_s, end_s=min(whole.end_s, large.stop * BUCKET_S))
+        bounds = (whole.run_id, whole.start_s, whole.end_s)
+        (rows,) = self._connection.execute(_ROWS_IN, bounds).fetchone()
+        large_s = large.start * BUCKET_S, large.stop * BUCKET_S
+        (before_s,) = self._connection.execute(_LAST_BEFORE, (whole.run_id, large_s[0])).fetchone()
+        start_s = whole.start_s if before_s is None else max(whole.start_s, before_s)
+        part = replace(whole, start_s=start_s, end_s=min(whole.end_s, large_s[1]))
         return replace(self._read_once(part, signals), stretch_rows=rows)
 
     def _stretch(self, part: Segment, signals: Sequence[Signal]) -> Numbers:
@@ -552,6 +555,11 @@ class LongView:
         return self.sample(self._signals)
 
     @functools.cached_property
+    def _interval_s(self) -> float | None:
+        """The usual one between the newest rows."""
+        return usual_interval_s(self._sample.moments)
+
+    @functools.cached_property
     def _resting(self) -> list[Signal]:
         """Those that have the same value throughout a bucket."""
         resting = {signal_id for (signal_id,) in self._connection.execute(_RESTING, self._span)}
@@ -586,7 +594,7 @@ class LongView:
 
     def _numbers(self, buckets: range, signals: Sequence[Signal]) -> Numbers:
         """The rows of some buckets, and a few before and after them."""
-        before_s = BACK_INTERVALS * (usual_interval_s(self._sample.times) or 0.0)
+        before_s = BACK_INTERVALS * (self._interval_s or 0.0)
         start_s = max(self._segment.start_s, buckets.start * BUCKET_S - before_s)
         end_s = min(self._segment.end_s, buckets.stop * BUCKET_S + before_s)
         return self._read_once(replace(self._segment, start_s=start_s, end_s=end_s), signals)

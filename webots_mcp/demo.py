@@ -92,7 +92,7 @@ def run(
     _say(f"Starting {DEFAULT_WORLD.name} on the stand-in simulator (this is not Webots) ...")
     with Simulation(DEFAULT_WORLD, environment={DATA_DIR_VARIABLE: str(data_dir)}) as simulation:
         _wait_for_rows(simulation, data_dir)
-        if not anyio.run(_converse, data_dir, conversation):
+        if not anyio.run(converse, data_dir, conversation):
             raise WebotsMCPError("the demo's server answered with an error, see above")
         _tell_where(data_dir)
         _tell_how_to_connect(data_dir, keep=keep)
@@ -119,7 +119,7 @@ def _newest_image(data_dir: Path) -> int:
         return int(connection.execute(sql).fetchone()[0]) if tables else 0
 
 
-async def _converse(data_dir: Path, conversation: tuple[Turn, ...]) -> bool:
+async def converse(data_dir: Path, conversation: tuple[Turn, ...]) -> bool:
     """Ask everything; False at the first answer that is an error."""
     async with _client(data_dir) as client:
         for question, tool, arguments in conversation:

@@ -1,0 +1,112 @@
+"""Makes the pictures of the pages, and the README's conversation, anew: `python -m docs.pictures`.
+
+They show the world and the controller of `webots-mcp demo`, for exactly so many simulated seconds.
+`images/drawn.json` says what was drawn by what; a test does the same again and compares.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import tempfile
+from contextlib import redirect_stdout
+from io import StringIO
+from pathlib import Path
+from statistics import fmean
+from typing import Final
+
+import anyio
+import matplotlib
+
+from webots_mcp import demo
+from webots_mcp.cli import main as webots_mcp
+from webots_mcp.contract import THROTTLE_VARIABLE
+from webots_mcp.testing import RecordedSimulation
+
+CHECKOUT: Final = Path(__file__).parent.parent
+README: Final = CHECKOUT / "README.md"
+IMAGES: Final = Path(__file__).parent / "images"
+DRAWN: Final = IMAGES / "drawn.json"
+DURATION_S: Final = 30.0
+# What is drawn, as the options of `webots-mcp plot`.
+PLOTS: Final = {
+    "signals.png": "lidar.nearest_m distance_m.left distance_m.right wheel_radps.left --height 520",
+    "way.png": "--trajectory --height 620",
+}
+# What a person would say, the tool that an assistant calls, and whether the README shows it.
+TURNS: Final[tuple[tuple[demo.Turn, bool], ...]] = (
+    (
+        (
+            "When did it begin and end to turn in the first ten seconds, and was it ever stuck?",
+            "webots_find_events",
+            {"kinds": ["change", "stuck"], "signals": ["mode"], "end_s": 10},
+        ),
+        True,
+    ),
+    (("Pause.", "webots_simulation_control", {"command": "pause"}), False),
+    (("Five steps.", "webots_simulation_control", {"command": "step", "steps": 5}), True),
+    (
+        (
+            "Which cruising speed gets farther in five seconds?",
+            "webots_run_trials",
+            {
+                "parameters": {"speed": [3.0, 8.0]},
+                "score": "max(pose.x) - first(pose.x)",
+                "for_s": 5,
+            },
+        ),
+        True,
+    ),
+)
+CONVERSATION: Final = re.compile(r"(?<=<!-- conversation -->\n```text\n).*?(?=^```$)", re.M | re.S)
+
+
+def recorded(folder: Path) -> RecordedSimulation:
+    """The demo's robot in its world; not started yet."""
+    return RecordedSimulation(data_dir=folder, environment={THROTTLE_VARIABLE: "5"})
+
+
+def draw_plots(data_dir: Path, images: Path) -> None:
+    """Draw what was recorded there."""
+    images.mkdir(exist_ok=True)
+    for name, options in PLOTS.items():
+        where = ["--data-dir", str(data_dir), "-o", str(images / name)]
+        if webots_mcp(["plot", *options.split(), *where]):
+            raise RuntimeError(f"{name} could not be drawn")
+
+
+def means(simulation: RecordedSimulation) -> dict[str, float]:
+    """What was drawn, in a few numbers: the mean of each signal of numbers."""
+    values = {each.name: each.values() for each in simulation.recording.signals()}
+    numbers = {name: [v for v in each if isinstance(v, float)] for name, each in values.items()}
+    return {name: round(fmean(each), 4) for name, each in numbers.items() if each}
+
+
+def conversation(data_dir: Path) -> str:
+    """What a person asks, what is called and what is answered, as the demo prints it."""
+    with redirect_stdout(StringIO()) as out:
+        anyio.run(demo.converse, data_dir, tuple(turn for turn, _ in TURNS))
+    said = re.sub(r"(?m)^  \(.* s\)\n", "", out.getvalue()).strip().split("\n\n")
+    shown = (text for text, (_, is_shown) in zip(said, TURNS, strict=True) if is_shown)
+    return "\n\n".join(shown) + "\n"
+
+
+def main() -> int:
+    """Make all of it."""
+    with tempfile.TemporaryDirectory() as folder:
+        data_dir = Path(folder)
+        simulation = recorded(data_dir)
+        with simulation:
+            simulation.run_for(DURATION_S)
+            draw_plots(data_dir, IMAGES)
+            drawn = {"matplotlib": matplotlib.__version__, "means": means(simulation)}
+            DRAWN.write_text(json.dumps(drawn, indent=2) + "\n", "utf-8")
+            simulation.resume()
+            said = conversation(data_dir)
+    README.write_text(CONVERSATION.sub(lambda _: said, README.read_text("utf-8")), "utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

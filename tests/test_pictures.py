@@ -1,0 +1,77 @@
+"""The pictures of the pages and the README's conversation are such as come about today."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import matplotlib
+import pytest
+from PIL import Image, ImageChops, ImageStat
+
+from docs import pictures
+from webots_mcp.testing import RecordedSimulation
+
+DRAWN = json.loads(pictures.DRAWN.read_text("utf-8"))
+MOST_BYTES = 150_000
+# Mean difference of the channels, of 255: 0 where the same is drawn, 1.9 and more where it is
+# drawn of a recording that is a second shorter.
+NEAR = 0.5
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("recorded")
+
+
+@pytest.fixture(scope="module")
+def simulation(data_dir: Path) -> Iterator[RecordedSimulation]:
+    simulation = pictures.recorded(data_dir)
+    with simulation:
+        simulation.run_for(pictures.DURATION_S)
+        yield simulation
+
+
+def test_what_was_drawn_is_what_the_demo_records(simulation: RecordedSimulation) -> None:
+    assert pictures.means(simulation) == pytest.approx(DRAWN["means"], rel=0.02, abs=0.02)
+
+
+@pytest.mark.usefixtures("simulation")
+def test_the_plots_look_as_they_are_drawn_today(data_dir: Path, tmp_path: Path) -> None:
+    if matplotlib.__version__ != DRAWN["matplotlib"]:
+        pytest.skip("another version of matplotlib drew the pictures")
+    pictures.draw_plots(data_dir, tmp_path)
+    for name in pictures.PLOTS:
+        assert difference(tmp_path / name, pictures.IMAGES / name) < NEAR, name
+
+
+def test_the_readme_has_the_conversation_of_today(
+    simulation: RecordedSimulation, data_dir: Path
+) -> None:
+    (shown,) = pictures.CONVERSATION.findall(pictures.README.read_text("utf-8"))
+    simulation.resume()
+    assert form(pictures.conversation(data_dir)) == form(shown)
+
+
+def test_pictures_are_small_and_each_is_shown() -> None:
+    pages = [pictures.README, *pictures.CHECKOUT.glob("docs/*.md")]
+    text = "".join(page.read_text("utf-8") for page in pages)
+    shown = set(re.findall(r"!\[.+\]\(\S*?images/(\S+)\)", text))
+    made = {file.name: file.stat().st_size for file in pictures.IMAGES.glob("*.png")}
+    assert made.keys() == shown
+    assert max(made.values()) < MOST_BYTES
+
+
+def form(text: str) -> str:
+    """Without numbers: when a step is asked for depends on the machine."""
+    return re.sub(r" +", " ", re.sub(r"-?\d+(\.\d+)?(e-\d+)?", "#", text))
+
+
+def difference(one: Path, other: Path) -> float:
+    """Of two pictures, looked at from so far away that single pixels do not count."""
+    small = [Image.open(file).convert("RGB").resize((90, 54), Image.Resampling.BOX)
+             for file in (one, other)]  # fmt: skip
+    means = ImageStat.Stat(ImageChops.difference(*small)).mean
+    return sum(means) / len(means)

@@ -23,14 +23,19 @@ from PIL import Image
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.server import create_server
+from webots_mcp.store.retention import Limit
+from webots_mcp.store.retention.limits import set_limits
 from webots_mcp.store.rollup.rolling import roll
 
 ROWS: Final = 60
+LATE_S: Final = (12.0, 505.0, 512.0)  # rows that end a bucket of 10 s, and one of 500 s
 JSON_COLUMNS: Final = {
     ("robot", "devices"), ("session", "versions"), ("session", "actions"), ("state", "data"),
     ("state", "odd"), ("kept_state", "data"), ("kept_state", "odd"), ("event", "data"),
     ("command", "params"), ("command", "result"),
     ("trial_set", "plan"), ("trial_set", "former_values"), ("trial", "parameters"),
+    ("parameter", "default_value"), ("parameter", "choices"), ("parameter", "next_value"),
+    ("parameter_value", "value"), ("coarse_rollup", "swings"), ("coarse_rollup", "standstills"),
 }  # fmt: skip
 _BLOB: Final = b"\x00\xff\x01"
 NOT_UTF8: Final = "CAST(x'7b22ff41227d' AS TEXT)"
@@ -48,7 +53,7 @@ _WRONG_JSON: Final = (
 )  # fmt: skip
 
 
-KEYED: Final = ("rollup", "coarse_rollup", "change")
+_KEYED: Final = ("rollup", "recent_rollup", "coarse_rollup", "change")
 READING: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     ("webots_list_robots", {}),
     ("webots_get_world_info", {}),
@@ -96,11 +101,13 @@ class Damage(NamedTuple):
 
     def apply(self, connection: sqlite3.Connection) -> None:
         where = f"rowid = (SELECT max(rowid) FROM {self.table})"
-        if self.table in KEYED:  # they have no rowid
-            where = f"(run_id, signal_id) = (SELECT max(run_id), max(signal_id) FROM {self.table})"
+        if self.table in _KEYED:  # they have no rowid
+            newest = f"SELECT run_id, signal_id FROM {self.table} ORDER BY run_id DESC, "
+            where = f"(run_id, signal_id) = ({newest} signal_id DESC LIMIT 1)"
         new, values = ("?", (self.value,)) if self.value is not NOT_UTF8 else (NOT_UTF8, ())
         connection.execute("PRAGMA foreign_keys=OFF")
-        connection.execute(f"UPDATE {self.table} SET {self.column} = {new} WHERE {where}", values)
+        sql = f"UPDATE {self.table} SET {self.column} = {new} WHERE {where}"
+        assert connection.execute(sql, values).rowcount > 0, f"{self.table} has no row"
 
     def __str__(self) -> str:
         return f"{self.table}.{self.column} = {self.value!r:.40}"
@@ -118,6 +125,7 @@ def record(file: Path) -> None:
     _add_trials(recorded.connection, robot)
     roll(recorded.connection)
     recorded.connection.execute("INSERT INTO lease VALUES ('maintenance', 'x', 1.0)")
+    set_limits(recorded.connection, {"log": Limit(rows=5)}, "retain")
     insert(recorded.connection, "console_line", {
         "instance": "webots-1", "wall_time_s": time.time(), "level": "error", "source": "console",
         "message": "it waits for a run", "logger": "stderr",
@@ -155,6 +163,9 @@ def _fill(robot: RecordedRobot, folder: Path) -> None:
         if step % 20 == 0:
             robot.log(step * 0.1, "hello", "warning")
             robot.event(step * 0.1, "change", "mode", {"from": "turn", "to": mode})
+    for late_s in LATE_S:
+        robot.state(late_s, {"pose": [late_s, 0.0, 0.1], "mode": "cruise", "battery_v": 11.0})
+    _set_parameter(robot)
     Image.new("RGB", (32, 24)).save(folder / "eye.png")
     robot.image(2.0, "eye.png")
     robot.kept(1.0, 2.0, "a look")
@@ -172,6 +183,22 @@ def _fill(robot: RecordedRobot, folder: Path) -> None:
             "claimed_sim_time_s": 1.0, "session_id": robot.session_id,
             "finished_wall_time_s": now if status == "done" else None,
             "finished_sim_time_s": 2.0, "result": '{"ok": true}' if status == "done" else None,
+        })  # fmt: skip
+
+
+def _set_parameter(robot: RecordedRobot) -> None:
+    """Declare one, as a controller does, with the values that it had in this run."""
+    declared = {
+        "robot_id": robot.id, "session_id": robot.session_id, "name": "kp", "kind": "float",
+        "default_value": "1.0", "low": 0.0, "high": 9.0, "choices": "[1.0, 2.0]", "doc": "Gain.",
+        "unit": "V", "next_value": "2.0", "declared_wall_time_s": robot.now,
+    }  # fmt: skip
+    robot.connection.execute("DELETE FROM parameter")
+    insert(robot.connection, "parameter", declared)
+    for sim_time_s, value in ((0.0, "1.0"), (3.0, "2.0")):
+        insert(robot.connection, "parameter_value", {
+            "run_id": robot.run_id, "name": "kp", "sim_time_s": sim_time_s, "value": value,
+            "wall_time_s": robot.now, "is_default": value == "1.0", "set_by": "code",
         })  # fmt: skip
 
 

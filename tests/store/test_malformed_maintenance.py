@@ -54,6 +54,8 @@ def test_a_row_that_cannot_be_summed_up_costs_only_itself_and_is_named(
     ("damage", "rolled"),
     [
         (Damage("run", "rolled_state_id", "yesterday"), {"x": 2}),
+        (Damage("watermark", "state_id", "yesterday"), {"x": 2}),
+        (Damage("watermark", "state_id", 2**63 - 1), {"x": 2}),
         (Damage("signal", "rows", 2**63 - 1), {"x": 2}),
         (Damage("signal", "name", BLOB), {"x": 1}),
         (Damage("signal", "path", BLOB), {"x": 1}),

@@ -30,11 +30,12 @@ _OBJECTS: Final = frozenset(
      "event.data", "command.params", "trial_set.plan", "trial_set.former_values",
      "trial.parameters"}
 )  # fmt: skip
+_PLAIN: Final = (bool, int, float, str)
 _OF_TEXTS: Final = frozenset({"robot.devices", "session.actions", "state.odd", "kept_state.odd"})
-_VALUES: Final = frozenset(
-    {"command.result", "parameter.default_value", "parameter.choices", "parameter.next_value",
-     "parameter_value.value"}
-)  # fmt: skip
+_SHAPES: Final = {  # of JSON that is no object
+    "command.result": "any", "parameter.choices": "values", "parameter.default_value": "value",
+    "parameter.next_value": "value", "parameter_value.value": "value",
+}  # fmt: skip
 # A row that refers to one that is not sound would lead there.
 _REFERENCES: Final = {
     "session": (("robot_id", "robot"),),
@@ -42,14 +43,16 @@ _REFERENCES: Final = {
     "trial": (("trial_set_id", "trial_set"),),
 }
 _TABLES: Final = ("robot", "session", "run", "state", "log", "event", "image", "command",
-                  "signal", "rollup", "coarse_rollup", "change", "watermark",
-                  "parameter", "parameter_value", "breakpoint", "trial_set", "trial",
-                  "kept_stretch", "kept_state", "console_line")  # fmt: skip
+                  "signal", "rollup", "recent_rollup", "coarse_rollup", "change", "watermark",
+                  "retention_limit", "parameter", "parameter_value", "breakpoint", "trial_set",
+                  "trial", "kept_stretch", "kept_state", "console_line")  # fmt: skip
 # What a row of foreign origin may hold: values of any type, numbers, text and nesting that cannot
 # be stored, a run that is not there.
 _UNSTORABLE: Final = (
     TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
 )  # fmt: skip
+# Where several tables are read as one, a view of `main` would go on to read the tables themselves.
+_VIEWS: Final = "SELECT sql FROM main.sqlite_master WHERE type = 'view'"
 _COLUMNS: Final = 'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)'
 
 
@@ -112,6 +115,8 @@ def shadow_if_asked(connection: sqlite3.Connection) -> None:
 def _shadow(connection: sqlite3.Connection, unsound: Unsound) -> None:
     connection.execute("PRAGMA query_only=OFF")  # a view of this connection alone
     _show_sound(connection, unsound)
+    for (sql,) in connection.execute(_VIEWS).fetchall():
+        connection.execute(sql.replace("CREATE VIEW", "CREATE TEMP VIEW", 1))
     connection.execute("PRAGMA query_only=ON")
 
 
@@ -161,8 +166,8 @@ def _view(connection: sqlite3.Connection, table: str, prefix: str) -> str:
 def _check(table: str, name: str, kind: str) -> tuple[str, str]:
     """An SQL condition that a sound value meets, and what such a value is called."""
     place = f"{table}.{name}"
-    if place in _OBJECTS | _VALUES:
-        what = "texts" if place in _OF_TEXTS else "value" if place in _VALUES else "object"
+    if place in _OBJECTS or place in _SHAPES:
+        what = "texts" if place in _OF_TEXTS else _SHAPES.get(place, "object")
         checked = f"sound_json(CAST({name} AS BLOB), '{what}')"  # it may be no UTF-8
         return f"CASE typeof({name}) WHEN 'text' THEN {checked} ELSE 0 END", "JSON"
     if kind == "TEXT":
@@ -183,12 +188,20 @@ def _is_sound_json(stored: bytes, what: str) -> int:
         _require_plain(value, MAX_DEPTH)
     except (ValueError, RecursionError, OverflowError):
         return 0
-    if what == "value":
-        return 1
-    members = cast("dict[str, Any]", value) if isinstance(value, dict) else None
-    if members is None or what == "object":
-        return int(members is not None)
-    return int(all(isinstance(member, str) for member in members.values()))
+    return int(_has_shape(value, what))
+
+
+def _has_shape(value: Any, what: str) -> bool:
+    """Whether it is anything, an object, one of texts, a parameter's value, or a list of these."""
+    if what in ("object", "texts"):
+        members = cast("dict[str, Any]", value).values() if isinstance(value, dict) else None
+        return members is not None and (
+            what == "object" or all(isinstance(member, str) for member in members)
+        )
+    if what == "values":
+        listed = cast("list[Any]", value) if isinstance(value, list) else [None]
+        return all(isinstance(each, _PLAIN) for each in listed)
+    return what == "any" or isinstance(value, _PLAIN)
 
 
 def _refuse(constant: str) -> None:

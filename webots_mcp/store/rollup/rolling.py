@@ -21,6 +21,7 @@ from webots_mcp.store.rollup.batch import Batch, BatchColumn
 from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of
 from webots_mcp.store.rollup.coarse import merge_coarse
 from webots_mcp.store.rollup.tables import (
+    IS_ID,
     Addition,
     Held,
     forget,
@@ -40,7 +41,8 @@ BATCH_ROWS: Final = 2000
 
 _SET_WATERMARK: Final = (
     "INSERT INTO watermark (name, state_id) VALUES ('rollup', ?) "
-    "ON CONFLICT (name) DO UPDATE SET state_id = max(state_id, excluded.state_id)"
+    "ON CONFLICT (name) DO UPDATE SET state_id = "
+    f"iif({IS_ID.format('state_id')}, max(state_id, excluded.state_id), excluded.state_id)"
 )
 _COLUMNS: Final = "s.id, r.robot_id, s.run_id, s.sim_time_s, s.wall_time_s, s.data, s.odd"
 _ROWS: Final = (

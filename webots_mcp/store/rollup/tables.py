@@ -27,10 +27,14 @@ Key = tuple[int, int]  # bucket, signal id
 
 _FIGURES: Final = ", ".join(Summary._fields)
 _COLUMNS: Final = f"run_id, bucket, signal_id, {_FIGURES}"
-_WATERMARK: Final = "SELECT state_id FROM watermark WHERE name = 'rollup'"
+# What cannot be an id is passed over: the marks of the runs still tell which rows are in.
+IS_ID: Final = f"typeof({{0}}) = 'integer' AND {{0}} BETWEEN 0 AND {2**53}"
+_WATERMARK: Final = (
+    f"SELECT state_id FROM watermark WHERE name = 'rollup' AND {IS_ID.format('state_id')}"
+)
 RUN_MARK: Final = (
-    "SELECT max(iif(typeof(rolled_state_id) = 'integer', rolled_state_id, 0), "
-    "coalesce((SELECT state_id FROM watermark WHERE name = 'rollup'), 0)) FROM run WHERE id = {}"
+    f"SELECT max(iif({IS_ID.format('rolled_state_id')}, rolled_state_id, 0), "
+    f"coalesce(({_WATERMARK}), 0)) FROM run WHERE id = {{}}"
 )
 _RECENT_ROWS: Final = "SELECT count(*) FROM recent_rollup WHERE run_id = {}"
 _RECENT: Final = f"SELECT bucket, signal_id, {_FIGURES} FROM recent_rollup WHERE run_id = ?"

@@ -14,16 +14,14 @@ from webots_mcp.store.detection.motion import (
     doubt_of_length,
     doubt_of_unit,
     find_motion,
-    path_length,
     places_of,
 )
+from webots_mcp.store.questions.ways import Way, read_way
 from webots_mcp.store.reading.coverage import row_before
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_range
-from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.recording import View
 from webots_mcp.store.signals.catalogue import known_signals
-from webots_mcp.store.signals.registry import Signal
 
 
 @dataclass(frozen=True)
@@ -81,12 +79,13 @@ def movement(
     ways: dict[int, dict[str, Any]] = {}
     speeds_m_s: list[float] = []
     for segment in found.segments:
-        part = read_columns(view.connection, segment, position, deadline)
-        missing = {"rows_missing_from_s": seconds((part.times or [segment.start_s])[-1])}
-        if way := (_way(part, position) or {}) | (missing if part.cut else {}):
-            ways[segment.run_id] = way
-            took_s = part.times[-1] - part.times[0] if part.times else 0.0
-            went_m: float = way.get("distance_m") or 0.0
+        way = read_way(view.connection, segment, position, deadline)
+        times, is_cut = way.columns.times, way.columns.cut
+        missing = {"rows_missing_from_s": seconds((times or [segment.start_s])[-1])}
+        if told := (_told(way) or {}) | (missing if is_cut else {}):
+            ways[segment.run_id] = told
+            took_s = times[-1] - times[0] if times else 0.0
+            went_m: float = told.get("distance_m") or 0.0
             speeds_m_s.append(went_m / took_s if took_s else 0.0)
     if doubt := doubt_of_unit(position, max(speeds_m_s, default=0.0)):
         names |= {"unit": doubt}
@@ -95,18 +94,19 @@ def movement(
     return next((names | way for way in ways.values()), None)
 
 
-def _way(part: Columns, position: tuple[Signal, Signal]) -> dict[str, Any] | None:
+def _told(way: Way) -> dict[str, Any] | None:
     """From where to where it went in one run; a lost position is no place."""
-    times, x, y = places_of(part, position)
+    times, x, y = places_of(way.columns, way.position)
     if len(times) < 2:
         return None
-    way = path_length(part, position)
-    doubt = doubt_of_length(way)
+    length = way.length
+    sampled = f"that of a position each {way.sampled_s:.2g} s" if way.sampled_s else None
+    notes = "; ".join(filter(None, (sampled, doubt_of_length(length))))
     first, last = ((float(x[row]), float(y[row])) for row in (0, -1))
     return {
         "from_m": [figure(value) for value in first],
         "to_m": [figure(value) for value in last],
-        "distance_m": figure(way.length_m),
-        **({"distance_note": doubt} if doubt else {}),
+        "distance_m": figure(length.length_m),
+        **({"distance_note": notes} if notes else {}),
         "displacement_m": figure(math.dist(first, last)),
     }

@@ -6,7 +6,7 @@ import sqlite3
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from webots_mcp.naming import NAME_POSITION
 from webots_mcp.store.analysis.spread import (
@@ -21,24 +21,16 @@ from webots_mcp.store.detection.motion import (
     Motion,
     doubt_of_length,
     doubt_of_unit,
-    path_length,
-    position_noise,
 )
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Collected, collect
 from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.questions.ways import read_way, sampling_interval_s
 from webots_mcp.store.reading.changes import change_points, longest_values
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange
-from webots_mcp.store.reading.rows import exceeds, read_columns
-from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.signals.registry import Signal
 
-if TYPE_CHECKING:
-    from webots_mcp.store.analysis.track import PathLength
-
-NOISE_ROWS: Final = 2000  # of a long run, that tell the noise of its position
-SAMPLE_S: Final = 0.5  # between the positions from which a long run's distance is summed
 _SHARE: Final = "share of "
 _RATE: Final = " per min"
 NO_MODE: Final = (
@@ -204,13 +196,14 @@ def _outcome(
     purged = run_info(connection, run_id).purged_rows > 0
     figures: dict[str, float | None] = {}
     not_known: dict[str, str] = {}
-    if part.motion.position is None:
+    position = part.motion.position
+    if position is None:
         not_known["distance_m, mean_speed_m_s"] = NAME_POSITION
     else:
-        way = None if purged else _way(connection, part, part.motion.position, deadline)
+        way = None if purged else read_way(connection, part.segment, position, deadline).length
         speed = None if way is None else way.length_m / duration_s
         figures |= {"distance_m": way and way.length_m, _SPEED: speed}
-        doubt = doubt_of_unit(part.motion.position, speed or 0.0)
+        doubt = doubt_of_unit(position, speed or 0.0)
         if doubt := doubt or (way and doubt_of_length(way)):
             not_known["distance_m, mean_speed_m_s"] = doubt
     modes = _mode_times(connection, part, deadline)
@@ -232,34 +225,13 @@ def _outcome(
     )
 
 
-def _way(
-    connection: sqlite3.Connection,
-    part: RunPart,
-    position: tuple[Signal, Signal],
-    deadline: Deadline,
-) -> PathLength:
-    """Of a long run from samples, which cut corners a little; its newest rows show its noise."""
-    if not exceeds(connection, part.segment) or not all(each.is_plain for each in position):
-        columns = read_columns(connection, part.segment, position, deadline)
-        return path_length(columns, position)
-    columns = read_sampled(connection, part.segment, position, _every_s(part.segment), deadline)
-    newest = newest_part(connection, part.segment, NOISE_ROWS)
-    noise_m = position_noise(read_columns(connection, newest, position, deadline), position)
-    return path_length(columns, position, noise_m)
-
-
-def _every_s(segment: Segment) -> float:
-    """Simulated seconds between the samples of a long run."""
-    return max(SAMPLE_S, (segment.end_s - segment.start_s) / MOST_SAMPLES)
-
-
 def sampling_notes(connection: sqlite3.Connection, parts: Sequence[RunPart]) -> list[str]:
     """Says of which runs the distance comes from samples."""
     return [
-        f"the distance of run {part.segment.run_id} is that of a position each "
-        f"{_every_s(part.segment):.2g} s"
+        f"the distance of run {part.segment.run_id} is that of a position each {every_s:.2g} s"
         for part in parts
-        if part.motion.position and exceeds(connection, part.segment)
+        if (position := part.motion.position)
+        if (every_s := sampling_interval_s(connection, part.segment, position))
     ]
 
 

@@ -50,7 +50,7 @@ def _tool(tool: Any) -> str:
         for name, schema in tool.input_schema["properties"].items()
     ]  # fmt: skip
     table = _table(["parameter", "type", "default", "meaning"], rows) if rows else ""
-    return f"### {tool.name}\n\n{_as_markdown(tool.description)}\n\n{table}"
+    return f"### {tool.name}\n\n{as_markdown(tool.description)}\n\n{table}"
 
 
 def _kind(schema: dict[str, Any]) -> str:
@@ -76,7 +76,7 @@ def _default(schema: dict[str, Any], required: bool) -> str:
 def commands(_page: str = "") -> str:
     """Each command with its arguments, as `--help` has them."""
     return "## Reference\n\n" + "\n".join(
-        f"### {each.name}\n\n{_as_markdown(inspect.getdoc(each.run) or '')}\n\n"
+        f"### {each.name}\n\n{as_markdown(inspect.getdoc(each.run) or '')}\n\n"
         + (_table(["argument", "meaning"], list(map(_argument, each.arguments))) or "")
         for each in sorted(COMMANDS)
     )
@@ -154,20 +154,20 @@ def _fixtures() -> Iterator[str]:
     members = vars(pytest_plugin)
     for name, each in sorted(members.items()):
         if isinstance(each, type(members["webots_robot"])):
-            yield f"### {name}\n\n{_as_markdown(inspect.getdoc(each) or '')}\n"
+            yield f"### {name}\n\n{as_markdown(inspect.getdoc(each) or '')}\n"
 
 
-def _as_markdown(text: str) -> str:
+def as_markdown(text: str) -> str:
     """A docstring: Markdown, but for brackets and stars; what is indented is to be copied."""
     return "\n\n".join(
         f"```sh\n{inspect.cleandoc(paragraph)}\n```"
         if paragraph.startswith(" ")
-        else _escaped(paragraph)
+        else escaped(paragraph)
         for paragraph in text.split("\n\n")
     )
 
 
-def _escaped(text: str) -> str:
+def escaped(text: str) -> str:
     """With what stands outside of backticks taken as it is."""
     parts = text.split("`")
     parts[::2] = [re.sub(r"([<>*\[\]])", r"\\\1", part) for part in parts[::2]]
@@ -177,7 +177,7 @@ def _escaped(text: str) -> str:
 def _table(columns: list[str], rows: list[list[str]]) -> str:
     lines = [columns, ["---"] * len(columns), *rows]
     cells = (
-        [_as_markdown(cell).replace("|", "\\|").replace("\n", " ") for cell in line]
+        [as_markdown(cell).replace("|", "\\|").replace("\n", " ") for cell in line]
         for line in lines
     )
     return "\n".join(f"| {' | '.join(line)} |" for line in cells) + "\n"

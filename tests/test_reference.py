@@ -1,0 +1,72 @@
+"""What the site adds to the pages from the code has all of it."""
+
+from __future__ import annotations
+
+import re
+
+import anyio
+import pytest
+
+from docs import reference
+from webots_mcp import MemoryDatabase
+from webots_mcp.cli import COMMANDS
+from webots_mcp.schema import SCHEMA_FILE
+from webots_mcp.server import create_server
+
+
+def parts(text: str) -> dict[str, str]:
+    """By heading what stands below it."""
+    return dict(re.findall(r"(?ms)^### (\S+).*?\n(.*?)(?=^### |\Z)", text))
+
+
+def test_each_tool_has_its_parameters_with_their_meaning() -> None:
+    memory = MemoryDatabase()
+    try:
+        tools = anyio.run(create_server(memory, memory.data_dir).list_tools)
+    finally:
+        memory.close()
+    shown = parts(reference.tools())
+    assert shown.keys() == {tool.name for tool in tools}
+    for tool in tools:
+        rows = re.findall(r"(?m)^\| `(\w+)` \| .+ \| .* \| (.*) \|$", shown[tool.name])
+        assert dict(rows).keys() == tool.input_schema["properties"].keys()
+        assert all(meaning for _, meaning in rows), tool.name
+
+
+def test_each_command_has_its_options() -> None:
+    shown = parts(reference.commands())
+    assert shown.keys() == {command.name for command in COMMANDS}
+    for command in COMMANDS:
+        for argument in command.arguments:
+            assert f"`{argument.typed}" in shown[command.name], command.name
+
+
+def test_each_table_and_view_has_its_columns_and_every_comment_of_the_schema() -> None:
+    shown = parts(reference.tables())
+    schema = SCHEMA_FILE.read_text("utf-8")
+    made = re.findall(r"(?ms)^CREATE (TABLE|VIEW) (\w+)(.*?);$", schema)
+    assert shown.keys() == {name for _, name, _ in made} - {"alembic_version"}
+    for kind, name, text in made:
+        comments = re.findall(r"/\* ?(.*?) ?\*/", text)
+        for comment in comments if kind == "TABLE" else comments[:1]:
+            assert reference.escaped(comment) in shown[name], name
+
+
+@pytest.mark.parametrize(
+    ("text", "markdown"),
+    [
+        ("a < b and `a < b`, 2 * 3", "a \\< b and `a < b`, 2 \\* 3"),
+        (
+            "So:\n\n  webots-mcp run 'x < 1'\n\nThat.",
+            "So:\n\n```sh\nwebots-mcp run 'x < 1'\n```\n\nThat.",
+        ),
+    ],
+)
+def test_docstrings_are_shown_as_they_are_meant(text: str, markdown: str) -> None:
+    assert reference.as_markdown(text) == markdown
+
+
+def test_the_navigation_has_the_pages_of_each_list() -> None:
+    index = "# A\n\n## One\n\n- [b](b.md): c\n- [d](../d.md)\n\n## Two\n\n- [e](e.md), f\n"
+    trees = re.findall(r":caption: ([^\n]+)\n\n(.*?)\n```", reference.navigation(index), re.DOTALL)
+    assert trees == [("One", "b.md\n../d.md"), ("Two", "e.md")]

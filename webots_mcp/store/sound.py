@@ -93,6 +93,12 @@ def past_unsound_rows() -> Generator[Unsound]:
         _reading.reset(token)
 
 
+def left_out_so_far() -> list[str]:
+    """What readers that were opened inside `past_unsound_rows` have left out until now."""
+    unsound = _reading.get()
+    return unsound.described() if unsound is not None else []
+
+
 @contextmanager
 def sound_rows(connection: sqlite3.Connection) -> Generator[Unsound]:
     """Inside, a writer has the view `sound_NAME` of each table, and reads any text."""

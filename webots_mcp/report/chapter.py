@@ -1,0 +1,422 @@
+"""What a report tells of one run: what ran, what happened, and what was recorded of it in texts."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.naming import find_mode
+from webots_mcp.report.grid import Grid, Row
+from webots_mcp.report.words import (
+    clock,
+    counted,
+    cut,
+    length,
+    listed,
+    number,
+    share,
+    spelled,
+    time_at,
+    told,
+    valued,
+)
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.registry import KINDS, stored_kinds
+from webots_mcp.store.detection.verdict import Verdicts
+from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, count_lines, newest_lines
+from webots_mcp.store.parameters import described
+from webots_mcp.store.questions.compare import compare_runs
+from webots_mcp.store.questions.events import Found, choose, search_events
+from webots_mcp.store.questions.runs import RunInfo, run_info
+from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
+from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.sessions import Session, fetch_session
+from webots_mcp.store.window import Window
+
+MOST_EVENTS: Final = 200
+MOST_ENTRIES: Final = 500  # of the timeline
+MOST_LINES: Final = 2_000  # of the log
+MOST_MOMENTS: Final = 8  # events that are shown with the seconds around them
+AROUND_S: Final = 5.0  # before and after
+MOST_SHOWN_S: Final = 30.0  # of the event itself
+_LINES_AROUND: Final = 12
+_MOST_VALUES: Final = 20  # of a mode
+_MARKS: Final = {"warning": "warning", "error": "error", "critical": "error"}
+# Where the room for texts goes; what one table leaves, the next ones have.
+_SHARES: Final = {
+    "parameters": 0.05, "moments": 0.1, "events": 0.15, "trends": 0.15, "commands": 0.1,
+    "timeline": 0.2, "log": 0.25,
+}  # fmt: skip
+
+
+class Held(NamedTuple):
+    """For how long a mode had a value."""
+
+    value: str
+    time: str
+    percent: float
+
+
+@dataclass(frozen=True)
+class Moment:
+    """An event with the seconds around it.
+
+    Attributes:
+        values: What a few signals were when it began.
+        lines: What else happened around it.
+    """
+
+    event: Event
+    title: str
+    says: str
+    values: str
+    lines: Grid
+
+    @property
+    def start_s(self) -> float:
+        """Where the seconds around it begin."""
+        return self.event.start_s - AROUND_S
+
+    @property
+    def end_s(self) -> float:
+        """Where they end; of a long event its begin is shown."""
+        return min(self.event.end_s, self.event.start_s + MOST_SHOWN_S) + AROUND_S
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """One run; a table that would be empty is None.
+
+    Attributes:
+        range: The whole run; None where it has no state row.
+        changed_most: Its numbers, what changed most first.
+        findings: What was found, what is absent, what was not looked for.
+    """
+
+    info: RunInfo
+    range: TimeRange | None
+    title: str
+    summary: str
+    facts: Mapping[str, str]
+    findings: Sequence[str] = ()
+    mode: str = ""
+    held: Sequence[Held] = ()
+    measures: Grid | None = None
+    moments: Sequence[Moment] = ()
+    parameters: Grid | None = None
+    events: Grid | None = None
+    trends: Grid | None = None
+    commands: Grid | None = None
+    timeline: Grid | None = None
+    log: Grid | None = None
+    changed_most: Sequence[str] = ()
+    notes: Sequence[str] = ()
+
+    @property
+    def grids(self) -> dict[str, Grid]:
+        """The tables that can lack rows, by what their rows are called."""
+        named = {
+            "parameter": self.parameters, "event": self.events, "trend": self.trends,
+            "command": self.commands, "entry of the timeline": self.timeline, "log line": self.log,
+        }  # fmt: skip
+        return {name: grid for name, grid in named.items() if grid is not None}
+
+
+class _Room:
+    """Bytes for the texts of a run, shared out in order."""
+
+    def __init__(self, room_bytes: float) -> None:
+        self._room_bytes, self._spare_bytes = room_bytes, 0.0
+
+    def fit(self, name: str, grid: Grid, *, newest: bool = False) -> Grid | None:
+        """The table with as many rows as have room; None without any."""
+        room_bytes = _SHARES[name] * self._room_bytes + self._spare_bytes
+        fitted = grid.within(room_bytes, newest=newest)
+        self._spare_bytes = room_bytes - sum(row.size_bytes for row in fitted.rows)
+        return fitted if fitted.rows or fitted.left_out else None
+
+
+def chapter_of(connection: sqlite3.Connection, run_id: int, room_bytes: float) -> Chapter:
+    """What there is to tell of a run, in texts that take about so many bytes at most.
+
+    Raises:
+        UnknownRunError: No run has that id.
+    """
+    run, info = fetch_run(connection, run_id), run_info(connection, run_id)
+    session = fetch_session(connection, run.session_id)
+    room = _Room(room_bytes)
+    facts = _facts(info, session, run.basic_time_step_ms)
+    parameters = room.fit("parameters", _parameters(connection, run_id))
+    title = f"Run {run_id} of {info.robot}" + (f": {info.label}" if info.label else "")
+    try:
+        whole = find_range(connection, Scope(run_id=run_id))
+    except NothingRecordedError as error:
+        log = room.fit("log", _log(connection, run_id), newest=True)
+        return Chapter(info, None, title, f"{_first_words(info)} {error}.", facts,
+                       parameters=parameters, log=log)  # fmt: skip
+    found, stored = _found(connection, whole), _stored(connection, whole)
+    moments = [_moment(each, stored) for each in _outstanding(connection, found)]
+    course = trends(connection, whole, limit=500)
+    (told_trends,) = course.runs
+    mode = _mode(told_trends)
+    measures, measure_notes = _measures(connection, run_id)
+    return Chapter(
+        info, whole, title,
+        summary=_first_words(info),
+        facts=facts,
+        findings=_findings(found.verdicts),
+        mode=mode.name if mode else "",
+        held=_held(mode) if mode else (),
+        measures=measures,
+        moments=[
+            each for each in moments if room.fit("moments", each.lines) or not each.lines.rows
+        ],
+        parameters=parameters,
+        events=room.fit("events", _events(connection, found)),
+        trends=room.fit("trends", _trends(told_trends)),
+        commands=room.fit("commands", _commands(connection, whole), newest=True),
+        timeline=room.fit("timeline", _timeline(connection, stored), newest=True),
+        log=room.fit("log", _log(connection, run_id), newest=True),
+        changed_most=[trend.name for trend in told_trends.numbers],
+        notes=tuple(dict.fromkeys((*found.notes, *course.notes, *measure_notes))),
+    )  # fmt: skip
+
+
+def _first_words(info: RunInfo) -> str:
+    world = f" in {_file(info.world)}" if info.world else ""
+    ended = f"ended: {info.end_reason}" if info.end_reason else "goes on"
+    pace = info.real_time_factor
+    paced = f", {pace:.2g} times as fast as real time" if pace is not None else ""
+    return (
+        f"{info.robot} ran for {length(info.duration_s)} of simulation time{world}, from "
+        f"{clock(info.started_wall_time_s)} on{paced}; the run began by {info.start_reason} and "
+        f"{ended}."
+    )
+
+
+def _facts(info: RunInfo, session: Session | None, step_ms: float | None) -> dict[str, str]:
+    """As recorded in the rows of run and session, without what is not known."""
+    facts: dict[str, object] = {
+        "robot": info.robot,
+        "run": f"{info.run_id} (session {info.session_id})",
+        "label": info.label,
+        "note": info.note,
+        "controller": info.controller,
+        "SHA-256 of its file": info.controller_sha256,
+        "git commit": info.git_commit,
+        "world": info.world,
+        "basic time step": f"{step_ms:g} ms" if step_ms else None,
+        "began": f"{clock(info.started_wall_time_s)}, by {info.start_reason}",
+        "ended": info.end_reason or "it goes on",
+        "simulation time": length(info.duration_s),
+        "wall time": length(info.wall_duration_s)
+        + (f", of which {length(info.held_s)} paused by a command" if info.held_s else ""),
+        "rows": f"{info.rows:,}"
+        + (f" ({info.purged_rows:,} of them purged since)" if info.purged_rows else ""),
+        "needs attention": listed(info.notable) or None,
+    }
+    if session is not None:
+        facts |= {
+            "host": session.host,
+            "supervisor": "yes" if session.supervisor else "no",
+            "versions": listed(session.versions) or None,
+            "end of the controller": session.end_reason,
+            "newest error of the recorder": session.last_error,
+            "rows dropped": session.rows_dropped or None,
+        }
+    return {name: cut(str(fact), 4_000) for name, fact in facts.items() if fact is not None}
+
+
+def _parameters(connection: sqlite3.Connection, run_id: int) -> Grid:
+    columns = ("name", "value", "unit", "default", "set_by", "since_s", "doc")
+    rows = [
+        Row([_text(each[column]) for column in columns])
+        for each in described(connection, fetch_run(connection, run_id))
+    ]
+    return Grid(("parameter", "value", "unit", "default", "set by", "since [s]", "what"), rows)
+
+
+def _found(connection: sqlite3.Connection, whole: TimeRange) -> Found:
+    """What stands out: all kinds that are looked for unless asked, but for what is routine."""
+    usual = EventOptions()
+    kinds = tuple(kind.name for kind in KINDS if kind.usual(usual) and kind.counted and not kind.routine)
+    return search_events(connection, whole, EventOptions(kinds=kinds))
+
+
+def _stored(connection: sqlite3.Connection, whole: TimeRange) -> Found:
+    """What was noted when it happened, one by one."""
+    options = EventOptions(kinds=stored_kinds(), log_level="info")
+    return search_events(connection, whole, options, around=(), group=False)
+
+
+def _findings(verdicts: Verdicts) -> list[str]:
+    """What became of each kind that was looked for."""
+    found = [f"{count} {kind}" for kind, count in verdicts.found.items()]
+    said = [f"Found: {', '.join(found)}."] if found else []
+    said += [f"Looked for and absent: {', '.join(verdicts.far)}."] if verdicts.far else []
+    said += [f"Absent, but came near: {kind} ({what})." for kind, what in verdicts.came_near.items()]
+    return said + [f"Not looked for: {kinds}: {why}." for kinds, why in verdicts.gaps.items()]
+
+
+def _events(connection: sqlite3.Connection, found: Found) -> Grid:
+    answer = found.told(connection, MOST_EVENTS)
+    rows = [
+        Row(
+            [time_at(each.start_s), _lasted(each), each.kind, told(each), valued(each.around)],
+            _mark(each),
+        )
+        for each in answer.events
+    ]
+    left_out = sum(each.count for each in answer.left_out.values())
+    columns = ("from [s]", "for [s]", "kind", "what", "values when it began")
+    return Grid(columns, rows, left_out=left_out)
+
+
+def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
+    """The few events whose surroundings are shown: what was found in the values, else in the log."""
+    matter = [each for each in found.events if each.kind not in ("run", "kept", "command", "log")]
+    failed = [each for each in found.events if each.kind in ("command", "log") and _mark(each)]
+    chosen = choose(matter, MOST_MOMENTS) or choose(failed, MOST_MOMENTS)
+    return list(found.only(chosen).told(connection, MOST_MOMENTS).events)
+
+
+def _moment(event: Event, stored: Found) -> Moment:
+    lasted = f", for {length(event.duration_s)}" if event.count == 1 and event.duration_s else ""
+    title = f"{event.kind} at {time_at(event.start_s)} s{lasted}"
+    columns = ("at [s]", "kind", "what")
+    moment = Moment(event, title, told(event), valued(event.around), Grid(columns, ()))
+    around = [
+        each for each in stored.events
+        if moment.start_s <= each.start_s <= moment.end_s and each.kind != "image"
+    ]  # fmt: skip
+    nearest = sorted(around, key=lambda each: abs(each.start_s - event.start_s))[:_LINES_AROUND]
+    shown = [each for each in around if any(each is near for near in nearest)]
+    rows = [Row([time_at(each.start_s), each.kind, told(each)], _mark(each)) for each in shown]
+    return replace(moment, lines=Grid(columns, rows, left_out=len(around) - len(shown)))
+
+
+def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
+    answer = stored.told(connection, MOST_ENTRIES, exact=False)
+    rows = [
+        Row([time_at(each.start_s), _lasted(each), each.kind, told(each)], _mark(each))
+        for each in answer.events
+    ]
+    left_out = sum(each.count for each in answer.left_out.values())
+    return Grid(("at [s]", "for [s]", "kind", "what"), rows, left_out=left_out)
+
+
+def _commands(connection: sqlite3.Connection, whole: TimeRange) -> Grid:
+    found = search_events(
+        connection, whole, EventOptions(kinds=("command",)), around=(), group=False
+    )
+    answer = found.told(connection, MOST_EVENTS)
+    rows = [
+        Row([
+            time_at(each.start_s), str(each.details["id"]), each.name or "",
+            valued(each.details.get("params") or {}), each.details["status"],
+            number(each.details.get("took_wall_s")),
+            cut(str(each.details.get("error") or spelled(each.details.get("result", "")))),
+        ], _mark(each))
+        for each in answer.events
+    ]  # fmt: skip
+    columns = ("at [s]", "id", "action", "parameters", "outcome", "took [s]", "answer")
+    return Grid(columns, rows, left_out=sum(each.count for each in answer.left_out.values()))
+
+
+def _log(connection: sqlite3.Connection, run_id: int) -> Grid:
+    robot_id = fetch_run(connection, run_id).robot_id
+    asked = LogFilter(run_id, Window(-math.inf, math.inf), robot_id=robot_id)
+    lines = newest_lines(connection, asked, MOST_LINES)
+    count = count_lines(connection, asked)
+    notes = [f"There are {COUNT_LIMIT:,} lines or more."] if count >= COUNT_LIMIT else []
+    return Grid(
+        ("at [s]", "level", "from", "line"),
+        [_line(line) for line in lines],
+        notes,
+        left_out=count - len(lines),
+    )
+
+
+def _line(line: LogLine) -> Row:
+    cells = [time_at(line.sim_time_s), line.level, line.source, cut(line.message, 2_000)]
+    return Row(cells, _MARKS.get(line.level, ""))
+
+
+def _trends(run: RunTrends) -> Grid:
+    """Numbers, what changed most first; then texts and flags."""
+    rows = [
+        Row([
+            trend.name, trend.unit or "", trend.says, number(trend.mean), number(trend.deviation),
+            number(trend.summary.min), number(trend.summary.max),
+        ])
+        for trend in run.numbers
+    ]  # fmt: skip
+    rows += [Row([state.name, "", _course(state), "", "", "", ""]) for state in run.states]
+    notes = [f"Without a value: {', '.join(run.silent[:50])}."] if run.silent else []
+    columns = ("signal", "unit", "what it did", "mean", "deviation", "least", "greatest")
+    return Grid(columns, rows, notes, left_out=run.total - len(run.numbers))
+
+
+def _course(state: StateTrend) -> str:
+    if state.changes == 0:
+        return f"always {spelled(state.last)}"
+    since = "" if state.since_s is None else f" since {time_at(state.since_s)} s"
+    times = ", ".join(
+        f"{cut(value, 40)} {length(held_s)}"
+        for value, held_s in list(state.time_by_value_s.items())[:_MOST_VALUES]
+    )
+    changed = counted(state.changes, "change")
+    return f"{changed}, {spelled(state.last)}{since}; {times}"
+
+
+def _mode(run: RunTrends) -> StateTrend | None:
+    name = find_mode([state.name for state in run.states if state.kind == "text"])
+    return next((state for state in run.states if state.name == name), None)
+
+
+def _held(mode: StateTrend) -> list[Held]:
+    whole_s = sum(mode.time_by_value_s.values())
+    return [
+        Held(
+            cut(value, 60),
+            f"{length(held_s)}, {share(held_s, whole_s)}",
+            100 * held_s / whole_s if whole_s else 0.0,
+        )
+        for value, held_s in list(mode.time_by_value_s.items())[:_MOST_VALUES]
+    ]
+
+
+def _measures(connection: sqlite3.Connection, run_id: int) -> tuple[Grid | None, Sequence[str]]:
+    """What the run came to as a whole, and why figures are not known."""
+    found = compare_runs(connection, [run_id])
+    rows = [
+        Row([each.name, number(each.spread[0].median)])
+        for each in found.measures
+        if each.spread[0] is not None
+    ]
+    notes = [f"not known: {figures}: {why}" for figures, why in found.not_known.items()]
+    return (Grid(("figure", "value"), rows) if rows else None), (*found.notes, *notes)
+
+
+def _mark(event: Event) -> str:
+    if event.kind == "log":
+        return _MARKS.get(event.name or "", "")
+    failed = event.kind == "command" and event.details.get("status") in ("failed", "lost")
+    return "error" if failed else ""
+
+
+def _lasted(event: Event) -> str:
+    return number(event.duration_s) if event.count == 1 and event.duration_s else ""
+
+
+def _text(value: object) -> str:
+    return "" if value is None else spelled(value)
+
+
+def _file(path: str) -> str:
+    return path.replace("\\", "/").rpartition("/")[2]

@@ -1,0 +1,174 @@
+"""How a report says things: numbers, times and events as texts for a person."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from datetime import datetime, timezone
+from typing import Any, Final, cast
+
+from webots_mcp.store.detection.event import Event
+
+LONGEST_TEXT: Final = 1_000  # characters of a cell
+_LONGEST_VALUE: Final = 200  # of a value within one
+_UNIT: Final = re.compile(r"(.+)_(s|m|rad)")
+_UNTOLD: Final = ("id", "image_id", "first_times_s")
+
+
+def cut(text: str, longest: int = LONGEST_TEXT) -> str:
+    """A text, a long one with how long it is."""
+    if len(text) <= longest:
+        return text
+    return f"{text[:longest]} … ({len(text)} characters)"
+
+
+def number(value: float | None) -> str:
+    """Four digits, which tell what a person can see; nothing where there is no number."""
+    return "" if value is None else f"{value:.4g}"
+
+
+def time_at(time_s: float | None) -> str:
+    """A simulation time, to the millisecond."""
+    return "" if time_s is None else f"{time_s:.3f}"
+
+
+def length(duration_s: float) -> str:
+    """A duration: 12.3 s, 4 min 5 s, 2 h 3 min."""
+    if duration_s < 120:
+        return f"{duration_s:.3g} s"
+    minutes, rest_s = divmod(round(duration_s), 60)
+    if minutes < 120:
+        return f"{minutes} min {rest_s} s"
+    return f"{minutes // 60} h {minutes % 60} min"
+
+
+def clock(wall_time_s: float) -> str:
+    """A wall time; in UTC, which means the same wherever the file is read."""
+    moment = datetime.fromtimestamp(wall_time_s, timezone.utc)
+    return moment.strftime("%Y-%m-%d %H:%M:%S UTC")
+
+
+def size(size_bytes: int) -> str:
+    """The size of a file."""
+    return f"{size_bytes / 1e6:.1f} MB"
+
+
+def share(part: float, whole: float) -> str:
+    """A part as a percentage."""
+    return f"{100 * part / whole:.3g} %" if whole > 0 else ""
+
+
+def counted(count: int, what: str) -> str:
+    """1 event, 2 events."""
+    return f"{count:,} {what}" + ("" if count == 1 else "s")
+
+
+def spelled(value: Any) -> str:
+    """A value of any kind in one line."""
+    if value is None:
+        return "null"
+    if isinstance(value, float):
+        return number(value)
+    if isinstance(value, str):
+        return cut(value, _LONGEST_VALUE)
+    return cut(json.dumps(_rounded(value), ensure_ascii=False, default=str), _LONGEST_VALUE)
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(number(value))
+    if isinstance(value, dict):
+        return {key: _rounded(each) for key, each in cast("dict[str, Any]", value).items()}
+    if isinstance(value, (list, tuple)):
+        return [_rounded(each) for each in cast("list[Any]", value)]
+    return value
+
+
+def listed(values: Mapping[str, Any]) -> str:
+    """Named values in one line; a unit at the end of a name stands behind its value."""
+    return ", ".join(_named(name, value) for name, value in values.items())
+
+
+def valued(values: Mapping[str, Any]) -> str:
+    """Values of signals or parameters in one line, under the names that they have."""
+    return ", ".join(f"{name} {spelled(value)}" for name, value in values.items())
+
+
+def _named(name: str, value: Any) -> str:
+    found = _UNIT.fullmatch(name)
+    if found is None or not isinstance(value, (int, float)):
+        return f"{name.replace('_', ' ')} {spelled(value)}"
+    return f"{found[1].replace('_', ' ')} {spelled(value)} {found[2]}"
+
+
+def told(event: Event) -> str:
+    """What happened, without when."""
+    if event.count > 1:
+        return _of_many(event)
+    return cut(_WORDS.get(event.kind, _of_others)(event))
+
+
+def _of_many(event: Event) -> str:
+    details = {name: each for name, each in event.details.items() if name not in _UNTOLD}
+    says = details.pop("says", event.kind)
+    of = f"{event.name}: " if event.name else ""
+    return cut("; ".join(filter(None, (f"{of}{event.count} {says}", listed(details)))))
+
+
+def _of_change(event: Event) -> str:
+    before, after = event.details["before"], event.details["after"]
+    return f"{event.name}: {spelled(before)} → {spelled(after)}"
+
+
+def _of_log(event: Event) -> str:
+    return f"{event.name} ({event.details['source']}): {event.details['message']}"
+
+
+def _of_command(event: Event) -> str:
+    details = dict(event.details)
+    params = valued(details.get("params") or {})
+    outcome = details["status"]
+    if "took_wall_s" in details:
+        outcome += f" after {length(details['took_wall_s'])} of wall time"
+    outcome += f", answer {spelled(details['result'])}" if details.get("result") else ""
+    outcome += f", {details['error']}" if details.get("error") else ""
+    return f"{event.name}({params}): {outcome}"
+
+
+def _of_run(event: Event) -> str:
+    return f"the run {event.details['what']} ({event.details['reason'] or 'unknown cause'})"
+
+
+def _of_noticed(event: Event) -> str:
+    name = f" {event.name}" if event.name else ""
+    data = event.details.get("data")
+    said = listed(cast("dict[str, Any]", data)) if isinstance(data, dict) else spelled(data)
+    return f"{event.details['what']}{name}" + (f": {said}" if data else "")
+
+
+def _of_image(event: Event) -> str:
+    return f"picture of {event.name or 'the main view'}"
+
+
+def _of_gap(event: Event) -> str:
+    usual_s = event.details.get("usual_interval_s")
+    return "no rows" + (f", else one each {number(usual_s)} s" if usual_s else "")
+
+
+def _of_others(event: Event) -> str:
+    details = {name: each for name, each in event.details.items() if name not in _UNTOLD}
+    said = [str(details.pop("says"))] if "says" in details else []
+    said += [listed(details)] if details else []
+    return ": ".join(filter(None, (event.name, "; ".join(said))))
+
+
+_WORDS: Final[Mapping[str, Callable[[Event], str]]] = {
+    "change": _of_change,
+    "log": _of_log,
+    "command": _of_command,
+    "run": _of_run,
+    "noticed": _of_noticed,
+    "image": _of_image,
+    "gap": _of_gap,
+}

@@ -41,7 +41,7 @@ from webots_mcp.store.window import Window
 MOST_EVENTS: Final = 200
 MOST_ENTRIES: Final = 500  # of the timeline
 MOST_LINES: Final = 2_000  # of the log
-MOST_MOMENTS: Final = 8  # events that are shown with the seconds around them
+MOST_MOMENTS: Final = 6  # events that are shown with the seconds around them
 AROUND_S: Final = 5.0  # before and after
 MOST_SHOWN_S: Final = 30.0  # of the event itself
 _LINES_AROUND: Final = 12
@@ -106,7 +106,6 @@ class Chapter:
     findings: Sequence[str] = ()
     mode: str = ""
     held: Sequence[Held] = ()
-    measures: Grid | None = None
     moments: Sequence[Moment] = ()
     parameters: Grid | None = None
     events: Grid | None = None
@@ -164,15 +163,14 @@ def chapter_of(connection: sqlite3.Connection, run_id: int, room_bytes: float) -
     course = trends(connection, whole, limit=500)
     (told_trends,) = course.runs
     mode = _mode(told_trends)
-    measures, measure_notes = _measures(connection, run_id)
+    travelled, why_not = _travelled(connection, run_id)
     return Chapter(
         info, whole, title,
         summary=_first_words(info),
         facts=facts,
-        findings=_findings(found.verdicts),
+        findings=[*travelled, *_findings(found.verdicts)],
         mode=mode.name if mode else "",
         held=_held(mode) if mode else (),
-        measures=measures,
         moments=[
             each for each in moments if room.fit("moments", each.lines) or not each.lines.rows
         ],
@@ -183,13 +181,13 @@ def chapter_of(connection: sqlite3.Connection, run_id: int, room_bytes: float) -
         timeline=room.fit("timeline", _timeline(connection, stored), newest=True),
         log=room.fit("log", _log(connection, run_id), newest=True),
         changed_most=[trend.name for trend in told_trends.numbers],
-        notes=tuple(dict.fromkeys((*found.notes, *course.notes, *measure_notes))),
+        notes=tuple(dict.fromkeys((*found.notes, *course.notes, *why_not))),
     )  # fmt: skip
 
 
 def _first_words(info: RunInfo) -> str:
     world = f" in {_file(info.world)}" if info.world else ""
-    ended = f"ended: {info.end_reason}" if info.end_reason else "goes on"
+    ended = f"ended by {info.end_reason}" if info.end_reason else "goes on"
     pace = info.real_time_factor
     paced = f", {pace:.2g} times as fast as real time" if pace is not None else ""
     return (
@@ -391,16 +389,20 @@ def _held(mode: StateTrend) -> list[Held]:
     ]
 
 
-def _measures(connection: sqlite3.Connection, run_id: int) -> tuple[Grid | None, Sequence[str]]:
-    """What the run came to as a whole, and why figures are not known."""
+def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], list[str]]:
+    """How far it went, in words, and why that is not known."""
     found = compare_runs(connection, [run_id])
-    rows = [
-        Row([each.name, number(each.spread[0].median)])
-        for each in found.measures
-        if each.spread[0] is not None
+    known = {each.name: each.spread[0] for each in found.measures}
+    distance, speed = known.get("distance_m"), known.get("mean_speed_m_s")
+    why_not = [
+        f"not known: {figures}: {why}"
+        for figures, why in found.not_known.items()
+        if "distance_m" in figures
     ]
-    notes = [f"not known: {figures}: {why}" for figures, why in found.not_known.items()]
-    return (Grid(("figure", "value"), rows) if rows else None), (*found.notes, *notes)
+    if distance is None or speed is None:
+        return [], why_not
+    went = f"It went {number(distance.median)} m, at {number(speed.median)} m/s in the mean."
+    return [went], why_not
 
 
 def _mark(event: Event) -> str:

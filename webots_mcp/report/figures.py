@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
@@ -52,13 +52,15 @@ class Figures:
         script: What draws them all.
         marks: Where each goes, by its key.
         titles: What each shows.
-        notes: What is not in them.
+        notes: What is not in each.
+        left_out: What is in none.
     """
 
     script: str = ""
     marks: Mapping[str, str] = field(default_factory=dict[str, str])
     titles: Mapping[str, str] = field(default_factory=dict[str, str])
-    notes: Sequence[str] = ()
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict[str, Sequence[str]])
+    left_out: Sequence[str] = ()
 
     @property
     def size_bytes(self) -> int:
@@ -89,10 +91,22 @@ def figures_of(
         first = {run_id: had[:count] for run_id, had in chosen.items()}
         made = _embedded(dict(_charts(connection, chapters, first, with_moments=count > 1)))
         if made.size_bytes <= room_bytes:
-            return made
-        if count == 1:
-            return Figures(notes=("no figure: they would take more than the file may",))
+            return replace(made, left_out=_not_drawn(chapters, first))
+        if count <= 1:
+            return Figures(left_out=("the figures: they would take more than the file may",))
         count //= 2
+
+
+def _not_drawn(
+    chapters: Sequence[Chapter], drawn: Mapping[int, Sequence[str]]
+) -> tuple[str, ...]:
+    """How many numbers have no curve."""
+    return tuple(
+        f"curves of {missing} of {len(each.changed_most)} numeric signals of run "
+        f"{each.info.run_id}: those that changed most are drawn, or those that are named"
+        for each in chapters
+        if (missing := len(set(each.changed_most) - {*drawn[each.info.run_id]})) > 0
+    )
 
 
 def moment_key(chapter: Chapter, moment: Moment) -> str:
@@ -165,6 +179,7 @@ def _around(
             chart = signals_chart(connection, [around], names, events=False, room=room)
         except (InvalidInputError, NothingRecordedError):
             continue  # it is named after no signal, or that has no value there
+        chart.layout.toolbar_location = None  # type: ignore[attr-defined]
         yield moment_key(chapter, moment), chart
         return
 
@@ -176,6 +191,5 @@ def _embedded(charts: Mapping[str, Chart]) -> Figures:
         return Figures()
     embed: Any = components
     script, marks = embed({key: chart.layout for key, chart in charts.items()})
-    notes = dict.fromkeys(note for chart in charts.values() for note in chart.notes)
     titles = {key: chart.title for key, chart in charts.items()}
-    return Figures(script, marks, titles, tuple(notes))
+    return Figures(script, marks, titles, {key: chart.notes for key, chart in charts.items()})

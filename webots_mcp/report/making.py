@@ -151,7 +151,7 @@ def _left_out(page: Page) -> list[str]:
         if missing := pictures.total - len(pictures.shown):
             gone = f" ({pictures.unusable} files cannot be read)" if pictures.unusable else ""
             said.append(f"{counted(missing, 'more picture')} {of_run}{gone}")
-    return [*said, *page.figures.notes, *left_out_so_far()]
+    return [*said, *page.figures.left_out, *left_out_so_far()]
 
 
 def _holds(page: Page) -> dict[str, int]:

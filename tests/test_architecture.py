@@ -50,11 +50,12 @@ ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}
 ALLOWED["launching"] = STDLIB | {"store", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
 ALLOWED["charts"] = ALLOWED["plotting"] | {"charts", "plotting", "standin"}
+ALLOWED["report"] = ALLOWED["charts"] | {"charts", "report", "__version__"}
 ALLOWED["belonging"] = STDLIB | {"store", "webots"}
 ALLOWED["console"] = ALLOWED["belonging"] | {"belonging", "console"}
 ALLOWED["server"] = STDLIB | {
     "belonging", "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
-    "launching", "__version__",
+    "launching", "report", "__version__",
 }  # fmt: skip
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
 ALLOWED["pytest_plugin"] = {"contract", "standin", "testing", "MCPBridge", "MemoryDatabase"}

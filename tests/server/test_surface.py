@@ -44,6 +44,7 @@ READING = {
 }
 ACTING = {
     "webots_annotate_run",
+    "webots_report",
     "webots_set_parameters",
     "webots_take_screenshot",
     "webots_simulation_control",

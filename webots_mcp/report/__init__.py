@@ -4,13 +4,14 @@ Jinja2 and Bokeh, the extra `view`, are imported with the first report, never wi
 """
 
 from webots_mcp.report.making import MAX_MB, MIN_MB, MOST_RUNS, Report, make_report
-from webots_mcp.report.writing import require_free, write_report
+from webots_mcp.report.writing import file_name, require_free, write_report
 
 __all__ = [
     "MAX_MB",
     "MIN_MB",
     "MOST_RUNS",
     "Report",
+    "file_name",
     "make_report",
     "require_free",
     "write_report",

@@ -94,7 +94,8 @@ class Chapter:
 
     Attributes:
         range: The whole run; None where it has no state row.
-        changed_most: Its numbers, what changed most first.
+        numbers: How many numeric signals have values.
+        changed_most: Those that changed, what changed most first.
         findings: What was found, what is absent, what was not looked for.
     """
 
@@ -113,6 +114,7 @@ class Chapter:
     commands: Grid | None = None
     timeline: Grid | None = None
     log: Grid | None = None
+    numbers: int = 0
     changed_most: Sequence[str] = ()
     notes: Sequence[str] = ()
 
@@ -180,7 +182,8 @@ def chapter_of(connection: sqlite3.Connection, run_id: int, room_bytes: float) -
         commands=room.fit("commands", _commands(connection, whole), newest=True),
         timeline=room.fit("timeline", _timeline(connection, stored), newest=True),
         log=room.fit("log", _log(connection, run_id), newest=True),
-        changed_most=[trend.name for trend in told_trends.numbers],
+        numbers=told_trends.total,
+        changed_most=[each.name for each in told_trends.numbers if each.shape != "constant"],
         notes=tuple(dict.fromkeys((*found.notes, *course.notes, *why_not))),
     )  # fmt: skip
 
@@ -242,7 +245,9 @@ def _parameters(connection: sqlite3.Connection, run_id: int) -> Grid:
 def _found(connection: sqlite3.Connection, whole: TimeRange) -> Found:
     """What stands out: all kinds that are looked for unless asked, but for what is routine."""
     usual = EventOptions()
-    kinds = tuple(kind.name for kind in KINDS if kind.usual(usual) and kind.counted and not kind.routine)
+    kinds = tuple(
+        kind.name for kind in KINDS if kind.usual(usual) and kind.counted and not kind.routine
+    )
     return search_events(connection, whole, EventOptions(kinds=kinds))
 
 
@@ -257,7 +262,9 @@ def _findings(verdicts: Verdicts) -> list[str]:
     found = [f"{count} {kind}" for kind, count in verdicts.found.items()]
     said = [f"Found: {', '.join(found)}."] if found else []
     said += [f"Looked for and absent: {', '.join(verdicts.far)}."] if verdicts.far else []
-    said += [f"Absent, but came near: {kind} ({what})." for kind, what in verdicts.came_near.items()]
+    said += [
+        f"Absent, but came near: {kind} ({what})." for kind, what in verdicts.came_near.items()
+    ]
     return said + [f"Not looked for: {kinds}: {why}." for kinds, why in verdicts.gaps.items()]
 
 
@@ -276,7 +283,7 @@ def _events(connection: sqlite3.Connection, found: Found) -> Grid:
 
 
 def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
-    """The few events whose surroundings are shown: what was found in the values, else in the log."""
+    """The few whose surroundings are shown: what was found in the values, else in the log."""
     matter = [each for each in found.events if each.kind not in ("run", "kept", "command", "log")]
     failed = [each for each in found.events if each.kind in ("command", "log") and _mark(each)]
     chosen = choose(matter, MOST_MOMENTS) or choose(failed, MOST_MOMENTS)

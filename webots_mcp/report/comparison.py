@@ -27,10 +27,12 @@ class Beside:
 
     Attributes:
         says: The comparison in words.
+        differing: The signals that differ, what differs most first.
         why_not: Why they could not be compared; empty where they were.
     """
 
     says: Sequence[str] = ()
+    differing: Sequence[str] = ()
     parameters: Grid | None = None
     measures: Grid | None = None
     differences: Grid | None = None
@@ -51,11 +53,10 @@ def beside(connection: sqlite3.Connection, run_ids: Sequence[int], room_bytes: f
     names = [group.name for group in found.groups]
     differences = _differences(found, names).within(_SHARE_OF_TEXTS * room_bytes)
     notes = [f"not known: {figures}: {why}" for figures, why in found.not_known.items()]
-    notes += [
-        f"only in {' and '.join(groups)}: {listed(only)}" for groups, only in _only_in(found)
-    ]
+    notes += [f"only in {' and '.join(groups)}: {listed(only)}" for groups, only in _only_in(found)]
     return Beside(
         _says(found),
+        [each.name for each in found.differences if each.effect[1]],
         _parameters(found, names),
         _measures(found, names),
         differences if differences.rows else None,
@@ -66,7 +67,9 @@ def beside(connection: sqlite3.Connection, run_ids: Sequence[int], room_bytes: f
 def _says(found: Comparison) -> list[str]:
     """In words: how long, what the runs came to, and the signals that differ most."""
     first, second = (group.name for group in found.groups)
-    said = [f"Compared are the first {length(found.compared_s)} of each run."]
+    said = [
+        f"Compared are the first {length(found.compared_s)} of each run: {second} with {first}."
+    ]
     said += [
         f"{name}: {first} {_values(first_had)}, {second} {_values(second_had)}."
         for name, first_had, second_had in _unlike_parameters(found)
@@ -75,17 +78,18 @@ def _says(found: Comparison) -> list[str]:
         one, other = each.spread
         if one is not None and other is not None and one.median != other.median:
             said.append(f"{each.name}: {_change(one, other)}.")
-    for each in found.differences[:_MOST_SAID]:
+    large = [each for each in found.differences if abs(each.effect[1] or 0.0) >= _LARGE[-1][0]]
+    for each in large[:_MOST_SAID]:
         one, other = each.mean
-        if one is not None and other is not None and one.median != other.median:
-            said.append(f"Mean of {each.name}: {_change(one, other)}{_effect(each)}.")
+        if one is not None and other is not None:
+            said.append(f"mean of {each.name}: {_change(one, other)}{_effect(each)}.")
     return said if len(said) > 1 else [*said, "No figure differs."]
 
 
 def _change(one: Spread, other: Spread) -> str:
     by = other.median - one.median
-    percent = f", {100 * by / abs(one.median):+.3g} %" if one.median else ""
-    return f"{number(other.median)} instead of {number(one.median)} ({by:+.3g}{percent})"
+    change = f"{100 * by / abs(one.median):+.3g} %" if one.median else f"{by:+.3g}"
+    return f"{number(other.median)} instead of {number(one.median)} ({change})"
 
 
 def _effect(difference: Difference) -> str:
@@ -93,7 +97,7 @@ def _effect(difference: Difference) -> str:
     if size is None:
         return ""
     word = next((word for least, word in _LARGE if abs(size) >= least), "hardly any")
-    return f", {word} beside how much it varies within a run (effect {number(size)})"
+    return f"; beside how much it varies within a run that is {word} (effect {number(size)})"
 
 
 def _unlike_parameters(found: Comparison) -> list[tuple[str, Sequence[object], Sequence[object]]]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
@@ -72,6 +73,7 @@ def figures_of(
     connection: sqlite3.Connection,
     chapters: Sequence[Chapter],
     names: Sequence[str],
+    differing: Sequence[str],
     room_bytes: float,
 ) -> Figures:
     """All figures of a report, with as many signals as have room.
@@ -80,33 +82,35 @@ def figures_of(
         connection: Any.
         chapters: Its runs; two are laid over each other as well.
         names: Signals, with `*`; none for those that changed most.
+        differing: Of two runs those that differ, which are laid over each other if none is named.
         room_bytes: How much they may take.
 
     Raises:
         UnknownSignalError: A name meets nothing.
     """
     chosen = {each.info.run_id: _chosen(connection, each, names) for each in chapters}
+    both = list(dict.fromkeys(name for had in chosen.values() for name in had))
+    both = both if names else [*differing[:MOST_SIGNALS]] or both
     count = max(map(len, chosen.values()), default=0)
     while True:
         first = {run_id: had[:count] for run_id, had in chosen.items()}
-        made = _embedded(dict(_charts(connection, chapters, first, with_moments=count > 1)))
+        charts = _charts(connection, chapters, first, both[:count], with_moments=count > 1)
+        made = _embedded(charts.drawn)
         if made.size_bytes <= room_bytes:
-            return replace(made, left_out=_not_drawn(chapters, first))
+            return replace(made, left_out=[*_curves_missing(chapters, first), *charts.not_drawn])
         if count <= 1:
             return Figures(left_out=("the figures: they would take more than the file may",))
         count //= 2
 
 
-def _not_drawn(
-    chapters: Sequence[Chapter], drawn: Mapping[int, Sequence[str]]
-) -> tuple[str, ...]:
+def _not_drawn(chapters: Sequence[Chapter], drawn: Mapping[int, Sequence[str]]) -> tuple[str, ...]:
     """How many numbers have no curve."""
-    return tuple(
-        f"curves of {missing} of {len(each.changed_most)} numeric signals of run "
-        f"{each.info.run_id}: those that changed most are drawn, or those that are named"
+    return [
+        f"curves of {missing} of {each.numbers} numeric signals of run {each.info.run_id}: those "
+        "that changed most are drawn, or those that are named"
         for each in chapters
-        if (missing := len(set(each.changed_most) - {*drawn[each.info.run_id]})) > 0
-    )
+        if (missing := each.numbers - len(drawn[each.info.run_id])) > 0
+    ]
 
 
 def moment_key(chapter: Chapter, moment: Moment) -> str:
@@ -123,65 +127,71 @@ def _chosen(connection: sqlite3.Connection, chapter: Chapter, names: Sequence[st
     return list(chapter.changed_most[:MOST_SIGNALS])
 
 
+class _Charts:
+    """The charts of a report by their keys, and why others could not be drawn."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        self.drawn: dict[str, Chart] = {}
+        self.not_drawn: list[str] = []
+
+    def pair(self, ranges: Sequence[TimeRange], names: Sequence[str], key: str, of: str) -> None:
+        """Signals over time, and the way."""
+        from webots_mcp.charts import signals_chart, way_chart
+        from webots_mcp.plotting.canvas import Room
+
+        room = Room(points=_POINTS, panels=_PANELS, lanes=8, rows=16)
+        try:
+            chart = signals_chart(self._connection, ranges, names or ["*"], room=room)
+            self.drawn[f"signals {key}"] = chart
+        except NothingRecordedError as error:
+            self.not_drawn.append(f"the signals of {of}: {error}")
+        try:
+            self.drawn[f"way {key}"] = way_chart(self._connection, ranges)
+        except (InvalidInputError, NothingRecordedError) as error:
+            self.not_drawn.append(f"the way of {of}: {error}")
+
+    def around(self, chapter: Chapter, moment: Moment) -> None:
+        """The signals that an event is about, or the usual ones, in the seconds around it."""
+        about = [moment.event.name] if moment.event.name else []
+        for names in filter(None, (about, list(moment.event.around))):
+            # It may be named after no signal, or after one without a value there.
+            with suppress(InvalidInputError, NothingRecordedError):
+                self.drawn[moment_key(chapter, moment)] = self._seconds(chapter, moment, names)
+                return
+
+    def _seconds(self, chapter: Chapter, moment: Moment, names: Sequence[str]) -> Chart:
+        from webots_mcp.charts import signals_chart
+        from webots_mcp.plotting.canvas import Room
+
+        scope = Scope(run_id=chapter.info.run_id, start_s=moment.start_s, end_s=moment.end_s)
+        around = find_range(self._connection, scope)
+        room = Room(points=_MOMENT_POINTS, panels=2, lanes=1, rows=0)
+        chart = signals_chart(self._connection, [around], names, events=False, room=room)
+        grid: Any = chart.layout
+        grid.toolbar_location = None  # the small figure has no room for it
+        return chart
+
+
 def _charts(
     connection: sqlite3.Connection,
     chapters: Sequence[Chapter],
     chosen: Mapping[int, Sequence[str]],
+    both: Sequence[str],
     *,
     with_moments: bool,
-) -> Iterator[tuple[str, Chart]]:
-    recorded = [each for each in chapters if each.range is not None]
-    ranges = [each.range for each in recorded if each.range is not None]
+) -> _Charts:
+    charts = _Charts(connection)
+    ranges = [each.range for each in chapters if each.range is not None]
     if len(ranges) > 1:
-        names = list(dict.fromkeys(name for each in chosen.values() for name in each))
-        shared = [each for each in names if all(each in had for had in chosen.values())]
-        yield from _pair(connection, ranges, shared or names, "both")
-    for chapter, whole in zip(recorded, ranges, strict=True):
-        run_id = chapter.info.run_id
-        yield from _pair(connection, [whole], chosen[run_id], str(run_id))
+        charts.pair(ranges, both, "both", "both runs")
+    for chapter in chapters:
+        if chapter.range is not None:
+            run_id = chapter.info.run_id
+            charts.pair([chapter.range], chosen[run_id], str(run_id), f"run {run_id}")
         for moment in chapter.moments if with_moments else ():
-            yield from _around(connection, chapter, moment)
-
-
-def _pair(
-    connection: sqlite3.Connection, ranges: Sequence[TimeRange], names: Sequence[str], key: str
-) -> Iterator[tuple[str, Chart]]:
-    """Signals over time, and the way; what cannot be drawn is left out."""
-    from webots_mcp.charts import signals_chart, way_chart
-    from webots_mcp.plotting.canvas import Room
-
-    room = Room(points=_POINTS, panels=_PANELS, lanes=8, rows=16)
-    try:
-        yield f"signals {key}", signals_chart(connection, ranges, names or ["*"], room=room)
-    except NothingRecordedError:
-        pass  # there is no number and no text in these rows: the tables say so
-    try:
-        yield f"way {key}", way_chart(connection, ranges)
-    except (InvalidInputError, NothingRecordedError):
-        pass  # no position is among the signals
-
-
-def _around(
-    connection: sqlite3.Connection, chapter: Chapter, moment: Moment
-) -> Iterator[tuple[str, Chart]]:
-    """The signals that an event is about, in the seconds around it."""
-    from webots_mcp.charts import signals_chart
-    from webots_mcp.plotting.canvas import Room
-
-    room = Room(points=_MOMENT_POINTS, panels=2, lanes=1, rows=0)
-    scope = Scope(run_id=chapter.info.run_id, start_s=moment.start_s, end_s=moment.end_s)
-    about = [moment.event.name] if moment.event.name else []
-    for names in (about, list(moment.event.around)):
-        if not names:
-            continue
-        try:
-            around = find_range(connection, scope)
-            chart = signals_chart(connection, [around], names, events=False, room=room)
-        except (InvalidInputError, NothingRecordedError):
-            continue  # it is named after no signal, or that has no value there
-        chart.layout.toolbar_location = None  # type: ignore[attr-defined]
-        yield moment_key(chapter, moment), chart
-        return
+            charts.around(chapter, moment)
+    return charts
 
 
 def _embedded(charts: Mapping[str, Chart]) -> Figures:

@@ -11,8 +11,8 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.report.chapter import Chapter, chapter_of
-from webots_mcp.report.comparison import Beside, beside
-from webots_mcp.report.figures import Figures, figures_of, library, require_view
+from webots_mcp.report.comparison import beside
+from webots_mcp.report.figures import figures_of, library, require_view
 from webots_mcp.report.page import Page, render
 from webots_mcp.report.pictures import Pictures, pictures_of
 from webots_mcp.report.words import counted
@@ -87,7 +87,8 @@ def make_report(
     compared = beside(connection, run_ids, texts_bytes) if len(run_ids) > 1 else None
     done.step()
     figures_bytes = _SHARE_OF_FIGURES * (room_bytes - texts_bytes)
-    figures = figures_of(connection, chapters, names, figures_bytes)
+    differing = compared.differing if compared is not None else ()
+    figures = figures_of(connection, chapters, names, differing, figures_bytes)
     done.step()
     page = Page(_title(chapters), time.time(), max_mb, script, chapters, compared, figures)
     rest_bytes = max_mb * 1e6 - len(render(page))

@@ -50,14 +50,9 @@ def pictures_of(
     found = search_events(
         connection, whole, EventOptions(kinds=("image",)), around=(), group=False
     ).events
-    made: list[Picture] = []
-    unusable = 0
-    for event in spread(found, MOST_PICTURES):
-        try:
-            made.append(_picture(event, data_dir))
-        except (InvalidInputError, NothingRecordedError):
-            unusable += 1
-    return Pictures(_within(made, room_bytes), len(found), unusable)
+    tried = [_picture(event, data_dir) for event in spread(found, MOST_PICTURES)]
+    made = [picture for picture in tried if picture is not None]
+    return Pictures(_within(made, room_bytes), len(found), len(tried) - len(made))
 
 
 def spread(items: Sequence[Event], most: int) -> list[Event]:
@@ -76,19 +71,25 @@ def _within(pictures: Sequence[Picture], room_bytes: float) -> list[Picture]:
     return []
 
 
-def _picture(event: Event, data_dir: Path) -> Picture:
-    file = inside(data_dir, str(event.details["path"]))
+def _picture(event: Event, data_dir: Path) -> Picture | None:
+    """None where the file is gone, or holds no picture."""
+    try:
+        media_type, data = _content(inside(data_dir, str(event.details["path"])))
+    except (InvalidInputError, NothingRecordedError):
+        return None
+    caption = f"{time_at(event.start_s)} s, {event.name or 'main view'}, {event.details['kind']}"
+    return Picture(f"data:{media_type};base64,{b64encode(data).decode()}", caption)
+
+
+def _content(file: Path) -> tuple[str, bytes]:
+    """Media type and content of a picture within 640 pixels."""
     with opened(file) as picture:
         picture.load()
         fits = max(picture.size) <= LONGEST_SIDE_PX and file.stat().st_size <= _SMALL_BYTES
         if fits and picture.format:
-            data, media_type = file.read_bytes(), f"image/{picture.format.lower()}"
-        else:
-            scaled = picture.convert("RGB")
-            scaled.thumbnail((LONGEST_SIDE_PX, LONGEST_SIDE_PX))
-            buffer = io.BytesIO()
-            scaled.save(buffer, "JPEG", quality=_JPEG_QUALITY)
-            data, media_type = buffer.getvalue(), "image/jpeg"
-    whose = event.name or "main view"
-    caption = f"{time_at(event.start_s)} s, {whose}, {event.details['kind']}"
-    return Picture(f"data:{media_type};base64,{b64encode(data).decode()}", caption)
+            return f"image/{picture.format.lower()}", file.read_bytes()
+        scaled = picture.convert("RGB")
+        scaled.thumbnail((LONGEST_SIDE_PX, LONGEST_SIDE_PX))
+        buffer = io.BytesIO()
+        scaled.save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    return "image/jpeg", buffer.getvalue()

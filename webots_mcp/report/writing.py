@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from webots_mcp.contract import PRIVATE_FILE
 from webots_mcp.errors import InvalidInputError
+
+
+def file_name(run_ids: Sequence[int]) -> str:
+    """How the file is called if nobody says: run-3.html, run-3-5.html."""
+    return f"run-{'-'.join(map(str, run_ids))}.html"
 
 
 def require_free(file: Path, *, overwrite: bool) -> None:

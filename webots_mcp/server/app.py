@@ -31,6 +31,7 @@ from webots_mcp.server.tools import (
     parameters,
     pictures,
     plot,
+    report,
     run,
     runs,
     scene,
@@ -63,7 +64,7 @@ _PAUSE_S: Final = 0.002  # between two short writes, for the robots to write the
 # In the order in which clients list them.
 _MODULES: Final = (
     world, diagnosis, state, pictures, logs, monitor, signals, history, trends, events, timeline,
-    runs, plot, sql, control, webots, run, trials, breakpoints, commands, parameters, scene,
+    runs, plot, report, sql, control, webots, run, trials, breakpoints, commands, parameters, scene,
 )  # fmt: skip
 
 

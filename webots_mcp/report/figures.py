@@ -103,7 +103,7 @@ def figures_of(
         count //= 2
 
 
-def _not_drawn(chapters: Sequence[Chapter], drawn: Mapping[int, Sequence[str]]) -> tuple[str, ...]:
+def _curves_missing(chapters: Sequence[Chapter], drawn: Mapping[int, Sequence[str]]) -> list[str]:
     """How many numbers have no curve."""
     return [
         f"curves of {missing} of {each.numbers} numeric signals of run {each.info.run_id}: those "

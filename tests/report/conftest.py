@@ -1,0 +1,83 @@
+"""Reports of the robot that the real bridge has recorded, and a browser that opens them."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from webots_mcp.connection import connect
+from webots_mcp.report import Report, make_report
+
+pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
+
+_VOID = {"meta", "img", "br", "link", "input"}
+
+
+class Shown(HTMLParser):
+    """What a page refers to, and the text that it shows: not that of its scripts and styles."""
+
+    def __init__(self, html: bytes) -> None:
+        super().__init__()
+        self.attributes: list[tuple[str, str, str]] = []
+        self.styles: list[str] = []
+        self.words: list[str] = []
+        self._inside: list[str] = []
+        self.feed(html.decode())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.attributes += [(tag, name, value or "") for name, value in attrs]
+        if tag not in _VOID:
+            self._inside.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        while self._inside and self._inside.pop() != tag:
+            pass
+
+    def handle_data(self, data: str) -> None:
+        if "style" in self._inside:
+            self.styles.append(data)
+        elif "script" not in self._inside:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture(scope="session")
+def both(bridge_recording: Path) -> Report:
+    """Of the two runs of `tests.recordings.bridge`."""
+    with closing(connect(bridge_recording, "reader")) as connection:
+        return make_report(connection, [1, 2], bridge_recording.parent)
+
+
+@pytest.fixture(scope="session")
+def page(both: Report) -> Shown:
+    return Shown(both.html)
+
+
+@pytest.fixture
+def recording(bridge_recording: Path) -> Iterator[sqlite3.Connection]:
+    with closing(connect(bridge_recording, "reader")) as connection:
+        yield connection
+
+
+@pytest.fixture(scope="session")
+def chromium() -> Iterator[Any]:
+    """A real browser; skipped where there is none."""
+    driver = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
+    program = Path("/usr/bin/chromium")
+    if not program.exists():
+        pytest.skip("there is no Chromium")
+    with driver.sync_playwright() as started:
+        browser = started.chromium.launch(
+            executable_path=str(program), args=["--no-sandbox", "--disable-gpu"]
+        )
+        yield browser
+        browser.close()

@@ -1,0 +1,75 @@
+"""A report in a real browser without a network."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from webots_mcp.report import Report
+
+DRAWN = (
+    "() => window.Bokeh && [...document.querySelectorAll('[data-figure] > div')]"
+    ".every(each => each.shadowRoot || each.children.length)"
+)
+CURVES = """() => Bokeh.documents.flatMap(d => [...d._all_models.values()])
+    .filter(m => m.type == 'ColumnDataSource' && m.data.mean && m.data.time_s)
+    .map(m => Math.max(...[...m.data.high].filter(v => !isNaN(v))))"""
+RANGES = """() => JSON.stringify(Bokeh.documents.flatMap(d => [...d._all_models.values()])
+    .filter(m => m.type == 'Figure').map(m => [m.x_range.start, m.x_range.end]))"""
+
+
+@pytest.fixture
+def opened(chromium: Any, both: Report, tmp_path: Path) -> Any:
+    """The report of two runs, with what went wrong and what was asked of a network."""
+    file = tmp_path / "both.html"
+    file.write_bytes(both.html)
+    context = chromium.new_context(offline=True, viewport={"width": 1280, "height": 900})
+    page = context.new_page()
+    page.wrong, page.asked = [], []
+    page.on("pageerror", lambda error: page.wrong.append(str(error)))
+    page.on(
+        "console",
+        lambda said: page.wrong.append(said.text) if said.type in ("error", "warning") else None,
+    )
+    page.on("request", lambda request: page.asked.append(request.url))
+    page.goto(file.as_uri())
+    page.wait_for_function(DRAWN, timeout=120_000)
+    yield page
+    context.close()
+
+
+def test_it_opens_without_a_network_draws_what_was_recorded_and_zooms(
+    opened: Any, both: Report, recording: sqlite3.Connection
+) -> None:
+    assert opened.wrong == []
+    assert [url[:80] for url in opened.asked if not url.startswith(("file:", "data:"))] == []
+    assert opened.locator("[data-figure]").count() == both.holds["figures"]
+
+    (greatest,) = recording.execute(
+        "SELECT max(json_extract(data, '$.battery_v')) FROM state WHERE run_id = 1"
+    ).fetchone()
+    assert any(abs(high - greatest) < 1e-9 for high in opened.evaluate(CURVES))
+
+    before = opened.evaluate(RANGES)
+    figure = opened.locator('[data-figure="signals 1"]')
+    figure.scroll_into_view_if_needed()
+    box = figure.bounding_box()
+    opened.mouse.move(box["x"] + box["width"] / 2, box["y"] + 80)
+    opened.keyboard.down("Control")
+    opened.mouse.wheel(0, -600)
+    opened.keyboard.up("Control")
+    opened.wait_for_function(f"before => ({RANGES})() != before", arg=before, timeout=30_000)
+
+
+def test_pictures_are_seen(opened: Any) -> None:
+    widths = opened.evaluate(
+        "async () => { const all = [...document.querySelectorAll('.pictures img')];"
+        "all.forEach(each => each.loading = 'eager');"
+        "await Promise.all(all.map(each => each.decode()));"
+        "return all.map(each => each.naturalWidth) }"
+    )
+    assert widths
+    assert min(widths) > 0

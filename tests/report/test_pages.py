@@ -1,0 +1,174 @@
+"""What a report says, and what it never does."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from pathlib import Path
+
+import pytest
+
+from tests.recordings.rows import Recorded
+from tests.report.conftest import Shown
+from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
+from webots_mcp.report import Report, make_report
+from webots_mcp.store.questions.compare import compare_runs
+
+EVIL = "</script><script>window.harmed = true</script><img src=x onerror=alert(1)>"
+
+
+def test_it_tells_what_ran_as_it_was_recorded(page: Shown, recording: sqlite3.Connection) -> None:
+    (sha256, versions) = recording.execute(
+        "SELECT controller_sha256, json_extract(versions, '$.python') FROM session WHERE id = 1"
+    ).fetchone()
+    assert "Run 1 of rover" in page.text
+    assert "Run 2 of rover" in page.text
+    assert sha256 is None or sha256 in page.text
+    assert versions in page.text
+
+
+def test_it_tells_events_with_the_seconds_around_them(page: Shown) -> None:
+    stuck = page.text.index("stuck at ")
+    around = page.text[stuck : page.text.index("Events", stuck)]
+    assert "mode: cruise → back_up" in around
+    assert "grasp(): failed" in page.text
+    assert "the gripper is not mounted" in page.text
+
+
+def test_it_tells_for_how_long_each_mode_was_there(page: Shown) -> None:
+    modes = page.text[page.text.index("Time per value of mode") :]
+    assert re.match(r"Time per value of mode cruise [\d.]+ s, [\d.]+ % ", modes)
+
+
+def test_it_compares_two_runs_as_compare_runs_does(
+    page: Shown, recording: sqlite3.Connection
+) -> None:
+    found = compare_runs(recording, [1, 2])
+    (distance,) = (each for each in found.measures if each.name == "distance_m")
+    one, other = distance.spread
+    assert one is not None
+    assert other is not None
+    assert f"distance_m {one.median:.4g} {other.median:.4g}" in page.text
+    assert all(note in page.text for note in found.notes)
+
+
+def test_its_pictures_are_inside(page: Shown, recording: sqlite3.Connection) -> None:
+    (count,) = recording.execute("SELECT count(*) FROM image").fetchone()
+    sources = [value for tag, name, value in page.attributes if (tag, name) == ("img", "src")]
+    assert len(sources) == count > 0
+    assert all(source.startswith("data:image/") for source in sources)
+
+
+def test_it_refers_to_nothing_outside(both: Report, page: Shown) -> None:
+    links = [
+        value
+        for tag, name, value in page.attributes
+        if name in ("src", "href", "srcset", "action", "data", "poster") and tag != "a"
+    ]
+    assert all(link.startswith("data:") for link in links)
+    anchors = [value for tag, name, value in page.attributes if (tag, name) == ("a", "href")]
+    assert anchors
+    assert all(anchor.startswith("#") for anchor in anchors)
+    assert not re.search(r"url\(|@import", " ".join(page.styles))
+    (policy,) = (value for _, name, value in page.attributes if value.startswith("default-src"))
+    assert "http" not in policy
+    assert b"cdn.bokeh.org" not in both.html
+
+
+def test_every_link_leads_to_a_place_in_the_page(page: Shown) -> None:
+    places = {value for _, name, value in page.attributes if name == "id"}
+    anchors = {value[1:] for tag, name, value in page.attributes if (tag, name) == ("a", "href")}
+    assert anchors <= places
+
+
+def test_it_says_how_large_it_is(both: Report, page: Shown) -> None:
+    assert f"It takes {len(both.html) / 1e6:.1f} MB of at most 10 MB" in page.text
+
+
+def test_what_was_recorded_is_shown_and_never_run(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot(f"rover {EVIL}", controller=f"/c/{EVIL}.py")
+    for step in range(50):
+        mode = EVIL if step > 25 else "drive"
+        robot.state(step * 0.1, {EVIL: step, "mode": mode, "pose": [step * 0.1, 0.0, 0.0]})
+    robot.log(1.0, EVIL, "error")
+    robot.event(2.0, "noticed_it", EVIL, {"why": EVIL})
+    report = make_report(recorded.connection, [robot.run_id], tmp_path)
+    recorded.close()
+    shown = Shown(report.html)
+    assert shown.text.count("window.harmed") >= 4
+    assert not [each for each in shown.attributes if each[1].startswith("on")]
+    assert b"<script>window" not in report.html
+    assert b"<img src=x" not in report.html
+
+
+def test_it_stays_as_small_as_was_asked_and_tells_what_is_not_in_it(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    for step in range(300):
+        robot.state(step * 0.1, {f"s{i}": (step * (i + 1)) % 7 for i in range(60)})
+        robot.log(step * 0.1, f"line {step} " + "<" * 3_000)
+    report = make_report(recorded.connection, [robot.run_id], tmp_path, max_mb=2)
+    recorded.close()
+    assert len(report.html) <= 2_000_000
+    assert any(re.match(r"\d+ more log lines of run 1", each) for each in report.left_out)
+    assert any("of 60 numeric signals" in each for each in report.left_out)
+    text = Shown(report.html).text
+    assert all(each in text for each in report.left_out)
+    assert "line 299" in text, "the newest lines stay"
+
+
+def test_of_a_run_without_rows_it_tells_what_there_is(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    robot.log(0.0, "ModuleNotFoundError: No module named 'cv2'", "error")
+    report = make_report(recorded.connection, [robot.run_id], tmp_path)
+    recorded.close()
+    text = Shown(report.html).text
+    assert "No module named 'cv2'" in text
+    assert "no state row" in text or "nothing" in text
+    assert "figures" not in report.holds
+
+
+def test_pictures_whose_files_are_gone_are_counted(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    robot.state(0.0, {"x": 1})
+    robot.state(1.0, {"x": 2})
+    robot.image(0.5, "camera/gone.png")
+    robot.image(0.6, "../outside.png")
+    report = make_report(recorded.connection, [robot.run_id], tmp_path)
+    recorded.close()
+    assert "2 more pictures of run 1 (2 files cannot be read)" in report.left_out
+
+
+@pytest.mark.parametrize(
+    ("run_ids", "options", "error", "says"),
+    [
+        ([], {}, InvalidInputError, "one run or two, not 0"),
+        ([1, 2, 3], {}, InvalidInputError, "one run or two, not 3"),
+        ([1, 1], {}, InvalidInputError, "named twice"),
+        ([7], {}, UnknownRunError, "no run 7"),
+        ([1], {"max_mb": 1}, InvalidInputError, "from 2 to 100"),
+        ([1], {"max_mb": float("nan")}, InvalidInputError, "from 2 to 100"),
+        ([1], {"names": ["nosuch"]}, UnknownSignalError, "nosuch"),
+    ],
+)
+def test_what_cannot_be_reported_is_refused(
+    recording: sqlite3.Connection,
+    tmp_path: Path,
+    run_ids: list[int],
+    options: dict[str, float],
+    error: type[Exception],
+    says: str,
+) -> None:
+    with pytest.raises(error, match=says):
+        make_report(recording, run_ids, tmp_path, **options)
+
+
+def test_without_the_extra_it_says_what_to_install(
+    recording: sqlite3.Connection, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(__import__("sys").modules, "bokeh", None)
+    with pytest.raises(InvalidInputError, match=r"pip install 'webots-mcp\[view\]'"):
+        make_report(recording, [1], tmp_path)

@@ -21,10 +21,10 @@ RANGES = """() => JSON.stringify(Bokeh.documents.flatMap(d => [...d._all_models.
     .filter(m => m.type == 'Figure').map(m => [m.x_range.start, m.x_range.end]))"""
 
 
-@pytest.fixture
-def opened(chromium: Any, both: Report, tmp_path: Path) -> Any:
+@pytest.fixture(scope="module")
+def opened(chromium: Any, both: Report, tmp_path_factory: pytest.TempPathFactory) -> Any:
     """The report of two runs, with what went wrong and what was asked of a network."""
-    file = tmp_path / "both.html"
+    file = tmp_path_factory.mktemp("report") / "both.html"
     file.write_bytes(both.html)
     context = chromium.new_context(offline=True, viewport={"width": 1280, "height": 900})
     page = context.new_page()

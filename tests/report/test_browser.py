@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -29,16 +28,18 @@ def opened(chromium: Any, both: Report, tmp_path_factory: pytest.TempPathFactory
     context = chromium.new_context(offline=True, viewport={"width": 1280, "height": 900})
     page = context.new_page()
     page.wrong, page.asked = [], []
-    page.on("pageerror", lambda error: page.wrong.append(str(error)))
-    page.on(
-        "console",
-        lambda said: page.wrong.append(said.text) if said.type in ("error", "warning") else None,
-    )
-    page.on("request", lambda request: page.asked.append(request.url))
+    page.on("pageerror", lambda error: page.wrong.append(str(error)))  # pyright: ignore
+    page.on("console", lambda said: _note(page, said))  # pyright: ignore
+    page.on("request", lambda request: page.asked.append(request.url))  # pyright: ignore
     page.goto(file.as_uri())
     page.wait_for_function(DRAWN, timeout=120_000)
     yield page
     context.close()
+
+
+def _note(page: Any, said: Any) -> None:
+    if said.type in ("error", "warning"):
+        page.wrong.append(said.text)
 
 
 def test_it_opens_without_a_network_draws_what_was_recorded_and_zooms(

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import re
 import sqlite3
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -70,7 +72,7 @@ def test_it_refers_to_nothing_outside(both: Report, page: Shown) -> None:
     assert anchors
     assert all(anchor.startswith("#") for anchor in anchors)
     assert not re.search(r"url\(|@import", " ".join(page.styles))
-    (policy,) = (value for _, name, value in page.attributes if value.startswith("default-src"))
+    (policy,) = (value for _, _, value in page.attributes if value.startswith("default-src"))
     assert "http" not in policy
     assert b"cdn.bokeh.org" not in both.html
 
@@ -158,7 +160,7 @@ def test_what_cannot_be_reported_is_refused(
     recording: sqlite3.Connection,
     tmp_path: Path,
     run_ids: list[int],
-    options: dict[str, float],
+    options: dict[str, Any],
     error: type[Exception],
     says: str,
 ) -> None:
@@ -169,6 +171,6 @@ def test_what_cannot_be_reported_is_refused(
 def test_without_the_extra_it_says_what_to_install(
     recording: sqlite3.Connection, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "bokeh", None)
+    monkeypatch.setitem(sys.modules, "bokeh", None)
     with pytest.raises(InvalidInputError, match=r"pip install 'webots-mcp\[view\]'"):
         make_report(recording, [1], tmp_path)

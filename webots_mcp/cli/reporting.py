@@ -38,7 +38,7 @@ def report(arguments: argparse.Namespace) -> None:
     file needs nothing else and opens without a network. It needs the extra view:
     pip install 'webots-mcp[view]'.
     """
-    from webots_mcp.report import file_name, make_report, require_free, write_report
+    from webots_mcp.report import file_name, make_report, require_folder, require_free, write_report
     from webots_mcp.report.words import size
     from webots_mcp.store.reading.subject import find_subject
 
@@ -47,6 +47,7 @@ def report(arguments: argparse.Namespace) -> None:
         run_ids = arguments.run_ids or [find_subject(connection, arguments.robot).run_id]
         file = Path(arguments.output or file_name(run_ids))
         require_free(file, overwrite=arguments.overwrite)
+        require_folder(file)
         made = make_report(
             connection, run_ids, data_dir, names=arguments.signal, max_mb=arguments.max_mb,
             progress=progress,

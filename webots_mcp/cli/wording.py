@@ -34,6 +34,7 @@ BY_TOOL: Final = {  # by tool
     "plot": "plot",
     "query_history": "history",
     "query_sql": "sql",
+    "report": "report",
     "run": "run",
     "send_command": "send",
     "set_parameters": "parameters",

@@ -4,7 +4,7 @@ Jinja2 and Bokeh, the extra `view`, are imported with the first report, never wi
 """
 
 from webots_mcp.report.making import MAX_MB, MIN_MB, MOST_RUNS, Report, make_report
-from webots_mcp.report.writing import file_name, require_free, write_report
+from webots_mcp.report.writing import file_name, require_folder, require_free, write_report
 
 __all__ = [
     "MAX_MB",
@@ -13,6 +13,7 @@ __all__ = [
     "Report",
     "file_name",
     "make_report",
+    "require_folder",
     "require_free",
     "write_report",
 ]

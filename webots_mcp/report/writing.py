@@ -6,7 +6,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from webots_mcp.contract import PRIVATE_FILE
+from webots_mcp.contract import PRIVATE_FILE, make_folder
 from webots_mcp.errors import InvalidInputError
 
 
@@ -19,14 +19,24 @@ def require_free(file: Path, *, overwrite: bool) -> None:
     """See that the file may be written, before the work is done.
 
     Raises:
-        InvalidInputError: Something is there already, or there is no such folder.
+        InvalidInputError: Something is there already, or it is no page's name.
     """
-    if file.suffix.lower() not in (".html", ".htm"):
-        raise InvalidInputError(f"{file.name!r} is no page's name: end it in .html")
     if file.is_dir():
         raise InvalidInputError(f"{file} is a folder: name a file in it")
+    if file.suffix.lower() not in (".html", ".htm"):
+        raise InvalidInputError(f"{file.name!r} is no page's name: end it in .html")
     if file.exists() and not overwrite:
-        raise InvalidInputError(f"{file} is there already: choose another name, or overwrite it")
+        raise InvalidInputError(
+            f"{file} is there already: name another one, or let it be overwritten"
+        )
+
+
+def require_folder(file: Path) -> None:
+    """See that there is a folder to write into.
+
+    Raises:
+        InvalidInputError: There is none.
+    """
     if not file.parent.is_dir():
         raise InvalidInputError(f"there is no folder {file.parent}: make it, or name another file")
 
@@ -34,16 +44,20 @@ def require_free(file: Path, *, overwrite: bool) -> None:
 def write_report(file: Path, html: bytes, *, overwrite: bool = False) -> None:
     """Write it as a file of its owner alone that appears only when it is complete.
 
+    A folder that is not there is made.
+
     Raises:
         InvalidInputError: It cannot be written, or something is there already.
     """
     require_free(file, overwrite=overwrite)
     aside = file.with_name(f"{file.name}.part")
     try:
-        aside.write_bytes(html)
-        aside.chmod(PRIVATE_FILE)
-        os.replace(aside, file)  # noqa: PTH105
+        make_folder(file.parent)
+        try:
+            aside.write_bytes(html)
+            aside.chmod(PRIVATE_FILE)
+            os.replace(aside, file)  # noqa: PTH105
+        finally:
+            aside.unlink(missing_ok=True)
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error
-    finally:
-        aside.unlink(missing_ok=True)

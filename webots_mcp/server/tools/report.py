@@ -7,7 +7,6 @@ from typing import Annotated, Final
 
 from pydantic import Field
 
-from webots_mcp.contract import make_folder
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.report import file_name, make_report, require_free, write_report
 from webots_mcp.server.budget import notes_of
@@ -37,8 +36,6 @@ def webots_report(
     with recording.view(robot, run_ids[0] if run_ids else None) as view:
         chosen = run_ids or [view.require_run().id]
         path = _inside(recording.data_dir, file or f"{FOLDER}/{file_name(chosen)}")
-        if not file:
-            make_folder(path.parent)
         require_free(path, overwrite=overwrite)
         made = make_report(view.connection, chosen, recording.data_dir, names=signals or ())
         write_report(path, made.html, overwrite=overwrite)

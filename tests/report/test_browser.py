@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from functools import partial
 from typing import Any
 
 import pytest
@@ -28,18 +29,26 @@ def opened(chromium: Any, both: Report, tmp_path_factory: pytest.TempPathFactory
     context = chromium.new_context(offline=True, viewport={"width": 1280, "height": 900})
     page = context.new_page()
     page.wrong, page.asked = [], []
-    page.on("pageerror", lambda error: page.wrong.append(str(error)))  # pyright: ignore
-    page.on("console", lambda said: _note(page, said))  # pyright: ignore
-    page.on("request", lambda request: page.asked.append(request.url))  # pyright: ignore
+    page.on("pageerror", partial(_keep, page.wrong))
+    page.on("console", partial(_note, page.wrong))
+    page.on("request", partial(_ask, page.asked))
     page.goto(file.as_uri())
     page.wait_for_function(DRAWN, timeout=120_000)
     yield page
     context.close()
 
 
-def _note(page: Any, said: Any) -> None:
+def _keep(wrong: list[str], error: Any) -> None:
+    wrong.append(str(error))
+
+
+def _note(wrong: list[str], said: Any) -> None:
     if said.type in ("error", "warning"):
-        page.wrong.append(said.text)
+        wrong.append(said.text)
+
+
+def _ask(asked: list[str], request: Any) -> None:
+    asked.append(request.url)
 
 
 def test_it_opens_without_a_network_draws_what_was_recorded_and_zooms(

@@ -30,8 +30,8 @@ def test_it_tells_what_ran_as_it_was_recorded(page: Shown, recording: sqlite3.Co
 
 
 def test_it_tells_events_with_the_seconds_around_them(page: Shown) -> None:
-    stuck = page.text.index("stuck at ")
-    around = page.text[stuck : page.text.index("Events", stuck)]
+    gap = page.text.index("gap at 11.968 s, for 3.04 s")
+    around = page.text[gap : page.text.index("Events", gap)]
     assert "mode: cruise → back_up" in around
     assert "grasp(): failed" in page.text
     assert "the gripper is not mounted" in page.text

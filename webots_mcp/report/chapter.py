@@ -225,7 +225,7 @@ def _facts(info: RunInfo, session: Session | None, step_ms: float | None) -> dic
         facts |= {
             "host": session.host,
             "supervisor": "yes" if session.supervisor else "no",
-            "versions": listed(session.versions) or None,
+            "versions": valued(session.versions) or None,
             "end of the controller": session.end_reason,
             "newest error of the recorder": session.last_error,
             "rows dropped": session.rows_dropped or None,

@@ -11,7 +11,7 @@ from typing import Any, Final, cast
 from webots_mcp.store.detection.event import Event
 
 LONGEST_TEXT: Final = 1_000  # characters of a cell
-_LONGEST_VALUE: Final = 200  # of a value within one
+_LONGEST_VALUE: Final = 400  # of a value within one
 _UNIT: Final = re.compile(r"(.+)_(s|m|rad)")
 _UNTOLD: Final = ("id", "image_id", "first_times_s")
 
@@ -87,7 +87,7 @@ def _rounded(value: Any) -> Any:
 
 def listed(values: Mapping[str, Any]) -> str:
     """Named values in one line; a unit at the end of a name stands behind its value."""
-    return ", ".join(_named(name, value) for name, value in values.items())
+    return "; ".join(_named(name, value) for name, value in values.items())
 
 
 def valued(values: Mapping[str, Any]) -> str:
@@ -97,6 +97,8 @@ def valued(values: Mapping[str, Any]) -> str:
 
 def _named(name: str, value: Any) -> str:
     found = _UNIT.fullmatch(name)
+    if isinstance(value, str) and " " in value:
+        return f"{name.replace('_', ' ')}: {spelled(value)}"
     if found is None or not isinstance(value, (int, float)):
         return f"{name.replace('_', ' ')} {spelled(value)}"
     return f"{found[1].replace('_', ' ')} {spelled(value)} {found[2]}"

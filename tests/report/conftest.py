@@ -68,9 +68,12 @@ def recording(bridge_recording: Path) -> Iterator[sqlite3.Connection]:
         yield connection
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """A real browser; skipped where there is none."""
+    """A real browser; skipped where there is none.
+
+    Its driver runs an event loop in this thread, beside which no asynchronous test can run.
+    """
     driver = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
     program = Path("/usr/bin/chromium")
     if not program.exists():

@@ -59,3 +59,16 @@ def test_a_python_that_did_not_make_the_environment_is_named(
     said = refused(checkout, other)
     assert "Python 3.12" in said
     assert ".venv was made by 3.11" in said
+
+
+def test_what_another_job_installed_is_not_installed_again(checkout: Path) -> None:
+    python = write_python(checkout / ".venv" / "bin" / "python", "3.11")
+    (checkout / "pyproject.toml").touch()
+
+    def said(job: str) -> str:
+        line, environment = [checkout / "run", job], {**os.environ, "PYTHON": python}
+        return subprocess.run(line, env=environment, capture_output=True, text=True).stderr
+
+    assert [bool(said(job)) for job in ("shell", "docs", "docs", "shell")] == [
+        True, True, False, False
+    ]  # fmt: skip

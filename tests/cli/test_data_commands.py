@@ -148,7 +148,7 @@ def test_a_name_without_a_format_is_bad_input(
     database: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = complaint(capsys, "export", "--database", str(database), "-o", "run.xlsx")
-    assert "end it in .csv, .jsonl, .parquet or .mcap" in said
+    assert "end it in .csv, .jsonl, .parquet, .mcap or .rrd" in said
 
 
 # -- import ---------------------------------------------------------------------------------------

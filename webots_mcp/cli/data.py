@@ -36,8 +36,8 @@ if TYPE_CHECKING:
 @command(
     "export", DATA_DIR, DATABASE, *RANGE,
     argument("-o", "--output", metavar="FILE",
-             help="a .csv, .jsonl, .parquet or .mcap file (default: CSV to stdout)"),
-    argument("--format", choices=("csv", "jsonl", "parquet", "mcap"),
+             help="a .csv, .jsonl, .parquet, .mcap or .rrd file (default: CSV to stdout)"),
+    argument("--format", choices=("csv", "jsonl", "parquet", "mcap", "rrd"),
              help="where the file's name does not tell it"),
     argument("--safe-cells", action="store_true",
              help="in CSV, an apostrophe before texts that a spreadsheet would run as a formula "
@@ -46,13 +46,13 @@ if TYPE_CHECKING:
              help="the trials of that set instead, one row each, with score, rank and spread"),
 )  # fmt: skip
 def export(arguments: argparse.Namespace) -> None:
-    """Write recorded states as a table, or all of a run for Foxglove, Lichtblick or PlotJuggler.
+    """Write recorded states as a table, or all of a run for a viewer.
 
     The newest run is written, or a range; --since 0 writes all runs of a robot. A table has one row
     per state; columns are run, row, times, and the dotted names of what the controller published;
-    NaN and infinity are kept. A .mcap file has states, poses, pictures, log lines, events and
-    commands, and a layout for Foxglove and Lichtblick beside it. Parquet and MCAP need extras:
-    pip install 'webots-mcp[parquet]' or 'webots-mcp[mcap]'.
+    NaN and infinity are kept. A .mcap (Foxglove, Lichtblick, PlotJuggler) or .rrd file (Rerun) has
+    states, poses, pictures, log lines, events and commands. Parquet, MCAP and Rerun need extras:
+    pip install 'webots-mcp[parquet]', 'webots-mcp[mcap]' or 'webots-mcp[rerun]'.
     """
     from webots_mcp.store.export import FOR_VIEWERS, TrialTable, export_file, format_of
     from webots_mcp.store.export import export as write
@@ -101,9 +101,11 @@ def _export_for_viewers(
     def run() -> None:
         with reading(arguments) as connection, shown_progress("exporting") as progress:
             wanted = range_of(connection, arguments)
-            counts = export_for_viewers(connection, recording.data_dir, wanted, file, progress)
+            place = (recording.data_dir, wanted, form, file)
+            counts = export_for_viewers(connection, *place, progress)
         told = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-        print(f"{file}: {told}; layout for Foxglove and Lichtblick: {layout_file(file)}")
+        beside = f"; layout for Foxglove and Lichtblick: {layout_file(file)}"
+        print(f"{file}: {told}{beside if form == 'mcap' else ''}")
         print_notes(wanted.notes, sys.stderr)
 
     past_wrong_values(run)

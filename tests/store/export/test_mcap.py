@@ -70,7 +70,7 @@ def recorded(tmp_path: Path) -> Iterator[Recorded]:
 def exported(recorder: Recorder, folder: Path, **wanted: Any) -> Mcap:
     file = folder / "run.mcap"
     export_for_viewers(
-        recorder.connection, folder, find_range(recorder.connection, Scope(**wanted)), file
+        recorder.connection, folder, find_range(recorder.connection, Scope(**wanted)), "mcap", file
     )
     return Mcap(file)
 
@@ -209,7 +209,7 @@ def test_a_picture_that_is_gone_or_outside_is_counted_and_left_out(
     wanted = find_range(recorder.connection, Scope())
     (tmp_path / "data").mkdir()
     counts = export_for_viewers(
-        recorder.connection, tmp_path / "data", wanted, tmp_path / "run.mcap"
+        recorder.connection, tmp_path / "data", wanted, "mcap", tmp_path / "run.mcap"
     )
     assert +counts == {"states": 1, "pictures that are gone": 2}
 
@@ -299,7 +299,7 @@ def test_memory_does_not_grow_with_a_recording_for_viewers(
         tracemalloc.start()
         exported_to = tmp_path / "run.mcap"
         wanted = find_range(recorder.connection, Scope())
-        export_for_viewers(recorder.connection, tmp_path, wanted, exported_to)
+        export_for_viewers(recorder.connection, tmp_path, wanted, "mcap", exported_to)
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[-1] < 1.2 * peaks[0]
@@ -317,7 +317,7 @@ def test_files_appear_when_they_are_complete_or_not_at_all(
 
     wanted = find_range(recorder.connection, Scope())
     with pytest.raises(InvalidInputError, match="disk full"):
-        export_for_viewers(recorder.connection, tmp_path, wanted, file, fail)
+        export_for_viewers(recorder.connection, tmp_path, wanted, "mcap", file, fail)
     assert file.read_text() == "old"
     assert list(tmp_path.iterdir()) == [file]
 

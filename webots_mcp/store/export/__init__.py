@@ -18,6 +18,7 @@ from webots_mcp.store.export.layout import layout
 from webots_mcp.store.export.mcap import write_mcap
 from webots_mcp.store.export.parquet import write_parquet
 from webots_mcp.store.export.rows import Progress, Source, Table
+from webots_mcp.store.export.rrd import write_rrd
 from webots_mcp.store.export.text import write_csv, write_json_lines
 from webots_mcp.store.export.trials import TrialTable
 from webots_mcp.store.reading.ranges import TimeRange
@@ -35,7 +36,7 @@ FORMATS: Final = {
     "jsonl": Format(write_json_lines, 1),
     "parquet": Format(write_parquet, 2),
 }
-FOR_VIEWERS: Final = ("mcap",)
+FOR_VIEWERS: Final = ("mcap", "rrd")
 
 
 def export(
@@ -103,10 +104,11 @@ def export_for_viewers(
     connection: sqlite3.Connection,
     data_dir: Path,
     wanted: TimeRange,
+    form: str,
     file: Path,
     progress: Progress | None = None,
 ) -> Counter[str]:
-    """Write all of a range as MCAP, with a layout for Foxglove and Lichtblick beside it.
+    """Write all of a range as MCAP, with a layout beside it, or as a recording of Rerun's.
 
     The files are of their owner alone and appear when they are complete.
 
@@ -114,6 +116,7 @@ def export_for_viewers(
         connection: Any; it is never kept busy for more than an instant.
         data_dir: The folder of the pictures.
         wanted: From `find_range`.
+        form: One of `FOR_VIEWERS`.
         file: Where to; the layout is `layout_file` of it.
         progress: Called now and then with the rows read so far and in all.
 
@@ -123,6 +126,9 @@ def export_for_viewers(
     Raises:
         InvalidInputError: The library is not installed, or a file cannot be written.
     """
+    if form == "rrd":
+        with _placed(file) as aside:
+            return write_rrd(Contents.of(connection, data_dir, wanted, 1, progress), aside)
     contents = Contents.of(connection, data_dir, wanted, 2, progress)
     with _placed(file) as aside, aside.open("wb") as sink:
         counts = write_mcap(contents, sink)
@@ -165,7 +171,7 @@ def format_of(file: Path) -> str:
     form = {"json": "jsonl", "ndjson": "jsonl", "pq": "parquet"}.get(ending, ending)
     if form not in (*FORMATS, *FOR_VIEWERS):
         raise InvalidInputError(
-            f"{file.name} does not tell its format: end it in .csv, .jsonl, .parquet or .mcap, or "
-            "give the format"
+            f"{file.name} does not tell its format: end it in .csv, .jsonl, .parquet, .mcap or "
+            ".rrd, or give the format"
         )
     return form

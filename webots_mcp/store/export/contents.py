@@ -30,6 +30,7 @@ from webots_mcp.units import metres_in
 KINDS: Final = (
     "states", "log lines", "events", "commands", "pictures", "pictures that are gone",
 )  # fmt: skip
+_WAY_POSES: Final = 1000  # of a run at least, in its way
 _IN_SEGMENT: Final = (
     "sim_time_s >= :start_s AND sim_time_s < :end_s "
     "AND wall_time_s >= :wall_start_s AND wall_time_s < :wall_end_s"
@@ -86,6 +87,27 @@ class Pose(NamedTuple):
     y_m: float
     z_m: float
     yaw_rad: float
+
+
+class Way:
+    """Poses of a run, as many as a viewer draws at once: every second one goes when it is full."""
+
+    def __init__(self) -> None:
+        self.poses: list[Pose] = []
+        self.first: Recorded | None = None
+        self._every = 1
+        self._seen = 0
+
+    def see(self, recorded: Recorded, pose: Pose) -> None:
+        """Take in the pose of a state, if it is its turn."""
+        self._seen += 1
+        if self._seen % self._every:
+            return
+        self.first = self.first or recorded
+        self.poses.append(pose)
+        if len(self.poses) == 2 * _WAY_POSES:
+            del self.poses[::2]
+            self._every *= 2
 
 
 Item: TypeAlias = "Recorded | LogLine | Event | PlacedCommand | StoredImage"

@@ -19,7 +19,7 @@ from typing import Any, BinaryIO, Final
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.events import Event
-from webots_mcp.store.export.contents import KINDS, Contents, PlacedCommand, Pose
+from webots_mcp.store.export.contents import KINDS, Contents, PlacedCommand, Pose, Way
 from webots_mcp.store.export.rows import Recorded, value_at
 from webots_mcp.store.export.schemas import FIXED, Schema, Shape
 from webots_mcp.store.export.text import json_text
@@ -32,7 +32,6 @@ _PROFILE: Final = ""  # of no middleware
 _LEVELS: Final = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
 _NOT_IN_TOPICS: Final = re.compile(r"[^A-Za-z0-9_-]+")  # as message paths take them unquoted
 _NOT_IN_JSON: Final = re.compile("NaN|Infinity")  # Python reads them as numbers, viewers do not
-_WAY_POSES: Final = 1000  # of a run at least, in its way
 
 
 def write_mcap(contents: Contents, sink: BinaryIO) -> Counter[str]:
@@ -109,11 +108,13 @@ class _Writing:
     def begin(self) -> None:
         """What comes before the messages: the schemas of states, ways, and what runs these are."""
         shapes = {run_id: Shape({"object"}) for run_id in self._contents.run_ids}
-        ways = {run_id: _Way() for run_id in self._contents.run_ids}
+        ways = {run_id: Way() for run_id in self._contents.run_ids}
         for recorded in self._contents.source.recorded():
             state = parse(recorded.data)
             shapes[recorded.run_id].see(_renamed(state))
-            ways[recorded.run_id].see(recorded, state, self._contents)
+            pose = self._contents.pose(partial(value_at, state))
+            if pose is not None:
+                ways[recorded.run_id].see(recorded, pose)
         for run_id, shape in shapes.items():
             name = f"webots_mcp.State.{self._topics.frame(run_id)}".replace("/", ".")
             schema = shape.schema() or {"type": "object", "properties": {}}
@@ -194,7 +195,7 @@ class _Writing:
         topic = self._topics.topic(item.run_id, "pose")
         self._message(item, topic, "foxglove.FrameTransform", message)
 
-    def _write_way(self, run_id: int, way: _Way) -> None:
+    def _write_way(self, run_id: int, way: Way) -> None:
         first = way.first
         assert first is not None
         poses = [_pose(pose) for pose in way.poses]
@@ -222,29 +223,6 @@ class _Writing:
             data = json.dumps({"title": name, **schema}).encode()
             self._schemas[name] = self._writer.register_schema(name, "jsonschema", data)
         self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[name])
-
-
-class _Way:
-    """Poses of a run, as many as a viewer draws at once: every second one goes when it is full."""
-
-    def __init__(self) -> None:
-        self.first: Recorded | None = None
-        self.poses: list[Pose] = []
-        self._every = 1
-        self._seen = 0
-
-    def see(self, recorded: Recorded, state: dict[str, Any], contents: Contents) -> None:
-        """Take in a state, if it is its turn and it has a pose."""
-        self._seen += 1
-        if self._seen % self._every:
-            return
-        pose = contents.pose(partial(value_at, state))
-        if pose is not None:
-            self.first = self.first or recorded
-            self.poses.append(pose)
-        if len(self.poses) == 2 * _WAY_POSES:
-            del self.poses[::2]
-            self._every *= 2
 
 
 def _state_text(item: Recorded, state: dict[str, Any]) -> str:

@@ -110,7 +110,7 @@ class Table(ABC):
         kinds: dict[str, ColumnKind] = {}
         for row in self.rows():
             for name, value in row.values.items():
-                seen = _PLAIN_KINDS.get(cast("type[object]", type(value))) or _kind(value)
+                seen = kind_of(value)
                 if kinds.get(name) != seen:
                     kinds[name] = _widened(kinds.get(name, seen), seen)
         return [Column(name, kind) for name, kind in kinds.items()]
@@ -220,7 +220,11 @@ def _spread(prefix: str, items: Iterable[tuple[str, Any]], values: dict[str, Any
             values[name] = value
 
 
-def _kind(value: object) -> ColumnKind:
+def kind_of(value: object) -> ColumnKind:
+    """What a flattened value is; "text" also for what is none and has no column of its own."""
+    plain = _PLAIN_KINDS.get(type(value))
+    if plain is not None:
+        return plain
     if isinstance(value, int):
         return "int" if abs(value) <= _LARGEST_INT else "text"
     return "numbers" if _is_numbers(cast("list[Any]", value)) else "text"

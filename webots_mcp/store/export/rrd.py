@@ -1,0 +1,260 @@
+"""A range as a recording of Rerun's, through the extra `rerun` (rerun-sdk 0.24 or newer).
+
+Everything stands on two timelines: `sim_time`, a duration, and `wall_time`, a timestamp.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
+from itertools import groupby, islice
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Final, TypeVar, cast
+from uuid import NAMESPACE_URL, uuid5
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.events import Event
+from webots_mcp.store.export.contents import KINDS, Contents, Item, PlacedCommand, Pose, Way
+from webots_mcp.store.export.layout import main_signals
+from webots_mcp.store.export.rows import Recorded, Row, as_text, flat_row, kind_of
+from webots_mcp.store.logs import LogLine
+
+_GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
+_LEVELS: Final = {"warning": "WARN"}  # Rerun's other names are ours in capitals
+_MEDIA_TYPES: Final = {"png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg"}
+_WORLD: Final = "world"
+_Item = TypeVar("_Item", bound=Item)
+
+
+def write_rrd(contents: Contents, file: Path) -> Counter[str]:
+    """Everything of a range, in columns.
+
+    Each number and flag of the states is scalars of an entity of its own (flags are 0 and 1, a long
+    array is several scalars at a time), each text its changes; null is nothing. The entities are
+    /ROBOT/state/..., /ROBOT/camera/DEVICE, /ROBOT/screenshot, /ROBOT/log, /ROBOT/events,
+    /ROBOT/commands and /world/ROBOT, of several runs below /run_ID each.
+
+    Returns:
+        How many there are of each kind.
+
+    Raises:
+        InvalidInputError: The library is not installed, or is switched off.
+    """
+    rerun = _library()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", rerun.error_utils.RerunWarning)
+        stream = rerun.RecordingStream("webots_mcp", recording_id=_recording_id(contents))
+        writing = _Writing(contents, rerun, stream)
+        stream.save(str(file), default_blueprint=writing.blueprint())
+        try:
+            writing.write()
+        finally:
+            stream.disconnect()
+    if not file.stat().st_size:
+        raise InvalidInputError("Rerun wrote nothing: is the environment variable RERUN 'off'?")
+    return writing.counts
+
+
+def _library() -> Any:
+    try:
+        import_module("rerun.blueprint")
+        return import_module("rerun")
+    except ImportError as error:
+        raise InvalidInputError(
+            "Rerun's format needs its SDK: pip install 'webots-mcp[rerun]', or export as mcap or "
+            "csv"
+        ) from error
+
+
+def _recording_id(contents: Contents) -> str:
+    """The same for the same runs: a viewer shows one that is opened again as the same."""
+    names = [contents.about(run_id).get("uuid", f"{run_id}") for run_id in contents.run_ids]
+    return names[0] if len(names) == 1 else str(uuid5(NAMESPACE_URL, " ".join(names)))
+
+
+class _Writing:
+    """A recording that is being written."""
+
+    def __init__(self, contents: Contents, rerun: Any, stream: Any) -> None:
+        self.counts: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
+        self._contents = contents
+        self._rerun = rerun
+        self._stream = stream
+        self._text_type = getattr(rerun, "StateChange", None)  # Rerun 0.33 and newer
+        self._last_texts: dict[tuple[int, str], str | None] = {}
+        self._several = len(contents.run_ids) > 1
+
+    def blueprint(self) -> Any:
+        """Views of the main signals, the way, the pictures and the log."""
+        views, run_id = self._rerun.blueprint, self._contents.run_ids[-1]
+        shown = [
+            self._path(each, "state", *signal.name.split("."))
+            for each in self._contents.run_ids
+            for signal in main_signals(self._contents)
+        ]
+        parts = [views.TimeSeriesView(name="signals", contents=shown)]
+        if self._contents.motion.position is not None:
+            parts.append(views.Spatial3DView(name="way", origin=f"/{_WORLD}"))
+        cameras = {(image.run_id, *_picture_name(image)): None for image in self._contents.images()}
+        for run, *name in islice(cameras, 4):
+            parts.append(views.Spatial2DView(name=name[-1], origin=self._path(run, *name)))
+        parts.append(views.TextLogView(name="log", origin=self._path(run_id)))
+        return views.Blueprint(views.Grid(*parts), collapse_panels=False)
+
+    def write(self) -> None:
+        """All of it."""
+        contents = self._contents
+        for run_id in contents.run_ids:
+            about = self._rerun.AnyValues(**_identifiers(contents.about(run_id)))
+            self._stream.log(self._path(run_id, "run"), about, static=True)
+        self._write_states()
+        self._write_lines("log lines", "log", contents.log_lines(), _log_text)
+        self._write_lines("events", "events", contents.events(), _event_text)
+        self._write_lines("commands", "commands", contents.commands(), _command_text)
+        self._write_pictures()
+
+    def _write_states(self) -> None:
+        recorded = self._contents.source.recorded()
+        for run_id, rows in groupby(recorded, attrgetter("run_id")):
+            way = Way()
+            for group in _groups(rows):
+                self.counts["states"] += len(group)
+                self._write_group(run_id, group, [flat_row(each) for each in group], way)
+            if way.poses:
+                points = [[pose.x_m, pose.y_m, pose.z_m] for pose in way.poses]
+                line = self._rerun.LineStrips3D([points])
+                self._stream.log(f"{self._frame(run_id)}_way", line, static=True)
+
+    def _write_group(
+        self, run_id: int, group: Sequence[Recorded], rows: Sequence[Row], way: Way
+    ) -> None:
+        numbers, texts = dict[str, list[tuple[int, Any]]](), dict[str, list[tuple[int, str]]]()
+        poses: list[tuple[int, Pose]] = []
+        for index, row in enumerate(rows):
+            for name, value in row.values.items():
+                self._sort_in(run_id, name, index, value, numbers, texts)
+            pose = self._contents.pose(row.values.get)
+            if pose is not None:
+                poses.append((index, pose))
+                way.see(group[index], pose)
+        for name, pairs in numbers.items():
+            self._send(self._signal(run_id, name), group, pairs, self._scalars(pairs))
+        for name, pairs in texts.items():
+            self._send(self._signal(run_id, name), group, pairs, self._texts(pairs))
+        if poses:
+            self._send(self._frame(run_id), group, poses, self._transforms(poses))
+        self._stream.flush()
+
+    def _sort_in(
+        self,
+        run_id: int,
+        name: str,
+        index: int,
+        value: Any,
+        numbers: dict[str, list[tuple[int, Any]]],
+        texts: dict[str, list[tuple[int, str]]],
+    ) -> None:
+        if kind_of(value) in ("num", "int", "bool", "numbers"):
+            numbers.setdefault(name, []).append((index, value))
+            return
+        text = as_text(value)
+        if self._last_texts.get((run_id, name)) != text:
+            self._last_texts[run_id, name] = text
+            if text is not None:
+                texts.setdefault(name, []).append((index, text))
+
+    def _scalars(self, pairs: Sequence[tuple[int, Any]]) -> Any:
+        values = [
+            cast("list[float]", value) if isinstance(value, list) else [value] for _, value in pairs
+        ]
+        flat = np.fromiter((number for each in values for number in each), float)
+        columns = self._rerun.Scalars.columns(scalars=flat)
+        lengths = [len(each) for each in values]
+        return columns if set(lengths) == {1} else columns.partition(lengths)
+
+    def _texts(self, pairs: Sequence[tuple[int, str]]) -> Any:
+        texts = [text for _, text in pairs]
+        if self._text_type is None:
+            return self._rerun.TextLog.columns(text=texts)
+        return self._text_type.columns(state=texts)
+
+    def _transforms(self, poses: Sequence[tuple[int, Pose]]) -> Any:
+        halves = [pose.yaw_rad / 2 for _, pose in poses]
+        return self._rerun.Transform3D.columns(
+            translation=[[pose.x_m, pose.y_m, pose.z_m] for _, pose in poses],
+            quaternion=[[0.0, 0.0, math.sin(half), math.cos(half)] for half in halves],
+        )
+
+    def _write_lines(self, kind: str, name: str, items: Iterable[Any], told: Any) -> None:
+        for run_id, rows in groupby(items, attrgetter("run_id")):
+            for group in _groups(rows):
+                self.counts[kind] += len(group)
+                texts, levels = zip(*map(told, group), strict=True)
+                lines = self._rerun.TextLog.columns(text=texts, level=levels)
+                self._send(self._path(run_id, name), group, list(enumerate(texts)), lines)
+
+    def _write_pictures(self) -> None:
+        for image in self._contents.images():
+            data = self._contents.picture(image)
+            self.counts["pictures" if data is not None else "pictures that are gone"] += 1
+            if data is not None:
+                media = _MEDIA_TYPES.get(image.path.rpartition(".")[2].lower(), "image/png")
+                picture = self._rerun.EncodedImage.columns(blob=[data], media_type=[media])
+                self._send(
+                    self._path(image.run_id, *_picture_name(image)), [image], [(0, None)], picture
+                )
+
+    def _send(
+        self, path: str, group: Sequence[Item], pairs: Sequence[tuple[int, Any]], columns: Any
+    ) -> None:
+        chosen: list[Any] = [group[index] for index, _ in pairs]
+        sim = np.array([round(each.sim_time_s * 1e9) for each in chosen], "timedelta64[ns]")
+        wall = np.array([round(each.wall_time_s * 1e9) for each in chosen], "datetime64[ns]")
+        column = self._rerun.TimeColumn
+        times = [column("sim_time", duration=sim), column("wall_time", timestamp=wall)]
+        self._stream.send_columns(path, indexes=times, columns=columns)
+
+    def _signal(self, run_id: int, name: str) -> str:
+        return self._path(run_id, "state", *name.split("."))
+
+    def _frame(self, run_id: int) -> str:
+        return f"/{_WORLD}{self._path(run_id)}"
+
+    def _path(self, run_id: int, *parts: str) -> str:
+        branch = (f"run_{run_id}",) if self._several else ()
+        named = (part or "(empty)" for part in (*branch, self._contents.wanted.robot, *parts))
+        return str(self._rerun.new_entity_path(list(named)))
+
+
+def _groups(rows: Iterable[_Item]) -> Iterator[list[_Item]]:
+    going = iter(rows)
+    while group := list(islice(going, _GROUP_ROWS)):
+        yield group
+
+
+def _picture_name(image: Any) -> tuple[str, ...]:
+    return ("camera", image.device) if image.device else (image.kind,)
+
+
+def _identifiers(about: dict[str, str]) -> dict[str, str]:
+    return {name.replace(" ", "_"): value for name, value in about.items()}
+
+
+def _log_text(line: LogLine) -> tuple[str, str]:
+    who = ": ".join(filter(None, (line.source, line.logger)))
+    return f"[{who}] {line.message}", _LEVELS.get(line.level, line.level.upper())
+
+
+def _event_text(event: Event) -> tuple[str, str]:
+    return " ".join(filter(None, (event.kind, event.name, event.data))), "INFO"
+
+
+def _command_text(command: PlacedCommand) -> tuple[str, str]:
+    fate = command.error or command.result
+    told = f"{command.action} {command.params}: {command.status}"
+    return f"{told} {fate}" if fate else told, "ERROR" if command.error else "INFO"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import re
+import shutil
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -27,11 +28,16 @@ assert models.Robot  # importing the models filled the metadata
 TABLES = SQLModel.metadata.sorted_tables
 
 
-@pytest.fixture
-def migrated(tmp_path: Path) -> Path:
-    file = tmp_path / "webots.db"
+@pytest.fixture(scope="module")
+def _migrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("migrated") / "webots.db"
     upgrade(file)
     return file
+
+
+@pytest.fixture
+def migrated(_migrated: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copy(_migrated, tmp_path))
 
 
 def is_compared(_object: Any, _name: str | None, kind: str, _reflected: bool, _to: Any) -> bool:

@@ -86,7 +86,7 @@ def measure_history(bench: Bench) -> Iterable[Line]:
         with closing(connect(file, "reader")) as db:
             for question in (*_questions(db, rows), *_looks_back(db, file)):
                 bench.say(f"{rows:,} rows, {question.what}")
-                taken = _take_turns(db, question)
+                taken = _take_turns(db, question, min(_TURNS, bench.count(50)))
                 minutes += [taken["ours"]] if question.what.startswith("last minute") else []
                 yield from _lines(question, rows, taken)
             yield from _stuck(db, rows)
@@ -203,14 +203,14 @@ def _scan(paths: list[str], last_s: float, *, length_s: float) -> str:
     return f"SELECT {bucket}, {found} FROM state WHERE {where} GROUP BY 1"
 
 
-def _take_turns(db: sqlite3.Connection, question: Question) -> dict[str, Samples]:
-    """Up to five times each in turn, seconds; what takes long is asked less often."""
+def _take_turns(db: sqlite3.Connection, question: Question, turns: int) -> dict[str, Samples]:
+    """Up to so many times each in turn, seconds; what takes long is asked less often."""
     contenders: dict[str, Callable[[int], object]] = {
         "ours": lambda _: question.ask(),
         "naive": lambda _: db.execute(question.naive).fetchall(),
     }
     spent: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(_TURNS):
+    for _ in range(turns):
         for name, call in contenders.items():
             if sum(spent[name]) < _ENOUGH_S:
                 spent[name] += time_calls(call, 1)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import sqlite3
 import sys
+from collections.abc import Iterator
 from contextlib import closing
 from typing import Any
 
 import pytest
 
+from tests.memory import memory_connection
 from tests.recordings.rover import WALL_START_S, Recorder, start_run
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold
 from webots_mcp.store.questions.events import find_events
@@ -20,11 +22,22 @@ STOPS_S = 200.0  # the robot drives, then stands, at 300 s it drives on
 GOES_ON_S = 300.0
 
 
-@pytest.fixture
-def standing(empty: sqlite3.Connection, tier: str) -> sqlite3.Connection:
+@pytest.fixture(scope="module")
+def _standing() -> Iterator[sqlite3.Connection]:
     """For 100 s the robot is stuck, its sensor silent, its battery low, its heading flat, and its
-    steering swings."""
-    recorder = start_run(empty)
+    steering swings; only read."""
+    with memory_connection() as connection:
+        _stand(connection)
+        yield connection
+
+
+@pytest.fixture
+def standing(_standing: sqlite3.Connection, tier: str) -> sqlite3.Connection:
+    return _standing
+
+
+def _stand(connection: sqlite3.Connection) -> None:
+    recorder = start_run(connection)
     for step in range(4000):
         time_s = round(step * 0.1, 6)
         stands = STOPS_S <= time_s < GOES_ON_S
@@ -39,8 +52,7 @@ def standing(empty: sqlite3.Connection, tier: str) -> sqlite3.Connection:
         }
         recorder.publish(time_s, state)
     recorder.end_run("finished")
-    roll(empty, 100_000)
-    return empty
+    roll(connection, 100_000)
 
 
 def told(connection: sqlite3.Connection, kind: str, **bounds: Any) -> list[Event]:

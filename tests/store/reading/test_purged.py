@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.recordings.rover import WALL_START_S, record_rover
+from tests.memory import memory_connection
+from tests.recordings.rover import WALL_START_S
 from webots_mcp.store.analysis.spread import Spread
 from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention, prune
-from webots_mcp.store.rollup.rolling import roll
 
 
 def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:
@@ -28,10 +29,9 @@ def keep_rows(connection: sqlite3.Connection, folder: Path, rows: int) -> None:
 
 
 @pytest.fixture
-def rover(empty: sqlite3.Connection) -> sqlite3.Connection:
-    record_rover(empty)
-    roll(empty, 100_000)
-    return empty
+def rover(_recorded: dict[str, sqlite3.Connection]) -> Iterator[sqlite3.Connection]:
+    with memory_connection(_recorded["rolled"]) as connection:
+        yield connection
 
 
 def test_an_overview_is_the_same_after_a_purge(rover: sqlite3.Connection, tmp_path: Path) -> None:

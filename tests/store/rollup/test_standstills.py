@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import random
 import sqlite3
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.questions.events import find_events
@@ -26,12 +28,32 @@ STANDS_S = ((100.0, 112.0), (497.8, 503.0), (730.0, 1620.0), (1990.0, 2040.0), (
 TURNS_S = (1100.0, 1110.0)  # within the long one
 
 
+@pytest.fixture(scope="module")
+def _long() -> Iterator[sqlite3.Connection]:
+    with memory_connection() as connection:
+        with pytest.MonkeyPatch.context() as patch:
+            _shorten(patch)
+            _record(connection)
+        yield connection
+
+
 @pytest.fixture
-def long(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
+def long(
+    _long: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[sqlite3.Connection]:
     """2300 s, of which four coarse buckets are over, with 2 mm of noise."""
-    monkeypatch.setattr(rows, "RAW_ROWS", 1000)
-    monkeypatch.setattr(findings, "STRETCH_ROWS", 1500)
-    recorder = Recorder(empty)
+    _shorten(monkeypatch)
+    with memory_connection(_long) as connection:
+        yield connection
+
+
+def _shorten(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(rows, "RAW_ROWS", 1000)
+    patch.setattr(findings, "STRETCH_ROWS", 1500)
+
+
+def _record(connection: sqlite3.Connection) -> None:
+    recorder = Recorder(connection)
     robot_id = recorder.robot("rover")
     recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
     x_m, draw = 0.0, random.Random(1)
@@ -40,10 +62,9 @@ def long(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.
         stands = any(start_s <= time_s < end_s for start_s, end_s in STANDS_S)
         x_m += 0.0 if stands else 0.2 * STEP_S
         recorder.publish(time_s, state(time_s, x_m + draw.gauss(0.0, 0.002), stands))
-    empty.execute("UPDATE run SET last_sim_time_s = ?", (END_S,))
-    while not roll(empty, 100_000).done:
+    connection.execute("UPDATE run SET last_sim_time_s = ?", (END_S,))
+    while not roll(connection, 100_000).done:
         pass
-    return empty
 
 
 def state(time_s: float, x_m: float, stands: bool) -> dict[str, Any]:

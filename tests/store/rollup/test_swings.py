@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import sqlite3
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, start_run
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import find_events
@@ -23,21 +25,40 @@ SWINGS_S = ((100.0, 130.0), (488.0, 512.0), (1205.0, 1230.0))
 END_S = 1300.0
 
 
+@pytest.fixture(scope="module")
+def _long() -> Iterator[sqlite3.Connection]:
+    with memory_connection() as connection:
+        with pytest.MonkeyPatch.context() as patch:
+            _shorten(patch)
+            _record(connection)
+        yield connection
+
+
 @pytest.fixture
-def long(empty: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch) -> sqlite3.Connection:
+def long(
+    _long: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[sqlite3.Connection]:
     """1300 s, of which two coarse buckets are over."""
-    monkeypatch.setattr(rows, "RAW_ROWS", 1000)
-    monkeypatch.setattr(findings, "STRETCH_ROWS", 1500)
-    monkeypatch.setattr(views, "STRETCH_ROWS", 1500)
-    recorder = Recorder(empty)
+    _shorten(monkeypatch)
+    with memory_connection(_long) as connection:
+        yield connection
+
+
+def _shorten(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(rows, "RAW_ROWS", 1000)
+    patch.setattr(findings, "STRETCH_ROWS", 1500)
+    patch.setattr(views, "STRETCH_ROWS", 1500)
+
+
+def _record(connection: sqlite3.Connection) -> None:
+    recorder = Recorder(connection)
     robot_id = recorder.robot("rover")
     recorder.run(recorder.session(robot_id, "a" * 64), robot_id)
     for step in range(round(END_S / 0.1)):
         recorder.publish(step * 0.1, state(step * 0.1))
-    empty.execute("UPDATE run SET last_sim_time_s = ?", (END_S,))
-    while not roll(empty, 100_000).done:
+    connection.execute("UPDATE run SET last_sim_time_s = ?", (END_S,))
+    while not roll(connection, 100_000).done:
         pass
-    return empty
 
 
 def state(time_s: float) -> dict[str, Any]:

@@ -43,6 +43,7 @@ def main(example: Path) -> None:
         with Simulation(world, mode=mode, environment=environment) as simulation:
             database, ready = Path(folder) / DATABASE_NAME, conversation.get("ready", READY)
             simulation.wait_for(lambda: database.exists() and answers(database, ready), 120.0)
+            simulation.resume()  # in real time: it need not hurry while they talk
             parts = anyio.run(converse, Path(folder), conversation["turn"])
     print("\n".join((conversation["beginning"], *parts)), end="")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from itertools import accumulate
 
 import pytest
@@ -58,6 +59,17 @@ def test_a_very_slow_robot_stands_from_when_it_stops(speed_m_s: float) -> None:
     track, _ = noisy_track([(60.0, speed_m_s, 0.0), (60.0, 0.0, 0.0)], 0.032, 0.0002)
     (found,) = find_standstills(track, RADIUS_M, LEAST_S)
     assert track.times[found.start] == pytest.approx(60.0, abs=0.001 / speed_m_s)
+
+
+def test_a_slow_way_is_used_as_far_as_it_is_straight_to_tell_when_it_ended() -> None:
+    errors_s: list[float] = []
+    for seed in range(20):
+        track, _ = noisy_track([(70.0, 0.003, 0.0), (50.0, 0.0, 0.0)], 0.1, 0.02, seed)
+        *_, found = find_standstills(track, RADIUS_M, LEAST_S)
+        errors_s.append(abs(float(track.times[found.start]) - 70.0))
+    # No estimate of a ramp of unknown speed that ends in rest has less than this deviation.
+    least_s = 2 * 0.02 / (0.003 * 700**0.5)
+    assert statistics.median(errors_s) < 1.5 * 0.6745 * least_s
 
 
 CREEPS = (60.0, 0.001, 0.0)

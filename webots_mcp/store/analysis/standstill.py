@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
-from webots_mcp.store.analysis.arrays import mean, median, np
+from webots_mcp.store.analysis.arrays import Array, mean, median, np
 from webots_mcp.store.analysis.creep import is_creep, rest_within
 from webots_mcp.store.analysis.track import Track
 
@@ -15,7 +15,8 @@ SETTLED_SHARE: Final = 0.2  # of the radius: within it of the place is where a s
 _NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
 UNSEEN_SLOPE: Final = 3.0  # deviations: a speed that is less may be noise alone
 _LEAST_RAMP_ROWS: Final = 4
-_MOST_RAMP_ROWS: Final = 512
+_MOST_RAMP_ROWS: Final = 2**14
+_AGREEING: Final = 1.5  # standard deviations: ends of one ramp in more and more rows
 _RAMP_SHARE: Final = 0.75  # of the smoothed rows: so far a ramp is looked for at first
 _CERTAIN_RAMP: Final = 50.0  # variances of the noise: a ramp that explains more is none of it
 
@@ -149,7 +150,10 @@ def _begin_of_rest(track: Track, first: int, last: int) -> int:
     """The row from which on it stands: of a ramp that ends in rest, the best fitting end.
 
     A slow robot is near its place long before it rests: its ramp is looked for in ever more rows,
-    until it stands out from the noise.
+    until it stands out from the noise. From then on more rows make its end more exact, as long as
+    they are of the same ramp: as long as the ends that ever more rows tell agree within their
+    standard deviations (A. Goldenshluger, A. Nemirovski, On spatially adaptive estimation of
+    nonparametric regression, Mathematical Methods of Statistics 6, 1997).
 
     Args:
         track: The positions as recorded count: smoothing blurs the bend.
@@ -159,37 +163,69 @@ def _begin_of_rest(track: Track, first: int, last: int) -> int:
     reach = max(_LEAST_RAMP_ROWS, int(_RAMP_SHARE * track.smoothed_rows))
     latest, quarter = (first + last) // 2, (last - first) // 4
     surely = slice(first + quarter, last + 1 - quarter)
+    earliest_s, latest_s, begin = -np.inf, np.inf, None
     while first > 0:
         rows = slice(max(0, first - reach), min(latest, first + reach))
         if rows.stop <= rows.start:
             break
-        best, explained_m2 = _end_of_ramp(track, rows, surely)
-        if (
-            explained_m2 <= _CERTAIN_RAMP * track.noise_m**2
-            and rows.start > 0
-            and reach < _MOST_RAMP_ROWS
-        ):
+        ramp = _end_of_ramp(track, rows, surely)
+        widest = rows.start == 0 or reach >= _MOST_RAMP_ROWS
+        certain = ramp.explained_m2 > _CERTAIN_RAMP * track.noise_m**2
+        if begin is None and not certain and not widest:
             reach *= 2
-        elif rows.start + best < rows.stop - 1 or rows.stop == latest:
-            return rows.start + best
+        elif begin is None and ramp.end == rows.stop - 1 and rows.stop < latest:
+            first = ramp.end
         else:
-            first = rows.start + best
-    return first
+            end_s = float(track.times[ramp.end])
+            if not earliest_s <= end_s <= latest_s:
+                break
+            begin = ramp.end
+            if widest or not ramp.error_s:
+                break
+            earliest_s = max(earliest_s, end_s - _AGREEING * ramp.error_s)
+            latest_s = min(latest_s, end_s + _AGREEING * ramp.error_s)
+            reach *= 2
+    return first if begin is None else begin
 
 
-def _end_of_ramp(track: Track, rows: slice, rest: slice) -> tuple[int, float]:
-    """Of ramps that end in rest, each in another row, the best, and how many squares it explains.
+class _Ramp(NamedTuple):
+    """A steady motion that ends in rest.
+
+    Attributes:
+        end: The row in which it rests.
+        explained_m2: How many squares it explains.
+        error_s: Standard deviation of when it ends.
+    """
+
+    end: int
+    explained_m2: float
+    error_s: float
+
+
+def _end_of_ramp(track: Track, rows: slice, rest: slice) -> _Ramp:
+    """Of ramps that end in rest, each in another row, the best.
+
+    Of n rows at a speed, the end is known to twice the noise over the speed and the root of n: the
+    bound of Cramer and Rao, where neither speed nor end is known.
 
     Args:
         track: Recorded positions.
         rows: Where one may end.
         rest: Rows in which it certainly stands.
     """
-    off = np.stack([each[rows] - mean(each[rest]) for each in (track.raw_x, track.raw_y)], axis=1)
-    times = track.times[rows]
-    ramps = np.minimum(times[None, :] - times[:, None], 0.0)  # one a row, for each end
-    squares = np.einsum("ij,ij->i", ramps, ramps)
-    explained = ((ramps @ off) ** 2).sum(axis=1)
+    off = np.stack([each[rows] - mean(each[rest]) for each in (track.raw_x, track.raw_y)])
+    times = track.times[rows] - track.times[rows.start]
+    counts = np.arange(len(times))
+    squares = _sums_before(times**2) - 2 * times * _sums_before(times) + counts * times**2
+    heights = _sums_before(times * off) - times * _sums_before(off)
+    explained: Array = (heights**2).sum(axis=0)
     gain = np.divide(explained, squares, out=np.zeros_like(squares), where=squares > 0)
     best = int(np.argmax(gain))
-    return best, float(gain[best])
+    speed_m_s = float(np.sqrt(explained[best])) / squares[best] if squares[best] else 0.0
+    error_s = 2 * track.noise_m / (speed_m_s * best**0.5) if speed_m_s else 0.0
+    return _Ramp(rows.start + best, float(gain[best]), error_s)
+
+
+def _sums_before(values: Array) -> Array:
+    """Of all values before each."""
+    return np.cumsum(values, axis=-1) - values

@@ -99,6 +99,19 @@ def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
     assert "it turned in place" in still.details["not_stuck"]
 
 
+@pytest.mark.parametrize("period_s", [0.6, 1.5, 2.0])
+def test_a_stuck_robot_that_wiggles_is_so_from_its_first_row_to_its_last(
+    empty: sqlite3.Connection, period_s: float
+) -> None:
+    recorder = start_run(empty)
+    for step in range(400):
+        time_s, travelled_m = step * 0.1, 0.02 * min(step, max(100, step - 60))
+        yaw = 0.2 * math.sin(math.tau * time_s / period_s)
+        recorder.publish(time_s, {"pose": [travelled_m, 0.0, yaw], "cmd_vel": 0.2})
+    (stuck,) = ask(empty, "stuck").events
+    assert (stuck.start_s, stuck.end_s) == pytest.approx((10.0, 16.0), abs=0.2)
+
+
 def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Connection) -> None:
     recorder = start_run(empty)
     for step in range(300):

@@ -13,6 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from webots_mcp.naming import Value
@@ -29,8 +30,9 @@ if TYPE_CHECKING:
 
 WHEELS_TURN: Final = 0.1  # rad/s, or in whatever unit they are published
 ON_THE_SPOT: Final = 0.2  # of the fastest wheel: where the mean of all is less, none drives ahead
-TURNED_RAD: Final = 0.1  # from a second before to a second after
-HEADING_NOISE: Final = 6.0  # standard deviations
+TURN_S: Final = 2.0
+TURNED_RAD: Final = 0.1  # from the mean of so many seconds before to that of as many after
+HEADING_NOISE: Final = 6.0  # standard deviations of such a mean
 SWAY_S: Final = 2.0
 SWAY_M: Final = 0.0035  # of 1 cm to and fro; less is how a robot trembles at a wall
 SWAY_NOISE: Final = 3.5  # deviations in each coordinate: noise alone comes to 1.4 of them
@@ -291,7 +293,11 @@ def _variances(values: Array, edges: Indexes) -> Array:
 
 
 def turns(columns: Columns, heading: Signal | None) -> Flags:
-    """Per row whether it looks elsewhere a second later than a second before."""
+    """Per row whether it looks elsewhere in the two seconds after it than in the two before.
+
+    Means are compared: who wiggles about one heading does not turn. Nearer to the ends of the rows
+    what holds two seconds further inside is taken to hold.
+    """
     none = np.zeros(len(columns.times), np.bool_)
     if heading is None or heading.name not in columns.values:
         return none
@@ -301,10 +307,21 @@ def turns(columns: Columns, heading: Signal | None) -> Flags:
         return none
     course = np.interp(np.arange(len(angles)), present, np.unwrap(angles[present]))
     times = columns.moments
-    later = np.minimum(np.searchsorted(times, times + 1.0), len(times) - 1)
-    earlier = np.maximum(np.searchsorted(times, times - 1.0, side="right") - 1, 0)
-    limit = max(TURNED_RAD, HEADING_NOISE * noise_of(course))
-    return np.asarray(np.abs(course[later] - course[earlier]) > limit)
+    within_s = min(TURN_S, float(times[-1] - times[0]) / 2)
+    middles = np.minimum(np.maximum(times, times[0] + within_s), times[-1] - within_s)
+    edges = [np.searchsorted(times, middles + by_s) for by_s in (-within_s, 0.0, within_s)]
+    before, after = (_means_between(course, *pair) for pair in pairwise(edges))
+    rows = max(1.0, len(times) * within_s / float(times[-1] - times[0] or 1.0))
+    limit = max(TURNED_RAD, HEADING_NOISE * noise_of(course) / math.sqrt(rows))
+    return np.asarray(np.abs(after - before) > limit)
+
+
+def _means_between(values: Array, starts: Indexes, ends: Indexes) -> Array:
+    """The means of values [start, end), of one at least."""
+    sums = np.concatenate(([0.0], np.cumsum(values)))
+    starts = np.minimum(starts, len(values) - 1)
+    ends = np.maximum(ends, starts + 1)
+    return (sums[ends] - sums[starts]) / (ends - starts)
 
 
 def turned_rad(parts: Sequence[Part]) -> float | None:

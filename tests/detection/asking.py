@@ -186,16 +186,21 @@ def _longer_m(doubts: str, run_id: int, distance_m: float) -> float:
     return 0.0
 
 
-def claimed_differences(connection: sqlite3.Connection) -> list[tuple[str, float]]:
+def compared_edits(connection: sqlite3.Connection) -> Comparison:
+    """The runs before the last edit and those after it."""
+    return compare_code(connection, limit=_ALL, deadline_s=UNHURRIED_S)
+
+
+def claimed_differences(comparison: Comparison) -> Iterable[tuple[str, float]]:
     """What is claimed to be different since the last edit: names, and how much more it is."""
-    comparison = compare_code(connection, limit=_ALL, deadline_s=UNHURRIED_S)
-    return list(_differences(comparison))
-
-
-def _differences(comparison: Comparison) -> Iterable[tuple[str, float]]:
     figures = [(each.name, each.spread, each.different) for each in comparison.measures]
     figures += [(each.name, each.mean, each.different) for each in comparison.differences]
     for name, spread, different in figures:
         before, after = spread[0], spread[-1]
         if different[-1] and before is not None and after is not None:
             yield name, after.median - before.median
+
+
+def undecided(comparison: Comparison) -> list[str]:
+    """What may be different, but for which more runs are wanted."""
+    return [each.name for each in comparison.measures if each.runs_wanted[-1] is not None]

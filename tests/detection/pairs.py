@@ -9,17 +9,21 @@ from typing import Final
 
 import numpy as np
 
-from tests.detection.asking import claimed_differences
+from tests.detection.asking import claimed_differences, compared_edits, undecided
 from tests.detection.driving import drive_of, driven, phase
 from tests.detection.labelled import LabelledRun
 from tests.detection.sensing import sensors
 from tests.detection.writing import Writer, roll_up
 from tests.memory import memory_connection
+from webots_mcp.store.questions.compare import Comparison
 
 SAME_PAIRS: Final = 20
 FASTER_PAIRS: Final = 10
 RUNS: Final = 4  # on either side of the edit
 FASTER: Final = 1.1
+# The t test of four runs each, at a chance of 0.002 for all figures together, shows it in 98 of 100
+# pairs: the like runs of one in fifty differ by more than usual, and then it asks for more of them.
+MOST_UNDECIDED: Final = 1
 SPEED_M_S: Final = 0.2
 INTERVAL_S: Final = 0.1
 LIKE_RUNS: Final = 0.01  # the speeds of like runs differ by this standard deviation, as a share
@@ -33,16 +37,20 @@ class Pairs:
     Attributes:
         claimed: Names of what is claimed to be different between like runs, pair by pair.
         found: Of the pairs with a robot that became faster, those in which that was claimed.
+        undecided: And those of which the answer says that more runs would show it.
     """
 
     claimed: tuple[tuple[str, ...], ...]
     faster: int
     found: int
+    undecided: int
 
     @property
     def missed(self) -> list[str]:
         """The goals that are not reached."""
-        return ["A/A"] * any(self.claimed) + ["+10 %"] * (self.found < self.faster)
+        lost = self.found + self.undecided < self.faster
+        few = self.found < self.faster - MOST_UNDECIDED
+        return ["A/A"] * any(self.claimed) + ["+10 %"] * (lost or few)
 
 
 def measure_pairs(
@@ -55,16 +63,20 @@ def measure_pairs(
     claimed: list[tuple[str, ...]] = []
     for index in range(same):
         say(f"A/A {index + 1}/{same}")
-        claimed.append(tuple(name for name, _ in _compared(seed, index, 1.0)))
-    found = 0
+        comparison = _compared(seed, index, 1.0)
+        claimed.append(tuple(name for name, _ in claimed_differences(comparison)))
+    found = unsure = 0
     for index in range(faster):
         say(f"+10 % {index + 1}/{faster}")
-        rises = [name for name, more in _compared(seed, same + index, FASTER) if more > 0]
-        found += any(_SPEED.search(name) for name in rises)
-    return Pairs(tuple(claimed), faster, found)
+        comparison = _compared(seed, same + index, FASTER)
+        rises = [name for name, more in claimed_differences(comparison) if more > 0]
+        is_found = any(map(_SPEED.search, rises))
+        found += is_found
+        unsure += not is_found and any(map(_SPEED.search, undecided(comparison)))
+    return Pairs(tuple(claimed), faster, found, unsure)
 
 
-def _compared(seed: int, index: int, faster: float) -> list[tuple[str, float]]:
+def _compared(seed: int, index: int, faster: float) -> Comparison:
     rng = np.random.default_rng([seed, index, 1])
     with memory_connection() as connection:
         writer = Writer(connection)
@@ -73,7 +85,7 @@ def _compared(seed: int, index: int, faster: float) -> list[tuple[str, float]]:
             for _ in range(RUNS):
                 writer.write(_run(rng, SPEED_M_S * factor))
         roll_up(connection)
-        return claimed_differences(connection)
+        return compared_edits(connection)
 
 
 def _run(rng: np.random.Generator, speed_m_s: float) -> LabelledRun:

@@ -112,7 +112,10 @@ def render_pairs(pairs: Pairs) -> str:
     names = Counter(name for names in false for name in names)
     most = ", ".join(f"{name} {count}" for name, count in names.most_common(6))
     same = f"A/A: {len(false)} of {len(pairs.claimed)} pairs with a difference that is none"
-    faster = f"+10 % speed: found in {pairs.found} of {pairs.faster} pairs"
+    faster = (
+        f"+10 % speed: found in {pairs.found} of {pairs.faster} pairs, more runs wanted for it in "
+        f"{pairs.undecided}"
+    )
     return "\n".join([f"{same} ({most})" if most else same, faster])
 
 

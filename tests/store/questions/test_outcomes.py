@@ -184,3 +184,23 @@ def test_repeats_among_single_runs_are_named(empty: sqlite3.Connection) -> None:
         record(empty, code, driving)
     (note,) = (note for note in compare_runs(empty, [1, 2, 3]).notes if "one run each" in note)
     assert "Runs 1 and 2 had the same controller file: without run_ids" in note
+
+
+def test_what_only_adding_tells_apart_asks_for_no_more_certainty(empty: sqlite3.Connection) -> None:
+    """Shares of the time that are one but for rounding count as no figures that may differ."""
+
+    def at(speed_m_s: float, start_s: float) -> State:
+        def state(time_s: float) -> dict[str, Any]:
+            resting = 10.0 + start_s <= time_s < 16.0 + start_s
+            driven_s = time_s - min(max(time_s - 10.0 - start_s, 0.0), 6.0)
+            return {"pose": [speed_m_s * driven_s, 0.0], "mode": "rest" if resting else "drive"}
+
+        return state
+
+    for code, factor in (("a", 1.0), ("b", 1.07)):
+        for run, share in enumerate((0.98, 1.0, 1.02, 1.01)):
+            record(empty, code, at(0.2 * factor * share, 0.1 * run))
+    found = compare_code(empty)
+    shares = measure(found, "share of rest").spread
+    assert all(each is not None and each.low == pytest.approx(each.high) for each in shares)
+    assert measure(found, "mean_speed_m_s").different == [False, True]

@@ -32,6 +32,7 @@ from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.signals.registry import Signal
 
 _SHARE: Final = "share of "
+_DUST: Final = 1e-9  # of a figure
 _RATE: Final = " per min"
 NO_MODE: Final = (
     "no mode is known: publish one as a text, such as mode, or name the signal of one: mode=NAME"
@@ -116,11 +117,18 @@ def _facts(runs: Sequence[_Outcome], names: Sequence[str], kinds: Sequence[str])
     method for discrete data, Biometrics 46, 1990); the distance and the mean speed over the same
     time are one fact, and the last share of the time follows from the others.
     """
-    vary = [name for name in names if len({run.figure(name) for run in runs}) > 1]
+    vary = [name for name in names if _varies([run.figure(name) for run in runs])]
     shares = sum(name.startswith(_SHARE) for name in vary)
     counted = sum(len({run.events_of(kind) for run in runs}) > 1 for kind in kinds)
     alike = (_SPEED in vary) + (shares > 0)
     return max(1, len(vary) - alike + counted)
+
+
+def _varies(figures: Sequence[float | None]) -> bool:
+    """Whether the figures of some runs differ, by more than adding makes of one."""
+    known = [figure for figure in figures if figure is not None]
+    spread = max(known, default=0.0) - min(known, default=0.0)
+    return len(known) < len(figures) or spread > _DUST * max(map(abs, known), default=0.0)
 
 
 def _measure(

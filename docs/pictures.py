@@ -6,18 +6,21 @@ They show the world and the controller of `webots-mcp demo`, for exactly so many
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
 import sys
 import tempfile
+from collections.abc import Generator
 from contextlib import redirect_stdout
-from io import StringIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from statistics import fmean
-from typing import Final
+from typing import Any, Final
 
 import anyio
 import matplotlib
+from PIL import Image
 
 from webots_mcp import demo
 from webots_mcp.cli import main as webots_mcp
@@ -59,6 +62,10 @@ TURNS: Final[tuple[tuple[demo.Turn, bool], ...]] = (
         True,
     ),
 )
+CHROMIUM: Final = Path("/usr/bin/chromium")
+# Every figure of Bokeh's has its parts.
+FIGURES_ARE_THERE: Final = """() => window.Bokeh && [...document.querySelectorAll("[data-root-id]")]
+    .every(each => each.shadowRoot || each.children.length)"""
 CONVERSATION: Final = re.compile(r"(?<=<!-- conversation -->\n```text\n).*?(?=^```$)", re.M | re.S)
 
 
@@ -74,6 +81,36 @@ def draw_plots(data_dir: Path, images: Path) -> None:
         where = ["--data-dir", str(data_dir), "-o", str(images / name)]
         if webots_mcp(["plot", *options.split(), *where]):
             raise RuntimeError(f"{name} could not be drawn")
+
+
+def photograph_report(browser: Any, data_dir: Path, images: Path) -> None:
+    """The part of a report that says what happened, as a browser shows it."""
+    file = data_dir / "run.html"
+    if webots_mcp(["report", "1", "-o", str(file), "--data-dir", str(data_dir), "--overwrite"]):
+        raise RuntimeError("the report could not be written")
+    page = browser.new_page(viewport={"width": 900, "height": 900})
+    page.goto(f"{file.as_uri()}#happened-1")
+    page.wait_for_function(FIGURES_ARE_THERE)
+    _save(page, images / "report.png")
+
+
+def _save(page: Any, file: Path) -> None:
+    """What is seen of a page, in few colours: a picture of text needs no more."""
+    page.wait_for_timeout(1000)  # figures are painted after they are there
+    seen = Image.open(BytesIO(page.screenshot())).convert("RGB")
+    seen.quantize(64, dither=Image.Dither.NONE).save(file, optimize=True)
+
+
+@contextlib.contextmanager
+def started_browser() -> Generator[Any]:
+    """A Chromium, driven by Playwright."""
+    from playwright.sync_api import sync_playwright
+
+    options = ["--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=str(CHROMIUM), args=options)
+        yield browser
+        browser.close()
 
 
 def means(simulation: RecordedSimulation) -> dict[str, float]:
@@ -100,7 +137,10 @@ def main() -> int:
         with simulation:
             simulation.run_for(DURATION_S)
             draw_plots(data_dir, IMAGES)
-            drawn = {"matplotlib": matplotlib.__version__, "means": means(simulation)}
+            with started_browser() as browser:
+                photograph_report(browser, data_dir, IMAGES)
+                by = {"matplotlib": matplotlib.__version__, "chromium": browser.version}
+            drawn = {"by": by, "means": means(simulation)}
             DRAWN.write_text(json.dumps(drawn, indent=2) + "\n", "utf-8")
             simulation.resume()
             said = conversation(data_dir)

@@ -40,11 +40,24 @@ def test_what_was_drawn_is_what_the_demo_records(simulation: RecordedSimulation)
 
 @pytest.mark.usefixtures("simulation")
 def test_the_plots_look_as_they_are_drawn_today(data_dir: Path, tmp_path: Path) -> None:
-    if matplotlib.__version__ != DRAWN["matplotlib"]:
+    if matplotlib.__version__ != DRAWN["by"]["matplotlib"]:
         pytest.skip("another version of matplotlib drew the pictures")
     pictures.draw_plots(data_dir, tmp_path)
     for name in pictures.PLOTS:
         assert difference(tmp_path / name, pictures.IMAGES / name) < NEAR, name
+
+
+@pytest.mark.usefixtures("simulation")
+def test_the_pages_look_as_a_browser_shows_them_today(data_dir: Path, tmp_path: Path) -> None:
+    pytest.importorskip("playwright", reason="Playwright is not installed")
+    pytest.importorskip("bokeh", reason="Bokeh is not installed")
+    if not pictures.CHROMIUM.exists():
+        pytest.skip("there is no Chromium")
+    with pictures.started_browser() as browser:
+        if browser.version != DRAWN["by"]["chromium"]:
+            pytest.skip("another version of Chromium took the pictures")
+        pictures.photograph_report(browser, data_dir, tmp_path)
+    assert difference(tmp_path / "report.png", pictures.IMAGES / "report.png") < NEAR
 
 
 def test_the_readme_has_the_conversation_of_today(

@@ -90,7 +90,7 @@ def photograph_report(browser: Any, data_dir: Path, images: Path) -> None:
         raise RuntimeError("the report could not be written")
     page = browser.new_page(viewport={"width": 900, "height": 900})
     page.goto(f"{file.as_uri()}#happened-1")
-    page.wait_for_function(FIGURES_ARE_THERE)
+    page.wait_for_function(FIGURES_ARE_THERE, timeout=120_000)
     _save(page, images / "report.png")
 
 

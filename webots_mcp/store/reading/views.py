@@ -65,8 +65,9 @@ _ROWS_IN: Final = (
 _LAST_BEFORE: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ? AND sim_time_s < ?"
 _FIRST_ROW: Final = "SELECT min(sim_time_s) FROM state WHERE run_id = ?"
 _RESTING: Final = (
-    "SELECT DISTINCT signal_id FROM all_rollup WHERE run_id = ? AND bucket >= ? AND bucket < ? "
-    "AND min = max AND present = rows"
+    "SELECT s.id FROM run r CROSS JOIN signal s ON s.robot_id = r.robot_id WHERE r.id = ? "
+    "AND EXISTS (SELECT 1 FROM all_rollup WHERE run_id = r.id AND signal_id = s.id "
+    "AND bucket >= ? AND bucket < ? AND min = max AND present = rows)"
 )
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.naming import flatten, listed
@@ -191,9 +191,14 @@ class Search:
     ) -> Event:
         """An event of this run; what has a duration and reaches the newest row goes on."""
         run_id = self.segment.run_id
-        wall_s = wall_time_at(self.connection, run_id, start_s)
         ongoing = end_s >= self.ended_s > start_s
+        wall_s = self._wall_time_at(start_s)
         return Event(kind, run_id, start_s, end_s, wall_s, name, details, ongoing)
+
+    @cached_property
+    def _wall_time_at(self) -> Callable[[float], float]:
+        """Looked up once of events that begin together."""
+        return cache(partial(wall_time_at, self.connection, self.segment.run_id))
 
     def not_searched(self, kind: str, *reasons: str) -> None:
         """Note why a kind was not looked for, or where it was not."""

@@ -29,7 +29,14 @@ from webots_mcp.store.reading.intervals import (
 )
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rollups import Pieces, read_pieces, rows_after
-from webots_mcp.store.reading.rows import Columns, Numbers, exceeds, numbers_of, read_columns
+from webots_mcp.store.reading.rows import (
+    Columns,
+    Numbers,
+    exceeds,
+    numbers_of,
+    read_columns,
+    read_numbers,
+)
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
 from webots_mcp.store.reading.steps import BucketSteps, read_steps
 from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, bucket_of, totals
@@ -527,14 +534,13 @@ class LongView:
         if kept is not None and all(signal.name in kept.values for signal in signals):
             return kept
         wanted = list({each.name: each for each in signals}.values())
-        columns = read_columns(self._connection, part, wanted, self._deadline)
-        if columns.cut:
-            reached_s = columns.times[-1] if columns.times else part.start_s
+        numbers = read_numbers(self._connection, part, wanted, self._deadline)
+        if numbers.cut:
+            reached_s = [part.start_s, *numbers.times.tolist()][-1]
             span = f"start_s={reached_s:.3f}, end_s={part.end_s:.3f}"
             self.notes.append(f"not from {reached_s:.3f} s on, the time was over; ask {span}")
-        numbers = numbers_of(columns, wanted)
         held = sum(len(each.times) * len(each.values) for each in self._kept.values())
-        if not columns.cut and held < MOST_KEPT:
+        if not numbers.cut and held < MOST_KEPT:
             self._kept[part] = numbers
         return numbers
 

@@ -85,6 +85,12 @@ def test_what_a_page_links_to_is_there(file: Path) -> None:
         assert not part or part in anchors(there.read_text("utf-8")), target
 
 
+@pytest.mark.parametrize("file", PAGES, ids=lambda file: file.relative_to(CHECKOUT).as_posix())
+def test_no_page_installs_from_the_package_index_what_is_not_there(file: Path) -> None:
+    found = re.findall(r"install [^`\n]*\bwebots-mcp\b[^`\n]*", file.read_text("utf-8"))
+    assert not found, "once it is published, this test goes"
+
+
 def anchors(text: str) -> set[str]:
     """Of the headings, as code hosts make them."""
     heads = re.findall(r"(?m)^#+ (.+)$", text)

@@ -148,7 +148,7 @@ def test_a_name_without_a_format_is_bad_input(
     database: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = complaint(capsys, "export", "--database", str(database), "-o", "run.xlsx")
-    assert "end it in .csv, .jsonl, .parquet, .mcap or .rrd" in said
+    assert "end it in .csv, .jsonl, .parquet, .mcap, .rrd or .zip" in said
 
 
 # -- import ---------------------------------------------------------------------------------------
@@ -185,6 +185,33 @@ def test_import_takes_in_another_recording_with_its_trials_once(
         assert query(new, "SELECT count(*) FROM run") == [(2,)]
     said = complaint(capsys, "import", str(new), "--database", str(new))
     assert "is the recording itself" in said
+
+
+def test_a_bundle_goes_from_one_recording_to_another(
+    database: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with closing(connect(database, "writer")) as connection:
+        connection.execute("UPDATE session SET ended_wall_time_s = 1.0")
+        connection.execute("UPDATE run SET ended_wall_time_s = 1.0")
+    file, new = tmp_path / "run.zip", tmp_path / "new"
+    assert main(["export", "--run", "2", "-o", str(file), "--database", str(database)]) == 0
+    assert capsys.readouterr().out == f"{file}: run 2, {file.stat().st_size:,} bytes\n"
+    for _ in range(2):
+        assert main(["import", str(file), "--data-dir", str(new)]) == 0
+        assert capsys.readouterr().out == f"of {file} there are here: run 1\n"
+    assert query(new / "webots.db", "SELECT count(*) FROM state") == [(327,)]
+    line = ("export", "--last", "5", "-o", str(file), "--database", str(database))
+    assert "a bundle is a whole run" in complaint(capsys, *line)
+
+
+def test_what_says_it_is_a_bundle_and_is_none_makes_no_database(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "run.zip"
+    file.write_bytes(b"PK")
+    said = complaint(capsys, "import", str(file), "--data-dir", str(tmp_path / "new"))
+    assert f"{file} is damaged" in said
+    assert not (tmp_path / "new").exists()
 
 
 def test_what_is_no_recording_is_not_imported(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import sqlite3
 import sys
 import time
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 @command(
     "export", DATA_DIR, DATABASE, *RANGE,
     argument("-o", "--output", metavar="FILE",
-             help="a .csv, .jsonl, .parquet, .mcap or .rrd file (default: CSV to stdout)"),
-    argument("--format", choices=("csv", "jsonl", "parquet", "mcap", "rrd"),
+             help="a .csv, .jsonl, .parquet, .mcap, .rrd or .zip file (default: CSV to stdout)"),
+    argument("--format", choices=("csv", "jsonl", "parquet", "mcap", "rrd", "zip"),
              help="where the file's name does not tell it"),
     argument("--safe-cells", action="store_true",
              help="in CSV, an apostrophe before texts that a spreadsheet would run as a formula "
@@ -46,15 +47,17 @@ if TYPE_CHECKING:
              help="the trials of that set instead, one row each, with score, rank and spread"),
 )  # fmt: skip
 def export(arguments: argparse.Namespace) -> None:
-    """Write recorded states as a table, or all of a run for a viewer.
+    """Write recorded states as a table, or all of a run for a viewer or for another recording.
 
     The newest run is written, or a range; --since 0 writes all runs of a robot. A table has one row
     per state; columns are run, row, times, and the dotted names of what the controller published;
     NaN and infinity are kept. A .mcap (Foxglove, Lichtblick, PlotJuggler) or .rrd file (Rerun) has
-    states, poses, pictures, log lines, events and commands. Parquet, MCAP and Rerun need extras:
-    pip install 'webots-mcp[parquet]', 'webots-mcp[mcap]' or 'webots-mcp[rerun]'.
+    states, poses, pictures, log lines, events and commands. A .zip file is a bundle: a run that is
+    over, as a recording of its own with its pictures, which 'webots-mcp import' takes in. Parquet,
+    MCAP and Rerun need extras: pip install 'webots-mcp[parquet]', 'webots-mcp[mcap]' or
+    'webots-mcp[rerun]'.
     """
-    from webots_mcp.store.export import FOR_VIEWERS, TrialTable, export_file, format_of
+    from webots_mcp.store.export import BUNDLE, FOR_VIEWERS, TrialTable, export_file, format_of
     from webots_mcp.store.export import export as write
     from webots_mcp.store.reading.ranges import Scope
 
@@ -65,8 +68,8 @@ def export(arguments: argparse.Namespace) -> None:
     recording = open_recording(arguments)
     if file and isinstance(recording.database, Path) and file.resolve() == recording.database:
         raise InvalidInputError(f"{file} is the recording itself: choose another file")
-    if form in FOR_VIEWERS:
-        return _export_for_viewers(arguments, recording, file, form)
+    if form in (*FOR_VIEWERS, BUNDLE):
+        return _export_whole(arguments, recording, file, form)
     if file is None and form == "parquet" and sys.stdout.isatty():
         raise InvalidInputError("Parquet is not for a terminal: give a file with -o")
 
@@ -88,41 +91,65 @@ def export(arguments: argparse.Namespace) -> None:
     past_unsound_rows(run) if file is None else past_wrong_values(run)
 
 
-def _export_for_viewers(
+def _export_whole(
     arguments: argparse.Namespace, recording: Recording, file: Path | None, form: str
 ) -> None:
-    from webots_mcp.store.export import export_for_viewers, layout_file
+    from webots_mcp.store.export import BUNDLE
 
     if file is None:
         raise InvalidInputError(f"{form} is not for stdout: give a file with -o")
     if arguments.trial_set is not None:
         raise InvalidInputError(f"trials are a table: choose csv, jsonl or parquet, not {form}")
+    if form == BUNDLE:
+        return _export_bundle(arguments, recording, file)
+    past_wrong_values(functools.partial(_export_for_viewers, arguments, recording, file, form))
 
-    def run() -> None:
-        with reading(arguments) as connection, shown_progress("exporting") as progress:
-            wanted = range_of(connection, arguments)
-            place = (recording.data_dir, wanted, form, file)
-            counts = export_for_viewers(connection, *place, progress)
-        told = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-        beside = f"; layout for Foxglove and Lichtblick: {layout_file(file)}"
-        print(f"{file}: {told}{beside if form == 'mcap' else ''}")
-        print_notes(wanted.notes, sys.stderr)
 
-    past_wrong_values(run)
+def _export_for_viewers(
+    arguments: argparse.Namespace, recording: Recording, file: Path, form: str
+) -> None:
+    from webots_mcp.store.export import export_for_viewers, layout_file
+
+    with reading(arguments) as connection, shown_progress("exporting") as progress:
+        wanted = range_of(connection, arguments)
+        counts = export_for_viewers(connection, recording.data_dir, wanted, form, file, progress)
+    told = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
+    beside = f"; layout for Foxglove and Lichtblick: {layout_file(file)}"
+    print(f"{file}: {told}{beside if form == 'mcap' else ''}")
+    print_notes(wanted.notes, sys.stderr)
+
+
+def _export_bundle(arguments: argparse.Namespace, recording: Recording, file: Path) -> None:
+    from webots_mcp.store.bundle import write_bundle
+    from webots_mcp.store.export import placed
+    from webots_mcp.store.reading.ranges import Scope
+    from webots_mcp.store.reading.subject import find_subject
+
+    scope = scope_of(arguments)
+    if scope != Scope(robot=scope.robot, run_id=scope.run_id):
+        raise InvalidInputError("a bundle is a whole run: give --run or --robot, and no times")
+    assert isinstance(recording.database, Path)
+    with reading(arguments) as connection, shown_progress("packing") as progress:
+        run_id = find_subject(connection, scope.robot, scope.run_id).run_id
+        place = (recording.database, recording.data_dir, run_id)
+        with placed(file) as aside:
+            write_bundle(connection, *place, aside, progress)
+    print(f"{file}: run {run_id}, {file.stat().st_size:,} bytes")
 
 
 @command(
     "import", DATA_DIR, DATABASE,
     argument("source", metavar="SOURCE",
-             help="a folder with status.json, logs/, camera/, ...; or a recording, a webots.db"),
+             help="a folder with status.json, logs/, camera/, ...; a recording, a webots.db; or a "
+             "bundle, a .zip of 'webots-mcp export'"),
     argument("--robot", default="imported", metavar="NAME",
              help="the name to record under, which no robot may have yet (imported)"),
 )  # fmt: skip
 def import_(arguments: argparse.Namespace) -> None:
     """Import another recording, or the data folder of a bridge that writes JSON files.
 
-    A recording that is over comes with all of its runs and trial sets; what is there already is
-    left as it is, so that it may be imported again.
+    A recording that is over comes with all of its runs and trial sets, a bundle with its run; what
+    is there already is left as it is, so that it may be imported again.
 
     Of such a folder status.json, logs/controller.log, camera/*.png, screenshots/*.png and
     commands.json become one finished run; if a file is damaged, nothing does. It has no simulation
@@ -131,7 +158,7 @@ def import_(arguments: argparse.Namespace) -> None:
     from webots_mcp.store.json_folder import import_folder, read_folder
 
     if (source := Path(arguments.source)).is_file():
-        return _import_recording(arguments, source)
+        return _import_file(arguments, source)
     read_folder(source)  # first: no database is made for what cannot be imported
     with _writable(arguments, create=True) as (recording, connection):
         with shown_progress("importing") as progress:
@@ -142,7 +169,16 @@ def import_(arguments: argparse.Namespace) -> None:
         )
 
 
-def _import_recording(arguments: argparse.Namespace, source: Path) -> None:
+def _import_file(arguments: argparse.Namespace, file: Path) -> None:
+    from webots_mcp.store.bundle import is_bundle, unpacked
+
+    if not is_bundle(file):
+        return _import_recording(arguments, file, file)
+    with unpacked(file) as source:
+        _import_recording(arguments, source, file)
+
+
+def _import_recording(arguments: argparse.Namespace, source: Path, told: Path) -> None:
     from webots_mcp.store.merging import merge, settled
 
     settled(source)  # first: no database is made for what is no recording
@@ -150,7 +186,7 @@ def _import_recording(arguments: argparse.Namespace, source: Path) -> None:
         if isinstance(recording.database, Path) and source.samefile(recording.database):
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
         runs = merge(connection, recording.data_dir, source)
-    print(f"of {source} there are here: run {_ranges(list(runs.values())) or 'none'}")
+    print(f"of {told} there are here: run {_ranges(list(runs.values())) or 'none'}")
 
 
 @command(

@@ -1,7 +1,8 @@
 """Taking in another recording: its sessions and runs, told from those that are there by UUID.
 
 Whatever is already there is left as it is, so merging may be repeated, and may be killed anywhere:
-each session comes in one transaction. Rollups are not copied, but made anew from the rows.
+what is new of a session comes in one transaction. Rollups are not copied, but made anew from the
+rows. A bundle is made the same way: an empty recording takes in one run.
 """
 
 from __future__ import annotations
@@ -24,23 +25,52 @@ from webots_mcp.store.images import inside
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import fetch_trial_set, is_at_work
 
-_SESSIONS: Final = "SELECT id, uuid, robot_id FROM source.session ORDER BY id"
+_SESSIONS: Final = (
+    "SELECT id, uuid, robot_id FROM source.session s WHERE :run IS NULL "
+    "OR id = (SELECT session_id FROM source.run WHERE id = :run) ORDER BY id"
+)
+_NEW_RUNS: Final = (
+    "SELECT id, uuid FROM source.run r WHERE session_id = :session AND (:run IS NULL OR id = :run) "
+    "AND NOT EXISTS (SELECT 1 FROM main.run n WHERE n.uuid = r.uuid) ORDER BY id"
+)
 _UNFIT: Final = (
-    "SELECT (SELECT count(*) FROM source.session WHERE ended_wall_time_s IS NULL), "
-    "(SELECT count(*) FROM source.run WHERE purged_rows > 0)"
+    "SELECT CASE WHEN :run IS NULL THEN "
+    "(SELECT count(*) FROM source.session WHERE ended_wall_time_s IS NULL) ELSE "
+    "(SELECT ended_wall_time_s IS NULL FROM source.run WHERE id = :run) END, "
+    "(SELECT count(*) FROM source.run WHERE purged_rows > 0 AND (:run IS NULL OR id = :run))"
+)
+# Those of one run: what its parameters were set by, and what was claimed while it went on.
+_COMMANDS: Final = (
+    "SELECT id, created_wall_time_s, action, params FROM source.command c "
+    "WHERE session_id = :session AND (:run IS NULL "
+    "OR id IN (SELECT command_id FROM source.parameter_value WHERE run_id = :run) "
+    "OR EXISTS (SELECT 1 FROM source.run r WHERE r.id = :run "
+    "AND coalesce(c.claimed_wall_time_s, c.created_wall_time_s) >= r.started_wall_time_s "
+    "AND coalesce(c.claimed_wall_time_s, c.created_wall_time_s) < coalesce((SELECT "
+    "min(n.started_wall_time_s) FROM source.run n WHERE n.robot_id = r.robot_id AND n.id > r.id), "
+    "9e99))) ORDER BY id"
+)
+_SAME_COMMAND: Final = (
+    "SELECT id FROM main.command WHERE session_id = ? AND created_wall_time_s = ? AND action = ? "
+    "AND params = ?"
 )
 _OF_RUN: Final = ("state", "kept_stretch", "kept_state", "log", "event", "parameter_value")
 _BUSY: Final = (
     "SELECT EXISTS (SELECT 1 FROM main.session s JOIN main.robot b ON b.id = s.robot_id "
     "WHERE b.name = ? AND s.ended_wall_time_s IS NULL)"
 )
+_ROBOT_OF: Final = "SELECT robot_id FROM main.session WHERE id = ?"
 _SET_BY: Final = (
     "SELECT id, command_id FROM main.parameter_value WHERE run_id = ? AND command_id IS NOT NULL"
 )
-_TRIAL_SETS: Final = "SELECT id, uuid FROM source.trial_set ORDER BY id"
+_TRIAL_SETS: Final = (
+    "SELECT id, uuid FROM source.trial_set s WHERE :run IS NULL "
+    "OR EXISTS (SELECT 1 FROM source.trial WHERE trial_set_id = s.id AND run_id = :run) ORDER BY id"
+)
 _TRIALS: Final = (
     "SELECT t.id, t.uuid, n.id FROM source.trial t LEFT JOIN source.run r ON r.id = t.run_id "
-    "LEFT JOIN main.run n ON n.uuid = r.uuid WHERE t.trial_set_id = ? ORDER BY t.id"
+    "LEFT JOIN main.run n ON n.uuid = r.uuid WHERE t.trial_set_id = :set "
+    "AND (:run IS NULL OR t.run_id = :run) ORDER BY t.id"
 )
 # A trial that waits here and is over there: the set was gone on with in a copy of the recording.
 _RESULT: Final = ", ".join(
@@ -57,13 +87,24 @@ _RUNS: Final = (
 )
 
 
-def merge(connection: sqlite3.Connection, data_dir: Path, source: Path) -> dict[str, int]:
-    """Take in all sessions of a recording that is over, and its trial sets.
+def merge(
+    connection: sqlite3.Connection,
+    data_dir: Path,
+    source: Path,
+    *,
+    run_id: int | None = None,
+    address: str | None = None,
+    pictures: Path | None = None,
+) -> dict[str, int]:
+    """Take in all sessions of a recording that is over, and its trial sets; or one run of it.
 
     Args:
         connection: In the role "writer".
         data_dir: The folder of the pictures.
-        source: The other database, of the same schema; its pictures lie beside it.
+        source: The other database, of the same schema.
+        run_id: Only this run, which has to be over, with its session, commands and trials.
+        address: How SQLite is to open it, where its path is not enough.
+        pictures: The folder of its pictures; None for the one that it lies in.
 
     Returns:
         By their UUIDs, the ids that its runs have here.
@@ -72,16 +113,19 @@ def merge(connection: sqlite3.Connection, data_dir: Path, source: Path) -> dict[
         InvalidInputError: A controller still records there, or rows were purged, of which the
             rollups would be lost.
     """
-    with _attached(connection, source):
-        _require_fit(connection, source)
-        sessions = connection.execute(_SESSIONS).fetchall()
-        for session_id, uuid, robot_id in sessions:
-            if _id_of(connection, "session", uuid) is None:
-                _copy_pictures(connection, data_dir, source.parent, session_id)
-                with transaction(connection):
-                    _take_in(connection, session_id, robot_id)
+    with _attached(connection, address or str(source)):
+        _require_fit(connection, source, run_id)
+        for session_id, uuid, robot_id in connection.execute(_SESSIONS, {"run": run_id}).fetchall():
+            wanted = {"session": session_id, "run": run_id}
+            runs = connection.execute(_NEW_RUNS, wanted).fetchall()
+            if not runs and _id_of(connection, "session", uuid) is not None:
+                continue
+            for run, run_uuid in runs:
+                _copy_pictures(connection, data_dir, pictures or source.parent, run, run_uuid)
+            with transaction(connection):
+                _take_in(connection, wanted, uuid, robot_id, runs)
         with transaction(connection):
-            _take_in_trials(connection)
+            _take_in_trials(connection, run_id)
         return dict(connection.execute(_RUNS).fetchall())
 
 
@@ -99,48 +143,61 @@ def settled(database: Path) -> Recording:
 
 
 @contextmanager
-def _attached(connection: sqlite3.Connection, source: Path) -> Generator[None]:
-    connection.execute("ATTACH DATABASE ? AS source", (str(source),))
+def _attached(connection: sqlite3.Connection, address: str) -> Generator[None]:
+    connection.execute("ATTACH DATABASE ? AS source", (address,))
     try:
         yield
     finally:
         connection.execute("DETACH DATABASE source")
 
 
-def _require_fit(connection: sqlite3.Connection, source: Path) -> None:
+def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | None) -> None:
     versions = [
         connection.execute(f"PRAGMA {name}.user_version").fetchone()[0]
         for name in ("main", "source")
     ]
     if versions[0] != versions[1]:
         raise InvalidInputError(f"{source} has another schema: run 'webots-mcp migrate' on it")
-    recording, purged = connection.execute(_UNFIT).fetchone()
+    recording, purged = connection.execute(_UNFIT, {"run": run_id}).fetchone()
+    subject = f"{source}" if run_id is None else f"run {run_id}"
     if recording:
-        raise InvalidInputError(f"a controller still records in {source}: merge it when it is over")
+        where = subject if run_id else f"in {subject}"
+        raise InvalidInputError(f"a controller still records {where}: take it when it is over")
     if purged:
-        raise InvalidInputError(f"{source} has purged rows: of them only rollups are left")
+        raise InvalidInputError(f"{subject} has purged rows: of them only rollups are left")
 
 
-def _take_in(connection: sqlite3.Connection, session_id: int, robot_id: int) -> None:
-    owner = {"robot_id": _robot(connection, robot_id)}
-    new = _insert(connection, "session", "id = ?", session_id, owner)
-    commands = _copy_commands(connection, session_id, owner | {"session_id": new})
-    own = owner | {"session_id": new, "rolled_state_id": 0, "coarse_end": None}
-    runs = connection.execute(
-        "SELECT id, uuid FROM source.run WHERE session_id = ? ORDER BY id", (session_id,)
-    ).fetchall()
-    for run_id, uuid in runs:
+def _take_in(
+    connection: sqlite3.Connection,
+    wanted: dict[str, int | None],
+    uuid: str,
+    robot_id: int,
+    runs: list[tuple[int, str]],
+) -> None:
+    """A session, unless it is here, and those of its runs that are not."""
+    session_id = wanted["session"] or 0
+    here = _id_of(connection, "session", uuid)
+    is_new = here is None
+    if here is None:
+        owner = {"robot_id": _robot(connection, robot_id)}
+        here = _insert(connection, "session", "id = ?", session_id, owner)
+    else:
+        owner = {"robot_id": connection.execute(_ROBOT_OF, (here,)).fetchone()[0]}
+    commands = _copy_commands(connection, wanted, owner | {"session_id": here}, is_new=is_new)
+    own = owner | {"session_id": here, "rolled_state_id": 0, "coarse_end": None}
+    for run_id, run_uuid in runs:
         run = _insert(connection, "run", "id = ?", run_id, own)
         for table in _OF_RUN:
             _insert(connection, table, "run_id = ?", run_id, {"run_id": run})
-        _copy_image_rows(connection, run_id, run, uuid)
+        _copy_image_rows(connection, run_id, run, run_uuid)
         set_by = connection.execute(_SET_BY, (run,)).fetchall()
         renamed = [(commands.get(command_id), value_id) for value_id, command_id in set_by]
         connection.executemany("UPDATE parameter_value SET command_id = ? WHERE id = ?", renamed)
-    _insert(connection, "parameter", "session_id = ?", session_id, owner | {"session_id": new})
+    if is_new:
+        _insert(connection, "parameter", "session_id = ?", session_id, owner | {"session_id": here})
 
 
-def _take_in_trials(connection: sqlite3.Connection) -> None:
+def _take_in_trials(connection: sqlite3.Connection, run_id: int | None) -> None:
     """Trial sets and trials that are not there, each with its run as it is called here.
 
     Nobody works on them here: their simulators and the parameters of their controllers are gone.
@@ -150,16 +207,17 @@ def _take_in_trials(connection: sqlite3.Connection) -> None:
     gone: dict[str, Any] = dict.fromkeys(
         ("host", "pid", "process", "robot_id", "session_id", "former_values")
     )
-    for set_id, uuid in connection.execute(_TRIAL_SETS).fetchall():
+    for set_id, uuid in connection.execute(_TRIAL_SETS, {"run": run_id}).fetchall():
         here = _id_of(connection, "trial_set", uuid)
         if here is None:
             here = _insert(connection, "trial_set", "id = ?", set_id, gone)
-        for trial_id, trial_uuid, run_id in connection.execute(_TRIALS, (set_id,)).fetchall():
+        asked = {"set": set_id, "run": run_id}
+        for trial_id, trial_uuid, run in connection.execute(_TRIALS, asked).fetchall():
             if _id_of(connection, "trial", trial_uuid) is None:
-                own = {"trial_set_id": here, "run_id": run_id, "pid": None, "process": None}
+                own = {"trial_set_id": here, "run_id": run, "pid": None, "process": None}
                 _insert(connection, "trial", "id = ?", trial_id, own)
             elif not is_at_work(connection, fetch_trial_set(connection, here)):
-                connection.execute(_TAKE_RESULT, (run_id, trial_id, trial_uuid, trial_id))
+                connection.execute(_TAKE_RESULT, (run, trial_id, trial_uuid, trial_id))
 
 
 def _robot(connection: sqlite3.Connection, robot_id: int) -> int:
@@ -176,14 +234,21 @@ def _robot(connection: sqlite3.Connection, robot_id: int) -> int:
 
 
 def _copy_commands(
-    connection: sqlite3.Connection, session_id: int, own: dict[str, Any]
+    connection: sqlite3.Connection,
+    wanted: dict[str, int | None],
+    own: dict[str, Any],
+    *,
+    is_new: bool,
 ) -> dict[int, int]:
     """By their ids there, the ids that the commands have here; a key that is taken stays theirs."""
-    found = connection.execute(
-        "SELECT id FROM source.command WHERE session_id = ? ORDER BY id", (session_id,)
-    ).fetchall()
     own = own | {"idempotency_key": None}
-    return {old: _insert(connection, "command", "id = ?", old, own) for (old,) in found}
+    ids: dict[int, int] = {}
+    for old, *told in connection.execute(_COMMANDS, wanted).fetchall():
+        same = None
+        if not is_new:
+            same = connection.execute(_SAME_COMMAND, (own["session_id"], *told)).fetchone()
+        ids[old] = same[0] if same else _insert(connection, "command", "id = ?", old, own)
+    return ids
 
 
 def _insert(
@@ -217,21 +282,23 @@ def _images(connection: sqlite3.Connection, where: str, key: int) -> list[tuple[
 
 
 def _path_here(path: str, run_uuid: str) -> str:
-    """Under another name than any that a bridge gives."""
+    """Under another name than any that a bridge gives; one that was taken in before keeps it."""
     folder, _, name = path.rpartition("/")
-    return f"{folder}/{run_uuid}.{name}"
+    return path if name.startswith(f"{run_uuid}.") else f"{folder}/{run_uuid}.{name}"
 
 
 def _copy_pictures(
-    connection: sqlite3.Connection, data_dir: Path, source_dir: Path, session_id: int
+    connection: sqlite3.Connection, data_dir: Path, source_dir: Path, run_id: int, run_uuid: str
 ) -> None:
     """Before their rows come: whoever is killed in between copies them once more."""
-    for _, path, run_uuid in _images(connection, "r.session_id = ?", session_id):
+    for _, path, _ in _images(connection, "r.id = ?", run_id):
         try:
             file = inside(source_dir, path)
         except NothingRecordedError:
             continue  # deleted since: its row stays as it was there, and says so when asked
         target = data_dir / _path_here(path, run_uuid)
+        if not target.resolve().is_relative_to(data_dir.resolve()):
+            raise InvalidInputError(f"{path!r} would lie outside the data folder and is not taken")
         make_folder(target.parent)
         aside = target.with_suffix(".part")
         shutil.copyfile(file, aside)

@@ -381,5 +381,7 @@ def test_a_files_name_tells_its_format(name: str, form: str) -> None:
 
 
 def test_a_name_that_tells_no_format_is_refused() -> None:
-    with pytest.raises(InvalidInputError, match=r"\.csv, \.jsonl, \.parquet, \.mcap or \.rrd"):
+    with pytest.raises(
+        InvalidInputError, match=r"\.csv, \.jsonl, \.parquet, \.mcap, \.rrd or \.zip"
+    ):
         format_of(Path("run"))

@@ -37,6 +37,7 @@ FORMATS: Final = {
     "parquet": Format(write_parquet, 2),
 }
 FOR_VIEWERS: Final = ("mcap", "rrd")
+BUNDLE: Final = "zip"
 
 
 def export(
@@ -96,7 +97,7 @@ def export_file(
     Raises:
         InvalidInputError: Also where the file cannot be written.
     """
-    with _placed(file) as aside, aside.open("wb") as sink:
+    with placed(file) as aside, aside.open("wb") as sink:
         return export(connection, wanted, form, sink, progress, safe_cells=safe_cells)
 
 
@@ -127,12 +128,12 @@ def export_for_viewers(
         InvalidInputError: The library is not installed, or a file cannot be written.
     """
     if form == "rrd":
-        with _placed(file) as aside:
+        with placed(file) as aside:
             return write_rrd(Contents.of(connection, data_dir, wanted, 1, progress), aside)
     contents = Contents.of(connection, data_dir, wanted, 2, progress)
-    with _placed(file) as aside, aside.open("wb") as sink:
+    with placed(file) as aside, aside.open("wb") as sink:
         counts = write_mcap(contents, sink)
-    with _placed(layout_file(file)) as aside:
+    with placed(layout_file(file)) as aside:
         aside.write_text(json.dumps(layout(contents), indent=2), "utf-8")
     return counts
 
@@ -143,7 +144,7 @@ def layout_file(file: Path) -> Path:
 
 
 @contextmanager
-def _placed(file: Path) -> Generator[Path]:
+def placed(file: Path) -> Generator[Path]:
     """A file beside it to write to, of its owner alone, which takes its place when it is whole.
 
     Raises:
@@ -169,9 +170,9 @@ def format_of(file: Path) -> str:
     """
     ending = file.suffix.lower().lstrip(".")
     form = {"json": "jsonl", "ndjson": "jsonl", "pq": "parquet"}.get(ending, ending)
-    if form not in (*FORMATS, *FOR_VIEWERS):
+    if form not in (*FORMATS, *FOR_VIEWERS, BUNDLE):
         raise InvalidInputError(
-            f"{file.name} does not tell its format: end it in .csv, .jsonl, .parquet, .mcap or "
-            ".rrd, or give the format"
+            f"{file.name} does not tell its format: end it in .csv, .jsonl, .parquet, .mcap, .rrd "
+            "or .zip, or give the format"
         )
     return form

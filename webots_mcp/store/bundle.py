@@ -1,0 +1,150 @@
+"""One run as a file to send: a ZIP archive with a small recording of its own and its pictures."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Generator
+from contextlib import closing, contextmanager
+from pathlib import Path, PurePosixPath
+from typing import Final
+
+from webots_mcp.connection import FrozenConnection, connect
+from webots_mcp.contract import DATABASE_NAME, PRIVATE_FILE
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.schema import create_schema
+from webots_mcp.store.export.rows import Progress
+from webots_mcp.store.images import MAX_FILE_BYTES
+from webots_mcp.store.merging import merge
+
+PICTURES: Final = (".png", ".jpg", ".jpeg")
+_PIECE_BYTES: Final = 1_000_000
+# Rows that are all alike become a fiftieth of their size; who unpacks to far more wants to harm.
+_MOST_TIMES: Final = 100
+_HARMLESS_BYTES: Final = 100_000_000
+_LINK: Final = 0o120000  # of a file's type in Unix, as archives keep it
+_END_SESSION: Final = (
+    "UPDATE session SET ended_wall_time_s = (SELECT max(ended_wall_time_s) FROM run), "
+    "end_reason = 'finished' WHERE ended_wall_time_s IS NULL"
+)
+_DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+
+
+def write_bundle(
+    connection: sqlite3.Connection,
+    database: Path,
+    data_dir: Path,
+    run_id: int,
+    file: Path,
+    progress: Progress | None = None,
+) -> None:
+    """Write a run that is over: everything of it that `merge` takes in, and its pictures.
+
+    Where its session still records, the session in the bundle ends with the run.
+
+    Args:
+        connection: A reader of the recording.
+        database: The recording.
+        data_dir: The folder of its pictures.
+        run_id: The run.
+        file: To write to, in a folder with room for the rows that are not compressed.
+        progress: Called now and then with the bytes that are packed and that there are.
+
+    Raises:
+        InvalidInputError: The run goes on, or has purged rows.
+    """
+    with tempfile.TemporaryDirectory(prefix=".bundle-", dir=file.parent) as name:
+        folder = Path(name)
+        small = folder / DATABASE_NAME
+        with closing(connect(small, "writer", create=True)) as writer:
+            create_schema(writer)
+            frozen = "&immutable=1" if isinstance(connection, FrozenConnection) else ""
+            address = f"{database.absolute().as_uri()}?mode=ro{frozen}"
+            merge(writer, folder, database, run_id=run_id, address=address, pictures=data_dir)
+            writer.execute(_END_SESSION)
+            writer.execute("PRAGMA journal_mode=DELETE")  # all of it in the one file
+        _pack(folder, file, progress)
+
+
+def _pack(folder: Path, file: Path, progress: Progress | None) -> None:
+    found = [each for each in sorted(folder.rglob("*")) if each.is_file()]
+    packed, of = 0, sum(each.stat().st_size for each in found)
+    with zipfile.ZipFile(file, "w") as archive:
+        for each in found:
+            entry = zipfile.ZipInfo.from_file(each, each.relative_to(folder).as_posix())
+            is_picture = each.suffix.lower() in PICTURES  # is compressed already
+            entry.compress_type = zipfile.ZIP_STORED if is_picture else zipfile.ZIP_DEFLATED
+            with each.open("rb") as source, archive.open(entry, "w") as target:
+                while piece := source.read(_PIECE_BYTES):
+                    target.write(piece)
+                    packed += len(piece)
+                    if progress is not None:
+                        progress(packed, of)
+
+
+def is_bundle(file: Path) -> bool:
+    """Whether a file is one, or says that it is: a damaged one is told as such."""
+    return file.suffix.lower() == ".zip" or zipfile.is_zipfile(file)
+
+
+@contextmanager
+def unpacked(file: Path) -> Generator[Path]:
+    """The database of a bundle with its pictures beside it, as long as the block goes on.
+
+    Nothing is trusted: what is no database of ours and no picture, leads out of the folder, is a
+    link or unpacks to far more than it holds is refused before anything is written.
+
+    Raises:
+        InvalidInputError: It is damaged, or no bundle.
+    """
+    with tempfile.TemporaryDirectory(prefix="webots-mcp-") as name:
+        try:
+            with zipfile.ZipFile(file) as archive:
+                _require_ours(file, archive)
+                for entry in archive.infolist():
+                    target = Path(name) / entry.filename
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    with archive.open(entry) as source, target.open("wb") as sink:
+                        target.chmod(PRIVATE_FILE)
+                        shutil.copyfileobj(source, sink, _PIECE_BYTES)
+        except _DAMAGED as error:
+            raise InvalidInputError(f"{file} is damaged, or no ZIP archive: {error}") from error
+        yield Path(name) / DATABASE_NAME
+
+
+def _require_ours(file: Path, archive: zipfile.ZipFile) -> None:
+    entries = archive.infolist()
+    names = [entry.filename for entry in entries]
+    if DATABASE_NAME not in names:
+        raise InvalidInputError(
+            f"{file} holds no {DATABASE_NAME}: it is no bundle of 'webots-mcp export -o RUN.zip'"
+        )
+    for entry in entries:
+        if not _is_ours(entry):
+            raise InvalidInputError(
+                f"{file} holds {entry.filename!r}, which no bundle does: it is not unpacked"
+            )
+    if len(set(names)) < len(names):
+        raise InvalidInputError(f"{file} holds a name twice, which no bundle does")
+    size = sum(entry.file_size for entry in entries)
+    if size > max(_HARMLESS_BYTES, _MOST_TIMES * file.stat().st_size):
+        raise InvalidInputError(
+            f"{file} would unpack to {size:,} bytes, which no bundle of its size does"
+        )
+
+
+def _is_ours(entry: zipfile.ZipInfo) -> bool:
+    path = PurePosixPath(entry.filename)
+    if entry.filename == DATABASE_NAME:
+        return not _is_link(entry)
+    plain = not path.is_absolute() and ".." not in path.parts and len(path.parts) > 1
+    named = plain and not any(sign in entry.filename for sign in "\\:\0")
+    fits = path.suffix.lower() in PICTURES and entry.file_size <= MAX_FILE_BYTES
+    return named and fits and not _is_link(entry)
+
+
+def _is_link(entry: zipfile.ZipInfo) -> bool:
+    return entry.external_attr >> 16 & 0o170000 == _LINK

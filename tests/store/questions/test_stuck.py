@@ -160,6 +160,11 @@ def test_a_mode_that_was_not_looked_at_in_time_is_not_said_to_be_one_in_which_it
     observed = Observed([part], Counts(rows=100))
     evidence = weigh(observed, motion, EventOptions(), moved_in)
     assert evidence.against == ["whether it moves in mode go was not looked at: the time was over"]
+    statements: list[str] = []
+    empty.set_trace_callback(statements.append)
+    assert weigh(observed, motion, EventOptions(), moved_in) == evidence
+    empty.set_trace_callback(None)
+    assert not statements  # what there is no time for is not tried again at each standstill
 
 
 def test_noise_is_no_motion_in_a_mode_of_which_there_are_few_rows(

@@ -66,7 +66,7 @@ class MovedIn:
 
     def seen(self, mode: Value) -> Seen | None:
         """None where none of the looked at visits shows that it moved."""
-        if mode not in self._seen or mode in self.cut:
+        if mode not in self._seen or (mode in self.cut and not self._deadline.passed):
             self._seen[mode] = self._look(mode) if isinstance(mode, str) else None
         return self._seen[mode]
 

@@ -1,6 +1,6 @@
 """Makes the pictures of the pages, and the README's conversation, anew: `python -m docs.pictures`.
 
-They show the world and the controller of `webots-mcp demo`, for exactly so many simulated seconds.
+They show the world and the controller of `webots-mcp demo`, up to a breakpoint at a certain step.
 `images/drawn.json` says what was drawn by what; a test does the same again and compares.
 """
 
@@ -24,42 +24,31 @@ from PIL import Image
 
 from webots_mcp import demo
 from webots_mcp.cli import main as webots_mcp
-from webots_mcp.contract import THROTTLE_VARIABLE
+from webots_mcp.contract import DATABASE_NAME, THROTTLE_VARIABLE
 from webots_mcp.testing import RecordedSimulation
 
 CHECKOUT: Final = Path(__file__).parent.parent
 README: Final = CHECKOUT / "README.md"
 IMAGES: Final = Path(__file__).parent / "images"
 DRAWN: Final = IMAGES / "drawn.json"
-DURATION_S: Final = 30.0
+BREAKPOINT: Final = "pose.y < -1.6"  # held first after some 28 s
 # What is drawn, as the options of `webots-mcp plot`.
 PLOTS: Final = {
     "signals.png": "lidar.nearest_m distance_m.left distance_m.right wheel_radps.left --height 520",
     "way.png": "--trajectory --height 620",
 }
-# What a person would say, the tool that an assistant calls, and whether the README shows it.
-TURNS: Final[tuple[tuple[demo.Turn, bool], ...]] = (
+# What a person would say, and the tool call that an assistant makes of it.
+TURNS: Final[tuple[demo.Turn, ...]] = (
     (
-        (
-            "When did it begin and end to turn in the first ten seconds, and was it ever stuck?",
-            "webots_find_events",
-            {"kinds": ["change", "stuck"], "signals": ["mode"], "end_s": 10},
-        ),
-        True,
+        "When did it begin and end to turn in the first ten seconds, and was it ever stuck?",
+        "webots_find_events",
+        {"kinds": ["change", "stuck"], "signals": ["mode"], "end_s": 10},
     ),
-    (("Pause.", "webots_simulation_control", {"command": "pause"}), False),
-    (("Five steps.", "webots_simulation_control", {"command": "step", "steps": 5}), True),
+    ("Five steps.", "webots_simulation_control", {"command": "step", "steps": 5}),
     (
-        (
-            "Which cruising speed gets farther in five seconds?",
-            "webots_run_trials",
-            {
-                "parameters": {"speed": [3.0, 8.0]},
-                "score": "max(pose.x) - first(pose.x)",
-                "for_s": 5,
-            },
-        ),
-        True,
+        "Which cruising speed gets farther in five seconds?",
+        "webots_run_trials",
+        {"parameters": {"speed": [3.0, 8.0]}, "score": "max(pose.x) - first(pose.x)", "for_s": 5},
     ),
 )
 CHROMIUM: Final = Path("/usr/bin/chromium")
@@ -74,24 +63,35 @@ def recorded(folder: Path) -> RecordedSimulation:
     return RecordedSimulation(data_dir=folder, environment={THROTTLE_VARIABLE: "5"})
 
 
+def drive(simulation: RecordedSimulation, data_dir: Path) -> None:
+    """Let it drive to the breakpoint, at which its bridge pauses it and goes on answering."""
+    simulation.resume()
+    simulation.wait_for((data_dir / DATABASE_NAME).exists, 60.0)
+    _run("breakpoint", BREAKPOINT, "--data-dir", str(data_dir))
+    simulation.run_for(120.0)
+
+
 def draw_plots(data_dir: Path, images: Path) -> None:
     """Draw what was recorded there."""
     images.mkdir(exist_ok=True)
     for name, options in PLOTS.items():
-        where = ["--data-dir", str(data_dir), "-o", str(images / name)]
-        if webots_mcp(["plot", *options.split(), *where]):
-            raise RuntimeError(f"{name} could not be drawn")
+        where = ("--data-dir", str(data_dir), "-o", str(images / name))
+        _run("plot", *options.split(), *where)
 
 
 def photograph_report(browser: Any, data_dir: Path, images: Path) -> None:
     """The part of a report that says what happened, as a browser shows it."""
     file = data_dir / "run.html"
-    if webots_mcp(["report", "1", "-o", str(file), "--data-dir", str(data_dir), "--overwrite"]):
-        raise RuntimeError("the report could not be written")
+    _run("report", "1", "-o", str(file), "--data-dir", str(data_dir))
     page = browser.new_page(viewport={"width": 900, "height": 900})
     page.goto(f"{file.as_uri()}#happened-1")
     page.wait_for_function(FIGURES_ARE_THERE, timeout=120_000)
     _save(page, images / "report.png")
+
+
+def _run(*arguments: str) -> None:
+    if webots_mcp(arguments):
+        raise RuntimeError(f"webots-mcp {' '.join(arguments)} failed")
 
 
 def _save(page: Any, file: Path) -> None:
@@ -123,10 +123,8 @@ def means(simulation: RecordedSimulation) -> dict[str, float]:
 def conversation(data_dir: Path) -> str:
     """What a person asks, what is called and what is answered, as the demo prints it."""
     with redirect_stdout(StringIO()) as out:
-        anyio.run(demo.converse, data_dir, tuple(turn for turn, _ in TURNS))
-    said = re.sub(r"(?m)^  \(.* s\)\n", "", out.getvalue()).strip().split("\n\n")
-    shown = (text for text, (_, is_shown) in zip(said, TURNS, strict=True) if is_shown)
-    return "\n\n".join(shown) + "\n"
+        anyio.run(demo.converse, data_dir, TURNS)
+    return re.sub(r"(?m)^  \(.* s\)\n", "", out.getvalue()).lstrip()
 
 
 def main() -> int:
@@ -135,14 +133,13 @@ def main() -> int:
         data_dir = Path(folder)
         simulation = recorded(data_dir)
         with simulation:
-            simulation.run_for(DURATION_S)
+            drive(simulation, data_dir)
             draw_plots(data_dir, IMAGES)
             with started_browser() as browser:
                 photograph_report(browser, data_dir, IMAGES)
                 by = {"matplotlib": matplotlib.__version__, "chromium": browser.version}
             drawn = {"by": by, "means": means(simulation)}
             DRAWN.write_text(json.dumps(drawn, indent=2) + "\n", "utf-8")
-            simulation.resume()
             said = conversation(data_dir)
     README.write_text(CONVERSATION.sub(lambda _: said, README.read_text("utf-8")), "utf-8")
     return 0

@@ -30,7 +30,7 @@ def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def simulation(data_dir: Path) -> Iterator[RecordedSimulation]:
     simulation = pictures.recorded(data_dir)
     with simulation:
-        simulation.run_for(pictures.DURATION_S)
+        pictures.drive(simulation, data_dir)
         yield simulation
 
 
@@ -60,11 +60,9 @@ def test_the_pages_look_as_a_browser_shows_them_today(data_dir: Path, tmp_path: 
     assert difference(tmp_path / "report.png", pictures.IMAGES / "report.png") < NEAR
 
 
-def test_the_readme_has_the_conversation_of_today(
-    simulation: RecordedSimulation, data_dir: Path
-) -> None:
+@pytest.mark.usefixtures("simulation")
+def test_the_readme_has_the_conversation_of_today(data_dir: Path) -> None:
     (shown,) = pictures.CONVERSATION.findall(pictures.README.read_text("utf-8"))
-    simulation.resume()
     assert form(pictures.conversation(data_dir)) == form(shown)
 
 

@@ -113,7 +113,7 @@ def test_it_stays_as_small_as_was_asked_and_tells_what_is_not_in_it(tmp_path: Pa
     report = make_report(recorded.connection, [robot.run_id], tmp_path, max_mb=2)
     recorded.close()
     assert len(report.html) <= 2_000_000
-    assert any(re.match(r"\d+ more log lines of run 1", each) for each in report.left_out)
+    assert any(re.match(r"\d+ of the log lines of run 1", each) for each in report.left_out)
     assert any("of 60 numeric signals" in each for each in report.left_out)
     text = Shown(report.html).text
     assert all(each in text for each in report.left_out)
@@ -141,7 +141,7 @@ def test_pictures_whose_files_are_gone_are_counted(tmp_path: Path) -> None:
     robot.image(0.6, "../outside.png")
     report = make_report(recorded.connection, [robot.run_id], tmp_path)
     recorded.close()
-    assert "2 more pictures of run 1 (2 files cannot be read)" in report.left_out
+    assert "2 of the pictures of run 1 (2 files cannot be read)" in report.left_out
 
 
 @pytest.mark.parametrize(

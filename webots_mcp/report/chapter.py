@@ -38,6 +38,7 @@ from webots_mcp.store.runs import fetch_run
 from webots_mcp.store.sessions import Session, fetch_session
 from webots_mcp.store.window import Window
 
+DEADLINE_S: Final = 12.0  # for each search in the values of a run: a report may take a while
 MOST_EVENTS: Final = 200
 MOST_ENTRIES: Final = 500  # of the timeline
 MOST_LINES: Final = 2_000  # of the log
@@ -122,8 +123,9 @@ class Chapter:
     def grids(self) -> dict[str, Grid]:
         """The tables that can lack rows, by what their rows are called."""
         named = {
-            "parameter": self.parameters, "event": self.events, "trend": self.trends,
-            "command": self.commands, "entry of the timeline": self.timeline, "log line": self.log,
+            "parameters": self.parameters, "events": self.events, "trends": self.trends,
+            "commands": self.commands, "entries of the timeline": self.timeline,
+            "log lines": self.log,
         }  # fmt: skip
         return {name: grid for name, grid in named.items() if grid is not None}
 
@@ -162,7 +164,7 @@ def chapter_of(connection: sqlite3.Connection, run_id: int, room_bytes: float) -
                        parameters=parameters, log=log)  # fmt: skip
     found, stored = _found(connection, whole), _stored(connection, whole)
     moments = [_moment(each, stored) for each in _outstanding(connection, found)]
-    course = trends(connection, whole, limit=500)
+    course = trends(connection, whole, limit=500, deadline_s=DEADLINE_S)
     (told_trends,) = course.runs
     mode = _mode(told_trends)
     travelled, why_not = _travelled(connection, run_id)
@@ -190,13 +192,12 @@ def chapter_of(connection: sqlite3.Connection, run_id: int, room_bytes: float) -
 
 def _first_words(info: RunInfo) -> str:
     world = f" in {_file(info.world)}" if info.world else ""
-    ended = f"ended by {info.end_reason}" if info.end_reason else "goes on"
+    ended = f"It ended: {info.end_reason}." if info.end_reason else "It goes on."
     pace = info.real_time_factor
-    paced = f", {pace:.2g} times as fast as real time" if pace is not None else ""
+    paced = f", at {pace:.2g} times real time" if pace is not None else ""
     return (
         f"{info.robot} ran for {length(info.duration_s)} of simulation time{world}, from "
-        f"{clock(info.started_wall_time_s)} on{paced}; the run began by {info.start_reason} and "
-        f"{ended}."
+        f"{clock(info.started_wall_time_s)} on{paced}. {ended}"
     )
 
 
@@ -248,13 +249,13 @@ def _found(connection: sqlite3.Connection, whole: TimeRange) -> Found:
     kinds = tuple(
         kind.name for kind in KINDS if kind.usual(usual) and kind.counted and not kind.routine
     )
-    return search_events(connection, whole, EventOptions(kinds=kinds))
+    return search_events(connection, whole, EventOptions(kinds=kinds), deadline_s=DEADLINE_S)
 
 
 def _stored(connection: sqlite3.Connection, whole: TimeRange) -> Found:
     """What was noted when it happened, one by one."""
     options = EventOptions(kinds=stored_kinds(), log_level="info")
-    return search_events(connection, whole, options, around=(), group=False)
+    return search_events(connection, whole, options, around=(), group=False, deadline_s=DEADLINE_S)
 
 
 def _findings(verdicts: Verdicts) -> list[str]:
@@ -265,7 +266,8 @@ def _findings(verdicts: Verdicts) -> list[str]:
     said += [
         f"Absent, but came near: {kind} ({what})." for kind, what in verdicts.came_near.items()
     ]
-    return said + [f"Not looked for: {kinds}: {why}." for kinds, why in verdicts.gaps.items()]
+    unlike = [f"{kinds}: {why}" for kinds, why in verdicts.gaps.items()]
+    return said + [f"Not looked for, or not everywhere: {each}." for each in unlike]
 
 
 def _events(connection: sqlite3.Connection, found: Found) -> Grid:
@@ -291,8 +293,9 @@ def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
 
 
 def _moment(event: Event, stored: Found) -> Moment:
-    lasted = f", for {length(event.duration_s)}" if event.count == 1 and event.duration_s else ""
-    title = f"{event.kind} at {time_at(event.start_s)} s{lasted}"
+    many = f", the first of {event.count}" if event.count > 1 else ""
+    lasted = f", for {length(event.duration_s)}" if event.duration_s and not many else ""
+    title = f"{event.kind} at {time_at(event.start_s)} s{lasted}{many}"
     columns = ("at [s]", "kind", "what")
     moment = Moment(event, title, told(event), valued(event.around), Grid(columns, ()))
     around = [
@@ -306,13 +309,18 @@ def _moment(event: Event, stored: Found) -> Moment:
 
 
 def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
+    """What was noted, in order; of a long run the log alone has what needs no attention."""
+    notes: list[str] = []
+    if len(stored.events) > MOST_ENTRIES:
+        stored = stored.only([e for e in stored.events if e.kind != "log" or _mark(e)])
+        notes = ["Of the log only warnings and errors stand here."]
     answer = stored.told(connection, MOST_ENTRIES, exact=False)
     rows = [
         Row([time_at(each.start_s), _lasted(each), each.kind, told(each)], _mark(each))
         for each in answer.events
     ]
     left_out = sum(each.count for each in answer.left_out.values())
-    return Grid(("at [s]", "for [s]", "kind", "what"), rows, left_out=left_out)
+    return Grid(("at [s]", "for [s]", "kind", "what"), rows, notes, left_out=left_out)
 
 
 def _commands(connection: sqlite3.Connection, whole: TimeRange) -> Grid:
@@ -338,12 +346,11 @@ def _log(connection: sqlite3.Connection, run_id: int) -> Grid:
     asked = LogFilter(run_id, Window(-math.inf, math.inf), robot_id=robot_id)
     lines = newest_lines(connection, asked, MOST_LINES)
     count = count_lines(connection, asked)
-    notes = [f"There are {COUNT_LIMIT:,} lines or more."] if count >= COUNT_LIMIT else []
     return Grid(
         ("at [s]", "level", "from", "line"),
         [_line(line) for line in lines],
-        notes,
         left_out=count - len(lines),
+        or_more=count >= COUNT_LIMIT,
     )
 
 

@@ -8,6 +8,7 @@ from html import escape
 from typing import Final, NamedTuple
 
 _ROW_BYTES: Final = 32  # of marks around a row
+_SHORT: Final = 24  # characters
 _CELL_BYTES: Final = 24  # of marks around a cell
 
 
@@ -29,22 +30,28 @@ class Grid:
     """A table.
 
     Attributes:
-        columns: A column whose name ends in a unit in brackets holds numbers.
+        columns: Their names; a unit stands in brackets.
         notes: What is said below it.
         left_out: How many rows are not shown for want of room.
+        or_more: There may be more than these, which nobody counted.
     """
 
     columns: Sequence[str]
     rows: Sequence[Row]
     notes: Sequence[str] = field(default=())
     left_out: int = 0
+    or_more: bool = False
 
     @property
-    def numeric(self) -> list[bool]:
-        """Which columns hold nothing but numbers, so that their digits stand below each other."""
+    def missing(self) -> str:
+        """How many rows are not shown, in words."""
+        return f"{self.left_out:,}" + (" or more" if self.or_more else "")
+
+    @property
+    def classes(self) -> list[str]:
+        """How each column is set: digits below each other, short texts in one line."""
         return [
-            all(_is_number(row.cells[index]) for row in self.rows)
-            for index in range(len(self.columns))
+            self._class_of([row.cells[i] for row in self.rows]) for i in range(len(self.columns))
         ]
 
     def within(self, room_bytes: float, *, newest: bool = False) -> Grid:
@@ -59,6 +66,11 @@ class Grid:
         left_out = self.left_out + len(rows) - len(kept)
         shown = replace(self, rows=kept[::-1] if newest else kept, left_out=left_out)
         return shown._without_empty_columns()
+
+    def _class_of(self, cells: Sequence[str]) -> str:
+        if all(map(_is_number, cells)):
+            return "number"
+        return "short" if max(map(len, cells)) <= _SHORT else ""
 
     def _without_empty_columns(self) -> Grid:
         kept = [i for i in range(len(self.columns)) if any(row.cells[i] for row in self.rows)]

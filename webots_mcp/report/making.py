@@ -147,11 +147,12 @@ def _left_out(page: Page) -> list[str]:
         of_run = f"of run {chapter.info.run_id}"
         for name, grid in chapter.grids.items():
             if grid.left_out:
-                said.append(f"{counted(grid.left_out, 'more ' + name)} {of_run}")
+                said.append(f"{grid.missing} of the {name} {of_run}")
         pictures = page.pictures[chapter.info.run_id]
         if missing := pictures.total - len(pictures.shown):
-            gone = f" ({pictures.unusable} files cannot be read)" if pictures.unusable else ""
-            said.append(f"{counted(missing, 'more picture')} {of_run}{gone}")
+            gone = f" ({counted(pictures.unusable, 'file')} cannot be read)"
+            gone = gone if pictures.unusable else ""
+            said.append(f"{missing:,} of the pictures {of_run}{gone}")
     return [*said, *page.figures.left_out, *left_out_so_far()]
 
 
@@ -160,7 +161,6 @@ def _holds(page: Page) -> dict[str, int]:
     counts: dict[str, int] = {"figures": len(page.figures.marks)}
     for chapter in page.chapters:
         for name, grid in chapter.grids.items():
-            plural = f"{name}s" if not name.startswith("entry") else "entries of the timeline"
-            counts[plural] = counts.get(plural, 0) + len(grid.rows)
+            counts[name] = counts.get(name, 0) + len(grid.rows)
     counts["pictures"] = sum(len(each.shown) for each in page.pictures.values())
     return {name: count for name, count in counts.items() if count}

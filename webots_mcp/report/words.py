@@ -113,9 +113,9 @@ def told(event: Event) -> str:
 
 def _of_many(event: Event) -> str:
     details = {name: each for name, each in event.details.items() if name not in _UNTOLD}
-    says = details.pop("says", event.kind)
+    says = details.pop("says", f"{event.count} times {event.kind}")
     of = f"{event.name}: " if event.name else ""
-    return cut("; ".join(filter(None, (f"{of}{event.count} {says}", listed(details)))))
+    return cut("; ".join(filter(None, (f"{of}{says}", listed(details)))))
 
 
 def _of_change(event: Event) -> str:

@@ -77,7 +77,6 @@ def test_it_opens_without_a_network_draws_what_was_recorded_and_zooms(
 def test_pictures_are_seen(opened: Any) -> None:
     widths = opened.evaluate(
         "async () => { const all = [...document.querySelectorAll('.pictures img')];"
-        "all.forEach(each => each.loading = 'eager');"
         "await Promise.all(all.map(each => each.decode()));"
         "return all.map(each => each.naturalWidth) }"
     )

@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
+from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.naming import find_mode
 from webots_mcp.report.grid import Grid, Row
@@ -47,6 +48,7 @@ AROUND_S: Final = 5.0  # before and after
 MOST_SHOWN_S: Final = 30.0  # of the event itself
 _LINES_AROUND: Final = 12
 _MOST_VALUES: Final = 20  # of a mode
+_ORDINARY: Final = ("pause", "resume", WORLD_EVENT, MODE_EVENT)  # that the bridge notices
 _MARKS: Final = {"warning": "warning", "error": "error", "critical": "error"}
 # Where the room for texts goes; what one table leaves, the next ones have.
 _SHARES: Final = {
@@ -271,7 +273,9 @@ def _findings(verdicts: Verdicts) -> list[str]:
 
 
 def _events(connection: sqlite3.Connection, found: Found) -> Grid:
-    answer = found.told(connection, MOST_EVENTS)
+    """What stands out; commands that were done have a table of their own."""
+    matter = [each for each in found.events if each.kind != "command" or _mark(each)]
+    answer = found.only(matter).told(connection, MOST_EVENTS)
     rows = [
         Row(
             [time_at(each.start_s), _lasted(each), each.kind, told(each), valued(each.around)],
@@ -286,8 +290,9 @@ def _events(connection: sqlite3.Connection, found: Found) -> Grid:
 
 def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
     """The few whose surroundings are shown: what was found in the values, else in the log."""
-    matter = [each for each in found.events if each.kind not in ("run", "kept", "command", "log")]
-    failed = [each for each in found.events if each.kind in ("command", "log") and _mark(each)]
+    matter = [each for each in found.events if each.kind not in ("kept", "command", "log")]
+    matter = [each for each in matter if each.details.get("what") not in _ORDINARY]
+    failed = [each for each in found.events if _mark(each)]
     chosen = choose(matter, MOST_MOMENTS) or choose(failed, MOST_MOMENTS)
     return list(found.only(chosen).told(connection, MOST_MOMENTS).events)
 

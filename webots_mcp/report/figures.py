@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from importlib import import_module
@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.report.chapter import Chapter, Moment
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.signals.catalogue import signals_of
+from webots_mcp.store.signals.catalogue import known_signals, resolve_signals
+from webots_mcp.store.signals.registry import Signal
 
 if TYPE_CHECKING:
     from webots_mcp.charts import Chart
@@ -88,9 +89,11 @@ def figures_of(
     Raises:
         UnknownSignalError: A name meets nothing.
     """
-    chosen = {each.info.run_id: _chosen(connection, each, names) for each in chapters}
+    known = [_known(connection, each) for each in chapters]
+    chosen = _chosen(chapters, known, names)
     both = list(dict.fromkeys(name for had in chosen.values() for name in had))
     both = both if names else [*differing[:MOST_SIGNALS]] or both
+    both = [name for name in both if all(name in each for each in known)]
     count = max(map(len, chosen.values()), default=0)
     while True:
         first = {run_id: had[:count] for run_id, had in chosen.items()}
@@ -118,13 +121,22 @@ def moment_key(chapter: Chapter, moment: Moment) -> str:
     return f"moment {chapter.info.run_id} {list(chapter.moments).index(moment)}"
 
 
-def _chosen(connection: sqlite3.Connection, chapter: Chapter, names: Sequence[str]) -> list[str]:
-    """The signals to draw of a run."""
-    if chapter.range is None:
-        return []
-    if names:
-        return [signal.name for signal in signals_of(connection, chapter.range, names)]
-    return list(chapter.changed_most[:MOST_SIGNALS])
+def _known(connection: sqlite3.Connection, chapter: Chapter) -> dict[str, Signal]:
+    return {} if chapter.range is None else known_signals(connection, chapter.range)
+
+
+def _chosen(
+    chapters: Sequence[Chapter], known: Sequence[dict[str, Signal]], names: Sequence[str]
+) -> dict[int, list[str]]:
+    """The signals to draw of each run; of two robots each may lack what the other has."""
+    if not names:
+        return {each.info.run_id: [*each.changed_most[:MOST_SIGNALS]] for each in chapters}
+    of_any = {name: signal for each in known for name, signal in each.items()}
+    asked = {signal.name for signal in resolve_signals(of_any, names)}
+    return {
+        chapter.info.run_id: [name for name in had if name in asked]
+        for chapter, had in zip(chapters, known, strict=True)
+    }
 
 
 class _Charts:
@@ -135,21 +147,37 @@ class _Charts:
         self.drawn: dict[str, Chart] = {}
         self.not_drawn: list[str] = []
 
-    def pair(self, ranges: Sequence[TimeRange], names: Sequence[str], key: str, of: str) -> None:
-        """Signals over time, and the way."""
-        from webots_mcp.charts import signals_chart, way_chart
+    def alone(self, run_id: int, whole: TimeRange, names: Sequence[str]) -> None:
+        """Signals of a run over time, and its way."""
+        key, drawn = f"signals {run_id}", names or ["*"]
+        self._add(key, f"the signals of run {run_id}", self._signals, [whole], drawn)
+        self._add(f"way {run_id}", f"the way of run {run_id}", self._way, [whole])
+
+    def overlaid(self, ranges: Sequence[TimeRange], names: Sequence[str]) -> None:
+        """The same of two runs over each other."""
+        if names:
+            self._add("signals both", "the signals of both runs", self._signals, ranges, names)
+        else:
+            self.not_drawn.append("the signals of both runs: they have none in common")
+        self._add("way both", "the ways of both runs", self._way, ranges)
+
+    def _add(self, key: str, what: str, draw: Callable[..., Chart], *asked: Any) -> None:
+        try:
+            self.drawn[key] = draw(*asked)
+        except (InvalidInputError, NothingRecordedError) as error:
+            self.not_drawn.append(f"{what}: {error}")
+
+    def _signals(self, ranges: Sequence[TimeRange], names: Sequence[str]) -> Chart:
+        from webots_mcp.charts import signals_chart
         from webots_mcp.plotting.canvas import Room
 
         room = Room(points=_POINTS, panels=_PANELS, lanes=8, rows=16)
-        try:
-            chart = signals_chart(self._connection, ranges, names or ["*"], room=room)
-            self.drawn[f"signals {key}"] = chart
-        except NothingRecordedError as error:
-            self.not_drawn.append(f"the signals of {of}: {error}")
-        try:
-            self.drawn[f"way {key}"] = way_chart(self._connection, ranges)
-        except (InvalidInputError, NothingRecordedError) as error:
-            self.not_drawn.append(f"the way of {of}: {error}")
+        return signals_chart(self._connection, ranges, names, room=room)
+
+    def _way(self, ranges: Sequence[TimeRange]) -> Chart:
+        from webots_mcp.charts import way_chart
+
+        return way_chart(self._connection, ranges)
 
     def around(self, chapter: Chapter, moment: Moment) -> None:
         """The signals that an event is about, or the usual ones, in the seconds around it."""
@@ -184,11 +212,11 @@ def _charts(
     charts = _Charts(connection)
     ranges = [each.range for each in chapters if each.range is not None]
     if len(ranges) > 1:
-        charts.pair(ranges, both, "both", "both runs")
+        charts.overlaid(ranges, both)
     for chapter in chapters:
         if chapter.range is not None:
             run_id = chapter.info.run_id
-            charts.pair([chapter.range], chosen[run_id], str(run_id), f"run {run_id}")
+            charts.alone(run_id, chapter.range, chosen[run_id])
         for moment in chapter.moments if with_moments else ():
             charts.around(chapter, moment)
     return charts

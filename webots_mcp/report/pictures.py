@@ -77,7 +77,8 @@ def _picture(event: Event, data_dir: Path) -> Picture | None:
         media_type, data = _content(inside(data_dir, str(event.details["path"])))
     except (InvalidInputError, NothingRecordedError):
         return None
-    caption = f"{time_at(event.start_s)} s, {event.name or 'main view'}, {event.details['kind']}"
+    kind = "" if event.details["kind"] == "camera" else f", {event.details['kind']}"
+    caption = f"{time_at(event.start_s)} s, {event.name or 'main view'}{kind}"
     return Picture(f"data:{media_type};base64,{b64encode(data).decode()}", caption)
 
 

@@ -107,17 +107,33 @@ def test_what_was_recorded_is_shown_and_never_run(tmp_path: Path) -> None:
 def test_it_stays_as_small_as_was_asked_and_tells_what_is_not_in_it(tmp_path: Path) -> None:
     recorded = Recorded(tmp_path / "webots.db")
     robot = recorded.robot()
-    for step in range(300):
-        robot.state(step * 0.1, {f"s{i}": (step * (i + 1)) % 7 for i in range(60)})
+    for step in range(120):
+        robot.state(step * 0.1, {f"s{i}": (step * (i + 1)) % 7 for i in range(30)})
         robot.log(step * 0.1, f"line {step} " + "<" * 3_000)
     report = make_report(recorded.connection, [robot.run_id], tmp_path, max_mb=2)
     recorded.close()
     assert len(report.html) <= 2_000_000
     assert any(re.match(r"\d+ of the log lines of run 1", each) for each in report.left_out)
-    assert any("of 60 numeric signals" in each for each in report.left_out)
+    assert any("of 30 numeric signals" in each for each in report.left_out)
     text = Shown(report.html).text
     assert all(each in text for each in report.left_out)
-    assert "line 299" in text, "the newest lines stay"
+    assert "line 119" in text, "the newest lines stay"
+
+
+def test_runs_of_two_robots_that_have_nothing_in_common_are_told_side_by_side(
+    tmp_path: Path,
+) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    run_ids: list[int] = []
+    for name in ("hunter", "runner"):
+        robot = recorded.robot(name)
+        run_ids.append(robot.run_id)
+        for step in range(20):
+            robot.state(step * 0.1, {f"{name}_m": step})
+    report = make_report(recorded.connection, run_ids, tmp_path, names=["hunter_m"])
+    recorded.close()
+    assert "the signals of both runs: they have none in common" in report.left_out
+    assert "Run 1 of hunter and Run 2 of runner" in report.title
 
 
 def test_of_a_run_without_rows_it_tells_what_there_is(tmp_path: Path) -> None:

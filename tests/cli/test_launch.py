@@ -15,7 +15,7 @@ import psutil
 import pytest
 
 from tests.trials.test_killed import wait_until
-from tests.webots.conftest import CONTROLLER, free_port, webots, write_project
+from tests.webots.conftest import CONTROLLER, free_port, started, webots, write_project
 from webots_mcp.launching import require_world
 
 __all__ = ["webots"]
@@ -33,23 +33,8 @@ QUITTING = CONTROLLER.replace("robot.getTime()})", "1})\n    robot.simulationQui
 def launch(webots: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Launch]:
     """Run the command, in the way of a person at a desktop."""
     monkeypatch.setenv("DISPLAY", ":99")
-    running: list[subprocess.Popen[str]] = []
-
-    def begin(*arguments: object) -> subprocess.Popen[str]:
-        process = subprocess.Popen(
-            [sys.executable, "-m", "webots_mcp", "launch", *map(str, arguments)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        running.append(process)
-        return process
-
-    yield begin
-    for process in running:
-        process.kill()
-        process.communicate(timeout=30)
+    with started(sys.executable, "-m", "webots_mcp", "launch", end=signal.SIGKILL) as launch:
+        yield launch
 
 
 @pytest.fixture

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import socket
 import subprocess
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -63,11 +65,23 @@ def webots(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.fixture
 def start_webots(webots: Path) -> Iterator[StartWebots]:
     """Start the program `webots` with arguments."""
+    with started(webots) as start:
+        yield start
+
+
+@contextmanager
+def started(*program: object, end: signal.Signals = signal.SIGTERM) -> Generator[StartWebots]:
+    """Start a program with arguments; all that were started end with the block.
+
+    Args:
+        program: With its first arguments.
+        end: How they are ended.
+    """
     running: list[subprocess.Popen[str]] = []
 
     def start(*arguments: object) -> subprocess.Popen[str]:
         process = subprocess.Popen(
-            [webots, *map(str, arguments)],
+            [str(each) for each in (*program, *arguments)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -78,7 +92,7 @@ def start_webots(webots: Path) -> Iterator[StartWebots]:
 
     yield start
     for process in running:
-        process.terminate()
+        process.send_signal(end)
     for process in running:
         process.communicate(timeout=30)
 

@@ -11,7 +11,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.commands import Command, Progress
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.goal import Goal, read_goal
 from webots_mcp.bridge.parameters import SETTERS, Setter
@@ -26,7 +26,6 @@ from webots_mcp.errors import (
     InvalidInputError,
 )
 
-Progress = Generator[None, None, object]
 Action = Callable[[Context, Command], Progress]
 
 _SCREENSHOT_TIMEOUT_S: Final = 10.0

@@ -9,13 +9,16 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from typing import Any, Final, cast
 
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.text import storable
+
+Progress = Generator[None, None, object]
+"""A built-in action under way: it yields until its outcome is known, and returns the result."""
 
 _MOST_NAMED: Final = 10
 

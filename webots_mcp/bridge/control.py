@@ -7,8 +7,7 @@ import time
 from typing import Final
 
 from webots_mcp.bridge import actions
-from webots_mcp.bridge.actions import Progress
-from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.commands import Command, Progress
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.handlers import Handlers
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S

@@ -67,6 +67,14 @@ class SceneNode:
     index: int | None
     hidden: bool
 
+    @classmethod
+    def of(
+        cls, node: Any, parent: SceneNode | None, field: str, index: int | None, *, hidden: bool
+    ) -> SceneNode:
+        """A node of Webots', with where it stands."""
+        kinds = (node.getTypeName(), node.getBaseTypeName(), node.getDef())
+        return cls(node, int(node.getId()), *kinds, parent, field, index, hidden)
+
     @property
     def depth(self) -> int:
         """How many nodes are around it."""
@@ -142,17 +150,7 @@ def _nodes_in(
     for name, field, is_inside in node_fields(node, inside=inside, everything=everything):
         for index, child in entries(field):
             if everything or child.getBaseTypeName() in _FIELDS or name.startswith("device"):
-                yield SceneNode(
-                    child,
-                    int(child.getId()),
-                    child.getTypeName(),
-                    child.getBaseTypeName(),
-                    child.getDef(),
-                    around,
-                    name,
-                    index,
-                    hidden or is_inside,
-                )
+                yield SceneNode.of(child, around, name, index, hidden=hidden or is_inside)
 
 
 def node_fields(node: Any, *, inside: bool = True, everything: bool = False) -> Iterator[NodeField]:

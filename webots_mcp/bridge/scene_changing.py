@@ -11,9 +11,9 @@ import re
 import time
 from collections.abc import Generator
 from dataclasses import replace
-from typing import Any, Final, cast
+from typing import Any, Final
 
-from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.commands import Command, Progress
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.scene_edits import MOST_EDITS, FieldEdit, Removal
 from webots_mcp.bridge.scene_path import Place, children, find, find_node, label
@@ -21,8 +21,6 @@ from webots_mcp.bridge.scene_restoring import find_again, import_node, spot_of
 from webots_mcp.bridge.scene_values import MOST_ENTRIES, checked, is_nearer, is_same, read, write
 from webots_mcp.bridge.text import cut
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-
-_Progress = Generator[None, None, object]
 
 _LONGEST_NODE: Final = 50_000  # characters of a node that is added
 _LONGEST_SHOWN: Final = 1_000  # characters of a value
@@ -33,7 +31,7 @@ _ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
 _SAYS: Final = "Webots' console (webots_get_logs, if it is recorded) says why"
 
 
-def set_field(context: Context, command: Command) -> _Progress:
+def set_field(context: Context, command: Command) -> Progress:
     """Set the field, or the entry of one, that a `path` leads to, to a `value`."""
     robot, params = context.simulation.robot, command.params
     place = yield from find(robot, params.get("path"))
@@ -71,8 +69,7 @@ def _shown(value: Any) -> Any:
 
 
 def _edit(place: Place, before: Any, value: Any) -> FieldEdit:
-    field = cast("Any", place.field)
-    name = str(field.getName())
+    name = str(place.webots_field.getName())
     node_id = int(place.node.getId())
     return FieldEdit(place.path, node_id, name, place.index, place.type_name, before, value)
 
@@ -129,7 +126,7 @@ def _told_of_reset(is_remembered: bool) -> dict[str, Any]:
     return {"a_reset": f"leaves it so: {MOST_EDITS} changes are remembered, and no more"}
 
 
-def add_node(context: Context, command: Command) -> _Progress:
+def add_node(context: Context, command: Command) -> Progress:
     """Add the node that `vrml` describes to the children of a `path`, or to a field of nodes."""
     robot, params = context.simulation.robot, command.params
     text = _require_one_node(params.get("vrml"))
@@ -154,12 +151,12 @@ def add_node(context: Context, command: Command) -> _Progress:
 
 
 def _count(place: Place) -> int:
-    return int(cast("Any", place.field).getCount())
+    return int(place.webots_field.getCount())
 
 
 def _newest(robot: Any, place: Place, before: int) -> Any | None:
     """The node that came to a field since; None where none did."""
-    field = find_again(robot, int(place.node.getId()), str(cast("Any", place.field).getName()))
+    field = find_again(robot, int(place.node.getId()), str(place.webots_field.getName()))
     if field is None or place.type_name == "SFNode":
         return None if field is None else field.getSFNode()
     return field.getMFNode(-1) if field.getCount() > before else None
@@ -198,7 +195,7 @@ def _find_room(robot: Any, path: object) -> Generator[None, None, Place]:
                 f"{place.path} ({label(place.node)}) has no field children: name a field of nodes"
             )
         place = replace(place, path=f"{place.path}.children", field=room)
-    room = cast("Any", place.field)
+    room = place.webots_field
     if place.type_name == "SFNode" and room.getSFNode() is not None:
         holds = label(room.getSFNode())
         raise InvalidInputError(f"{place.path} holds a node ({holds}): remove that one first")
@@ -217,7 +214,7 @@ def _path_of(robot: Any, node: Any) -> str:
     return definition if is_first else f"#{node.getId()}"
 
 
-def remove_node(context: Context, command: Command) -> _Progress:
+def remove_node(context: Context, command: Command) -> Progress:
     """Remove the node that a `path` leads to, with all in it."""
     robot = context.simulation.robot
     place = yield from find_node(robot, command.params.get("path"))

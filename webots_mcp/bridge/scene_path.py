@@ -67,6 +67,11 @@ class Place:
     definition: str = ""
 
     @property
+    def webots_field(self) -> Any:
+        """Webots' `Field` of a path that is known to lead to one."""
+        return self.field
+
+    @property
     def type_name(self) -> str:
         """Of the field, such as SFVec3f; of one entry the type of a single field."""
         whole = str(self.field.getTypeName()) if self.field is not None else ""
@@ -184,8 +189,7 @@ def _once(found: Iterable[SceneNode]) -> Iterable[SceneNode]:
 
 def _at_the_top(root: Any, index: int) -> SceneNode:
     node = children(root).getMFNode(index)
-    kinds = (node.getTypeName(), node.getBaseTypeName(), node.getDef())
-    return SceneNode(node, int(node.getId()), *kinds, None, "children", index, False)
+    return SceneNode.of(node, None, "children", index, hidden=False)
 
 
 def children(root: Any) -> Any:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, Final
 from webots_mcp.cli.command import DATA_DIR, argument, command
 from webots_mcp.cli.setting_up import apply_change, diff_of, print_json, require_yes
 from webots_mcp.contract import OBSERVER_NAME, find_project
-from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.errors import CommandRefusedError
+from webots_mcp.observer.pace import PERIOD_MS, checked_period
 
 if TYPE_CHECKING:
     from webots_mcp.setup.files import Change
@@ -25,8 +26,8 @@ _URL: Final = "WEBOTS_CONTROLLER_URL"
              help=f"the Robot node to be, with supervisor TRUE ({OBSERVER_NAME})"),
     argument("--url", metavar="URL",
              help="where Webots is: ipc://1234, tcp://192.168.1.5:1234 (default: here, port 1234)"),
-    argument("--period-ms", type=int, default=100, metavar="N",
-             help="simulation time between two rows (100)"),
+    argument("--period-ms", type=int, default=PERIOD_MS, metavar="N",
+             help=f"simulation time between two rows ({PERIOD_MS})"),
     DATA_DIR,
 )  # fmt: skip
 def observe(arguments: argparse.Namespace) -> None:
@@ -36,14 +37,13 @@ def observe(arguments: argparse.Namespace) -> None:
     --extern Webots starts the observer itself, and this command is not needed. It ends when Webots
     reloads the world or ends.
     """
-    if not 1 <= arguments.period_ms <= 60_000:
-        raise InvalidInputError(f"--period-ms is from 1 to 60000, not {arguments.period_ms}")
+    period_ms = checked_period(arguments.period_ms)
     _prepare(arguments)
     from controller import Supervisor  # type: ignore[import-not-found]
 
     from webots_mcp.observer.observe import observe as run
 
-    run(Supervisor(), arguments.period_ms, data_dir=arguments.data_dir)
+    run(Supervisor(), period_ms, data_dir=arguments.data_dir)
 
 
 def _prepare(arguments: argparse.Namespace) -> None:

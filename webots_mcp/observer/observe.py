@@ -11,10 +11,9 @@ from webots_mcp.bridge.mcp_bridge import MCPBridge
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.observer.body import Body
-from webots_mcp.observer.pace import Pace
+from webots_mcp.observer.pace import LONGEST_PERIOD_MS, PERIOD_MS, Pace, checked_period
 from webots_mcp.observer.world import World
 
-PERIOD_MS: Final = 100
 _TELL_AGAIN_S: Final = 3600.0  # of wall time: old events are purged
 _MOST_CONTACTS: Final = 30
 _DIGITS: Final = 6
@@ -59,12 +58,11 @@ def _period(given: list[str]) -> int:
     if not given:
         return PERIOD_MS
     try:
-        period_ms = int(given[0])
-    except ValueError:
-        period_ms = 0
-    if len(given) > 1 or not 1 <= period_ms <= 60_000:
-        raise SystemExit(f"give a period of 1 to 60000 ms, not {' '.join(given)!r}")
-    return period_ms
+        return checked_period(int(" ".join(given)))
+    except (ValueError, InvalidInputError) as error:
+        raise SystemExit(
+            f"give a period of 1 to {LONGEST_PERIOD_MS} ms, not {' '.join(given)!r}"
+        ) from error
 
 
 def observe(robot: Any, period_ms: int = PERIOD_MS, **options: Any) -> None:

@@ -11,8 +11,24 @@ from __future__ import annotations
 import time
 from typing import Any, Final
 
+from webots_mcp.errors import InvalidInputError
+
+PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
+LONGEST_PERIOD_MS: Final = 60_000
+
 _ROUND_S: Final = 0.01  # of wall time
 _TRIAL_S: Final = 1.0  # of wall time in which time ought to have moved
+
+
+def checked_period(period_ms: int) -> int:
+    """A period that can be kept to.
+
+    Raises:
+        InvalidInputError: It cannot.
+    """
+    if not 1 <= period_ms <= LONGEST_PERIOD_MS:
+        raise InvalidInputError(f"the period is from 1 to {LONGEST_PERIOD_MS} ms, not {period_ms}")
+    return period_ms
 
 
 class Pace:

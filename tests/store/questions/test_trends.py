@@ -182,13 +182,13 @@ def test_rows_without_the_signal_are_rows_without_a_value(
     record(empty, rows=2000, interval_s=0.1, x=float, lidar=lambda t: 1.0 + t if t < 100 else None)
     lidar = one(empty, "lidar")
     assert 2 * lidar.missing == lidar.summary.rows
-    assert "no value in 1000 of 2000 rows" in lidar.says
+    assert f"no {'usable ' * (tier != 'rows')}value in 1000 of 2000 rows" in lidar.says
 
 
 def test_missing_values_are_told(rover: sqlite3.Connection, tier: str) -> None:
     front = one(rover, "sensors.front", start_s=90.0)
     assert front.missing == 40
-    assert "no value in 40 of 250 rows" in front.says
+    assert f"no {'usable ' * (tier != 'rows')}value in 40 of 250 rows" in front.says
 
 
 def test_what_changed_most_comes_first(rover: sqlite3.Connection, tier: str) -> None:
@@ -319,3 +319,17 @@ def test_whole_numbers_that_name_a_mode_have_times_and_no_slope(
     assert mode.time_by_value_s == pytest.approx(
         {"3": 44.9, "0": 25.0, "2": 24.9, "1": 23.1, "null": 2.0}
     )
+
+
+def test_numbers_that_are_too_large_are_not_told_as_missing(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(
+        empty, rows=700, interval_s=0.1,
+        range_m=lambda time_s: 1e200 if round(10 * time_s) % 7 == 0 else None if time_s < 5 else 2,
+    )  # fmt: skip
+    says = one(empty, "range_m").says
+    if tier == "rows":
+        assert "beyond 1e+100 in 100 of 700 rows; no value in 42 of 700 rows" in says
+    else:
+        assert "no usable value in" in says

@@ -20,7 +20,7 @@ from webots_mcp.store.analysis.features import (
     time_effect,
 )
 from webots_mcp.store.analysis.summaries import Summaries
-from webots_mcp.store.analysis.summary import Summary, summarise_numbers
+from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
 from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.signals.registry import Signal
@@ -61,7 +61,8 @@ class Trend:
         spikes: Values that stand out from both neighbours; None where rows were not looked at.
         step: The one change that makes most of its range; None where rows were not looked at, and
             of an angle.
-        missing: Of the rows, those without a value.
+        missing: Of the rows, those without a value; from rollups also those with one beyond 1e100.
+        too_large: Of the rows, those with a number beyond 1e100; None where rows were not read.
         change: How much it changed with time, 0 to 2: the share of its variance that is slow
             (`time_effect`) times its range in units of its largest magnitude. Free of units.
         says: What a person would notice.
@@ -86,6 +87,7 @@ class Trend:
     spikes: tuple[Spike, ...] | None
     step: Step | None
     missing: int
+    too_large: int | None
     change: float
     says: str
 
@@ -104,6 +106,7 @@ def judge(
     inner_variance: float = 0.0,
     resolution_s: float | None = None,
     pieces: Summaries | None = None,
+    too_large: int | None = None,
 ) -> Trend:
     """Put together what the summary tells and what the course of the numbers tells.
 
@@ -117,6 +120,7 @@ def judge(
             between them, a course of their means is not that of the values (it may be an alias).
         resolution_s: The length of the buckets; None where the numbers are the values.
         pieces: The buckets, of which ends and extremes are known beside their means.
+        too_large: How many of the values are beyond 1e100; None where that is not known.
     """
     of_rows = spikes is not None
     turn = signal.turn if of_rows else summary.turn_of(signal.turn)
@@ -158,7 +162,8 @@ def judge(
         flat_since_s=rest_s,
         spikes=None if spikes is None else tuple(spikes),
         step=None if spikes is None or turn else find_step(times, numbers),
-        missing=summary.rows - summary.present,
+        missing=summary.rows - summary.present - (too_large or 0),
+        too_large=too_large,
         change=time_effect(times, course, inner.mean or 0.0, inner.squares or 0.0)
         * slow
         * _relative_range(summary),
@@ -304,9 +309,12 @@ def _remarks(trend: Trend) -> Iterator[str]:
             f"{len(trend.spikes)} spike{'s' if len(trend.spikes) > 1 else ''}, the largest "
             f"{largest.value:.4g} at {largest.sim_time_s:.6g} s"
         )
+    if trend.too_large:
+        yield f"beyond {LARGEST:g} in {trend.too_large} of {summary.rows} rows"
     if trend.is_lacking:
+        usable = "usable " if trend.too_large is None else ""  # rollups do not tell the two apart
         yield (
-            f"no value in {trend.missing} of {summary.rows} rows, the last value at "
+            f"no {usable}value in {trend.missing} of {summary.rows} rows, the last value at "
             f"{summary.last_sim_time_s:.6g} s"
         )
 

@@ -11,7 +11,7 @@ from typing import Final
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.features import find_spikes
 from webots_mcp.store.analysis.summaries import Summaries
-from webots_mcp.store.analysis.summary import Summary, summarise_numbers, with_extremes
+from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.questions.trend import Trend, judge
 from webots_mcp.store.reading.changes import change_points, longest_values
@@ -180,7 +180,9 @@ def _trend_of_rows(signal: Signal, read: Numbers, kept: Columns | None) -> Trend
         return None
     summary = summarise_numbers(times, numbers, rows=len(read.times), turn=signal.turn)
     summary = _with_kept(signal, summary, kept)
-    return judge(signal, summary, times, numbers, find_spikes(times, numbers, signal.turn))
+    spikes = find_spikes(times, numbers, signal.turn)
+    too_large = int(np.count_nonzero(np.abs(read.values[signal.name]) > LARGEST))
+    return judge(signal, summary, times, numbers, spikes, too_large=too_large)
 
 
 def _trend_of_pieces(

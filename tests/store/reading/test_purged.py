@@ -9,13 +9,16 @@ from pathlib import Path
 import pytest
 
 from tests.memory import memory_connection
-from tests.recordings.rover import WALL_START_S
+from tests.recordings.rover import WALL_START_S, start_run
 from webots_mcp.store.analysis.spread import Spread
+from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.compare import Comparison, compare_code, compare_runs
-from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.series import RunHistory, query_history
+from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.rollup.rolling import roll
 
 
 def overview(connection: sqlite3.Connection, start_s: float | None = None) -> RunHistory:
@@ -120,3 +123,56 @@ def test_the_distance_of_a_run_that_lost_rows_is_not_known(
     assert first is None and third is not None
     assert any("run 1 were purged" in note and "distance" in note for note in comparison.notes)
     assert distance(compare_code(rover))[0] is None  # of one of its runs it is not known
+
+
+@pytest.fixture
+def patrol(empty: sqlite3.Connection, tmp_path: Path) -> sqlite3.Connection:
+    """Of 400 s only the last 50 s are left as rows; a mode that is a number changes at 83.5 s."""
+    recorder = start_run(empty)
+    empty.execute("BEGIN")
+    for step in range(4000):
+        time_s = round(step * 0.1, 6)
+        state = {"x": 0.1 * time_s, "y": 0.0, "task": int(time_s >= 83.5)}
+        front_m = None if 123.5 <= time_s < 200 else 3.0 if 233.5 <= time_s < 290 else 1 + step % 7
+        recorder.publish(time_s, state | {"front_m": front_m})
+    empty.execute("COMMIT")
+    roll(empty, 100_000)
+    keep_rows(empty, tmp_path, 500)
+    return empty
+
+
+def events_of(connection: sqlite3.Connection, kind: str, **bounds: float) -> Events:
+    found = find_range(connection, Scope(run_id=1, **bounds))  # pyright: ignore[reportArgumentType]
+    options = EventOptions(kinds=(kind,), where="front_m > 2" if kind == "condition" else None)
+    return find_events(connection, found, options)
+
+
+def test_a_mode_that_is_a_number_changed_when_its_summary_says(
+    patrol: sqlite3.Connection,
+) -> None:
+    told = events_of(patrol, "change", end_s=300.0)
+    assert [(each.name, each.start_s) for each in told.events] == [("task", 83.5)]
+    assert "of task not more than one in 10 s" in told.verdicts.not_searched["change"]
+
+
+def test_where_only_a_bucket_tells_when_a_silence_began_the_answer_says_so(
+    patrol: sqlite3.Connection,
+) -> None:
+    (silent,) = events_of(patrol, "silent", end_s=300.0).events
+    assert (silent.start_s, silent.end_s) == pytest.approx((130.0, 200.0), abs=0.2)
+    assert silent.details["within_s"] == 10.0
+
+
+@pytest.mark.parametrize("kind", ["still", "jump", "oscillation", "condition"])
+def test_of_what_was_purged_no_call_is_advised_that_brings_nothing(
+    patrol: sqlite3.Connection, kind: str
+) -> None:
+    verdicts = events_of(patrol, kind, start_s=100.0, end_s=300.0).verdicts
+    assert verdicts.unlooked(kind) == "the rows of that time were purged, and no call brings more"
+
+
+def test_trends_of_what_was_purged_advise_no_shorter_range(patrol: sqlite3.Connection) -> None:
+    purged = trends(patrol, find_range(patrol, Scope(run_id=1, start_s=20.0, end_s=120.0)))
+    (front,) = (each for each in purged.runs[0].numbers if each.name == "front_m")
+    assert "varies faster than 10 s, and its rows were purged" in front.says
+    assert not any("ask for" in note for note in purged.notes)

@@ -26,6 +26,7 @@ def condition_events(search: Search) -> Iterator[Event]:
     _require_known(condition, search)
     if search.recorded is None:
         raise NotSearchableError("nothing was recorded in that range")
+    search.require_rows()
     held = where_held(search.connection, search.recorded, condition, search.deadline)
     if held.cut and held.reached_s is not None:
         then = f"ask again with start_s={held.reached_s:.3f}"

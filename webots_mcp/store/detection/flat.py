@@ -35,7 +35,8 @@ def flat_events(search: Search) -> Iterator[Event]:
     signals = search.required_quantities()
     search.note_too_large("flat")
     if (shortest_s := search.view.shortest_rest_s) and search.only is None:
-        why = f"not all of noisy signals for less than {shortest_s:g} s: ask for less time"
+        advice = "" if search.is_purged else ": ask for less time"
+        why = f"not all of noisy signals for less than {shortest_s:g} s{advice}"
         search.not_searched("flat", why)
     resting: dict[str, list[Span]] = {}
     sooner: list[tuple[Resting, Span]] = []

@@ -28,6 +28,7 @@ _ALIKE_SHARE: Final = 0.05  # of a dropout's size: so near each other they go to
 
 def jump_events(search: Search) -> Iterator[Event]:
     """Dropouts and spikes that come back, steps that stay, and leaps of the position."""
+    search.require_rows()
     position = search.motion.position or ()
     numbers = search.numbers if position else search.required_quantities()
     search.note_too_large("jump")

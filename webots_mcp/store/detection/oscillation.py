@@ -20,6 +20,8 @@ _MOST_NAMED: Final = 5
 def oscillation_events(search: Search) -> Iterator[Event]:
     """Of heading, wheels, speed, position and the like, and of what is asked for."""
     signals = _swinging(search)
+    if search.is_purged and not search.view.stored_swings(signals)[1]:
+        search.require_rows()
     if left := [each.name for each in search.required_numbers() if each not in signals]:
         why = (
             f"not in {len(left)} of {len(search.numbers)} signals, whose names are not of what a "

@@ -14,6 +14,7 @@ from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
 from webots_mcp.store.detection.motion import Motion, find_motion
 from webots_mcp.store.detection.verdict import Ledger
+from webots_mcp.store.reading.coverage import purged_until_s
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.views import View, view_of
@@ -98,6 +99,22 @@ class Search:
             return None
         start_s, end_s = max(here.start_s, first_s), min(here.end_s, just_after(newest_s))
         return replace(here, start_s=start_s, end_s=end_s)
+
+    @cached_property
+    def is_purged(self) -> bool:
+        """Whether no row of the segment is left, of which there are rollups."""
+        run_id, start_s = self.segment.run_id, self.segment.start_s
+        until_s = purged_until_s(self.connection, run_id, start_s)
+        return until_s is not None and until_s >= self.segment.end_s
+
+    def require_rows(self) -> None:
+        """For what shows in single rows only.
+
+        Raises:
+            NotSearchableError: They were purged.
+        """
+        if self.is_purged:
+            raise NotSearchableError("the rows of that time were purged, and no call brings more")
 
     @cached_property
     def motion(self) -> Motion:

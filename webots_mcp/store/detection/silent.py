@@ -48,7 +48,7 @@ def silent_events(search: Search) -> Iterator[Event]:
             lasts_s = span.end_s - span.start_s
             if lasts_s >= least_s:
                 instead = replaced_value(search, signal, span.start_s)
-                details = {"value": instead} if instead else {}
+                details = {**span.how_exact, **({"value": instead} if instead else {})}
                 yield search.event("silent", span.start_s, span.end_s, signal.name, **details)
             elif lasts_s > 0:
                 what = f"{signal.name} had no value for {lasts_s:.3g} s from {span.start_s:.6g} s"

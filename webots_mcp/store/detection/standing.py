@@ -81,6 +81,7 @@ def _found(search: Search) -> StretchStandings:
         about = [fine for each in in_rows.standings for fine in _at_border(search, each, stored)]
         in_rows = in_all([*found, replace(in_rows, standings=about)])
     if in_rows.noise_m is None:
+        search.require_rows()
         names = " and ".join(signal.name for signal in search.motion.position or ())
         raise NotSearchableError(f"{names} have no value in run {run_id} there")
     return in_rows

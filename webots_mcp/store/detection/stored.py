@@ -10,7 +10,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.naming import Value
+from webots_mcp.naming import Value, listed
 from webots_mcp.store.analysis.rhythm import rhythm_of
 from webots_mcp.store.detection.event import LEVELS, Event
 from webots_mcp.store.detection.kind import (
@@ -23,6 +23,7 @@ from webots_mcp.store.detection.kind import (
 from webots_mcp.store.detection.search import Search, wall_time_at
 from webots_mcp.store.detection.together import told_together
 from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
+from webots_mcp.store.reading.coverage import purged_until_s
 from webots_mcp.store.reading.gaps import rhythm_in, with_rows_around
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rows import exceeds, read_columns
@@ -112,6 +113,7 @@ def change_events(search: Search) -> Iterator[Event]:
             "no text, flag or mode was published, or none of these names; of another number ask "
             "where='changed(NAME)'"
         )
+    _note_purged(search, [each.name for each in states if each.is_number])
     around = Segment(segment.run_id, segment.start_s - AROUND_S, segment.end_s + AROUND_S)
     found = change_points(search.connection, around, states, search.deadline, since=False)
     for signal in states:
@@ -127,6 +129,16 @@ def change_events(search: Search) -> Iterator[Event]:
             why = f"not from number to number of {name}, which measures: ask signals=['{name}']"
             search.not_searched("change", f"{why} of webots_query_history")
         yield from _told(search, name, changes)
+
+
+def _note_purged(search: Search, numbers: Sequence[str]) -> None:
+    """Of numbers no change is stored: what came and went within a bucket is gone with its rows."""
+    until_s = purged_until_s(search.connection, search.segment.run_id, search.segment.start_s)
+    if numbers and until_s is not None:
+        before = "" if until_s == math.inf else f" before {until_s:.3f} s"
+        names = listed(numbers, MOST_NAMED)
+        why = f"of {names} not more than one in 10 s{before}, whose rows were purged"
+        search.not_searched("change", why)
 
 
 class _Change(NamedTuple):

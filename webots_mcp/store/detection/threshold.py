@@ -52,7 +52,7 @@ def _beyond(search: Search, signal: Signal, threshold: Threshold) -> Iterator[Ev
     longest_s = None
     for span in search.view.spans(signal, Beyond(threshold.holds)):
         if span.end_s - span.start_s >= threshold.for_s:
-            details = {**given, "min": span.low, "max": span.high}
+            details = {**given, "min": span.low, "max": span.high, **span.how_exact}
             yield search.event("threshold", span.start_s, span.end_s, signal.name, **details)
         else:
             longest_s = max(longest_s or 0.0, span.end_s - span.start_s)

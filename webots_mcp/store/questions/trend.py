@@ -107,6 +107,8 @@ def judge(
     resolution_s: float | None = None,
     pieces: Summaries | None = None,
     too_large: int | None = None,
+    *,
+    rows_left: bool = True,
 ) -> Trend:
     """Put together what the summary tells and what the course of the numbers tells.
 
@@ -121,6 +123,7 @@ def judge(
         resolution_s: The length of the buckets; None where the numbers are the values.
         pieces: The buckets, of which ends and extremes are known beside their means.
         too_large: How many of the values are beyond 1e100; None where that is not known.
+        rows_left: Whether less time would be seen in rows.
     """
     of_rows = spikes is not None
     turn = signal.turn if of_rows else summary.turn_of(signal.turn)
@@ -169,7 +172,7 @@ def judge(
         * _relative_range(summary),
         says="",
     )
-    return replace(trend, says="; ".join(_remarks(trend)))
+    return replace(trend, says="; ".join(_remarks(trend, rows_left=rows_left)))
 
 
 def _slow_share(means: Summary, inner_variance: float, turn: float | None) -> float:
@@ -291,13 +294,14 @@ def _relative_range(summary: Summary) -> float:
     return (summary.max - summary.min) / largest if largest else 0.0
 
 
-def _remarks(trend: Trend) -> Iterator[str]:
+def _remarks(trend: Trend, *, rows_left: bool) -> Iterator[str]:
     summary, unit = trend.summary, f" {trend.unit}" if trend.unit else ""
     yield _course(trend, unit)
     if trend.leaps:
         yield "changes by more than a quarter turn at once: turns are not counted"
     elif trend.fast:
-        yield f"varies faster than {trend.resolution_s:g} s: ask for a shorter range"
+        advice = ": ask for a shorter range" if rows_left else ", and its rows were purged"
+        yield f"varies faster than {trend.resolution_s:g} s{advice}"
     yield from _beyond_ends(trend)
     if trend.swings and not any(_is_wide(each, summary) for each in trend.swings):
         yield f"also {_swinging(trend, unit)}"

@@ -15,6 +15,7 @@ from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_number
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.questions.trend import Trend, judge
 from webots_mcp.store.reading.changes import change_points, longest_values
+from webots_mcp.store.reading.coverage import purged_until_s
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.reading.rollups import piece_length_s, read_pieces
@@ -55,6 +56,7 @@ class RunTrends:
         numbers: What changed most comes first; at most `limit` of `total`.
         silent: Names that have no value in the range, or none that can be reckoned with.
         cut_at_s: The deadline passed; from there on rows are missing in the answer.
+        rows_left: Whether less time would be seen in rows: they were not purged, or not all.
     """
 
     run_id: int
@@ -67,6 +69,7 @@ class RunTrends:
     silent: tuple[str, ...]
     total: int
     cut_at_s: float | None
+    rows_left: bool = True
 
 
 @dataclass(frozen=True)
@@ -111,9 +114,10 @@ def trends(
 
 def _unseen_swings(run: RunTrends) -> str:
     shortest_s = SHORTEST_PERIOD_ROWS * (run.resolution_s or 0.0)
+    advice = "; ask for less time to see them" if run.rows_left else ""
     return (
         f"run {run.run_id} is seen in means of {run.resolution_s:g} s: swings shorter than "
-        f"{shortest_s:g} s were not looked for; ask for less time to see them"
+        f"{shortest_s:g} s were not looked for{advice}"
     )
 
 
@@ -128,13 +132,15 @@ def _run_trends(
     numbers = [signal for signal in signals if signal.is_number and not signal.is_choice]
     states = [signal for signal in signals if signal not in numbers]
     found: list[Trend | None]
+    purged_s = purged_until_s(connection, segment.run_id, segment.start_s)
+    rows_left = purged_s is None or purged_s < segment.end_s
     if exceeds(connection, segment):
         piece_s = piece_length_s(connection, segment, LEAST_PIECES)
         pieces = read_pieces(connection, segment, numbers, deadline, piece_s)
         kept = kept_columns(connection, segment, numbers, deadline)
         parts = [pieces.summaries(signal.name) for signal in numbers]
         found = [
-            _trend_of_pieces(signal, of_signal, piece_s, kept)
+            _trend_of_pieces(signal, of_signal, piece_s, kept, rows_left=rows_left)
             for signal, of_signal in zip(numbers, parts, strict=True)
         ]
         has_values = [bool(of_signal["present"].any()) for of_signal in parts]
@@ -164,6 +170,7 @@ def _run_trends(
         silent=tuple(silent),
         total=len(held),
         cut_at_s=cut_at_s,
+        rows_left=rows_left,
     )
 
 
@@ -186,7 +193,12 @@ def _trend_of_rows(signal: Signal, read: Numbers, kept: Columns | None) -> Trend
 
 
 def _trend_of_pieces(
-    signal: Signal, pieces: Summaries, piece_s: float, kept: Columns | None
+    signal: Signal,
+    pieces: Summaries,
+    piece_s: float,
+    kept: Columns | None,
+    *,
+    rows_left: bool,
 ) -> Trend | None:
     summary = pieces.whole()
     if summary.sum is None:
@@ -197,7 +209,8 @@ def _trend_of_pieces(
     middles: Array = (pieces["first_sim_time_s"] + pieces["last_sim_time_s"]) / 2
     held = ~np.isnan(centres) & ~np.isnan(middles)
     variance = math.fsum(pieces.variances(turn)[held].tolist()) / int(held.sum())
-    return judge(signal, summary, middles[held], centres[held], None, variance, piece_s, pieces)
+    course = middles[held], centres[held]
+    return judge(signal, summary, *course, None, variance, piece_s, pieces, rows_left=rows_left)
 
 
 def _state_trends(

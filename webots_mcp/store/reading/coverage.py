@@ -65,12 +65,23 @@ def coverage_notes(
         yield from _gap_notes(connection, run_id, start_s, end_s)
 
 
-def purge_notes(connection: sqlite3.Connection, run_id: int, start_s: float) -> Iterator[str]:
-    """That rows from `start_s` on were purged, and what is left of that time."""
+def purged_until_s(connection: sqlite3.Connection, run_id: int, start_s: float) -> float | None:
+    """When the rows begin that are left of a run, where those from `start_s` on were purged.
+
+    None where they were not; infinite where none is left.
+    """
     found = connection.execute(_ROWS_LEFT, (run_id,)).fetchone()
     if found is None or (found[0] is not None and start_s >= found[0]):
+        return None
+    return math.inf if found[0] is None else found[0]
+
+
+def purge_notes(connection: sqlite3.Connection, run_id: int, start_s: float) -> Iterator[str]:
+    """That rows from `start_s` on were purged, and what is left of that time."""
+    until_s = purged_until_s(connection, run_id, start_s)
+    if until_s is None:
         return
-    when = "" if found[0] is None else f" before {found[0]:g} s"
+    when = "" if until_s == math.inf else f" before {until_s:g} s"
     left = "of that time only 10 s summaries are left (no single rows, jumps or export)"
     yield f"the rows of run {run_id}{when} were purged: {left}"
 

@@ -35,6 +35,7 @@ class Span:
         key: What held: spans that touch are one only if it is the same.
         from_first: It held in the first row that was read: it may have begun before.
         to_last: It held in the last row that was read: it may go on.
+        within_s: How exactly begin and end are known, where the rows there were purged.
     """
 
     start_s: float
@@ -44,6 +45,12 @@ class Span:
     high: float | None = None
     from_first: bool = False
     to_last: bool = False
+    within_s: float = 0.0
+
+    @property
+    def how_exact(self) -> dict[str, float]:
+        """`within_s` as a detail of an event, where its ends are not known to the row."""
+        return {"within_s": self.within_s} if self.within_s else {}
 
 
 class Condition(Protocol):
@@ -164,11 +171,13 @@ def spans_in_pieces(
     pieces: Pieces,
     condition: Condition,
     read: Callable[[Segment], Columns],
-) -> Iterator[list[Span]]:
+) -> Iterator[list[Span] | None]:
     """The spans in a long segment, bucket by bucket; the rows of one in between are read.
 
     Flat buckets are looked for whole; of the others only those next to one are looked at, and read
     where older rollups do not tell up to when the first value lasted, and since when the last one.
+    Of a bucket in between whose rows were purged nothing more is known than that; None where that
+    is nothing.
     """
     numbers, summaries = pieces.numbered(signal.name)
     whole, some = condition.of_buckets(summaries)
@@ -186,7 +195,19 @@ def spans_in_pieces(
             yield rests
         else:
             columns = read(_bucket_of(segment, int(numbers[start])))
-            yield list(spans_in_rows(columns.times, columns.values[signal.name], condition))
+            found = list(spans_in_rows(columns.times, columns.values[signal.name], condition))
+            purged = not columns.times and not columns.cut
+            yield _at_ends(groups.one(place), condition) if purged else found
+
+
+def _at_ends(summary: Summary, condition: Condition) -> list[Span] | None:
+    """What its first and its last value tell of a bucket without rows; None: not enough."""
+    rests = rests_at_ends(summary)
+    keys = condition.of_rows([rest.key for rest in rests or ()])
+    known = rests is not None and summary.changes == 1
+    return (
+        [replace(e, key=key) for e, key in zip(rests or (), keys, strict=True)] if known else None
+    )
 
 
 def _groups(whole: Flags, some: Flags, last: Array) -> Indexes:
@@ -225,16 +246,23 @@ def _bucket_of(segment: Segment, bucket: int) -> Segment:
     return replace(segment, start_s=start_s, end_s=min(segment.end_s, (bucket + 1) * BUCKET_S))
 
 
-def joined(pieces: Iterable[Sequence[Span]]) -> list[Span]:
-    """The spans of pieces whose rows follow each other: what goes on across a border is one."""
+def joined(pieces: Iterable[Sequence[Span] | None]) -> list[Span]:
+    """The spans of pieces whose rows follow each other: what goes on across a border is one.
+
+    What reaches a piece of which nothing is known ends, or begins, somewhere in it.
+    """
     found: list[Span] = []
-    goes_on = False
+    goes_on = unknown = False
     for spans in pieces:
-        more = list(spans)
-        if goes_on and more and more[0].from_first and more[0].key == found[-1].key:
+        more = list(spans or ())
+        if spans is None and goes_on:
+            found[-1] = replace(found[-1], within_s=BUCKET_S)
+        elif unknown and more and more[0].from_first:
+            more[0] = replace(more[0], within_s=BUCKET_S)
+        elif goes_on and more and more[0].from_first and more[0].key == found[-1].key:
             more[0] = _as_one(found.pop(), more[0])
         found += more
-        goes_on = bool(more) and more[-1].to_last
+        unknown, goes_on = spans is None, bool(more) and more[-1].to_last
     return found
 
 
@@ -243,7 +271,8 @@ def _as_one(before: Span, after: Span) -> Span:
     highs = [each for each in (before.high, after.high) if each is not None]
     low, high = min(lows, default=None), max(highs, default=None)
     ends = (before.from_first, after.to_last)
-    return Span(before.start_s, after.end_s, before.key, low, high, *ends)
+    within_s = max(before.within_s, after.within_s)
+    return Span(before.start_s, after.end_s, before.key, low, high, *ends, within_s)
 
 
 def common(spans: Sequence[Span], others: Sequence[Span]) -> Iterator[Span]:
@@ -253,7 +282,8 @@ def common(spans: Sequence[Span], others: Sequence[Span]) -> Iterator[Span]:
             start, end = max(span, other, key=_start_of), min(span, other, key=_end_of)
             if start.start_s <= end.end_s:
                 ends = (start.from_first, end.to_last)
-                yield Span(start.start_s, end.end_s, span.key, span.low, span.high, *ends)
+                within_s = max(start.within_s, end.within_s)
+                yield Span(start.start_s, end.end_s, span.key, span.low, span.high, *ends, within_s)
 
 
 def _start_of(span: Span) -> float:

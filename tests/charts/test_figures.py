@@ -84,11 +84,11 @@ def test_runs_over_each_other_begin_at_zero_each(rover: sqlite3.Connection) -> N
 
 def test_the_way_ends_where_the_robot_is_and_has_equal_scales(rover: sqlite3.Connection) -> None:
     chart: Any = way_chart(rover, [whole(rover)])
-    (end,) = chart.ends
-    assert (end.data["x"][0], end.data["y"][0]) == pytest.approx((12.79, 1.0), abs=0.05)
+    end = chart.sources["end", 0].data
+    assert (end["x"][0], end["y"][0]) == pytest.approx((12.79, 1.0), abs=0.05)
     (plot,) = models(chart.layout, Plot)
     assert plot.match_aspect
-    way = chart.ways[0].data
+    way = chart.sources["way", 0].data
     assert set(way["value"]) == {"cruise", "back_up", "avoid"}
 
 

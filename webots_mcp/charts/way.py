@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Sequence
-from dataclasses import dataclass, field
-from typing import Any, Final
+from dataclasses import dataclass
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 from bokeh.core.properties import field as of_column
@@ -40,19 +40,30 @@ _AT: Final = ("at", "@time_s{0.000} s")
 _WHERE: Final = (_AT, ("x, y", "@x1{0.000}, @y1{0.000}"))
 
 
+Key: TypeAlias = "tuple[str, int]"  # what it is, of which track
+
+
 @dataclass(frozen=True)
 class WayChart(Chart):
     """Ways in the plane.
 
     Attributes:
-        ways: The steps of each run, in order: x0, y0, x1, y1, time_s, value, colour.
-        ends: Where each run is last: x, y.
-        axes: What was drawn.
+        plot: What is drawn.
+        sources: The data of what is drawn. The steps of a track, `("way", number)`, have x0, y0,
+            x1, y1, time_s, value and colour; where it ends, `("end", number)`, x and y.
     """
 
-    axes: TrajectoryAxes
-    ways: list[ColumnDataSource] = field(default_factory=list[ColumnDataSource])
-    ends: list[ColumnDataSource] = field(default_factory=list[ColumnDataSource])
+    plot: TrajectoryAxes
+    sources: dict[Key, ColumnDataSource]
+
+    def refresh(self, plot: TrajectoryAxes) -> bool:
+        """Show other data in the same figure; False where that would have to be another."""
+        data = data_of(plot)
+        if data.keys() != self.sources.keys() or _legend_of(plot) != _legend_of(self.plot):
+            return False
+        for key, source in self.sources.items():
+            source.data = data[key]
+        return True
 
 
 def way_chart(
@@ -93,14 +104,37 @@ def draw_way(
     fig.add_tools(BoxZoomTool(match_aspect=True), WheelZoomTool(modifiers="ctrl"))
     fig.xaxis.axis_label, fig.yaxis.axis_label = plain(plot.x_label), plain(plot.y_label)
     _obstacles(fig, obstacles)
+    sources = {key: ColumnDataSource(data) for key, data in data_of(plot).items()}
     items: list[LegendItem] = []
-    chart = WayChart(fig, plot.title, tuple(notes), plot)
     for index, track in enumerate(plot.tracks):
         if track.path.places:
-            items += _track(fig, track, index, chart)
+            items += _track(fig, track, index, sources, alone=len(plot.tracks) == 1)
     _least_size(fig, [place for track in plot.tracks for place in track.path.places])
     fig.add_layout(legend(items), "above")
-    return chart
+    return WayChart(fig, plot.title, tuple(notes), plot, sources)
+
+
+def data_of(plot: TrajectoryAxes) -> dict[Key, dict[str, Any]]:
+    """All that the figure shows of the tracks, by what it is."""
+    found: dict[Key, dict[str, Any]] = {}
+    for index, track in enumerate(plot.tracks):
+        if not track.path.places:
+            continue
+        first, last = track.path.places[0], track.path.places[-1]
+        found["way", index] = _steps(track, LINES[index % len(LINES)])
+        found["start", index] = {"x": [first.x], "y": [first.y]}
+        found["end", index] = {"x": [last.x], "y": [last.y]}
+        found["headings", index] = _headings(track.path)
+        for mark in track.marks:
+            if mark.intervals:
+                found[f"mark {mark.name}", index] = _marked(mark, track.path)
+    return found
+
+
+def _legend_of(plot: TrajectoryAxes) -> Any:
+    """What the legend tells, which stays as it is as long as the figure."""
+    marks = [[(mark.name, len(mark.intervals)) for mark in track.marks] for track in plot.tracks]
+    return marks, [track.name for track in plot.tracks], plot.mode, plot.x_label, plot.y_label
 
 
 def _obstacles(fig: Any, obstacles: Sequence[Obstacle]) -> None:
@@ -124,31 +158,35 @@ def _obstacles(fig: Any, obstacles: Sequence[Obstacle]) -> None:
     fig.add_tools(hover([areas, dots], [("stands here", "@name")]))
 
 
-def _track(fig: Any, track: Track, index: int, chart: WayChart) -> list[LegendItem]:
-    alone = len(chart.axes.tracks) == 1
+def _track(
+    fig: Any, track: Track, index: int, sources: dict[Key, ColumnDataSource], *, alone: bool
+) -> list[LegendItem]:
     colour = LINES[index % len(LINES)]
-    source = ColumnDataSource(steps_of(track, colour))
-    chart.ways.append(source)
-    steps = {"x0": "x0", "y0": "y0", "x1": "x1", "y1": "y1", "source": source}
-    fig.segment(**steps, line_width=5, line_color=INK, line_alpha=0.5, line_cap="round")
+    steps: dict[str, Any] = {name: name for name in ("x0", "y0", "x1", "y1")}
+    steps |= {"source": sources["way", index], "line_cap": "round"}
+    fig.segment(**steps, line_width=5, line_color=INK, line_alpha=0.5)
     by_time = alone and track.modes is None
     mapper = LinearColorMapper(palette="Viridis256")
     paint: Any = {"field": "time_s", "transform": mapper} if by_time else "colour"
-    way = fig.segment(**steps, line_width=3.4, line_color=paint, line_cap="round")
+    way = fig.segment(**steps, line_width=3.4, line_color=paint)
     if by_time:
         fig.add_layout(ColorBar(color_mapper=mapper, title="time [s]", width=10), "right")
-    told = [(track.name, "@value"), *_WHERE] if track.modes else [(track.name, ""), *_WHERE]
+    told = [(track.name, "@value" if track.modes else ""), *_WHERE]
     fig.add_tools(hover([way], told, line_policy="next"))
     items: list[LegendItem] = []
     if track.modes is not None:
         items.append(LegendItem(label=of_column("value"), renderers=[way]))
     elif not alone:
         items.append(LegendItem(label=the_text(plain(track.name)), renderers=[way]))
-    _headings(fig, track.path, INK if alone else colour)
-    return [*items, *_ends(fig, track, colour, chart), *_marks(fig, track, index, alone)]
+    fig.scatter(
+        "x", "y", angle="angle", source=sources["headings", index], marker="triangle", size=10,
+        color=INK if alone else colour, line_color="white",
+    )  # fmt: skip
+    items += _ends(fig, index, colour, sources)
+    return [*items, *_marks(fig, track, index, sources, alone=alone)]
 
 
-def steps_of(track: Track, colour: str) -> dict[str, Any]:
+def _steps(track: Track, colour: str) -> dict[str, Any]:
     """The columns of a way: each step with what it is coloured by."""
     steps = track.path.steps() or [(place, place) for place in track.path.places[:1]]
     values = _values([after.time_s for _, after in steps], track.modes)
@@ -177,56 +215,58 @@ def _values(times: Sequence[float], modes: Lane | None) -> list[str]:
     return found
 
 
-def _headings(fig: Any, path: Path, colour: str) -> None:
+def _headings(path: Path) -> dict[str, Any]:
+    """Where a triangle points along the way, and by how much it is turned."""
     found = headings(path, _ARROWS)
-    if not found:
-        return
-    x, y, degrees = zip(*found, strict=True)
-    angles = [math.radians(each - 90) for each in degrees]
-    data = {"x": numbers(x), "y": numbers(y), "angle": numbers(angles)}
-    fig.scatter(
-        "x", "y", angle="angle", source=ColumnDataSource(data), marker="triangle", size=10,
-        color=colour, line_color="white",
-    )  # fmt: skip
+    return {
+        "x": numbers([each.x for each in found]),
+        "y": numbers([each.y for each in found]),
+        "angle": numbers([math.radians(each.degrees - 90) for each in found]),
+    }
 
 
-def _ends(fig: Any, track: Track, colour: str, chart: WayChart) -> list[LegendItem]:
-    first, last = track.path.places[0], track.path.places[-1]
+def _marked(mark: Lane, path: Path) -> dict[str, Any]:
+    places = [path.at(each.start_s) for each in mark.intervals]
+    return {
+        "x1": numbers([place.x for place in places]),
+        "y1": numbers([place.y for place in places]),
+        "time_s": numbers([each.start_s for each in mark.intervals]),
+        "until_s": numbers([each.end_s for each in mark.intervals]),
+    }
+
+
+def _ends(
+    fig: Any, index: int, colour: str, sources: dict[Key, ColumnDataSource]
+) -> list[LegendItem]:
     start = fig.scatter(
-        [first.x], [first.y], size=11, fill_color="white", line_color=INK, line_width=2
-    )
-    source = ColumnDataSource({"x": [last.x], "y": [last.y]})
-    chart.ends.append(source)
-    end = fig.scatter("x", "y", source=source, marker="square", size=11, color=colour,
-                      line_color="white")  # fmt: skip
-    if track is not chart.axes.tracks[0]:
-        return []
-    return [
-        LegendItem(label="start", renderers=[start]),
-        LegendItem(label="end", renderers=[end]),
-    ]
+        "x", "y", source=sources["start", index], size=11, fill_color="white", line_color=INK,
+        line_width=2,
+    )  # fmt: skip
+    end = fig.scatter(
+        "x", "y", source=sources["end", index], marker="square", size=11, color=colour,
+        line_color="white",
+    )  # fmt: skip
+    told = [] if index else [("start", start), ("end", end)]
+    return [LegendItem(label=name, renderers=[renderer]) for name, renderer in told]
 
 
-def _marks(fig: Any, track: Track, index: int, alone: bool) -> list[LegendItem]:
+def _marks(
+    fig: Any, track: Track, index: int, sources: dict[Key, ColumnDataSource], *, alone: bool
+) -> list[LegendItem]:
     items: list[LegendItem] = []
     for mark, shape in zip(track.marks, _SHAPES, strict=False):
         if not mark.intervals:
             continue
-        places = [track.path.at(each.start_s) for each in mark.intervals]
-        source = ColumnDataSource({
-            "x1": numbers([place.x for place in places]),
-            "y1": numbers([place.y for place in places]),
-            "time_s": numbers([each.start_s for each in mark.intervals]),
-            "until_s": numbers([each.end_s for each in mark.intervals]),
-        })  # fmt: skip
         colour = LINES[1] if alone else LINES[index % len(LINES)]
         hollow = {"fill_alpha": 0.0} if shape == "circle" else {}
         dots = fig.scatter(
-            "x1", "y1", source=source, marker=shape, size=14, color=colour, line_width=2, **hollow
-        )
+            "x1", "y1", source=sources[f"mark {mark.name}", index], marker=shape, size=14,
+            color=colour, line_width=2, **hollow,
+        )  # fmt: skip
         name = f"{short(mark.name)}{'' if alone else f', {track.name}'}"
         fig.add_tools(hover([dots], [(name, "@time_s{0.000} to @until_s{0.000} s")]))
-        items.append(LegendItem(label=the_text(plain(f"{name} ({len(places)})")), renderers=[dots]))
+        label = the_text(plain(f"{name} ({len(mark.intervals)})"))
+        items.append(LegendItem(label=label, renderers=[dots]))
     return items
 
 

@@ -51,6 +51,9 @@ _FRAMES: Final = (
     "AND (:device IS NULL OR device = :device) AND (:kind IS NULL OR kind = :kind) "
     "ORDER BY {order}, id DESC LIMIT :count"
 )
+_NEWEST: Final = (
+    f"SELECT {_COLUMNS} FROM image WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
 _KEPT_FRAMES: Final = (
     f"SELECT count(*) FROM image WHERE run_id = ? AND kind = '{KEPT_FRAME}' "
     "AND sim_time_s BETWEEN ? AND ?"
@@ -141,6 +144,12 @@ def camera_frames(
         of = {"device": found[0][5], "kind": found[0][4], "count": count}
         found = connection.execute(query, values | of).fetchall()
     return sorted((StoredImage(*row) for row in found), key=lambda each: each.sim_time_s)
+
+
+def newest_image(connection: sqlite3.Connection, run_id: int) -> StoredImage | None:
+    """The newest picture of a run, of whatever kind."""
+    row = connection.execute(_NEWEST, (run_id,)).fetchone()
+    return StoredImage(*row) if row else None
 
 
 def count_kept_frames(

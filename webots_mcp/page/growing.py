@@ -1,0 +1,93 @@
+"""Rows that have just come, at the end of what is drawn already."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import groupby
+from operator import itemgetter
+from typing import Any, Final
+
+import numpy as np
+
+from webots_mcp.charts import SignalsChart, WayChart
+from webots_mcp.naming import Value
+from webots_mcp.plotting.palette import FAINT, area_styles
+from webots_mcp.store.reading.changes import spelled
+from webots_mcp.store.reading.rows import Columns
+
+MOST_POINTS: Final = 20_000  # of a curve in the browser; the oldest go first
+_PALE: Final = "#EEEEEE"
+_STRETCH: Final = ("start_s", "end_s", "value", "colour", "hatch")
+
+
+def grow_signals(chart: SignalsChart, columns: Columns) -> None:
+    """Add rows to the curves, and let the modes and rows of states go on."""
+    for (what, name, _), source in chart.sources.items():
+        values = columns.values.get(name, [])
+        if what == "curve" and values:
+            source.stream(_points(columns.times, values), MOST_POINTS)
+        elif what in ("ground", "lane") and values:
+            _go_on(source, columns.times, values)
+
+
+def _points(times: Sequence[float], values: Sequence[Value]) -> dict[str, Any]:
+    numbers = np.array(
+        [value if isinstance(value, (int, float)) else math.nan for value in values], np.float64
+    )
+    return {"time_s": np.array(times), "mean": numbers, "low": numbers, "high": numbers}
+
+
+def _go_on(source: Any, times: Sequence[float], values: Sequence[Value]) -> None:
+    """The last stretch goes on until the first row that has another value, which begins one."""
+    pieces = groupby(zip(times, map(_spelled, values), strict=True), key=itemgetter(1))
+    starts, shown = zip(*((next(rows)[0], value) for value, rows in pieces), strict=True)
+    stretches = list(zip(starts, [*starts[1:], times[-1]], shown, strict=True))
+    before = list(source.data["value"])
+    if before:
+        start_s, end_s, value = stretches[0]
+        goes_on = value == before[-1]
+        source.patch({"end_s": [(len(before) - 1, end_s if goes_on else start_s)]})
+        del stretches[: int(goes_on)]
+    if stretches:
+        starts, ends, shown = zip(*stretches, strict=True)
+        known = dict(zip(before, source.data["colour"], strict=True))
+        colours = [known.get(value) or _colour(value, known) for value in shown]
+        hatches = [" "] * len(shown)
+        columns = (starts, ends, shown, colours, hatches)
+        source.stream(dict(zip(_STRETCH, map(list, columns), strict=True)), MOST_POINTS)
+
+
+def _spelled(value: Value) -> str:
+    """As the rows and the legend name it."""
+    return spelled(value) if value is None or isinstance(value, (str, bool)) else f"{value:g}"
+
+
+def _colour(value: str, known: dict[str, str]) -> str:
+    """The one that it will have in the next drawing, mostly."""
+    return area_styles([*known, value])[value].colour if value != "null" else _PALE
+
+
+def grow_way(chart: WayChart, position: tuple[str, str], columns: Columns) -> None:
+    """Add steps to the way, up to where the robot is now."""
+    source, end = chart.sources["way", 0], chart.sources["end", 0]
+    data: Any = source.data
+    mode = chart.plot.mode
+    modes = columns.values.get(mode or "", [None] * len(columns.times))
+    colours = dict(zip(data["value"], data["colour"], strict=True))
+    last: Any = end.data
+    x0, y0 = float(last["x"][0]), float(last["y"][0])
+    steps: dict[str, list[Any]] = {name: [] for name in data}
+    places = zip(columns.times, *(columns.values[name] for name in position), modes, strict=True)
+    for time_s, x, y, value in places:
+        if not isinstance(x, (int, float)) or not isinstance(y, (int, float)):
+            continue
+        held = _spelled(value) if mode else "-"
+        colour = colours.get(held) or (_colour(held, colours) if mode else FAINT)
+        row = {"x0": x0, "y0": y0, "x1": x, "y1": y, "time_s": time_s}
+        for name, item in {**row, "value": held, "colour": colour}.items():
+            steps[name].append(item)
+        x0, y0 = x, y
+    if steps["x0"]:
+        source.stream(steps, MOST_POINTS)
+        end.data = {"x": [x0], "y": [y0]}

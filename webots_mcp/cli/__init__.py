@@ -31,6 +31,7 @@ from webots_mcp.cli import (
     steering,
     trials,
     tuning,
+    viewing,
 )
 from webots_mcp.cli.command import COMMANDS
 from webots_mcp.cli.ending import ended_by, ending_by_signals
@@ -56,6 +57,7 @@ FAMILIES: Final = (
     steering,
     scene,
     breakpoints,
+    viewing,
 )
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2

@@ -23,7 +23,8 @@ _STRETCH: Final = ("start_s", "end_s", "value", "colour", "hatch")
 
 def grow_signals(chart: SignalsChart, columns: Columns) -> None:
     """Add rows to the curves, and let the modes and rows of states go on."""
-    for (what, name, _), source in chart.sources.items():
+    sources: dict[Any, Any] = dict(chart.sources)
+    for (what, name, _), source in sources.items():
         values = columns.values.get(name, [])
         if what == "curve" and values:
             source.stream(_points(columns.times, values), MOST_POINTS)
@@ -70,13 +71,13 @@ def _colour(value: str, known: dict[str, str]) -> str:
 
 def grow_way(chart: WayChart, position: tuple[str, str], columns: Columns) -> None:
     """Add steps to the way, up to where the robot is now."""
-    source, end = chart.sources["way", 0], chart.sources["end", 0]
-    data: Any = source.data
+    source: Any = chart.sources["way", 0]
+    end: Any = chart.sources["end", 0]
+    data = source.data
     mode = chart.plot.mode
     modes = columns.values.get(mode or "", [None] * len(columns.times))
     colours = dict(zip(data["value"], data["colour"], strict=True))
-    last: Any = end.data
-    x0, y0 = float(last["x"][0]), float(last["y"][0])
+    x0, y0 = float(end.data["x"][0]), float(end.data["y"][0])
     steps: dict[str, list[Any]] = {name: [] for name in data}
     places = zip(columns.times, *(columns.values[name] for name in position), modes, strict=True)
     for time_s, x, y, value in places:

@@ -17,7 +17,6 @@ from webots_mcp.errors import (
     NothingRecordedError,
     UnknownRobotError,
     UnknownSignalError,
-    WebotsMCPError,
 )
 from webots_mcp.page.choice import Choice
 from webots_mcp.plotting.question import changed_most
@@ -233,8 +232,3 @@ def run_title(run: RunInfo) -> str:
     label = f" “{run.label}”" if run.label else ""
     began = datetime.fromtimestamp(run.started_wall_time_s).strftime("%d %b %H:%M:%S")
     return f"run {run.run_id}{label} · {began} · {run.duration_s:.1f} s"
-
-
-def problem(error: WebotsMCPError) -> str:
-    """Why nothing can be shown."""
-    return str(error).split(". ")[0]

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
-from bokeh.models import HoverTool, LayoutDOM, Legend, LegendItem
+from bokeh.models import ColumnDataSource, HoverTool, LayoutDOM, Legend, LegendItem
 
 from webots_mcp.plotting.palette import FAINT, INK
+
+Key = TypeVar("Key", bound="tuple[object, ...]")
 
 GRID: Final = "#E6E6E6"
 _FONT: Final = "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif"
@@ -36,6 +38,12 @@ def plain(text: str) -> str:
     for mark in ("$$", "\\(", "\\["):
         text = text.replace(mark, f"{mark[0]}\u200b{mark[1]}")
     return text
+
+
+def sources_of(data: Mapping[Key, dict[str, Any]]) -> dict[Key, ColumnDataSource]:
+    """Data sources of columns; their names in the browser are such as "curve pose.x 3"."""
+    names = {key: " ".join(str(part) for part in key if part != "") for key in data}
+    return {key: ColumnDataSource(data=data[key], name=names[key]) for key in data}
 
 
 def numbers(values: Sequence[float]) -> np.ndarray[Any, Any]:

@@ -23,7 +23,7 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
-from webots_mcp.charts.chart import Chart, hover, legend, numbers, plain, style
+from webots_mcp.charts.chart import Chart, hover, legend, numbers, plain, sources_of, style
 from webots_mcp.plotting.canvas import Room, short
 from webots_mcp.plotting.curves import Curve, Point
 from webots_mcp.plotting.intervals import Interval, Lane
@@ -39,6 +39,8 @@ ROOM: Final = Room(points=MOST_POINTS, panels=8, lanes=8, rows=16)
 DASHES: Final = ("solid", "dashed", "dotted", "dotdash")
 _PANEL_PX: Final = 120
 _ROW_PX: Final = 24
+_AXIS_PX: Final = 70  # below the last figure, and the legend of modes above the first
+_HEADING_PX: Final = 30  # the title of a panel, or its legend
 _LETTER_PX: Final = 7
 _TOOLS: Final = "xpan,xbox_zoom,xzoom_in,xzoom_out,reset,save"
 _FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#EFEFEF", dotted=False)}
@@ -106,7 +108,11 @@ def signals_chart(
 
 
 def draw_signals(
-    plot: SignalAxes, notes: Sequence[str] = (), x_range: Range | None = None
+    plot: SignalAxes,
+    notes: Sequence[str] = (),
+    *,
+    x_range: Range | None = None,
+    height_px: int | None = None,
 ) -> SignalsChart:
     """The figures of what `compose_signals` has gathered.
 
@@ -114,10 +120,11 @@ def draw_signals(
         plot: That.
         notes: Its notes.
         x_range: Of all figures; None for that of the data.
+        height_px: What they may fill; they are not made lower than is readable.
     """
     x_range = x_range or Range1d(start=plot.x_range[0], end=plot.x_range[1])
-    sources = {key: ColumnDataSource(data) for key, data in data_of(plot).items()}
-    drawing = _Drawing(plot, x_range, sources)
+    sources = sources_of(data_of(plot))
+    drawing = _Drawing(plot, x_range, sources, _panel_px(plot, height_px))
     figures = [drawing.panel(panel) for panel in plot.panels]
     if plot.lanes or plot.events:
         figures.append(drawing.lanes())
@@ -137,18 +144,19 @@ class _Drawing:
     """Draws figures that share a clock, a crosshair and a margin."""
 
     def __init__(
-        self, plot: SignalAxes, x_range: Range, sources: dict[Key, ColumnDataSource]
+        self, plot: SignalAxes, x_range: Range, sources: dict[Key, ColumnDataSource], panel_px: int
     ) -> None:
         self._plot = plot
         self._x_range = x_range
         self._sources = sources
+        self._panel_px = panel_px
         self._line = Span(dimension="height", line_color=FAINT, line_width=1, line_dash="dotted")
         named = [short(lane.name) for lane in (*plot.lanes, *plot.events)]
         self._left_px = max([58, *(14 + _LETTER_PX * len(name) for name in named)])
 
     def panel(self, panel: Panel) -> Any:
         """Curves on one axis, with what happened behind them."""
-        fig = self._figure(_PANEL_PX)
+        fig = self._figure(self._panel_px)
         self._ground(fig)
         fig.xgrid.grid_line_color = None
         items = [self._curve(fig, panel, index) for index in range(len(panel.curves))]
@@ -272,6 +280,15 @@ _GAP: Final[dict[str, Any]] = {
     "fill_color": "white", "line_width": 0, "hatch_pattern": "/", "hatch_color": "#AAAAAA",
     "hatch_weight": 0.5, "level": "underlay",
 }  # fmt: skip
+
+
+def _panel_px(plot: SignalAxes, height_px: int | None) -> int:
+    """How high a panel is, of what the rows below leave."""
+    if height_px is None or not plot.panels:
+        return _PANEL_PX
+    rows = len(plot.lanes) + len(plot.events)
+    left_px = height_px - rows * _ROW_PX - _AXIS_PX
+    return max(_PANEL_PX, left_px // len(plot.panels) - _HEADING_PX)
 
 
 def _form(plot: SignalAxes) -> Any:

@@ -21,7 +21,7 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
-from webots_mcp.charts.chart import Chart, hover, legend, numbers, plain, style
+from webots_mcp.charts.chart import Chart, hover, legend, numbers, plain, sources_of, style
 from webots_mcp.charts.obstacles import Obstacle, obstacles_of
 from webots_mcp.plotting.canvas import short
 from webots_mcp.plotting.intervals import Lane
@@ -104,7 +104,7 @@ def draw_way(
     fig.add_tools(BoxZoomTool(match_aspect=True), WheelZoomTool(modifiers="ctrl"))
     fig.xaxis.axis_label, fig.yaxis.axis_label = plain(plot.x_label), plain(plot.y_label)
     _obstacles(fig, obstacles)
-    sources = {key: ColumnDataSource(data) for key, data in data_of(plot).items()}
+    sources = sources_of(data_of(plot))
     items: list[LegendItem] = []
     for index, track in enumerate(plot.tracks):
         if track.path.places:
@@ -265,8 +265,9 @@ def _marks(
         )  # fmt: skip
         name = f"{short(mark.name)}{'' if alone else f', {track.name}'}"
         fig.add_tools(hover([dots], [(name, "@time_s{0.000} to @until_s{0.000} s")]))
-        label = the_text(plain(f"{name} ({len(mark.intervals)})"))
-        items.append(LegendItem(label=label, renderers=[dots]))
+        items.append(
+            LegendItem(label=the_text(plain(f"{name} ({len(mark.intervals)})")), renderers=[dots])
+        )
     return items
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from webots_mcp.cli.command import DATA_DIR, DATABASE, argument, command, count
+from webots_mcp.cli.ending import ending_in_time
 from webots_mcp.errors import InvalidInputError
 
 _LAST_PORT = 65535
@@ -44,4 +45,5 @@ def view(arguments: argparse.Namespace) -> None:
         if not arguments.no_browser:
             webbrowser.open(url)
 
-    server.run(ready)
+    with ending_in_time():
+        server.run(ready)

@@ -127,7 +127,7 @@ class Selectors:
         self._is_told = False
 
 
-def _offer(select: Select, options: list[tuple[str, str]], fallback: str) -> None:
+def _offer(select: Any, options: list[tuple[str, str]], fallback: str) -> None:
     if list(select.options) != options:
         select.options = options
     if select.value not in [value for value, _ in options]:

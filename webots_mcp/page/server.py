@@ -15,7 +15,6 @@ from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from tornado.httpserver import HTTPServer
 from tornado.ioloop import IOLoop
-from tornado.netutil import bind_sockets
 from tornado.routing import AnyMatches, HostMatches, Rule, RuleRouter
 from tornado.web import Application as WebApplication
 from tornado.web import RequestHandler
@@ -77,24 +76,26 @@ def create_page_server(recording: Recording, port: int, *, read_only: bool = Fal
     Raises:
         InvalidInputError: The port is taken.
     """
-    logging.getLogger("bokeh").setLevel(logging.WARNING)
+    logging.getLogger("bokeh").setLevel(logging.ERROR)  # a tab that was closed is no news
     logging.getLogger("tornado.access").setLevel(logging.ERROR)
     try:
-        sockets, port = _bound(port)
+        listening = _listening(port)
     except (OSError, OverflowError) as error:
         raise InvalidInputError(
             f"port {port} of {HOST} cannot be listened on: {error}; choose another by --port, or 0 "
             "for any that is free"
         ) from error
     application = Application(FunctionHandler(partial(open_tab, recording, read_only)))
+    port = int(listening.getsockname()[1])
     origins = [f"{name}:{port}" for name in _NAMES]
     pages = BokehTornado({"/": application}, extra_websocket_origins=origins)
     refusals = WebApplication([(r".*", _Refusal)])
     http = HTTPServer(RuleRouter([Rule(HostMatches(_HOSTS), pages), Rule(AnyMatches(), refusals)]))
-    http.add_sockets(sockets)
+    http.add_sockets([listening])
     return PageServer(BaseServer(IOLoop.current(), pages, http), port)
 
 
-def _bound(port: int) -> tuple[list[socket.socket], int]:
-    sockets: list[Any] = bind_sockets(port, HOST)
-    return sockets, int(sockets[0].getsockname()[1])
+def _listening(port: int) -> socket.socket:
+    made = socket.create_server((HOST, port), backlog=128)
+    made.setblocking(False)
+    return made

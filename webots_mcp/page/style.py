@@ -25,7 +25,7 @@ h2 {{ font-size: 12px; margin: 6px 0 2px; color: #666666; font-weight: 600; }}
 """
 LOG: Final = f"""
 :host {{ color: {_INK}; {_FONT} }}
-.log {{ display: flex; flex-direction: column-reverse; height: 120px; overflow-y: auto;
+.log {{ display: flex; flex-direction: column-reverse; height: 124px; overflow-y: auto;
   font: 12px/1.5 ui-monospace, 'DejaVu Sans Mono', monospace; }}
 .log p {{ margin: 0; white-space: pre-wrap; overflow-wrap: anywhere; }}
 .log time {{ color: #888888; display: inline-block; min-width: 76px; }}

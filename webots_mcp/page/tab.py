@@ -49,7 +49,8 @@ _AROUND_S: Final = 1.0  # between two looks at what changes seldom
 _STATUS_S: Final = 0.5  # between two ages
 _REDRAW_S: Final = 3.0  # between two drawings, at least;
 _SHARE: Final = 0.1  # and so that drawing takes no more of the time
-_HEIGHT_PX: Final = 800  # of a usual window
+_HEIGHT_PX: Final = 800  # of a usual window;
+_FIGURES_PX: Final = _HEIGHT_PX - 280  # of it for the signals
 _EMPTY: Final = "Nothing to draw yet: the figures appear with the first rows of a run."
 
 
@@ -164,14 +165,18 @@ class Tab:
             self._figures.children = [self._empty]
         elif is_other or self._signals is None or not self._signals.refresh(plot):
             before = None if is_other or self._signals is None else self._signals.x_range
-            self._signals = draw_signals(plot, x_range=before or self._time_range())
+            self._signals = draw_signals(
+                plot, x_range=before or self._time_range(), height_px=_FIGURES_PX - 40
+            )
             _only_curves(self._signals)
             self._figures.children = [self._signals.layout]
 
     def _time_range(self) -> DataRange1d:
         if self._choice.window_s is None:
-            return DataRange1d(range_padding=0)
-        return DataRange1d(follow="end", follow_interval=self._choice.window_s, range_padding=0)
+            return DataRange1d(range_padding=0, name="time")
+        return DataRange1d(
+            follow="end", follow_interval=self._choice.window_s, range_padding=0, name="time"
+        )
 
     def _show_way(self, drawing: Drawing, *, is_other: bool) -> None:
         plot = drawing.way
@@ -275,7 +280,7 @@ class Tab:
             stylesheets=sheet(CARD, SCROLLING),
         )  # fmt: skip
         drawn = column(
-            self._figures, self._notes, sizing_mode="stretch_width", height=_HEIGHT_PX - 280,
+            self._figures, self._notes, sizing_mode="stretch_width", height=_FIGURES_PX,
             stylesheets=sheet(CARD, SCROLLING),
         )  # fmt: skip
         log = column(self._log, sizing_mode="stretch_width", stylesheets=sheet(CARD, SCROLLING))

@@ -9,7 +9,7 @@ from html import escape
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.errors import WebotsMCPError
+from webots_mcp.errors import NoDatabaseError, NothingRecordedError, WebotsMCPError
 from webots_mcp.page.looking import Look
 from webots_mcp.store.images import StoredImage, opened
 from webots_mcp.store.logs import LogLine
@@ -38,7 +38,10 @@ def status_markup(shown: Look) -> str:
 
 def problem_markup(error: WebotsMCPError) -> str:
     """Why nothing can be read now."""
-    return f'<span class="pill problem">cannot read</span> <span>{escape(str(error))}</span>'
+    waits = isinstance(error, (NoDatabaseError, NothingRecordedError))
+    pill = "nothing recorded yet" if waits else "cannot be read"
+    kind = "standing" if waits else "problem"
+    return f'<span class="pill {kind}">{pill}</span> <span>{escape(str(error))}</span>'
 
 
 def log_markup(lines: Sequence[LogLine]) -> str:

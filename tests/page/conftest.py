@@ -1,0 +1,118 @@
+"""A browser, and servers of the page as real processes."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.recordings.rover import record_rover, start_run
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
+from webots_mcp.schema import create_schema
+from webots_mcp.standin import Simulation
+from webots_mcp.standin.in_process import DEFAULT_WORLD
+from webots_mcp.store.rollup.rolling import roll
+
+pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+NAME = "<img src=x onerror=hacked=1>"
+LINE = "<script>window.hacked = 1</script>"
+
+
+class Server:
+    """`webots-mcp view` on a data folder."""
+
+    def __init__(self, data_dir: Path, *options: str) -> None:
+        arguments = ["view", "--port", "0", "--no-browser", "--data-dir", str(data_dir), *options]
+        self.data_dir = data_dir
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "webots_mcp", *arguments],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert self.process.stdout is not None
+        said = self.process.stdout.readline()
+        assert "the page is at" in said, self.process.communicate(timeout=30)
+        self.url = said.split(" at ")[1].split()[0]
+        self.port = int(self.url.rstrip("/").rpartition(":")[2])
+
+    def stop(self) -> str:
+        """End it as Ctrl-C does; returns what it said on stderr."""
+        self.process.terminate()
+        return self.process.communicate(timeout=30)[1]
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """One browser for all tests."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("there is no chromium on this machine")
+    with playwright.sync_playwright() as running:
+        browser = running.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="session")
+def serve() -> Iterator[Callable[..., Server]]:
+    """Start servers, which end with the tests."""
+    running: list[Server] = []
+
+    def start(data_dir: Path, *options: str) -> Server:
+        running.append(Server(data_dir, *options))
+        return running[-1]
+
+    yield start
+    for server in running:
+        if server.process.poll() is None:
+            server.stop()
+
+
+@pytest.fixture(scope="session")
+def story(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data folder of the rover's story, and of a robot that has markup for everything."""
+    data_dir = tmp_path_factory.mktemp("story")
+    write_story(data_dir)
+    return data_dir
+
+
+def write_story(data_dir: Path) -> None:
+    with closing(connect(data_dir / DATABASE_NAME, "writer", create=True)) as connection:
+        create_schema(connection)
+        record_rover(connection)
+        hostile = start_run(connection, NAME)
+        for step in range(50):
+            hostile.publish(step / 10, {"$$x$$": step, "mode": LINE, NAME: step % 2 == 0})
+        logged = {"level": "info", "source": "controller", "message": LINE}
+        hostile.insert("log", **hostile.at(5.0), **logged)
+        roll(connection, 100_000)
+
+
+@pytest.fixture(scope="session")
+def told(serve: Callable[..., Server], story: Path) -> Server:
+    """A server of the story that may only read."""
+    return serve(story, "--read-only")
+
+
+@pytest.fixture(scope="session")
+def arena(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """The data folder of a rover that drives on the stand-in."""
+    data_dir = tmp_path_factory.mktemp("arena")
+    with Simulation(DEFAULT_WORLD, environment={DATA_DIR_VARIABLE: str(data_dir)}):
+        yield data_dir
+
+
+@pytest.fixture(scope="session")
+def driven(serve: Callable[..., Server], arena: Path) -> Server:
+    """A server of the rover that drives."""
+    return serve(arena)

@@ -49,6 +49,10 @@ class Tab:
         has = f"([name, least]) => (({SOURCE % column})(name) ?? []).some(each => each >= least)"
         self.page.wait_for_function(has, arg=[source, least])
 
+    def until_it_is(self, source: str, column: str, values: list[str]) -> None:
+        same = f"([name, all]) => String(({SOURCE % column})(name)) == String(all)"
+        self.page.wait_for_function(same, arg=[source, values])
+
     def time(self) -> tuple[float, float]:
         start, end = self.page.evaluate(RANGE)
         return start, end
@@ -88,7 +92,7 @@ def test_it_shows_the_values_of_the_database_and_asks_nobody_else(
     tab.until("curve pose.0 1", "time_s", 119)
     places = tab.column("curve pose.0 1", "mean")
     assert max(place for place in places if place == place) == pytest.approx(12.8, abs=0.1)
-    assert tab.column("ground mode 0", "value") == ["cruise", "back_up", "avoid", "cruise"]
+    tab.until_it_is("ground mode 0", "value", ["cruise", "back_up", "avoid", "cruise"])
     tab.says("this is an earlier run; it ended by reset")
     assert {url.split("/")[2] for url in tab.asked} == {f"127.0.0.1:{told.port}"}
     assert tab.page.get_by_role("button", name="Pause").count() == 0

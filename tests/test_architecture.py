@@ -57,6 +57,7 @@ ALLOWED["server"] = STDLIB | {
     "belonging", "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
     "launching", "report", "__version__",
 }  # fmt: skip
+ALLOWED["page"] = ALLOWED["server"] | ALLOWED["charts"] | {"page"}
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
 ALLOWED["pytest_plugin"] = {"contract", "standin", "testing", "MCPBridge", "MemoryDatabase"}
 

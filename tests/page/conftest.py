@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from tests.browsing import chromium
 from tests.recordings.rover import record_rover, start_run
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
@@ -22,7 +21,7 @@ from webots_mcp.store.rollup.rolling import roll
 
 pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+__all__ = ["chromium"]
 NAME = "<img src=x onerror=hacked=1>"
 LINE = "<script>window.hacked = 1</script>"
 
@@ -49,18 +48,6 @@ class Server:
         """End it as Ctrl-C does; returns what it said on stderr."""
         self.process.terminate()
         return self.process.communicate(timeout=30)[1]
-
-
-@pytest.fixture(scope="session")
-def browser() -> Iterator[Any]:
-    """One browser for all tests."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("there is no chromium on this machine")
-    with playwright.sync_playwright() as running:
-        browser = running.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="session")

@@ -69,12 +69,12 @@ class Tab:
 
 
 @pytest.fixture
-def opened(browser: Any) -> Iterator[Callable[[Server], Tab]]:
+def opened(chromium: Any) -> Iterator[Callable[[Server], Tab]]:
     """Open the page of a server in a tab of its own."""
     contexts: list[Any] = []
 
     def start(server: Server) -> Tab:
-        contexts.append(browser.new_context(viewport={"width": 1280, "height": 800}))
+        contexts.append(chromium.new_context(viewport={"width": 1280, "height": 800}))
         return Tab(contexts[-1].new_page(), server)
 
     yield start
@@ -107,9 +107,8 @@ def test_two_runs_lie_over_each_other_and_all_figures_zoom_together(
     tab.choose("run", "run 1 ")
     tab.choose("over it", "run 2 ")
     tab.choose("time", "all")
-    assert tab.column("curve pose.0 1", "time_s")[0] == pytest.approx(
-        tab.column("curve pose.0 2", "time_s")[0], abs=1
-    )
+    starts = [tab.column(f"curve pose.0 {run}", "time_s")[0] for run in (2, 1)]
+    assert max(starts) < 1
     tab.page.wait_for_function(f"() => ({RANGE})()[1] > 100")
     before = tab.time()
     plot = tab.page.locator(".bk-Figure").first.bounding_box()

@@ -7,14 +7,16 @@ from collections.abc import Iterator
 from contextlib import closing
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import Any
 
 import pytest
 
+from tests.browsing import chromium
 from webots_mcp.connection import connect
 from webots_mcp.report import Report, make_report
 
 pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
+
+__all__ = ["chromium"]
 
 _VOID = {"meta", "img", "br", "link", "input"}
 
@@ -66,21 +68,3 @@ def page(both: Report) -> Shown:
 def recording(bridge_recording: Path) -> Iterator[sqlite3.Connection]:
     with closing(connect(bridge_recording, "reader")) as connection:
         yield connection
-
-
-@pytest.fixture(scope="module")
-def chromium() -> Iterator[Any]:
-    """A real browser; skipped where there is none.
-
-    Its driver runs an event loop in this thread, beside which no asynchronous test can run.
-    """
-    driver = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
-    program = Path("/usr/bin/chromium")
-    if not program.exists():
-        pytest.skip("there is no Chromium")
-    with driver.sync_playwright() as started:
-        browser = started.chromium.launch(
-            executable_path=str(program), args=["--no-sandbox", "--disable-gpu"]
-        )
-        yield browser
-        browser.close()

@@ -26,7 +26,8 @@ def view(arguments: argparse.Namespace) -> None:
 
     The page is for this computer only (127.0.0.1) and needs no network. Its buttons pause, resume,
     step and reset the simulation and set parameters, as the commands of the same names do. It needs
-    the extra 'view': pip install 'webots-mcp[view]'. Ctrl-C ends it; the robots do not notice.
+    the extra 'view' (Bokeh): pip install '.[view]' in a checkout. Ctrl-C ends it, and the robots
+    do not notice.
     """
     import webbrowser
 

@@ -32,6 +32,7 @@ from webots_mcp.page.looking import (
     look_around,
     rows_after,
 )
+from webots_mcp.page.pacing import Beat
 from webots_mcp.page.style import CARD, LOG, NOTES, PICTURE, SCROLLING, STATUS, page_sheet, sheet
 from webots_mcp.page.words import (
     log_markup,
@@ -89,6 +90,7 @@ class Tab:
         # Of the monotonic clock.
         self._next_around_s = self._next_drawing_s = self._next_status_s = 0.0
         self._said_status = ""
+        self._beat = Beat()
         self._selectors = Selectors(self._chosen)
         self._tree = SignalTree(self._signals_chosen)
         self._parameters = Parameters(None if read_only else self._tune)
@@ -96,7 +98,9 @@ class Tab:
         self.layout = self._laid_out()
 
     async def go_on(self) -> None:
-        """Look, and show what has changed."""
+        """Look, and show what has changed; not while the browser is still at what came before."""
+        if not self._beat.is_due:
+            return
         self._document.hold("combine")  # the browser is sent what changed in one message
         try:
             self._shown = await to_thread.run_sync(look, self._recording, self._choice)
@@ -106,6 +110,7 @@ class Tab:
         except WebotsMCPError as error:
             self._say_problem(error)
         finally:
+            self._beat.send()
             self._document.unhold()
 
     def _say_status(self, shown: Look) -> None:
@@ -289,7 +294,7 @@ class Tab:
         body = row(side, middle, right, sizing_mode="stretch_width", spacing=10)
         return column(
             head, self._status, body, sizing_mode="stretch_width", spacing=6, margin=10,
-            stylesheets=page_sheet(),
+            stylesheets=page_sheet(), tags=self._beat.models,
         )  # fmt: skip
 
 

@@ -223,7 +223,7 @@ class Search:
 
     def note_too_large(self, kind: str) -> None:
         """Note which signals have numbers that are too large to be judged."""
-        if names := listed(self._too_large, MOST_NAMED):
+        if self.only is None and (names := listed(self._too_large, MOST_NAMED)):
             self.not_searched(kind, f"not in {names}, whose numbers are beyond {LARGEST:g}")
 
     @cached_property

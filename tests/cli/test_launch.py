@@ -117,8 +117,8 @@ def test_it_says_why_nobody_records(
 def test_it_says_that_controllers_do_not_begin_in_a_pause(
     launch: Launch, project: Callable[..., Path]
 ) -> None:
-    process = launch(project(), "--patience", "3", "--mode", "pause")
-    assert "it begins paused" in _told(process, "no controller has recorded within 3 s: ")
+    process = launch(project(), "--patience", "1", "--mode", "pause")
+    assert "it begins paused" in _told(process, "no controller has recorded within 1 s: ")
 
 
 def test_an_extern_controller_that_is_missing_is_named(
@@ -127,8 +127,8 @@ def test_an_extern_controller_that_is_missing_is_named(
     world = project()
     text = world.read_text("utf-8").replace('controller "rover"', 'controller "<extern>"')
     world.write_text(text, "utf-8")
-    process = launch(world, "--patience", "3")
-    told = _told(process, "no controller has recorded within 3 s: ")
+    process = launch(world, "--patience", "1")
+    told = _told(process, "no controller has recorded within 1 s: ")
     assert "a robot has the controller <extern>: start it with webots-controller" in told
 
 

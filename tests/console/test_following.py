@@ -21,6 +21,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from tests.webots.server import WebotsServer
+from webots_mcp.console import following
 from webots_mcp.console import lines as limits
 from webots_mcp.console.following import follow_console, job_of
 from webots_mcp.contract import host_name
@@ -61,6 +62,13 @@ def until(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < last_s, "it did not come about"
         time.sleep(0.02)
+
+
+@pytest.fixture(autouse=True)
+def at_short_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody else records these lines, and nothing has to be spared."""
+    for interval in ("_HOLD_S", "_LOOK_S", "_SHORTEST_PAUSE_S"):
+        monkeypatch.setattr(following, interval, 0.05)
 
 
 @pytest.fixture
@@ -201,8 +209,12 @@ RUDE = {
 
 @pytest.mark.parametrize("greeting", RUDE.values(), ids=RUDE)
 def test_who_does_not_answer_is_named_and_asked_again(
-    recorded: Recorded, follow: Callable[..., Any], greeting: bytes
+    recorded: Recorded,
+    follow: Callable[..., Any],
+    greeting: bytes,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr(following, "_CONNECTING_S", 0.3)
     callers: list[socket.socket] = []
     with socket.create_server(("127.0.0.1", 0)) as door:
 

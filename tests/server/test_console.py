@@ -23,6 +23,7 @@ from tests.webots.conftest import (
     write_project,
 )
 from webots_mcp.belonging import belongs
+from webots_mcp.console import watching as console_watching
 from webots_mcp.server import create_server
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.instances import instances
@@ -33,6 +34,13 @@ FAILS = """
 print("about to fail")
 import nothing_of_that_name
 """
+
+
+@pytest.fixture(autouse=True)
+def looked_for_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A Webots that starts is followed at once, not five seconds later."""
+    monkeypatch.setattr(console_watching, "_FIRST_LOOK_S", 0.2)
+    monkeypatch.setattr(console_watching, "_LOOK_EVERY_S", 0.5)
 
 
 async def lines_with(client: Client, text: str, **arguments: object) -> list[list[Any]]:

@@ -58,6 +58,7 @@ def test_the_command_writes_a_file_says_what_it_holds_and_never_overwrites_unask
         (["-o", "run.pdf"], "end it in .html"),
         (["-o", "nowhere/run.html"], "there is no folder nowhere"),
         (["-o", "."], "is a folder"),
+        (["-o", f"{'a' * 300}.html"], "cannot be written"),
         (["--max-mb", "1"], "--max-mb 1 must be from 2 to 100"),
         (["--signal", "nope"], "no signal 'nope'"),
         (["--robot", "nobody"], "nobody"),

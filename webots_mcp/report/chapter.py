@@ -39,7 +39,6 @@ from webots_mcp.store.runs import fetch_run
 from webots_mcp.store.sessions import Session, fetch_session
 from webots_mcp.store.window import Window
 
-DEADLINE_S: Final = 12.0  # for each search in the values of a run: a report may take a while
 MOST_EVENTS: Final = 200
 MOST_ENTRIES: Final = 500  # of the timeline
 MOST_LINES: Final = 2_000  # of the log
@@ -146,8 +145,17 @@ class _Room:
         return fitted if fitted.rows or fitted.left_out else None
 
 
-def chapter_of(connection: sqlite3.Connection, run_id: int, room_bytes: float) -> Chapter:
-    """What there is to tell of a run, in texts that take about so many bytes at most.
+def chapter_of(
+    connection: sqlite3.Connection, run_id: int, room_bytes: float, deadline_s: float
+) -> Chapter:
+    """What there is to tell of a run.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        room_bytes: About what its texts may take.
+        deadline_s: For how long events are looked for in its values; what is read besides has a
+            third of that each. What was not looked at by then is said.
 
     Raises:
         UnknownRunError: No run has that id.
@@ -164,9 +172,10 @@ def chapter_of(connection: sqlite3.Connection, run_id: int, room_bytes: float) -
         log = room.fit("log", _log(connection, run_id), newest=True)
         return Chapter(info, None, title, f"{_first_words(info)} {error}.", facts,
                        parameters=parameters, log=log)  # fmt: skip
-    found, stored = _found(connection, whole), _stored(connection, whole)
+    found = _found(connection, whole, deadline_s)
+    stored = _stored(connection, whole, deadline_s / 3)
     moments = [_moment(each, stored) for each in _outstanding(connection, found)]
-    course = trends(connection, whole, limit=500, deadline_s=DEADLINE_S)
+    course = trends(connection, whole, limit=500, deadline_s=deadline_s / 3)
     (told_trends,) = course.runs
     mode = _mode(told_trends)
     travelled, why_not = _travelled(connection, run_id)
@@ -245,19 +254,19 @@ def _parameters(connection: sqlite3.Connection, run_id: int) -> Grid:
     return Grid(("parameter", "value", "unit", "default", "set by", "since [s]", "what"), rows)
 
 
-def _found(connection: sqlite3.Connection, whole: TimeRange) -> Found:
+def _found(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float) -> Found:
     """What stands out: all kinds that are looked for unless asked, but for what is routine."""
     usual = EventOptions()
     kinds = tuple(
         kind.name for kind in KINDS if kind.usual(usual) and kind.counted and not kind.routine
     )
-    return search_events(connection, whole, EventOptions(kinds=kinds), deadline_s=DEADLINE_S)
+    return search_events(connection, whole, EventOptions(kinds=kinds), deadline_s=deadline_s)
 
 
-def _stored(connection: sqlite3.Connection, whole: TimeRange) -> Found:
+def _stored(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float) -> Found:
     """What was noted when it happened, one by one."""
     options = EventOptions(kinds=stored_kinds(), log_level="info")
-    return search_events(connection, whole, options, around=(), group=False, deadline_s=DEADLINE_S)
+    return search_events(connection, whole, options, around=(), group=False, deadline_s=deadline_s)
 
 
 def _findings(verdicts: Verdicts) -> list[str]:

@@ -109,8 +109,8 @@ def figures_of(
 def _curves_missing(chapters: Sequence[Chapter], drawn: Mapping[int, Sequence[str]]) -> list[str]:
     """How many numbers have no curve."""
     return [
-        f"curves of {missing} of {each.numbers} numeric signals of run {each.info.run_id}: those "
-        "that changed most are drawn, or those that are named"
+        f"curves of {missing} of {each.numbers} numeric signals of run {each.info.run_id} (drawn "
+        "is what changed most, or is named)"
         for each in chapters
         if (missing := each.numbers - len(drawn[each.info.run_id])) > 0
     ]

@@ -23,6 +23,7 @@ from webots_mcp.store.sound import left_out_so_far
 MAX_MB: Final = 10.0
 MIN_MB: Final = 2.0  # Bokeh's script takes more than half of it
 MOST_RUNS: Final = 2
+DEADLINE_S: Final = 12.0  # for all searches in values: a report may take a while
 _SHARE_OF_TEXTS: Final = 0.35  # of what Bokeh's script leaves; then the figures have
 _SHARE_OF_FIGURES: Final = 0.7  # of the rest, and the pictures what remains
 _FRAME_BYTES: Final = 40_000  # style, headings, facts: all that is not shared out
@@ -81,8 +82,9 @@ def make_report(
     room_bytes = max_mb * 1e6 - len(script.encode()) - _FRAME_BYTES
     texts_bytes = _SHARE_OF_TEXTS * room_bytes
     chapters: list[Chapter] = []
+    count = len(run_ids)
     for run_id in run_ids:
-        chapters.append(chapter_of(connection, run_id, texts_bytes / len(run_ids)))
+        chapters.append(chapter_of(connection, run_id, texts_bytes / count, DEADLINE_S / count))
         done.step()
     compared = beside(connection, run_ids, texts_bytes) if len(run_ids) > 1 else None
     done.step()

@@ -21,11 +21,15 @@ def require_free(file: Path, *, overwrite: bool) -> None:
     Raises:
         InvalidInputError: Something is there already, or it is no page's name.
     """
-    if file.is_dir():
+    try:
+        is_folder, is_there = file.is_dir(), file.exists()
+    except OSError as error:  # too long a name
+        raise InvalidInputError(f"{str(file)[:200]} cannot be written: {error.strerror}") from error
+    if is_folder:
         raise InvalidInputError(f"{file} is a folder: name a file in it")
     if file.suffix.lower() not in (".html", ".htm"):
         raise InvalidInputError(f"{file.name!r} is no page's name: end it in .html")
-    if file.exists() and not overwrite:
+    if is_there and not overwrite:
         raise InvalidInputError(
             f"{file} is there already: name another one, or let it be overwritten"
         )

@@ -98,7 +98,8 @@ class Chapter:
         range: The whole run; None where it has no state row.
         numbers: How many numeric signals have values.
         changed_most: Those that changed, what changed most first.
-        findings: What was found, what is absent, what was not looked for.
+        findings: What was found, and what is absent.
+        unsearched: What was not looked for, or not everywhere, and why.
     """
 
     info: RunInfo
@@ -107,6 +108,7 @@ class Chapter:
     summary: str
     facts: Mapping[str, str]
     findings: Sequence[str] = ()
+    unsearched: Sequence[str] = ()
     mode: str = ""
     held: Sequence[Held] = ()
     moments: Sequence[Moment] = ()
@@ -184,6 +186,7 @@ def chapter_of(
         summary=_first_words(info),
         facts=facts,
         findings=[*travelled, *_findings(found.verdicts)],
+        unsearched=[f"{kinds}: {why}" for kinds, why in found.verdicts.gaps.items()],
         mode=mode.name if mode else "",
         held=_held(mode) if mode else (),
         moments=[
@@ -270,15 +273,14 @@ def _stored(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float)
 
 
 def _findings(verdicts: Verdicts) -> list[str]:
-    """What became of each kind that was looked for."""
+    """What there is of each kind that was looked for, and what there is none of."""
     found = [f"{count} {kind}" for kind, count in verdicts.found.items()]
     said = [f"Found: {', '.join(found)}."] if found else []
     said += [f"Looked for and absent: {', '.join(verdicts.far)}."] if verdicts.far else []
     said += [
         f"Absent, but came near: {kind} ({what})." for kind, what in verdicts.came_near.items()
     ]
-    unlike = [f"{kinds}: {why}" for kinds, why in verdicts.gaps.items()]
-    return said + [f"Not looked for, or not everywhere: {each}." for each in unlike]
+    return said
 
 
 def _events(connection: sqlite3.Connection, found: Found) -> Grid:
@@ -287,7 +289,7 @@ def _events(connection: sqlite3.Connection, found: Found) -> Grid:
     answer = found.only(matter).told(connection, MOST_EVENTS)
     rows = [
         Row(
-            [time_at(each.start_s), _lasted(each), each.kind, told(each), valued(each.around)],
+            [time_at(each.start_s), _lasted(each), each.kind, told(each), _around(each)],
             _mark(each),
         )
         for each in answer.events
@@ -311,7 +313,7 @@ def _moment(event: Event, stored: Found) -> Moment:
     lasted = f", for {length(event.duration_s)}" if event.duration_s and not many else ""
     title = f"{event.kind} at {time_at(event.start_s)} s{lasted}{many}"
     columns = ("at [s]", "kind", "what")
-    moment = Moment(event, title, told(event), valued(event.around), Grid(columns, ()))
+    moment = Moment(event, title, told(event), _around(event), Grid(columns, ()))
     around = [
         each for each in stored.events
         if moment.start_s <= each.start_s <= moment.end_s and each.kind != "image"
@@ -431,6 +433,12 @@ def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], 
         return [], why_not
     went = f"It went {number(distance.median)} m, at {number(speed.median)} m/s in the mean."
     return [went], why_not
+
+
+def _around(event: Event) -> str:
+    """Values when it began; nothing where those rows are gone."""
+    known = any(value is not None for value in event.around.values())
+    return valued(event.around) if known else ""
 
 
 def _mark(event: Event) -> str:

@@ -9,6 +9,8 @@ from __future__ import annotations
 import contextlib
 import json
 import re
+import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Generator
@@ -51,7 +53,7 @@ TURNS: Final[tuple[demo.Turn, ...]] = (
         {"parameters": {"speed": [3.0, 8.0]}, "score": "max(pose.x) - first(pose.x)", "for_s": 5},
     ),
 )
-CHROMIUM: Final = Path("/usr/bin/chromium")
+CHROMIUM: Final = shutil.which("chromium") or shutil.which("chromium-browser")
 # Every figure of Bokeh's has its parts.
 FIGURES_ARE_THERE: Final = """() => window.Bokeh && [...document.querySelectorAll("[data-root-id]")]
     .every(each => each.shadowRoot || each.children.length)"""
@@ -89,16 +91,34 @@ def photograph_report(browser: Any, data_dir: Path, images: Path) -> None:
     _save(page, images / "report.png")
 
 
+def photograph_page(browser: Any, data_dir: Path, images: Path) -> None:
+    """The live page, as a browser shows it."""
+    options = ["--port", "0", "--no-browser", "--data-dir", str(data_dir)]
+    line = [sys.executable, "-m", "webots_mcp", "view", *options]
+    with subprocess.Popen(
+        line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as server:
+        try:
+            assert server.stdout is not None
+            (address,) = re.findall(r"http://\S+", server.stdout.readline())
+            page = browser.new_page(viewport={"width": 1280, "height": 800})
+            page.goto(address)
+            page.wait_for_function(FIGURES_ARE_THERE, timeout=120_000)
+            _save(page, images / "page.png")
+        finally:
+            server.terminate()
+
+
 def _run(*arguments: str) -> None:
     if webots_mcp(arguments):
         raise RuntimeError(f"webots-mcp {' '.join(arguments)} failed")
 
 
 def _save(page: Any, file: Path) -> None:
-    """What is seen of a page, in few colours: a picture of text needs no more."""
+    """What is seen of a page, in 256 colours, which make a small file."""
     page.wait_for_timeout(1000)  # figures are painted after they are there
     seen = Image.open(BytesIO(page.screenshot())).convert("RGB")
-    seen.quantize(64, dither=Image.Dither.NONE).save(file, optimize=True)
+    seen.quantize(256, dither=Image.Dither.NONE).save(file, optimize=True)
 
 
 @contextlib.contextmanager
@@ -108,7 +128,7 @@ def started_browser() -> Generator[Any]:
 
     options = ["--no-sandbox", "--disable-gpu", "--hide-scrollbars"]
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=str(CHROMIUM), args=options)
+        browser = driver.chromium.launch(executable_path=CHROMIUM, args=options)
         yield browser
         browser.close()
 
@@ -137,6 +157,7 @@ def main() -> int:
             draw_plots(data_dir, IMAGES)
             with started_browser() as browser:
                 photograph_report(browser, data_dir, IMAGES)
+                photograph_page(browser, data_dir, IMAGES)
                 by = {"matplotlib": matplotlib.__version__, "chromium": browser.version}
             drawn = {"by": by, "means": means(simulation)}
             DRAWN.write_text(json.dumps(drawn, indent=2) + "\n", "utf-8")

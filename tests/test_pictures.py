@@ -51,13 +51,15 @@ def test_the_plots_look_as_they_are_drawn_today(data_dir: Path, tmp_path: Path) 
 def test_the_pages_look_as_a_browser_shows_them_today(data_dir: Path, tmp_path: Path) -> None:
     pytest.importorskip("playwright", reason="Playwright is not installed")
     pytest.importorskip("bokeh", reason="Bokeh is not installed")
-    if not pictures.CHROMIUM.exists():
+    if pictures.CHROMIUM is None:
         pytest.skip("there is no Chromium")
     with pictures.started_browser() as browser:
         if browser.version != DRAWN["by"]["chromium"]:
             pytest.skip("another version of Chromium took the pictures")
         pictures.photograph_report(browser, data_dir, tmp_path)
-    assert difference(tmp_path / "report.png", pictures.IMAGES / "report.png") < NEAR
+        pictures.photograph_page(browser, data_dir, tmp_path)
+    for name in ("report.png", "page.png"):
+        assert difference(tmp_path / name, pictures.IMAGES / name) < NEAR, name
 
 
 @pytest.mark.usefixtures("simulation")

@@ -53,9 +53,8 @@ def export(arguments: argparse.Namespace) -> None:
     per state; columns are run, row, times, and the dotted names of what the controller published;
     NaN and infinity are kept. A .mcap (Foxglove, Lichtblick, PlotJuggler) or .rrd file (Rerun) has
     states, poses, pictures, log lines, events and commands. A .zip file is a bundle: a run that is
-    over, as a recording of its own with its pictures, which 'webots-mcp import' takes in. Parquet,
-    MCAP and Rerun need extras: pip install 'webots-mcp[parquet]', 'webots-mcp[mcap]' or
-    'webots-mcp[rerun]'.
+    over, as a recording of its own with its pictures, which 'webots-mcp import' takes in. Parquet
+    needs pyarrow, MCAP mcap, and Rerun rerun-sdk: pip install ...
     """
     from webots_mcp.store.export import BUNDLE, FOR_VIEWERS, TrialTable, export_file, format_of
     from webots_mcp.store.export import export as write

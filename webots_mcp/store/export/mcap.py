@@ -61,7 +61,7 @@ def _library() -> Any:
         return import_module("mcap.writer")
     except ImportError as error:
         raise InvalidInputError(
-            "MCAP needs the package mcap: pip install 'webots-mcp[mcap]', or export as csv or jsonl"
+            "MCAP needs its library: pip install mcap, or export as csv or jsonl"
         ) from error
 
 

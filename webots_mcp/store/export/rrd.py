@@ -66,8 +66,7 @@ def _library() -> Any:
         return import_module("rerun")
     except ImportError as error:
         raise InvalidInputError(
-            "Rerun's format needs its SDK: pip install 'webots-mcp[rerun]', or export as mcap or "
-            "csv"
+            "Rerun's format needs its SDK: pip install rerun-sdk, or export as mcap or csv"
         ) from error
 
 

@@ -61,11 +61,12 @@ def write_bundle(
         small = folder / DATABASE_NAME
         with closing(connect(small, "writer", create=True)) as writer:
             create_schema(writer)
+            writer.execute("PRAGMA journal_mode=DELETE")  # all of it in the one file, written once
+            writer.execute("PRAGMA synchronous=OFF")  # whoever is killed leaves nothing to keep
             frozen = "&immutable=1" if isinstance(connection, FrozenConnection) else ""
             address = f"{database.absolute().as_uri()}?mode=ro{frozen}"
             merge(writer, folder, database, run_id=run_id, address=address, pictures=data_dir)
             writer.execute(_END_SESSION)
-            writer.execute("PRAGMA journal_mode=DELETE")  # all of it in the one file
         _pack(folder, file, progress)
 
 

@@ -10,10 +10,10 @@ import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import import_module
-from itertools import groupby, islice
+from itertools import chain, groupby, islice
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final, TypeVar, cast
+from typing import Any, Final, NamedTuple, TypeVar
 from uuid import NAMESPACE_URL, uuid5
 
 from webots_mcp.errors import InvalidInputError
@@ -74,6 +74,13 @@ def _recording_id(contents: Contents) -> str:
     """The same for the same runs: a viewer shows one that is opened again as the same."""
     names = [contents.about(run_id).get("uuid", f"{run_id}") for run_id in contents.run_ids]
     return names[0] if len(names) == 1 else str(uuid5(NAMESPACE_URL, " ".join(names)))
+
+
+class _Times(NamedTuple):
+    """Of the items of a group, as NumPy has durations and timestamps."""
+
+    sim: Any
+    wall: Any
 
 
 class _Writing:
@@ -141,12 +148,13 @@ class _Writing:
             if pose is not None:
                 poses.append((index, pose))
                 way.see(group[index], pose)
+        times = _times(group)
         for name, pairs in numbers.items():
-            self._send(self._signal(run_id, name), group, pairs, self._scalars(pairs))
+            self._send(self._signal(run_id, name), times, pairs, self._scalars(pairs))
         for name, pairs in texts.items():
-            self._send(self._signal(run_id, name), group, pairs, self._texts(pairs))
+            self._send(self._signal(run_id, name), times, pairs, self._texts(pairs))
         if poses:
-            self._send(self._frame(run_id), group, poses, self._transforms(poses))
+            self._send(self._frame(run_id), times, poses, self._transforms(poses))
         self._stream.flush()
 
     def _sort_in(
@@ -168,13 +176,15 @@ class _Writing:
                 texts.setdefault(name, []).append((index, text))
 
     def _scalars(self, pairs: Sequence[tuple[int, Any]]) -> Any:
-        values = [
-            cast("list[float]", value) if isinstance(value, list) else [value] for _, value in pairs
+        values = [value for _, value in pairs]
+        listed = [isinstance(value, list) for value in values]
+        if not any(listed):
+            return self._rerun.Scalars.columns(scalars=np.array(values, float))
+        parts: list[list[float]] = [
+            value if is_list else [value] for value, is_list in zip(values, listed, strict=True)
         ]
-        flat = np.fromiter((number for each in values for number in each), float)
-        columns = self._rerun.Scalars.columns(scalars=flat)
-        lengths = [len(each) for each in values]
-        return columns if set(lengths) == {1} else columns.partition(lengths)
+        flat = np.fromiter(chain.from_iterable(parts), float)
+        return self._rerun.Scalars.columns(scalars=flat).partition([*map(len, parts)])
 
     def _texts(self, pairs: Sequence[tuple[int, str]]) -> Any:
         texts = [text for _, text in pairs]
@@ -195,7 +205,7 @@ class _Writing:
                 self.counts[kind] += len(group)
                 texts, levels = zip(*map(told, group), strict=True)
                 lines = self._rerun.TextLog.columns(text=texts, level=levels)
-                self._send(self._path(run_id, name), group, list(enumerate(texts)), lines)
+                self._send(self._path(run_id, name), _times(group), [*enumerate(texts)], lines)
 
     def _write_pictures(self) -> None:
         for image in self._contents.images():
@@ -204,19 +214,20 @@ class _Writing:
             if data is not None:
                 media = _MEDIA_TYPES.get(image.path.rpartition(".")[2].lower(), "image/png")
                 picture = self._rerun.EncodedImage.columns(blob=[data], media_type=[media])
-                self._send(
-                    self._path(image.run_id, *_picture_name(image)), [image], [(0, None)], picture
-                )
+                path = self._path(image.run_id, *_picture_name(image))
+                self._send(path, _times([image]), [(0, None)], picture)
 
     def _send(
-        self, path: str, group: Sequence[Item], pairs: Sequence[tuple[int, Any]], columns: Any
+        self, path: str, times: _Times, pairs: Sequence[tuple[int, Any]], columns: Any
     ) -> None:
-        chosen: list[Any] = [group[index] for index, _ in pairs]
-        sim = np.array([round(each.sim_time_s * 1e9) for each in chosen], "timedelta64[ns]")
-        wall = np.array([round(each.wall_time_s * 1e9) for each in chosen], "datetime64[ns]")
+        """Columns for those items of a group that `pairs` names, with their times."""
+        chosen = [index for index, _ in pairs]
         column = self._rerun.TimeColumn
-        times = [column("sim_time", duration=sim), column("wall_time", timestamp=wall)]
-        self._stream.send_columns(path, indexes=times, columns=columns)
+        indexes = [
+            column("sim_time", duration=times.sim[chosen]),
+            column("wall_time", timestamp=times.wall[chosen]),
+        ]
+        self._stream.send_columns(path, indexes=indexes, columns=columns)
 
     def _signal(self, run_id: int, name: str) -> str:
         return self._path(run_id, "state", *name.split("."))
@@ -228,6 +239,12 @@ class _Writing:
         branch = (f"run_{run_id}",) if self._several else ()
         named = (part or "(empty)" for part in (*branch, self._contents.wanted.robot, *parts))
         return str(self._rerun.new_entity_path(list(named)))
+
+
+def _times(group: Sequence[Any]) -> _Times:
+    sim = np.array([round(each.sim_time_s * 1e9) for each in group], "timedelta64[ns]")
+    wall = np.array([round(each.wall_time_s * 1e9) for each in group], "datetime64[ns]")
+    return _Times(sim, wall)
 
 
 def _groups(rows: Iterable[_Item]) -> Iterator[list[_Item]]:

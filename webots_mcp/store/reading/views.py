@@ -460,6 +460,8 @@ class LongView:
             if part.start_s < first_s:
                 self._note_purged()
             steps = [] if least_steps is None else self._largest_steps(part, signals)
+            if least_steps is not None and self._is_ruled_out(part, steps, least_steps):
+                continue
             for whole in self._stretches(part, first_s):
                 if least_steps is None or (here := self._steps_in(whole, steps)) is None:
                     yield self._stretch(whole, signals)
@@ -513,6 +515,13 @@ class LongView:
         here = [{bucket: own.get(bucket, 0.0) for bucket in span} for own in steps]
         is_late = self._rolled_until_s < part.end_s
         return None if is_late or any(math.inf in own.values() for own in here) else here
+
+    def _is_ruled_out(
+        self, part: Segment, steps: Sequence[dict[int, float]], least_steps: Sequence[float]
+    ) -> bool:
+        """Whether no step of a part is as large, as is known of all its buckets."""
+        here = self._steps_in(part, steps)
+        return here is not None and not _above(here, least_steps)
 
     def _part(self, whole: Segment, large: range, signals: Sequence[Signal]) -> Numbers:
         """The rows of some buckets of a stretch, and the one before them."""

@@ -5,10 +5,13 @@ from __future__ import annotations
 import re
 import sqlite3
 import sys
+from base64 import b64decode
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from tests.recordings.rows import Recorded
 from tests.report.conftest import Shown
@@ -158,6 +161,27 @@ def test_pictures_whose_files_are_gone_are_counted(tmp_path: Path) -> None:
     report = make_report(recorded.connection, [robot.run_id], tmp_path)
     recorded.close()
     assert "2 of the pictures of run 1 (2 files cannot be read)" in report.left_out
+
+
+def test_pictures_are_scaled_down_and_thinned_evenly_where_they_have_no_room(
+    tmp_path: Path,
+) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    for step in range(8):
+        robot.state(step, {"x": step})
+        file = tmp_path / f"{step}.png"
+        Image.effect_noise((900, 700), 80).save(file)
+        robot.image(step, file.name)
+    report = make_report(recorded.connection, [robot.run_id], tmp_path, max_mb=2)
+    recorded.close()
+    shown = Shown(report.html)
+    sources = [value for tag, name, value in shown.attributes if (tag, name) == ("img", "src")]
+    assert 0 < len(sources) == report.holds["pictures"] < 8
+    assert len(report.html) <= 2_000_000
+    assert f"{8 - len(sources)} of the pictures of run 1" in report.left_out
+    sizes = {Image.open(BytesIO(b64decode(each.partition(",")[2]))).size for each in sources}
+    assert sizes == {(640, 498)}
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME
 from webots_mcp.standin import Simulation
 
 SHOWN_CHARACTERS = 600
+LONGEST_START_S = 480.0  # of wall time until what is talked of has happened
 READY = "SELECT 1 FROM state WHERE sim_time_s > 1"
 
 Answer = dict[str, Any]
@@ -42,7 +43,9 @@ def main(example: Path) -> None:
         world, mode = example / conversation["world"], conversation.get("mode", "realtime")
         with Simulation(world, mode=mode, environment=environment) as simulation:
             database, ready = Path(folder) / DATABASE_NAME, conversation.get("ready", READY)
-            simulation.wait_for(lambda: database.exists() and answers(database, ready), 120.0)
+            simulation.wait_for(
+                lambda: database.exists() and answers(database, ready), LONGEST_START_S
+            )
             simulation.resume()  # in real time: it need not hurry while they talk
             parts = anyio.run(converse, Path(folder), conversation["turn"])
     print("\n".join((conversation["beginning"], *parts)), end="")

@@ -40,7 +40,7 @@ def test_there_are_conversations_to_have() -> None:
 @pytest.mark.parametrize("name", CONVERSATIONS)
 def test_the_page_shows_what_is_said_and_answered_today(name: str) -> None:
     line = [sys.executable, str(EXAMPLES / "ask.py"), str(EXAMPLES / name)]
-    had = subprocess.run(line, capture_output=True, text=True, timeout=240, check=False)
+    had = subprocess.run(line, capture_output=True, text=True, timeout=600, check=False)
     assert had.returncode == 0, had.stderr
     shown = (EXAMPLES / name / "README.md").read_text("utf-8")
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TypeVar
 
 import pytest
 
@@ -16,6 +17,7 @@ from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 
 Start = Callable[..., Simulation]
+T = TypeVar("T")
 
 CONTROLLER = """
 import sys
@@ -25,6 +27,13 @@ from webots_mcp import MCPBridge
 robot = Supervisor()
 bridge = MCPBridge(robot, throttle_interval=1)
 """
+
+
+class PatientSimulation(Simulation):
+    """Waits long for what does come about, however busy the machine is."""
+
+    def wait_for(self, condition: Callable[[], T], timeout_s: float = 60.0) -> T:
+        return super().wait_for(condition, max(timeout_s, 60.0))
 
 
 @pytest.fixture
@@ -45,7 +54,7 @@ def start(tmp_path: Path, data_dir: Path) -> Iterator[Start]:
     def run(loop: str, mode: str = "fast") -> Simulation:
         controller = tmp_path / "rover.py"
         controller.write_text(CONTROLLER + loop)
-        simulation = Simulation(
+        simulation = PatientSimulation(
             DEFAULT_WORLD,
             mode=mode,
             controllers={"rover": controller},

@@ -19,6 +19,7 @@ MOST_BYTES = 150_000
 # Mean difference of the channels, of 255: 0 where the same is drawn, 1.9 and more where it is
 # drawn of a recording that is a second shorter.
 NEAR = 0.5
+ANEW = "looks otherwise today: look at what `python -m docs.pictures` makes, and commit it"
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +45,7 @@ def test_the_plots_look_as_they_are_drawn_today(data_dir: Path, tmp_path: Path) 
         pytest.skip("another version of matplotlib drew the pictures")
     pictures.draw_plots(data_dir, tmp_path)
     for name in pictures.PLOTS:
-        assert difference(tmp_path / name, pictures.IMAGES / name) < NEAR, name
+        assert difference(tmp_path / name, pictures.IMAGES / name) < NEAR, f"{name} {ANEW}"
 
 
 @pytest.mark.usefixtures("simulation")
@@ -59,13 +60,13 @@ def test_the_pages_look_as_a_browser_shows_them_today(data_dir: Path, tmp_path: 
         pictures.photograph_report(browser, data_dir, tmp_path)
         pictures.photograph_page(browser, data_dir, tmp_path)
     for name in ("report.png", "page.png"):
-        assert difference(tmp_path / name, pictures.IMAGES / name) < NEAR, name
+        assert difference(tmp_path / name, pictures.IMAGES / name) < NEAR, f"{name} {ANEW}"
 
 
 @pytest.mark.usefixtures("simulation")
 def test_the_readme_has_the_conversation_of_today(data_dir: Path) -> None:
     (shown,) = pictures.CONVERSATION.findall(pictures.README.read_text("utf-8"))
-    assert form(pictures.conversation(data_dir)) == form(shown)
+    assert form(pictures.conversation(data_dir)) == form(shown), f"the README's conversation {ANEW}"
 
 
 def test_pictures_are_small_and_each_is_shown() -> None:

@@ -37,7 +37,8 @@ _UNFIT: Final = (
     "SELECT CASE WHEN :run IS NULL THEN "
     "(SELECT count(*) FROM source.session WHERE ended_wall_time_s IS NULL) ELSE "
     "(SELECT ended_wall_time_s IS NULL FROM source.run WHERE id = :run) END, "
-    "(SELECT count(*) FROM source.run WHERE purged_rows > 0 AND (:run IS NULL OR id = :run))"
+    "(SELECT count(*) FROM source.run WHERE purged_rows > 0 AND (:run IS NULL OR id = :run)), "
+    "(SELECT count(*) FROM source.run WHERE uuid IS NULL AND id = :run)"
 )
 # Those of one run: what its parameters were set by, and what was claimed while it went on.
 _COMMANDS: Final = (
@@ -158,13 +159,18 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
     ]
     if versions[0] != versions[1]:
         raise InvalidInputError(f"{source} has another schema: run 'webots-mcp migrate' on it")
-    recording, purged = connection.execute(_UNFIT, {"run": run_id}).fetchone()
+    recording, purged, nameless = connection.execute(_UNFIT, {"run": run_id}).fetchone()
     subject = f"{source}" if run_id is None else f"run {run_id}"
     if recording:
         where = subject if run_id else f"in {subject}"
         raise InvalidInputError(f"a controller still records {where}: take it when it is over")
     if purged:
         raise InvalidInputError(f"{subject} has purged rows: of them only rollups are left")
+    if nameless:
+        raise InvalidInputError(
+            f"{subject} has no UUID, which each bridge gives: no recording "
+            "could tell whether it is there already"
+        )
 
 
 def _take_in(

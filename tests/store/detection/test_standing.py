@@ -12,9 +12,16 @@ import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.kind import NotSearchableError
+from webots_mcp.store.detection.registry import kind_named
+from webots_mcp.store.detection.search import Search
+from webots_mcp.store.detection.standing import find_standings
 from webots_mcp.store.questions.events import Events, find_events
+from webots_mcp.store.reading import deadline
+from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.signals.catalogue import known_signals
 
 OPTIONS = EventOptions(kinds=("still", "stuck"))
 
@@ -220,3 +227,14 @@ def test_noise_alone_is_no_going_to_and_fro(
 
     (stuck,) = ask(empty, drives_and_is_held, interval_s=interval_s, seconds=held_s + 60).events
     assert stuck.kind == "stuck"
+
+
+def test_a_position_that_there_was_no_time_to_read_is_not_said_to_have_no_value(
+    rover: sqlite3.Connection, long_ranges: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(deadline, "_STEPS_PER_LOOK", 1)
+    found = find_range(rover, Scope(run_id=1))
+    known, kinds = known_signals(rover, found), [kind_named("still")]
+    search = Search(rover, found.segments[0], known, kinds, EventOptions(), Deadline(0))
+    with pytest.raises(NotSearchableError, match="the time was over"):
+        find_standings(search)

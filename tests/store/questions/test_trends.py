@@ -333,3 +333,17 @@ def test_numbers_that_are_too_large_are_not_told_as_missing(
         assert "beyond 1e+100 in 100 of 700 rows; no value in 42 of 700 rows" in says
     else:
         assert "no usable value in" in says
+
+
+@pytest.mark.parametrize("centre", [0.0, 2.6])
+def test_the_extremes_of_an_angle_are_its_own_and_not_those_of_means(
+    empty: sqlite3.Connection, tier: str, centre: float
+) -> None:
+    def yaw(time_s: float) -> float:
+        swings = 100 <= time_s < 120
+        return centre + 0.1 * math.sin(time_s / 60) + swings * 0.3 * math.sin(4 * time_s)
+
+    record(empty, rows=6000, interval_s=0.1, yaw=yaw)
+    summary, values = one(empty, "yaw").summary, [yaw(step * 0.1) for step in range(6000)]
+    assert (summary.min, summary.max) == pytest.approx((min(values), max(values)))
+    assert yaw(summary.max_sim_time_s or 0.0) == pytest.approx(max(values))

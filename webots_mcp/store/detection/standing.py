@@ -82,6 +82,8 @@ def _found(search: Search) -> StretchStandings:
         in_rows = in_all([*found, replace(in_rows, standings=about)])
     if in_rows.noise_m is None:
         search.require_rows()
+        if search.deadline.passed:
+            raise NotSearchableError("the time was over: ask for this kind alone")
         names = " and ".join(signal.name for signal in search.motion.position or ())
         raise NotSearchableError(f"{names} have no value in run {run_id} there")
     return in_rows

@@ -45,7 +45,7 @@ class Trend:
     Attributes:
         summary: Count, first, last, extremes with their times, mean, deviation. Where the turns of
             an angle are counted, its extremes are those of the unwrapped angle too (from rollups
-            those of their means).
+            in which it passed the border of a turn those of their means).
         mean: Of an angle the circular mean. What is less than a few millionths of the range is
             rounded away: it comes from adding.
         deviation: Standard deviation; of an angle that of the unwrapped angle, or the circular one
@@ -144,7 +144,10 @@ def judge(
     deviation = summary.deviation_in(signal.turn)
     if counted:
         deviation = _deviation(inner, inner_variance)
-    summary = _with_extremes_of(inner, summary) if counted else summary
+    if counted and pieces is not None and turn is not None:
+        summary = _with_extremes_in(pieces, course - numbers, course, turn, summary)
+    elif counted:
+        summary = _with_extremes_of(inner, summary)
     shape = _shape(summary, line, monotonic, swings, rest_s, float(times[-1] - times[0]))
     trend = Trend(
         name=signal.name,
@@ -216,6 +219,26 @@ def _with_extremes_of(course: Summary, summary: Summary) -> Summary:
         min_sim_time_s=course.min_sim_time_s,
         max=course.max,
         max_sim_time_s=course.max_sim_time_s,
+    )
+
+
+def _with_extremes_in(
+    pieces: Summaries, turned: Array, course: Array, turn: float, summary: Summary
+) -> Summary:
+    """With those of the buckets, turned on as far as their means are.
+
+    Of one that reaches over half a turn, because it passed the border of a turn, only the mean is
+    known to be in the course.
+    """
+    narrow = pieces["max"] - pieces["min"] < turn / 2
+    lows = np.where(narrow, pieces["min"] + turned, course)
+    highs = np.where(narrow, pieces["max"] + turned, course)
+    least, most = int(lows.argmin()), int(highs.argmax())
+    return summary._replace(
+        min=float(lows[least]),
+        min_sim_time_s=float(pieces["min_sim_time_s"][least]),
+        max=float(highs[most]),
+        max_sim_time_s=float(pieces["max_sim_time_s"][most]),
     )
 
 

@@ -209,7 +209,7 @@ def _trend_of_pieces(
     middles: Array = (pieces["first_sim_time_s"] + pieces["last_sim_time_s"]) / 2
     held = ~np.isnan(centres) & ~np.isnan(middles)
     variance = math.fsum(pieces.variances(turn)[held].tolist()) / int(held.sum())
-    course = middles[held], centres[held]
+    course, pieces = (middles[held], centres[held]), Summaries(pieces.table[held])
     return judge(signal, summary, *course, None, variance, piece_s, pieces, rows_left=rows_left)
 
 

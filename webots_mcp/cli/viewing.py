@@ -32,6 +32,9 @@ def view(arguments: argparse.Namespace) -> None:
     import webbrowser
 
     from webots_mcp.contract import resolve_database
+    from webots_mcp.report.figures import require_view
+
+    require_view("the live page")
     from webots_mcp.page.server import create_page_server
     from webots_mcp.store.recording import Recording
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import groupby
 from operator import itemgetter
 from typing import Any, Final
@@ -21,13 +21,22 @@ _PALE: Final = "#EEEEEE"
 _STRETCH: Final = ("start_s", "end_s", "value", "colour", "hatch")
 
 
-def grow_signals(chart: SignalsChart, columns: Columns) -> None:
-    """Add rows to the curves, and let the modes and rows of states go on."""
+def grow_signals(chart: SignalsChart, columns: Columns, angles: Collection[str] = ()) -> None:
+    """Add rows to the curves, and let the modes and rows of states go on.
+
+    Args:
+        chart: What is drawn.
+        columns: The rows.
+        angles: Names of signals whose curves are broken where they go round.
+    """
     sources: dict[Any, Any] = dict(chart.sources)
     for (what, name, _), source in sources.items():
         values = columns.values.get(name, [])
         if what == "curve" and values:
-            source.stream(_points(columns.times, values), MOST_POINTS)
+            points = _points(columns.times, values)
+            if name in angles:
+                points = _broken(source.data, points)
+            source.stream(points, MOST_POINTS)
         elif what in ("ground", "lane") and values:
             _go_on(source, columns.times, values)
 
@@ -37,6 +46,13 @@ def _points(times: Sequence[float], values: Sequence[Value]) -> dict[str, Any]:
         [value if isinstance(value, (int, float)) else math.nan for value in values], np.float64
     )
     return {"time_s": np.array(times), "mean": numbers, "low": numbers, "high": numbers}
+
+
+def _broken(drawn: Any, points: dict[str, Any]) -> dict[str, Any]:
+    """The points of an angle with a break before each that is half a turn away or more."""
+    before = list(drawn["mean"][-1:]) or [math.nan]
+    leaps = np.flatnonzero(np.abs(np.diff(points["mean"], prepend=before)) > math.pi)
+    return {name: np.insert(column, leaps, math.nan) for name, column in points.items()}
 
 
 def _go_on(source: Any, times: Sequence[float], values: Sequence[Value]) -> None:

@@ -49,6 +49,7 @@ _PERIOD_MS: Final = 100
 _AROUND_S: Final = 1.0  # between two looks at what changes seldom
 _STATUS_S: Final = 0.5  # between two ages
 _REDRAW_S: Final = 3.0  # between two drawings, at least;
+_SETTLED_S: Final = 5.0  # of simulation time tell which signals change
 _SHARE: Final = 0.1  # and so that drawing takes no more of the time
 _HEIGHT_PX: Final = 800  # of a usual window;
 _FIGURES_PX: Final = _HEIGHT_PX - 280  # of it for the signals
@@ -144,8 +145,8 @@ class Tab:
         wanted = (shown.key, self._choice)
         if wanted != self._drawn or (self._has_grown and time.monotonic() >= self._next_drawing_s):
             drawing = await to_thread.run_sync(gather, self._recording, shown, self._choice)
-            self._show(drawing, is_other=wanted != self._drawn)
-            self._drawn = wanted
+            is_other, self._drawn = wanted != self._drawn, wanted
+            self._show(drawing, is_other=is_other)
         elif self._choice.beside_id is None:
             await self._grow(shown)
         else:  # runs over each other have clocks of their own
@@ -161,7 +162,16 @@ class Tab:
         self._show_signals(drawing, is_other=is_other)
         self._show_way(drawing, is_other=is_other)
         self._tree.choose(drawing.names)
+        self._keep_names(drawing)
         _say(self._notes, notes_markup(drawing.notes))
+
+    def _keep_names(self, drawing: Drawing) -> None:
+        """Those that changed most are others later, and a person would not know why."""
+        plot = drawing.signals
+        lasts = plot is not None and plot.x_range[1] - plot.x_range[0] > _SETTLED_S
+        if self._choice.names is None and lasts and self._shown and self._shown.key:
+            self._choice = replace(self._choice, names=drawing.names)
+            self._drawn = (self._shown.key, self._choice)
 
     def _show_signals(self, drawing: Drawing, *, is_other: bool) -> None:
         plot = drawing.signals
@@ -205,7 +215,8 @@ class Tab:
             return
         self._until_s, self._has_grown = columns.times[-1], True
         if self._signals is not None:
-            grow_signals(self._signals, columns)
+            angles = {each.name for each in drawing.read if each.kind == "angle"}
+            grow_signals(self._signals, columns, angles)
         if self._way is not None and drawing.position is not None:
             grow_way(self._way, drawing.position, columns)
 
@@ -214,6 +225,7 @@ class Tab:
         if robot != self._choice.robot and self._choice.robot is not None:
             run, beside = NEWEST, NONE
             self._selectors.run.value, self._selectors.beside.value = run, beside
+            self._choice = replace(self._choice, names=None)
         self._choice = replace(
             self._choice,
             robot=robot or None,

@@ -24,8 +24,11 @@ _POINTS: Final = 500
 _MOMENT_POINTS: Final = 200
 
 
-def require_view() -> None:
+def require_view(what: str = "a report") -> None:
     """See that there is what a page is made with, before anything is read.
+
+    Args:
+        what: What needs it.
 
     Raises:
         InvalidInputError: The extra `view` is not installed.
@@ -35,7 +38,7 @@ def require_view() -> None:
         import_module("jinja2")
     except ImportError as error:
         raise InvalidInputError(
-            "a report needs Bokeh: pip install 'webots-mcp[view]' (the extra [view] of webots-mcp)"
+            f"{what} needs Bokeh: pip install 'webots-mcp[view]' (the extra [view] of webots-mcp)"
         ) from error
 
 

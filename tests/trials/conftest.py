@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from webots_mcp.cli import main
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 
 # It drives off a table at speed 3, and ends by itself at speed 4.
@@ -85,6 +86,19 @@ def wait_for_trial(project: Path, number: int) -> int:
             return int(found[0][0])
         time.sleep(0.01)
     raise TimeoutError(f"trial {number} did not begin")
+
+
+@pytest.fixture
+def refused(project: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """What a plan that cannot be run is refused with, in this process: nothing is started."""
+
+    def run_plan(*options: str) -> str:
+        assert main(command(project, *options)[3:]) == 2
+        said = capsys.readouterr()
+        assert said.out == ""
+        return said.err
+
+    return run_plan
 
 
 @pytest.fixture

@@ -76,14 +76,15 @@ def rows(project: Path, sql: str) -> list[Any]:
         return connection.execute(sql).fetchall()
 
 
-def wait_for_trial(project: Path, number: int) -> int:
-    """The process of a trial's simulator, once it runs."""
+def wait_for_trial(project: Path, number: int, runner: subprocess.Popen[Any]) -> int:
+    """The process of a trial's simulator, once it runs; who runs it must not have ended before."""
     tables = "SELECT 1 FROM sqlite_master WHERE name = 'trial'"
     sql = f"SELECT pid FROM trial WHERE number = {number} AND status = 'running'"
     until_s = time.monotonic() + 60
     while time.monotonic() < until_s:
         if rows(project, tables) and (found := rows(project, sql)):
             return int(found[0][0])
+        assert runner.poll() is None, runner.communicate()[1]
         time.sleep(0.01)
     raise TimeoutError(f"trial {number} did not begin")
 

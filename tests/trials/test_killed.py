@@ -129,7 +129,7 @@ def test_who_is_ended_in_the_middle_is_gone_on_from(
         stderr=subprocess.PIPE,
         text=True,
     )
-    pid = wait_for_trial(project, 2)
+    pid = wait_for_trial(project, 2, process)
     for number in numbers:
         process.send_signal(number)
     _, said = process.communicate(timeout=30)
@@ -158,7 +158,7 @@ def test_who_was_stopped_until_another_took_over_writes_nothing_more(
         stderr=subprocess.PIPE,
         text=True,
     )
-    wait_for_trial(project, 2)
+    wait_for_trial(project, 2, process)
     stop_between_writes(process.pid, project / "data" / "webots.db")
     refused = run("--jobs", "2")
     assert f"process {process.pid} on " in refused.stderr

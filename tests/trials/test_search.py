@@ -156,7 +156,7 @@ def test_a_search_that_was_killed_goes_on_as_if_it_had_not_been(
 ) -> None:
     plan('score = "last(x)"\nfor_s = 0.3\nsets = 4\nseed = 3\n[ranges]\nspeed = { low=1, high=2 }')
     with subprocess.Popen(command(project, "--search", "tpe"), stderr=subprocess.DEVNULL) as killed:
-        wait_for_trial(project, 2)
+        wait_for_trial(project, 2, killed)
         killed.kill()
 
     left = told_of_set(Recording(project / "data" / "webots.db", project / "data"), None)

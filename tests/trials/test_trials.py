@@ -92,7 +92,7 @@ def test_two_cannot_work_on_one_set(project: Path, plan: Plan, run: Run) -> None
     plan('score = "last(x)"\nuntil = "x > 1e6"\n[grid]\nspeed = [1.0, 2.0]')
     process = subprocess.Popen(command(project, "--jobs", "2"), stderr=subprocess.DEVNULL)
     try:
-        wait_for_trial(project, 2)
+        wait_for_trial(project, 2, process)
         refused = run()
     finally:
         process.send_signal(signal.SIGTERM)

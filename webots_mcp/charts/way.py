@@ -94,9 +94,20 @@ def way_chart(
 
 
 def draw_way(
-    plot: TrajectoryAxes, notes: Sequence[str] = (), obstacles: Sequence[Obstacle] = ()
+    plot: TrajectoryAxes,
+    notes: Sequence[str] = (),
+    obstacles: Sequence[Obstacle] = (),
+    *,
+    legend_columns: int | None = None,
 ) -> WayChart:
-    """The figure of what `compose_trajectory` has gathered, and of what stands there."""
+    """The figure of what `compose_trajectory` has gathered, and of what stands there.
+
+    Args:
+        plot: That.
+        notes: Its notes.
+        obstacles: What stands there.
+        legend_columns: Of a narrow figure; None for a legend in one row.
+    """
     fig: Any = figure(
         height=HEIGHT_PX, sizing_mode="stretch_width", match_aspect=True, tools=_TOOLS
     )
@@ -110,7 +121,10 @@ def draw_way(
         if track.path.places:
             items += _track(fig, track, index, sources, alone=len(plot.tracks) == 1)
     _least_size(fig, [place for track in plot.tracks for place in track.path.places])
-    fig.add_layout(legend(items), "above")
+    shown = legend(items)
+    if legend_columns is not None:
+        shown.ncols = legend_columns
+    fig.add_layout(shown, "above")
     return WayChart(fig, plot.title, tuple(notes), plot, sources)
 
 

@@ -199,7 +199,7 @@ class Tab:
             self._way = None
             self._ways.children = []
         elif is_other or self._way is None or not self._way.refresh(plot):
-            self._way = draw_way(plot, obstacles=drawing.obstacles)
+            self._way = draw_way(plot, obstacles=drawing.obstacles, legend_columns=2)
             figure: Any = self._way.layout
             figure.height = 330
             self._ways.children = [figure]

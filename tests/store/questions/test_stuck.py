@@ -99,6 +99,17 @@ def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
     assert "it turned in place" in still.details["not_stuck"]
 
 
+def test_wheels_against_each_other_are_no_turn_that_was_seen(empty: sqlite3.Connection) -> None:
+    recorder = start_run(empty)
+    for step in range(300):
+        wheels = {"left": 5.0, "right": 5.0 if step < 150 else -5.0}
+        state = {"x": min(step, 150) * 0.02, "y": 0.0, "wheels": wheels, "mode": "go"}
+        recorder.publish(step * 0.1, state)
+    (still,) = ask(empty, "still").events
+    assert "its wheels ran against each other" in still.details["not_stuck"]
+    assert "it turned in place" not in still.details["not_stuck"]
+
+
 @pytest.mark.parametrize("period_s", [0.6, 1.5, 2.0])
 def test_a_stuck_robot_that_wiggles_is_so_from_its_first_row_to_its_last(
     empty: sqlite3.Connection, period_s: float

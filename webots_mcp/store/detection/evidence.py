@@ -133,7 +133,7 @@ def weigh(observed: Observed, motion: Motion, options: EventOptions, moved_in: M
     modes, mode_why, mode_against = _by_mode(parts, motion, options, moved_in)
     should_move = [(part.drives or part.mode in modes) and not part.hindered for part in parts]
     against = [*_against_in(counts, motion), *mode_against]
-    against += ["it turned in place"] if counts.mostly(counts.turning) else []
+    against += [_turned(motion)] if counts.mostly(counts.turning) else []
     to_and_fro = f"it went to and fro within {counts.reach_m:.2g} m"
     against += [to_and_fro] if counts.mostly(counts.swaying) else []
     if not any(should_move) and not against:
@@ -141,6 +141,13 @@ def weigh(observed: Observed, motion: Motion, options: EventOptions, moved_in: M
         against = [f"nothing that is published shows that it should have moved{modeless}"]
     rows = sum(part.rows for part, should in zip(parts, should_move, strict=True) if should)
     return Evidence(should_move, [*mode_why, *_shown_in(counts, motion, rows)], against)
+
+
+def _turned(motion: Motion) -> str:
+    """A turn that was seen, or what only the wheels tell: a quadcopter's also run like that."""
+    if motion.heading is not None:
+        return "it turned in place"
+    return "its wheels ran against each other, as to turn in place; no heading is recorded"
 
 
 def _shown_in(counts: Counts, motion: Motion, rows: int) -> list[str]:

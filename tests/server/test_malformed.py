@@ -49,7 +49,7 @@ def _tried(table: str) -> Any:
     return pytest.param(table, marks=[pytest.mark.xfail(reason=why)] if known else [])
 
 
-@pytest.mark.parametrize("table", map(_tried, TABLES))
+@pytest.mark.parametrize("table", [_tried(table) for table in TABLES])
 async def test_a_wrong_value_anywhere_leaves_every_tool_with_an_answer(
     base: Path, tmp_path: Path, table: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

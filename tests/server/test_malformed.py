@@ -43,13 +43,7 @@ def test_every_table_is_tried(base: Path) -> None:
     assert names - KEPT_BY_OTHERS == set(TABLES)
 
 
-def _tried(table: str) -> Any:
-    why = "a figure of a rollup that no bridge writes still fails some answers from rollups"
-    known = table in ("rollup", "coarse_rollup")
-    return pytest.param(table, marks=[pytest.mark.xfail(reason=why)] if known else [])
-
-
-@pytest.mark.parametrize("table", [_tried(table) for table in TABLES])
+@pytest.mark.parametrize("table", TABLES)
 async def test_a_wrong_value_anywhere_leaves_every_tool_with_an_answer(
     base: Path, tmp_path: Path, table: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

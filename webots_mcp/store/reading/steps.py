@@ -143,4 +143,4 @@ def _parts(
             into = 0.0 if before is None else abs(first - before[0])
             if before is None or max(largest, into) > limit:
                 yield range(since, first_bucket + COARSE_BUCKETS)
-            before = last, bucket_of(last_s)
+            before = last, first_bucket if last_s is None else bucket_of(last_s)

@@ -11,16 +11,19 @@ from collections.abc import Iterator
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.store.analysis.arrays import Array, np
-from webots_mcp.store.analysis.summary import Summary
+from webots_mcp.store.analysis.summary import COUNTS, Summary
 
 BUCKET_S: Final = 10.0
 COARSE_BUCKETS: Final = 50  # of 10 s in a coarse one: a round length, as those of answers are
 COARSE_S: Final = COARSE_BUCKETS * BUCKET_S
 
 _COARSE_END: Final = "SELECT coarse_end FROM run WHERE id = ?"
+_OF_NUMBERS: Final = Summary._fields[COUNTS : Summary._fields.index("sines")]
+# A sum without values, or without its extremes, is no summary: another program wrote there.
 _BUCKETS: Final = (
     f"SELECT bucket, {', '.join(Summary._fields)} FROM {{table}} "
-    "WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ? ORDER BY bucket"
+    "WHERE run_id = ? AND signal_id = ? AND bucket >= ? AND bucket < ? "
+    f"AND (sum IS NULL OR present > 0 AND {' + '.join(_OF_NUMBERS)} IS NOT NULL) ORDER BY bucket"
 )
 _STORED: Final = (
     "SELECT {name} FROM coarse_rollup WHERE run_id = ? AND signal_id = ? "

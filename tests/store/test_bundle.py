@@ -6,7 +6,7 @@ import sqlite3
 import stat
 import zipfile
 from collections.abc import Callable, Generator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -358,3 +358,29 @@ def test_a_database_that_is_none_of_ours_is_refused(
     with here.opened() as connection:
         assert counts(connection)["run"] == 0
     assert not list(here.path.rglob("*.png"))
+
+
+@pytest.mark.parametrize(
+    ("uuid", "path", "said"),
+    [("webots", "webots.db", "is no picture"), ("front", "camera/front.000001.png", None)],
+)
+def test_no_file_that_is_here_is_replaced_whatever_a_foreign_recording_calls_its_pictures(
+    there: Folder, here: Folder, uuid: str, path: str, said: str | None
+) -> None:
+    here.take_in(there.bundled(2))
+    own = here.path / "camera" / "front.000001.png"
+    own.parent.mkdir(exist_ok=True)
+    own.write_bytes(b"own")
+    before = here.everything(1)
+    bundle = there.bundled(1)
+    with unpacked(bundle) as source:
+        with closing(sqlite3.connect(source)) as foreign, foreign:
+            foreign.execute("UPDATE run SET uuid = ?", (uuid,))
+            foreign.execute("UPDATE image SET path = ?", (path,))
+        with zipfile.ZipFile(bundle, "w") as archive:
+            archive.write(source, DATABASE_NAME)
+            archive.writestr("camera/front.000001.png", b"theirs")
+    with pytest.raises(InvalidInputError, match=said) if said else nullcontext():
+        here.take_in(bundle)
+    assert here.everything(1) == before
+    assert own.read_bytes() == b"own"

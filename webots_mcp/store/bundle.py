@@ -17,10 +17,9 @@ from webots_mcp.contract import DATABASE_NAME, PRIVATE_FILE
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
 from webots_mcp.store.export.rows import Progress
-from webots_mcp.store.images import MAX_FILE_BYTES
+from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES
 from webots_mcp.store.merging import merge
 
-PICTURES: Final = (".png", ".jpg", ".jpeg")
 _PIECE_BYTES: Final = 1_000_000
 # Rows that are all alike become a fiftieth of their size; who unpacks to far more wants to harm.
 _MOST_TIMES: Final = 100

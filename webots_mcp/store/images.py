@@ -17,6 +17,7 @@ from webots_mcp.store.rows import columns_of
 if TYPE_CHECKING:
     from PIL.Image import Image
 
+PICTURES: Final = (".png", ".jpg", ".jpeg")
 MAX_FILE_BYTES: Final = 64_000_000
 MAX_PIXELS: Final = 50_000_000  # 200 MB in memory
 

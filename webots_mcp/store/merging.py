@@ -21,7 +21,7 @@ from webots_mcp.connection import transaction
 from webots_mcp.contract import make_folder
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.settlement import settle
-from webots_mcp.store.images import inside
+from webots_mcp.store.images import PICTURES, inside
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import fetch_trial_set, is_at_work
 
@@ -296,7 +296,11 @@ def _path_here(path: str, run_uuid: str) -> str:
 def _copy_pictures(
     connection: sqlite3.Connection, data_dir: Path, source_dir: Path, run_id: int, run_uuid: str
 ) -> None:
-    """Before their rows come: whoever is killed in between copies them once more."""
+    """Before their rows come: whoever is killed in between copies those that lack.
+
+    The other recording says how its pictures are called, which may be a lie: only pictures are
+    taken, into this folder, and in no other file's place.
+    """
     for _, path, _ in _images(connection, "r.id = ?", run_id):
         try:
             file = inside(source_dir, path)
@@ -305,6 +309,10 @@ def _copy_pictures(
         target = data_dir / _path_here(path, run_uuid)
         if not target.resolve().is_relative_to(data_dir.resolve()):
             raise InvalidInputError(f"{path!r} would lie outside the data folder and is not taken")
+        if target.suffix.lower() not in PICTURES:
+            raise InvalidInputError(f"{path!r} is no picture's name and is not taken")
+        if target.exists():
+            continue  # a whole one, from an import that was killed
         make_folder(target.parent)
         aside = target.with_suffix(".part")
         shutil.copyfile(file, aside)

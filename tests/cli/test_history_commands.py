@@ -180,6 +180,17 @@ def test_a_count_that_is_none_is_refused_by_every_command(
     assert f"argument -n: '{number}' must be a whole number" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("asked", ["report {}", "compare 1 {}", "export --run {}", "command {}"])
+@pytest.mark.parametrize("number", [str(2**63), "1.5", "x"])
+def test_an_id_that_no_row_can_have_is_refused(
+    capsys: pytest.CaptureFixture[str], asked: str, number: str
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(asked.format(number).split())
+    assert ended.value.code == 2
+    assert f"'{number}' is no id" in capsys.readouterr().err
+
+
 def test_what_a_terminal_would_obey_is_spelled_out(capsys: pytest.CaptureFixture[str]) -> None:
     print_table(("name", "empty"), [["red \x1b[31m alarm", None], ["two\nlines", None]])
     assert capsys.readouterr().out == "name\nred \\x1b[31m alarm\ntwo\\nlines\n"

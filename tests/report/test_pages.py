@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import sqlite3
 import sys
@@ -17,6 +18,7 @@ from tests.recordings.rows import Recorded
 from tests.report.conftest import Shown
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
 from webots_mcp.report import Report, make_report
+from webots_mcp.report.words import number
 from webots_mcp.store.questions.compare import compare_runs
 
 EVIL = "</script><script>window.harmed = true</script><img src=x onerror=alert(1)>"
@@ -214,3 +216,23 @@ def test_without_the_extra_it_says_what_to_install(
     monkeypatch.setitem(sys.modules, "bokeh", None)
     with pytest.raises(InvalidInputError, match=r"pip install 'webots-mcp\[view\]'"):
         make_report(recording, [1], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("value", "span", "told"),
+    [(-4.857e-17, 0.64, "0"), (-4.857e-17, 0.0, "-4.857e-17"), (1e308, math.inf, "1e+308")],
+)
+def test_what_is_nothing_beside_the_span_of_its_signal_is_0(
+    value: float, span: float, told: str
+) -> None:
+    assert number(value, span) == told
+
+
+def test_a_number_that_cancelled_itself_out_is_told_as_0(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    robot = recorded.robot()
+    for step in range(50):
+        robot.state(step * 0.1, {"x": step * 0.013 or -4.857e-17})
+    text = Shown(make_report(recorded.connection, [robot.run_id], tmp_path).html).text
+    recorded.close()
+    assert "e-17" not in text

@@ -15,6 +15,7 @@ from webots_mcp.cli.command import (
     command,
     count,
     reading,
+    row_id,
 )
 from webots_mcp.cli.steering import show_progress, writable
 from webots_mcp.cli.tables import print_table
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     argument("condition", nargs="?", metavar="CONDITION", help="such as 'front_m < 0.1 for 0.5'"),
     argument("--action", choices=BREAKPOINT_ACTIONS, default="pause", help="at a hit (pause)"),
     count("--after-hits", "act from the Nth hit of a run on", default=1, dest="after_hits"),
-    argument("--remove", type=int, dest="breakpoint_id", metavar="ID", help="remove this one"),
+    argument("--remove", type=row_id, dest="breakpoint_id", metavar="ID", help="remove this one"),
 )  # fmt: skip
 def breakpoint_(arguments: argparse.Namespace) -> None:
     """Pause, or take note, when a condition begins to hold; without one, list the breakpoints.

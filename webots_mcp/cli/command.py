@@ -77,6 +77,17 @@ def count(
     return argument(flag, type=parse, default=default, dest=dest, metavar=metavar, help=told)
 
 
+def row_id(text: str) -> int:
+    """The id of a run, a command or another row, as `argparse` takes types.
+
+    Raises:
+        argparse.ArgumentTypeError: It is none that SQLite could have given.
+    """
+    if text.isascii() and text.isdecimal() and int(text) < 2**63:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"{text!r} is no id: it is a number that an answer has told")
+
+
 def command(name: str, *arguments: Argument) -> Callable[[_Run], _Run]:
     """Make a function a subcommand."""
 

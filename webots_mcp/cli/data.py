@@ -22,6 +22,7 @@ from webots_mcp.cli.command import (
     past_unsound_rows,
     past_wrong_values,
     reading,
+    row_id,
 )
 from webots_mcp.cli.limits import LIMITS, limits_of
 from webots_mcp.cli.progress import shown_progress
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     argument("--safe-cells", action="store_true",
              help="in CSV, an apostrophe before texts that a spreadsheet would run as a formula "
              "(they begin with =, +, - or @)"),
-    argument("--trials", type=int, dest="trial_set", metavar="SET",
+    argument("--trials", type=row_id, dest="trial_set", metavar="SET",
              help="the trials of that set instead, one row each, with score, rank and spread"),
 )  # fmt: skip
 def export(arguments: argparse.Namespace) -> None:
@@ -227,7 +228,8 @@ def prune(arguments: argparse.Namespace) -> None:
 
 @command(
     "retain", DATA_DIR, DATABASE,
-    argument("run_ids", type=int, nargs="*", metavar="RUN", help="as 'webots-mcp runs' lists them"),
+    argument("run_ids", type=row_id, nargs="*", metavar="RUN",
+             help="as 'webots-mcp runs' lists them"),
     argument("--release", action="store_true", help="let retention have them again"), *LIMITS,
 )  # fmt: skip
 def retain(arguments: argparse.Namespace) -> None:
@@ -249,7 +251,7 @@ def retain(arguments: argparse.Namespace) -> None:
 
 @command(
     "label", DATA_DIR, DATABASE, JSON,
-    argument("run_id", type=int, metavar="RUN", help="as 'webots-mcp runs' lists them"),
+    argument("run_id", type=row_id, metavar="RUN", help="as 'webots-mcp runs' lists them"),
     argument("label", nargs="?", metavar="TEXT", help="short; '-' takes it away"),
     argument("--note", metavar="TEXT", help="any text; '-' takes it away"),
 )  # fmt: skip

@@ -18,6 +18,7 @@ from webots_mcp.cli.command import (
     count,
     question,
     reading,
+    row_id,
     settings_of,
 )
 from webots_mcp.cli.comparison import print_comparison
@@ -184,7 +185,7 @@ def _verdicts(verdicts: Verdicts) -> list[str]:
     argument("--trajectory", action="store_true", help="the way of the robot, seen from above"),
     argument("--runs", type=_id_or_signal, nargs="+", default=[], dest="run_ids", metavar="ID",
              help="several runs, laid over each other"),
-    argument("--trials", type=int, dest="trial_set", metavar="SET",
+    argument("--trials", type=row_id, dest="trial_set", metavar="SET",
              help="the scores of a trial set, over one or two parameters (named as signals)"),
     count("--width", "pixels", default=900, dest="width_px", metavar="PX"),
     count("--height", "pixels", default=500, dest="height_px", metavar="PX"),
@@ -227,9 +228,9 @@ def write_picture(file: Path, picture: Picture) -> None:
 
 @question(
     "compare", DATA_DIR, DATABASE, ROBOT, JSON,
-    argument("run_ids", type=int, nargs="*", metavar="RUN",
+    argument("run_ids", type=row_id, nargs="*", metavar="RUN",
              help="one or more runs; none: before and after the last edit of the controller"),
-    argument("--trials", type=int, dest="trial_set", metavar="SET",
+    argument("--trials", type=row_id, dest="trial_set", metavar="SET",
              help="the runs of a trial set, by their parameters"),
     argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
     *MOTION,

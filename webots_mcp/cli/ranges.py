@@ -7,13 +7,13 @@ import sqlite3
 from dataclasses import fields
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.cli.command import ROBOT, Argument, argument
+from webots_mcp.cli.command import ROBOT, Argument, argument, row_id
 
 if TYPE_CHECKING:
     from webots_mcp.store.reading.ranges import Scope, TimeRange
 
 RUN: Final = argument(
-    "--run", type=int, dest="run_id", metavar="ID", help="that run instead of the newest one"
+    "--run", type=row_id, dest="run_id", metavar="ID", help="that run instead of the newest one"
 )
 SIMULATION_TIMES: Final[tuple[Argument, ...]] = (
     argument(

@@ -13,6 +13,7 @@ from webots_mcp.cli.command import (
     open_recording,
     question,
     reading,
+    row_id,
 )
 from webots_mcp.cli.progress import shown_progress
 from webots_mcp.cli.tables import print_notes
@@ -20,7 +21,7 @@ from webots_mcp.cli.tables import print_notes
 
 @question(
     "report", DATA_DIR, DATABASE, ROBOT,
-    argument("run_ids", type=int, nargs="*", metavar="RUN",
+    argument("run_ids", type=row_id, nargs="*", metavar="RUN",
              help="one run, or two beside each other; none: the newest"),
     argument("-o", "--output", metavar="FILE",
              help="a .html file (default: run-RUN.html in this folder)"),
@@ -54,5 +55,6 @@ def report(arguments: argparse.Namespace) -> None:
         )  # fmt: skip
         write_report(file, made.html, overwrite=arguments.overwrite)
     held = ", ".join(f"{name} {count}" for name, count in made.holds.items())
-    print(f"{file}: {made.title}, {size(len(made.html))}; {held}")
+    holds = f"; {held}" if held else ""
+    print(f"{file}: {made.title}, {size(len(made.html))}{holds}")
     print_notes([f"left out: {each}" for each in made.left_out])

@@ -10,7 +10,16 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from webots_mcp.cli.command import DATA_DIR, DATABASE, JSON, ROBOT, argument, command, settings_of
+from webots_mcp.cli.command import (
+    DATA_DIR,
+    DATABASE,
+    JSON,
+    ROBOT,
+    argument,
+    command,
+    row_id,
+    settings_of,
+)
 from webots_mcp.cli.tables import print_table, text_of
 from webots_mcp.cli.tuning import parameters_of
 from webots_mcp.contract import LOOPING
@@ -139,7 +148,8 @@ def step(arguments: argparse.Namespace) -> None:
 
 @command(
     "wait", DATA_DIR, DATABASE, JSON, TIMEOUT,
-    argument("command_id", type=int, metavar="COMMAND", help="its number, as 'run' and 'send' say"),
+    argument("command_id", type=row_id, metavar="COMMAND",
+             help="its number, as 'run' and 'send' say"),
 )  # fmt: skip
 def wait(arguments: argparse.Namespace) -> None:
     """Go on waiting for a command that was still under way when --timeout was over.

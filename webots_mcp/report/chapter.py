@@ -19,6 +19,7 @@ from webots_mcp.report.words import (
     length,
     listed,
     number,
+    paced,
     share,
     spelled,
     time_at,
@@ -33,6 +34,7 @@ from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.events import Found, choose, search_events
 from webots_mcp.store.questions.runs import RunInfo, run_info
+from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.runs import fetch_run
@@ -208,10 +210,10 @@ def _first_words(info: RunInfo) -> str:
     world = f" in {_file(info.world)}" if info.world else ""
     ended = f"It ended: {info.end_reason}." if info.end_reason else "It goes on."
     pace = info.real_time_factor
-    paced = f", at {pace:.2g} times real time" if pace is not None else ""
+    how_fast = f", {paced(pace)}" if pace is not None else ""
     return (
         f"{info.robot} ran for {length(info.duration_s)} of simulation time{world}, from "
-        f"{clock(info.started_wall_time_s)} on{paced}. {ended}"
+        f"{clock(info.started_wall_time_s)} on{how_fast}. {ended}"
     )
 
 
@@ -274,7 +276,7 @@ def _stored(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float)
 
 def _findings(verdicts: Verdicts) -> list[str]:
     """What there is of each kind that was looked for, and what there is none of."""
-    found = [f"{count} {kind}" for kind, count in verdicts.found.items()]
+    found = [f"{kind} ({count})" for kind, count in verdicts.found.items()]
     said = [f"Found: {', '.join(found)}."] if found else []
     said += [f"Looked for and absent: {', '.join(verdicts.far)}."] if verdicts.far else []
     said += [
@@ -378,16 +380,19 @@ def _line(line: LogLine) -> Row:
 def _trends(run: RunTrends) -> Grid:
     """Numbers, what changed most first; then texts and flags."""
     rows = [
-        Row([
-            trend.name, trend.unit or "", trend.says, number(trend.mean), number(trend.deviation),
-            number(trend.summary.min), number(trend.summary.max),
-        ])
-        for trend in run.numbers
-    ]  # fmt: skip
+        Row([trend.name, trend.unit or "", trend.says, *_figures(trend)]) for trend in run.numbers
+    ]
     rows += [Row([state.name, "", _course(state), "", "", "", ""]) for state in run.states]
     notes = [f"Without a value: {', '.join(run.silent[:50])}."] if run.silent else []
     columns = ("signal", "unit", "what it did", "mean", "deviation", "least", "greatest")
     return Grid(columns, rows, notes, left_out=run.total - len(run.numbers))
+
+
+def _figures(trend: Trend) -> list[str]:
+    """Mean, deviation, least and greatest value."""
+    least, greatest = trend.summary.min, trend.summary.max
+    span = 0.0 if least is None or greatest is None else greatest - least
+    return [number(each, span) for each in (trend.mean, trend.deviation, least, greatest)]
 
 
 def _course(state: StateTrend) -> str:

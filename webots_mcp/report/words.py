@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
@@ -12,6 +13,7 @@ from webots_mcp.store.detection.event import Event
 
 LONGEST_TEXT: Final = 1_000  # characters of a cell
 _LONGEST_VALUE: Final = 400  # of a value within one
+_NOTHING: Final = 1e-9  # of a signal's span: what is left when numbers cancel each other out
 _UNIT: Final = re.compile(r"(.+)_(s|m|rad)")
 _UNTOLD: Final = ("id", "image_id", "first_times_s")
 
@@ -23,9 +25,23 @@ def cut(text: str, longest: int = LONGEST_TEXT) -> str:
     return f"{text[:longest]} … ({len(text)} characters)"
 
 
-def number(value: float | None) -> str:
-    """Four digits, which tell what a person can see; nothing where there is no number."""
-    return "" if value is None else f"{value:.4g}"
+def number(value: float | None, span: float = 0.0) -> str:
+    """Four digits, which tell what a person can see; nothing where there is no number.
+
+    Args:
+        value: Any.
+        span: From the least to the greatest value of its signal: what is nothing beside it is 0.
+    """
+    if value is None:
+        return ""
+    is_nothing = abs(value) <= _NOTHING * span < math.inf
+    return f"{0.0 if is_nothing else value:.4g}"
+
+
+def paced(factor: float) -> str:
+    """How fast simulation time went by."""
+    text = f"{factor:.2g}"
+    return "at the pace of real time" if text == "1" else f"at {text} times real time"
 
 
 def time_at(time_s: float | None) -> str:

@@ -385,3 +385,14 @@ def test_a_name_that_tells_no_format_is_refused() -> None:
         InvalidInputError, match=r"\.csv, \.jsonl, \.parquet, \.mcap, \.rrd or \.zip"
     ):
         format_of(Path("run"))
+
+
+@pytest.mark.parametrize("name", ["file/x.csv", f"{'k' * 300}.csv", "none/x.csv"])
+def test_a_file_that_cannot_be_made_is_said_to_be_none(
+    recorder: Recorder, tmp_path: Path, name: str
+) -> None:
+    publish(recorder, 0.0, {"x": 1})
+    (tmp_path / "file").touch()
+    wanted = find_range(recorder.connection, Scope(run_id=1))
+    with pytest.raises(InvalidInputError, match="cannot be written"):
+        export_file(recorder.connection, wanted, "csv", tmp_path / name)

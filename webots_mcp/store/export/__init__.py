@@ -153,13 +153,14 @@ def placed(file: Path) -> Generator[Path]:
     aside = file.with_name(f"{file.name}.part")
     try:
         aside.touch(PRIVATE_FILE)
-        aside.chmod(PRIVATE_FILE)
-        yield aside
-        os.replace(aside, file)  # noqa: PTH105
+        try:
+            aside.chmod(PRIVATE_FILE)
+            yield aside
+            os.replace(aside, file)  # noqa: PTH105
+        finally:
+            aside.unlink(missing_ok=True)
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error
-    finally:
-        aside.unlink(missing_ok=True)
 
 
 def format_of(file: Path) -> str:

@@ -180,7 +180,7 @@ def test_a_count_that_is_none_is_refused_by_every_command(
     assert f"argument -n: '{number}' must be a whole number" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("asked", ["report {}", "compare 1 {}", "export --run {}", "command {}"])
+@pytest.mark.parametrize("asked", ["report {}", "compare 1 {}", "export --run {}", "wait {}"])
 @pytest.mark.parametrize("number", [str(2**63), "1.5", "x"])
 def test_an_id_that_no_row_can_have_is_refused(
     capsys: pytest.CaptureFixture[str], asked: str, number: str

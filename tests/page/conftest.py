@@ -82,6 +82,12 @@ def write_story(data_dir: Path) -> None:
             hostile.publish(step / 10, {"$$x$$": step, "mode": LINE, NAME: step % 2 == 0})
         logged = {"level": "info", "source": "controller", "message": LINE}
         hostile.insert("log", **hostile.at(5.0), **logged)
+        still = start_run(connection, "still")
+        (session_id, robot_id) = connection.execute(
+            "SELECT session_id, robot_id FROM run WHERE id = ?", (still.run_id,)
+        ).fetchone()
+        still.run(session_id, robot_id, "reset")
+        still.publish(0.0, {"x": 1.0})
         roll(connection, 100_000)
 
 

@@ -121,6 +121,17 @@ def test_two_runs_lie_over_each_other_and_all_figures_zoom_together(
     assert tab.time()[0] > before[0]
 
 
+def test_of_a_run_without_rows_it_says_so_and_stays_with_it(
+    opened: Callable[[Server], Tab], told: Server
+) -> None:
+    tab = opened(told)
+    tab.choose("robot", "still")
+    tab.choose("run", "run 5 ")
+    tab.says("run 5 of robot 'still' has no state row yet")
+    tab.says("this is an earlier run; it ended by an unknown cause")
+    assert tab.errors == []
+
+
 def test_what_was_recorded_is_text_and_nothing_else(
     opened: Callable[[Server], Tab], told: Server
 ) -> None:

@@ -232,3 +232,11 @@ def test_arrows_point_the_way_that_was_taken() -> None:
     found = headings(path, 4)
     assert [heading.degrees for heading in found] == pytest.approx([0, 90, 180, -90])
     assert headings(Path([Place(0, 1, 1)], None, frozenset()), 4) == []
+
+
+def test_what_is_too_far_to_tell_a_distance_to_is_no_place(record: Record) -> None:
+    far = record(lambda time_s: {"x": 1.7e308 if 4 <= time_s < 5 else time_s, "y": 0.0})
+    axes, _ = compose_trajectory(far, [whole(far)])
+    (track,) = axes.tracks
+    assert len(track.path.places) == 90
+    assert len(headings(track.path, 5)) == 5

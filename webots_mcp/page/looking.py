@@ -162,7 +162,10 @@ def gather(recording: Recording, shown: Look, choice: Choice) -> Drawing:
     """Read what is to be drawn of the run."""
     started_s = time.monotonic()
     with recording.reader() as connection:
-        ranges = _ranges(connection, shown, choice)
+        try:
+            ranges = _ranges(connection, shown, choice)
+        except NothingRecordedError as error:
+            return Drawing((), (), None, None, None, (), (str(error),), 0.0)
         known = known_signals(connection, ranges[0])
         names = tuple(name for name in choice.names or () if name in known)
         names = names or tuple(changed_most(connection, ranges[0]))

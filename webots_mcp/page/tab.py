@@ -272,11 +272,11 @@ class Tab:
         _say(self._status, problem_markup(error))
         if isinstance(error, (NoDatabaseError, NothingRecordedError)):
             self._drawn = None
-            self._choice = replace(self._choice, run_id=None, beside_id=None)
+            self._selectors.run.value, self._selectors.beside.value = NEWEST, NONE
 
     def _make_places(self) -> None:
         self._status = Div(name="status", stylesheets=sheet(STATUS), sizing_mode="stretch_width")
-        self._said = Div(name="said", stylesheets=sheet(NOTES), width=260, align="end")
+        self._said = Div(name="said", stylesheets=sheet(NOTES), sizing_mode="stretch_width")
         self._notes = Div(name="notes", stylesheets=sheet(NOTES), sizing_mode="stretch_width")
         self._log = Div(name="log", stylesheets=sheet(LOG), sizing_mode="stretch_width")
         self._picture = Div(name="picture", stylesheets=sheet(PICTURE), width=320)
@@ -290,8 +290,9 @@ class Tab:
         if not self._read_only:
             from webots_mcp.page.steering import ORDERS
 
-            orders = [buttons(ORDERS, self._steer), self._said]
+            orders = [buttons(ORDERS, self._steer)]
         head = row(title, *self._selectors.all, *orders, sizing_mode="stretch_width")
+        state = row(self._status, self._said, sizing_mode="stretch_width")
         side = column(
             self._tree.layout, self._parameters.layout, width=200, height=_HEIGHT_PX - 130,
             stylesheets=sheet(CARD, SCROLLING),
@@ -305,7 +306,7 @@ class Tab:
         middle = column(drawn, log, sizing_mode="stretch_width", spacing=10)
         body = row(side, middle, right, sizing_mode="stretch_width", spacing=10)
         return column(
-            head, self._status, body, sizing_mode="stretch_width", spacing=6, margin=10,
+            head, state, body, sizing_mode="stretch_width", spacing=6, margin=10,
             stylesheets=page_sheet(), tags=self._beat.models,
         )  # fmt: skip
 

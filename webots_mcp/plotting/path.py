@@ -8,11 +8,12 @@ from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate, pairwise
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeGuard
 
 from webots_mcp.naming import Value
 from webots_mcp.plotting.parts import Part
 from webots_mcp.store.analysis.rhythm import rhythm_of
+from webots_mcp.store.analysis.summary import LARGEST
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.rows import exceeds, read_columns
 from webots_mcp.store.signals.registry import Signal
@@ -80,9 +81,14 @@ def _path(
     places = [
         Place(time, x, y)
         for time, x, y in zip(times, xs, ys, strict=True)
-        if isinstance(x, (int, float)) and isinstance(y, (int, float))
+        if _is_usable(x) and _is_usable(y)
     ]
     return Path(places, step_s, frozenset(_breaks(places)))
+
+
+def _is_usable(value: Value) -> TypeGuard[float]:
+    """Whether a distance to it can be told."""
+    return isinstance(value, (int, float)) and abs(value) <= LARGEST
 
 
 def _breaks(places: Sequence[Place]) -> Iterator[int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import stat
+import sys
 import zipfile
 from collections.abc import Callable, Generator
 from contextlib import closing, contextmanager, nullcontext
@@ -384,3 +385,17 @@ def test_no_file_that_is_here_is_replaced_whatever_a_foreign_recording_calls_its
         here.take_in(bundle)
     assert here.everything(1) == before
     assert own.read_bytes() == b"own"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no file's size")
+def test_where_there_is_no_room_to_unpack_a_bundle_that_is_said(there: Folder) -> None:
+    import resource
+
+    bundle = there.bundled(1)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(InvalidInputError, match="cannot be unpacked in"), unpacked(bundle):
+            pass
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)

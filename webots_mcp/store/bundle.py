@@ -98,7 +98,7 @@ def unpacked(file: Path) -> Generator[Path]:
     link or unpacks to far more than it holds is refused before anything is written.
 
     Raises:
-        InvalidInputError: It is damaged, or no bundle.
+        InvalidInputError: It is damaged or no bundle, or there is no room to unpack it.
     """
     with tempfile.TemporaryDirectory(prefix="webots-mcp-") as name:
         try:
@@ -112,6 +112,8 @@ def unpacked(file: Path) -> Generator[Path]:
                         shutil.copyfileobj(source, sink, _PIECE_BYTES)
         except _DAMAGED as error:
             raise InvalidInputError(f"{file} is damaged, or no ZIP archive: {error}") from error
+        except OSError as error:
+            raise InvalidInputError(f"{file} cannot be unpacked in {name}: {error}") from error
         yield Path(name) / DATABASE_NAME
 
 

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ from hypothesis import given, settings
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder
+from tests.recordings.rows import Recorded as RecordedOnDisk
 from tests.recordings.runs import Recorded
 from tests.store.export.test_export import STATES, expected, publish, recorded_run, same
 from webots_mcp.errors import InvalidInputError
@@ -202,6 +206,28 @@ def test_a_recording_appears_when_it_is_complete_or_not_at_all(
         export_for_viewers(recorder.connection, tmp_path, wanted, "rrd", file, fail)
     assert file.read_text() == "old"
     assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows limits no file's size")
+def test_a_disk_that_is_full_ends_the_export_and_is_told(tmp_path: Path) -> None:
+    import resource
+
+    with closing(RecordedOnDisk(tmp_path / "webots.db")) as recorded:
+        robot = recorded.robot()
+        for i in range(2_000):
+            robot.state(i * 0.1, {f"x{k}": i * 0.37 + k for k in range(10)})
+    file = tmp_path / "run.rrd"
+    ran = subprocess.run(
+        [sys.executable, "-m", "webots_mcp", "export", "-o", file, "--data-dir", tmp_path],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)),
+        capture_output=True,
+        text=True,
+        timeout=60,  # Rerun's own thread may wait for ever
+        check=False,
+    )
+    assert ran.returncode == 2
+    assert f"{file} cannot be written: [Errno {errno.EFBIG}]" in ran.stderr
+    assert not list(tmp_path.glob("run.rrd*"))
 
 
 def test_rerun_that_is_switched_off_is_told(

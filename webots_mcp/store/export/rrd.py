@@ -6,6 +6,8 @@ Everything stands on two timelines: `sim_time`, a duration, and `wall_time`, a t
 from __future__ import annotations
 
 import math
+import os
+import sys
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
@@ -13,6 +15,9 @@ from importlib import import_module
 from itertools import chain, groupby, islice
 from operator import attrgetter
 from pathlib import Path
+from shutil import copyfileobj
+from tempfile import TemporaryDirectory
+from threading import Thread
 from typing import Any, Final, NamedTuple, TypeVar
 from uuid import NAMESPACE_URL, uuid5
 
@@ -24,6 +29,7 @@ from webots_mcp.store.export.layout import main_signals
 from webots_mcp.store.export.rows import Recorded, Row, as_text, flat_row, kind_of
 from webots_mcp.store.logs import LogLine
 
+_COPY_BYTES: Final = 1 << 16
 _GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
 _LEVELS: Final = {"warning": "WARN"}  # Rerun's other names are ours in capitals
 _MEDIA_TYPES: Final = {"png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg"}
@@ -44,20 +50,81 @@ def write_rrd(contents: Contents, file: Path) -> Counter[str]:
 
     Raises:
         InvalidInputError: The library is not installed, or is switched off.
+        OSError: The file takes no more.
     """
     rerun = _library()
     with warnings.catch_warnings():
         warnings.simplefilter("error", rerun.error_utils.RerunWarning)
         stream = rerun.RecordingStream("webots_mcp", recording_id=_recording_id(contents))
-        writing = _Writing(contents, rerun, stream)
-        stream.save(str(file), default_blueprint=writing.blueprint())
-        try:
-            writing.write()
-        finally:
-            stream.disconnect()
+        with _Saved(file) as saved:
+            writing = _Writing(contents, rerun, stream, saved)
+            stream.save(str(saved.path), default_blueprint=writing.blueprint())
+            saved.begin()
+            try:
+                writing.write()
+            finally:
+                stream.disconnect()
     if not file.stat().st_size:
         raise InvalidInputError("Rerun wrote nothing: is the environment variable RERUN 'off'?")
     return writing.counts
+
+
+class _Saved:
+    """A pipe for Rerun to save to, of which a thread of ours writes the bytes to the file.
+
+    Rerun's own thread stops at the first byte that a full disk refuses, and whoever flushes then
+    waits for it for ever. A pipe takes everything; `check` raises what the file has refused.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.path = file
+        self._file = file
+        self._folder: TemporaryDirectory[str] | None = None
+        self._end = -1
+        self._error: OSError | None = None
+        self._thread = Thread(target=self._copy, name="rrd")
+
+    def __enter__(self) -> _Saved:
+        if sys.platform != "win32":  # has no pipes among its files: Rerun writes the file itself
+            self._folder = TemporaryDirectory()
+            self.path = Path(self._folder.name, "pipe")
+            try:
+                os.mkfifo(self.path)
+                self._end = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # no writer yet
+                os.set_blocking(self._end, True)
+            except OSError:
+                self._folder.cleanup()
+                raise
+        return self
+
+    def begin(self) -> None:
+        """Write from here on: Rerun has opened the pipe."""
+        if self._folder:
+            self._thread.start()
+
+    def check(self) -> None:
+        """Raise the OSError of the file, if it takes no more."""
+        if self._error:
+            raise self._error
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if self._folder:
+            if self._thread.ident:
+                self._thread.join()
+            os.close(self._end)
+            self._folder.cleanup()
+        if kind is None:
+            self.check()
+
+    def _copy(self) -> None:
+        try:
+            with open(self._end, "rb", 0, closefd=False) as pipe, self._file.open("wb") as sink:
+                copyfileobj(pipe, sink)
+        except OSError as error:
+            self._error = error
+        finally:
+            while os.read(self._end, _COPY_BYTES):  # Rerun waits until all of it has been taken
+                pass
 
 
 def _library() -> Any:
@@ -86,11 +153,12 @@ class _Times(NamedTuple):
 class _Writing:
     """A recording that is being written."""
 
-    def __init__(self, contents: Contents, rerun: Any, stream: Any) -> None:
+    def __init__(self, contents: Contents, rerun: Any, stream: Any, saved: _Saved) -> None:
         self.counts: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
         self._contents = contents
         self._rerun = rerun
         self._stream = stream
+        self._saved = saved
         self._text_type = getattr(rerun, "StateChange", None)  # Rerun 0.33 and newer
         self._last_texts: dict[tuple[int, str], str | None] = {}
         self._several = len(contents.run_ids) > 1
@@ -228,6 +296,7 @@ class _Writing:
             column("wall_time", timestamp=times.wall[chosen]),
         ]
         self._stream.send_columns(path, indexes=indexes, columns=columns)
+        self._saved.check()
 
     def _signal(self, run_id: int, name: str) -> str:
         return self._path(run_id, "state", *name.split("."))

@@ -409,3 +409,12 @@ def test_all_keeps_everything(say: Say, database: Path) -> None:
 )
 def test_sizes_are_written_as_they_are_read(size: float, text: str) -> None:
     assert size_text(size) == text
+
+
+@pytest.mark.parametrize("name", ["nothing.zip", "nothing.db", "nothing"])
+def test_a_recording_to_import_that_is_not_there_is_told(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = complaint(capsys, "import", str(tmp_path / name), "--data-dir", str(tmp_path / "new"))
+    assert f"{tmp_path / name} cannot be imported: there is no such file or folder" in said
+    assert not (tmp_path / "new").exists()

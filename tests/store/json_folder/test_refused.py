@@ -146,11 +146,9 @@ def test_a_robot_needs_a_name(
         import_folder(database, peer.folder, data_dir, name)
 
 
-@pytest.mark.parametrize("make", [True, False])
 def test_a_folder_without_anything_to_import_says_what_was_looked_for(
-    peer: Peer, database: sqlite3.Connection, data_dir: Path, make: bool
+    peer: Peer, database: sqlite3.Connection, data_dir: Path
 ) -> None:
-    if make:
-        peer.folder.mkdir()
+    peer.folder.mkdir()
     with pytest.raises(InvalidInputError, match=r"no status\.json, no logs/controller\.log"):
         import_folder(database, peer.folder, data_dir)

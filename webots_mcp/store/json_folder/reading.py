@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import re
 import stat
 from collections.abc import Iterable, Iterator
@@ -107,8 +108,11 @@ def read_folder(folder: Path) -> Found:
     """Read a folder; every file in it is looked through.
 
     Raises:
-        InvalidInputError: It holds nothing to import, or a file is not as it should be.
+        InvalidInputError: It is not there or holds nothing to import, or a file is not as it
+            should be.
     """
+    if not os.path.lexists(folder):
+        raise InvalidInputError(f"{folder} cannot be imported: there is no such file or folder")
     try:
         state = _read_state(folder / STATUS)
         found = Found(

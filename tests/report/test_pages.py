@@ -137,8 +137,21 @@ def test_runs_of_two_robots_that_have_nothing_in_common_are_told_side_by_side(
             robot.state(step * 0.1, {f"{name}_m": step})
     report = make_report(recorded.connection, run_ids, tmp_path, names=["hunter_m"])
     recorded.close()
-    assert "the signals of both runs: they have none in common" in report.left_out
+    assert "the signals of both runs: none that was asked for is in both" in report.left_out
     assert "Run 1 of hunter and Run 2 of runner" in report.title
+
+
+def test_runs_that_share_only_texts_are_told_to_share_no_numbers(tmp_path: Path) -> None:
+    recorded = Recorded(tmp_path / "webots.db")
+    run_ids: list[int] = []
+    for name in ("hunter", "runner"):
+        robot = recorded.robot(name)
+        run_ids.append(robot.run_id)
+        for step in range(20):
+            robot.state(step * 0.1, {f"{name}_m": step, "mode": "ab"[step // 10]})
+    report = make_report(recorded.connection, run_ids, tmp_path)
+    recorded.close()
+    assert "the signals of both runs: they share no numeric signals" in report.left_out
 
 
 def test_of_a_run_without_rows_it_tells_what_there_is(tmp_path: Path) -> None:

@@ -101,6 +101,8 @@ def figures_of(
     while True:
         first = {run_id: had[:count] for run_id, had in chosen.items()}
         charts = _charts(connection, chapters, first, both[:count], with_moments=count > 1)
+        if not both[:count] and len([each for each in chapters if each.range is not None]) > 1:
+            charts.not_drawn.append(f"the signals of both runs: {_why_none(known, names)}")
         made = _embedded(charts.drawn)
         if made.size_bytes <= room_bytes:
             return replace(made, left_out=[*_curves_missing(chapters, first), *charts.not_drawn])
@@ -142,6 +144,16 @@ def _chosen(
     }
 
 
+def _why_none(known: Sequence[dict[str, Signal]], names: Sequence[str]) -> str:
+    """Why none can be laid over each other: texts, and what rests, are chosen by name alone."""
+    if names:
+        return "none that was asked for is in both"
+    shared = [name for name in known[0] if all(name in each for each in known)]
+    if any(each[name].is_number for name in shared for each in known):
+        return "none of those that changed most is in both"
+    return "they share no numeric signals"
+
+
 class _Charts:
     """The charts of a report by their keys, and why others could not be drawn."""
 
@@ -160,8 +172,6 @@ class _Charts:
         """The same of two runs over each other."""
         if names:
             self._add("signals both", "the signals of both runs", self._signals, ranges, names)
-        else:
-            self.not_drawn.append("the signals of both runs: they have none in common")
         self._add("way both", "the ways of both runs", self._way, ranges)
 
     def _add(self, key: str, what: str, draw: Callable[..., Chart], *asked: Any) -> None:

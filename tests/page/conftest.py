@@ -97,7 +97,7 @@ def told(serve: Callable[..., Server], story: Path) -> Server:
     return serve(story, "--read-only")
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def arena(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """The data folder of a rover that drives on the stand-in."""
     data_dir = tmp_path_factory.mktemp("arena")
@@ -105,7 +105,7 @@ def arena(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
         yield data_dir
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def driven(serve: Callable[..., Server], arena: Path) -> Server:
     """A server of the rover that drives."""
     return serve(arena)

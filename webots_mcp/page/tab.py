@@ -6,6 +6,7 @@ and that did not take long; between, new rows are added to what is drawn.
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -18,7 +19,12 @@ from bokeh.layouts import column, row
 from bokeh.models import DataRange1d, Div, GlyphRenderer
 
 from webots_mcp.charts import SignalsChart, WayChart, draw_signals, draw_way
-from webots_mcp.errors import NoDatabaseError, NothingRecordedError, WebotsMCPError
+from webots_mcp.errors import (
+    NoDatabaseError,
+    NothingRecordedError,
+    UnknownRobotError,
+    WebotsMCPError,
+)
 from webots_mcp.page.choice import Choice
 from webots_mcp.page.controls import NEWEST, NONE, Parameters, Selectors, SignalTree, buttons
 from webots_mcp.page.growing import grow_signals, grow_way
@@ -45,6 +51,7 @@ from webots_mcp.parameter import Value
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.stream import Order
 
+_log: Final = logging.getLogger(__name__)
 _PERIOD_MS: Final = 100
 _AROUND_S: Final = 1.0  # between two looks at what changes seldom
 _STATUS_S: Final = 0.5  # between two ages
@@ -110,6 +117,9 @@ class Tab:
             await self._draw()
         except WebotsMCPError as error:
             self._say_problem(error)
+        except Exception as error:  # noqa: BLE001  (the page would stand still without a word)
+            if _say(self._said, problem_markup(error)):  # once, not at each look
+                _log.exception("a tab cannot show all")
         finally:
             self._beat.send()
             self._document.unhold()
@@ -270,9 +280,12 @@ class Tab:
     def _say_problem(self, error: WebotsMCPError) -> None:
         """What is drawn stays: a database may be away for a moment only."""
         _say(self._status, problem_markup(error))
-        if isinstance(error, (NoDatabaseError, NothingRecordedError)):
+        self._next_status_s = 0.0
+        if isinstance(error, (NoDatabaseError, NothingRecordedError, UnknownRobotError)):
             self._drawn = None
             self._selectors.run.value, self._selectors.beside.value = NEWEST, NONE
+        if isinstance(error, UnknownRobotError):  # another database has taken the place
+            self._choice = replace(self._choice, robot=None)
 
     def _make_places(self) -> None:
         self._status = Div(name="status", stylesheets=sheet(STATUS), sizing_mode="stretch_width")
@@ -311,10 +324,12 @@ class Tab:
         )  # fmt: skip
 
 
-def _say(place: Div, markup: str) -> None:
-    """Only what has changed goes to the browser."""
-    if place.text != markup:
+def _say(place: Div, markup: str) -> bool:
+    """Only what has changed goes to the browser; returns whether it has."""
+    has_changed = place.text != markup
+    if has_changed:
         place.text = markup
+    return has_changed
 
 
 def _only_curves(chart: SignalsChart) -> None:

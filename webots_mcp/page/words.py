@@ -16,6 +16,10 @@ from webots_mcp.store.logs import LogLine
 from webots_mcp.store.status import RUNNING
 
 _LONGEST_LINE: Final = 1000  # characters of a log line
+_DEFECT: Final = (
+    "a defect of webots-mcp, or rows that it did not write; webots-mcp view has written more about "
+    "it to its terminal"
+)
 _SIDE_PX: Final = 640
 _JPEG_QUALITY: Final = 80
 _LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
@@ -36,12 +40,15 @@ def status_markup(shown: Look) -> str:
     )
 
 
-def problem_markup(error: WebotsMCPError) -> str:
-    """Why nothing can be read now."""
+def problem_markup(error: Exception) -> str:
+    """Why nothing can be read now, and of what nobody foresaw where more about it stands."""
     waits = isinstance(error, (NoDatabaseError, NothingRecordedError))
     pill = "nothing recorded yet" if waits else "cannot be read"
     kind = "standing" if waits else "problem"
-    return f'<span class="pill {kind}">{pill}</span> <span>{escape(str(error))}</span>'
+    why = str(error)
+    if not isinstance(error, WebotsMCPError):
+        why = f"{_DEFECT} ({type(error).__name__}: {why[:_LONGEST_LINE]})"
+    return f'<span class="pill {kind}">{pill}</span> <span>{escape(why)}</span>'
 
 
 def log_markup(lines: Sequence[LogLine]) -> str:

@@ -1,0 +1,70 @@
+"""What a tab does where it cannot read or draw what it was asked for."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+
+pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
+
+from bokeh.document import Document
+
+from tests.recordings.rover import start_run
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.page.tab import Tab
+from webots_mcp.schema import create_schema
+from webots_mcp.store.recording import Recording
+
+
+def record(folder: Path, robot: str, state: dict[str, Any]) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / DATABASE_NAME).unlink(missing_ok=True)
+    with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as connection:
+        create_schema(connection)
+        run = start_run(connection, robot)
+        for step in range(20):
+            run.publish(step / 10, state)
+        run.insert("log", **run.at(1.0), level="info", source="controller", message="hello")
+
+
+def opened(folder: Path) -> Tab:
+    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    return Tab(recording, Document(), read_only=True)
+
+
+def go_on(tab: Tab) -> str:
+    """One look, of which the browser says that it took it in; returns the line of the status."""
+    anyio.run(tab.go_on)
+    sent, answered = tab.layout.tags
+    answered.start = sent.start
+    return "".join(tab.layout.select_one({"name": name}).text for name in ("status", "said"))
+
+
+def test_a_robot_that_another_database_lacks_is_chosen_no_more(tmp_path: Path) -> None:
+    record(tmp_path, "first", {"x": 1.0})
+    tab = opened(tmp_path)
+    go_on(tab)
+    tab.layout.select_one({"name": "run"}).value = "1"
+    record(tmp_path, "other", {"y": 1.0})
+    assert "first" in go_on(tab)
+    assert "run 1" in go_on(tab)
+    assert tab.layout.select_one({"name": "robot"}).value == "other"
+
+
+def test_what_no_bridge_writes_is_said_on_the_page_and_logged_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    record(tmp_path, "rover", {"x": 1.0})
+    tab = opened(tmp_path)
+    go_on(tab)
+    with closing(connect(tmp_path / DATABASE_NAME, "writer")) as connection:
+        connection.execute("UPDATE log SET message = x'00ff'")
+    tab.layout.select_one({"name": "window"}).value = "10"
+    assert "rows that it did not write" in go_on(tab)
+    assert "rows that it did not write" in go_on(tab)
+    assert len([each for each in caplog.records if each.exc_info]) == 1

@@ -214,6 +214,36 @@ def test_a_picture_that_is_gone_or_outside_is_counted_and_left_out(
     assert +counts == {"states": 1, "pictures that are gone": 2}
 
 
+def test_devices_with_names_alike_have_topics_of_their_own(
+    recorder: Recorder, tmp_path: Path
+) -> None:
+    recorder.publish(0.0, {"x": 1})
+    devices = ["a b", "a_b", "a/b", "a_b_2", "c"]
+    for number, device in enumerate(devices):
+        (tmp_path / f"{number}.png").write_bytes(device.encode())
+        recorder.insert(
+            "image", **recorder.at(0.0), kind="camera", device=device, path=f"{number}.png",
+            width=1, height=1, bytes=3,
+        )  # fmt: skip
+    read = exported(recorder, tmp_path)
+    told = {
+        topic: [base64.b64decode(each["data"]).decode() for each in read.values(topic)]
+        for topic in read.messages
+        if "camera" in topic
+    }
+    assert told == {
+        "/rover/camera/a_b": ["a_b"],
+        "/rover/camera/a_b_2": ["a_b_2"],
+        "/rover/camera/a_b_3": ["a b"],
+        "/rover/camera/a_b_4": ["a/b"],
+        "/rover/camera/c": ["c"],
+    }
+    panels = json.loads(layout_file(tmp_path / "run.mcap").read_text())["configById"].values()
+    shown = [panel["imageMode"]["imageTopic"] for panel in panels if "imageMode" in panel]
+    assert len(shown) == 4
+    assert set(shown) <= set(told)
+
+
 def test_a_pose_is_a_frame_in_the_world_in_metres(recorder: Recorder, tmp_path: Path) -> None:
     publish(recorder, 0.0, {"pose_mm": [1000, 2000], "heading_deg": 90})
     publish(recorder, 1.0, {"pose_mm": [math.nan, 2000], "heading_deg": 90})

@@ -15,6 +15,7 @@ import re
 from collections import Counter
 from functools import partial, singledispatchmethod
 from importlib import import_module
+from itertools import chain, count
 from typing import Any, BinaryIO, Final
 
 from webots_mcp.errors import InvalidInputError
@@ -69,10 +70,15 @@ class Topics:
     """How the topics of a range are called.
 
     They are /ROBOT/state, /ROBOT/pose, /ROBOT/way, /ROBOT/camera/DEVICE, /ROBOT/screenshot,
-    /ROBOT/log, /ROBOT/events and /ROBOT/commands; of several runs /run_ID/ROBOT/... each.
+    /ROBOT/log, /ROBOT/events and /ROBOT/commands; of several runs /run_ID/ROBOT/... each. Of two
+    devices that would be called the same, one is called NAME_2.
     """
 
     def __init__(self, contents: Contents) -> None:
+        self._devices: dict[str, str] = {}
+        devices = {image.device for image in contents.images() if image.device}
+        for device in sorted(devices, key=lambda each: (_named(each) != each, each)):
+            self._device(device)  # first those that may be called as they are
         self._robot = _named(contents.wanted.robot)
         self._several = len(contents.run_ids) > 1
 
@@ -86,8 +92,17 @@ class Topics:
 
     def image(self, image: StoredImage) -> str:
         """The topic of a picture; those of a kept stretch are its camera's."""
-        name = f"camera/{_named(image.device)}" if image.device else image.kind
+        name = f"camera/{self._device(image.device)}" if image.device else image.kind
         return self.topic(image.run_id, name)
+
+    def _device(self, name: str) -> str:
+        """What a device is called, unlike all others; its first picture may have come just now."""
+        if name not in self._devices:
+            plain, taken = _named(name), self._devices.values()
+            numbered = (f"{plain}_{number}" for number in count(2))
+            free = (each for each in chain([plain], numbered) if each not in taken)
+            self._devices[name] = next(free)
+        return self._devices[name]
 
 
 def _named(name: str) -> str:

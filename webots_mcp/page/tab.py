@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from anyio import to_thread
 from bokeh.document import Document, without_document_lock
@@ -50,6 +50,9 @@ from webots_mcp.page.words import (
 from webots_mcp.parameter import Value
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.stream import Order
+
+if TYPE_CHECKING:
+    from webots_mcp.page.steering import Told
 
 _log: Final = logging.getLogger(__name__)
 _PERIOD_MS: Final = 100
@@ -266,15 +269,16 @@ class Tab:
 
         @without_document_lock
         async def wait() -> None:
-            said = await ask()
-            self._document.add_next_tick_callback(partial(self._answered, said))
+            told = await ask()
+            self._document.add_next_tick_callback(partial(self._answered, told))
 
         asking: Any = wait
         self._document.add_next_tick_callback(asking)
 
-    def _answered(self, said: str) -> None:
-        _say(self._said, notes_markup([said]))
-        self._parameters.put_back()
+    def _answered(self, told: Told) -> None:
+        _say(self._said, notes_markup([told.text]))
+        if not told.is_done:  # what is done shows with the next look; meanwhile somebody may type
+            self._parameters.put_back()
         self._next_around_s = 0.0
 
     def _say_problem(self, error: WebotsMCPError) -> None:

@@ -45,6 +45,7 @@ STDLIB = {
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
 ALLOWED["store"] = STDLIB | {"store"}
+ALLOWED["pool"] = STDLIB | {"store", "pool"}
 ALLOWED["trials"] = STDLIB | {"store", "trials", "webots"}
 ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}
 ALLOWED["launching"] = STDLIB | {"store", "setup", "webots"}

@@ -12,6 +12,9 @@ of its own.
     │   ├── SessionGoneError        somebody deleted the session that is being recorded
     │   ├── SchemaTooNewError       a newer webots-mcp wrote it
     │   └── SchemaTooOldError       an older webots-mcp wrote it: migrate first
+    ├── PoolError                   the store of many recordings is the problem
+    │   ├── PoolUnavailableError    it is away, restarts or is full: worth trying again
+    │   └── PoolBusyError           another ships the same recording
     ├── InvalidInputError           the question is the problem; the text says how to ask
     │   ├── UnknownRobotError
     │   ├── AmbiguousRobotError
@@ -65,6 +68,18 @@ class SchemaTooNewError(DatabaseError):
 
 class SchemaTooOldError(DatabaseError):
     """The database has an older schema and was not migrated."""
+
+
+class PoolError(WebotsMCPError):
+    """A pool cannot be used as it is."""
+
+
+class PoolUnavailableError(PoolError):
+    """A pool does not answer, restarts or has no room: the same may succeed later."""
+
+
+class PoolBusyError(PoolError):
+    """Another process ships the same recording to the same pool just now."""
 
 
 class InvalidInputError(WebotsMCPError):

@@ -1,0 +1,55 @@
+"""What a URL of a pool may be, and what of it may be shown."""
+
+from __future__ import annotations
+
+import pytest
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.pool.tables import tables
+from webots_mcp.pool.target import open_target, redacted
+
+SECRET = "hunter2"
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        f"postgresql://robot:{SECRET}@db.lab/pool",
+        f"postgresql://robot:{SECRET}/@x@db.lab/pool",
+        f"postgresql://db.lab/pool?password={SECRET}",
+        f"s3://key:{SECRET}@bucket/prefix",
+        f"s3://bucket/prefix?secret_access_key={SECRET}",
+    ],
+)
+def test_a_secret_in_a_url_is_refused_and_not_repeated(url: str) -> None:
+    with pytest.raises(InvalidInputError, match="every process on this machine can see") as raised:
+        open_target(url)
+    assert SECRET not in str(raised.value)
+    assert SECRET not in redacted(url)
+
+
+@pytest.mark.parametrize("url", ["", " ", "postgresql:pool", "mailto:me", "s3:bucket"])
+def test_what_is_neither_a_url_nor_a_folder_is_refused_with_examples(url: str) -> None:
+    with pytest.raises(InvalidInputError, match="postgresql://HOST/DATABASE"):
+        open_target(url)
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "postgresql:///?service=lab",
+        "postgresql://robot@db.lab:5433/pool?sslmode=require&passfile=/home/me/.pgpass",
+        "/srv/pool",
+        "s3://bucket/prefix",
+        "memory://",
+    ],
+)
+def test_a_url_without_a_secret_is_shown_as_it_is(url: str) -> None:
+    assert redacted(url) == url
+
+
+def test_each_table_comes_after_those_that_it_refers_to() -> None:
+    names = [table.name for table in tables()]
+    assert names.index("robot") < names.index("session") < names.index("run")
+    assert all(names.index("run") < names.index(name) for name in ("state", "rollup", "log"))
+    assert not {"lease", "watermark", "retention_limit"} & set(names)

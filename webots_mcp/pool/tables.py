@@ -1,0 +1,96 @@
+"""Which tables are shipped to a pool, and how: derived from the models."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Final, TypeAlias, cast
+
+SQLValue: TypeAlias = "int | float | str | bytes | None"
+
+_APPENDED: Final = ("state", "kept_state", "log", "event", "image", "parameter_value")
+# Of one machine or one moment: who maintains it, what is kept there, and console lines that wait
+# to become log lines. Recent rollups are shipped as rollups: the difference is how they are
+# written here.
+_LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line", "recent_rollup")
+_TYPES: Final[dict[str, type[int | float | str]]] = {
+    "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table that is shipped; its columns in the order in which a batch has their values.
+
+    Attributes:
+        key: Its primary key in a recording; in a pool the recording's UUID stands before it.
+        columns: All columns, those of the key included, by their names in the recording.
+        types: Of the columns, as the model declares them; SQLite may hold others.
+        json_columns: Those that hold JSON as text.
+        nullable: Those that may be null.
+        lasting: References that retention sets to null where it deletes what they name: a null
+            does not replace the value that the pool has.
+        is_appended: Rows come with rising ids and never change; otherwise a row replaces the one
+            of the same key.
+        full_rate_only: Shipped only at full rate.
+        time_column: The wall time by which a pool may cut it into parts, of appended tables.
+        run_column: The column that names the row's run, where it belongs to one.
+    """
+
+    name: str
+    key: tuple[str, ...]
+    columns: tuple[str, ...]
+    types: tuple[type[int | float | str], ...]
+    json_columns: frozenset[str]
+    nullable: frozenset[str]
+    lasting: frozenset[str]
+    is_appended: bool
+    full_rate_only: bool
+    time_column: str | None
+    run_column: str | None
+
+
+@cache
+def tables() -> tuple[Table, ...]:
+    """All that are shipped, each after those that it refers to. Importing the models costs."""
+    from webots_mcp.store import models
+
+    ordered: list[Any] = cast("Any", models).SQLModel.metadata.sorted_tables
+    return tuple(_table(each) for each in ordered if each.name not in _LOCAL)
+
+
+def table(name: str) -> Table:
+    """The table of that name.
+
+    Raises:
+        KeyError: None of that name is shipped.
+    """
+    return {each.name: each for each in tables()}[name]
+
+
+def _table(model: Any) -> Table:
+    name: str = model.name
+    columns = tuple(str(column.name) for column in model.columns)
+    is_appended = name in _APPENDED
+    run_column = "id" if name == "run" else "run_id" if "run_id" in columns else None
+    return Table(
+        name=name,
+        key=tuple(column.name for column in model.primary_key.columns),
+        columns=columns,
+        types=tuple(_TYPES[str(column.type)] for column in model.columns),
+        json_columns=frozenset(column.name for column in model.columns if _is_json(column)),
+        nullable=frozenset(column.name for column in model.columns if column.nullable),
+        lasting=frozenset(column.name for column in model.columns if _is_lasting(column)),
+        is_appended=is_appended,
+        full_rate_only=name == "state",
+        time_column="wall_time_s" if is_appended else None,
+        run_column=run_column,
+    )
+
+
+def _is_json(column: Any) -> bool:
+    return (column.comment or "").startswith("JSON") or column.name == "odd"
+
+
+def _is_lasting(column: Any) -> bool:
+    return any(key.ondelete == "SET NULL" for key in column.foreign_keys)

@@ -213,11 +213,10 @@ def test_of_a_session_that_goes_on_a_run_that_is_over_can_be_sent(
     ("change", "said"),
     [
         ("UPDATE run SET ended_wall_time_s = NULL WHERE id = 2", "still records run 2"),
-        ("UPDATE run SET purged_rows = 3 WHERE id = 2", "run 2 has purged rows"),
         ("UPDATE run SET uuid = NULL WHERE id = 2", "run 2 has no UUID"),
     ],
 )
-def test_what_goes_on_is_purged_or_has_no_name_is_no_bundle_and_no_matter_for_others(
+def test_what_goes_on_or_has_no_name_is_no_bundle_and_no_matter_for_others(
     there: Folder, change: str, said: str
 ) -> None:
     with there.opened() as connection:

@@ -53,7 +53,7 @@ def write_bundle(
         progress: Called now and then with the bytes that are packed and that there are.
 
     Raises:
-        InvalidInputError: The run goes on, or has purged rows.
+        InvalidInputError: The run goes on, or has no UUID.
     """
     with tempfile.TemporaryDirectory(prefix=".bundle-", dir=file.parent) as name:
         folder = Path(name)

@@ -1,8 +1,9 @@
 """Taking in another recording: its sessions and runs, told from those that are there by UUID.
 
 Whatever is already there is left as it is, so merging may be repeated, and may be killed anywhere:
-what is new of a session comes in one transaction. Rollups are not copied, but made anew from the
-rows. A bundle is made the same way: an empty recording takes in one run.
+what is new of a session comes in one transaction. Rollups are made anew from the rows; those of a
+run that has lost rows come as they are. A bundle is made the same way: an empty recording takes in
+one run.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.settlement import settle
 from webots_mcp.store.images import PICTURES, inside
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.rollup.taking_in import take_in_summaries
 from webots_mcp.store.trials import fetch_trial_set, is_at_work
 
 _SESSIONS: Final = (
@@ -37,7 +39,6 @@ _UNFIT: Final = (
     "SELECT CASE WHEN :run IS NULL THEN "
     "(SELECT count(*) FROM source.session WHERE ended_wall_time_s IS NULL) ELSE "
     "(SELECT ended_wall_time_s IS NULL FROM source.run WHERE id = :run) END, "
-    "(SELECT count(*) FROM source.run WHERE purged_rows > 0 AND (:run IS NULL OR id = :run)), "
     "(SELECT count(*) FROM source.run WHERE uuid IS NULL AND id = :run)"
 )
 # Those of one run: what its parameters were set by, and what was claimed while it went on.
@@ -55,7 +56,8 @@ _SAME_COMMAND: Final = (
     "SELECT id FROM main.command WHERE session_id = ? AND created_wall_time_s = ? AND action = ? "
     "AND params = ?"
 )
-_OF_RUN: Final = ("state", "kept_stretch", "kept_state", "log", "event", "parameter_value")
+_IS_PURGED: Final = "SELECT purged_rows > 0 FROM main.run WHERE id = ?"
+_OF_RUN: Final = ("kept_stretch", "kept_state", "log", "event", "parameter_value")
 _BUSY: Final = (
     "SELECT EXISTS (SELECT 1 FROM main.session s JOIN main.robot b ON b.id = s.robot_id "
     "WHERE b.name = ? AND s.ended_wall_time_s IS NULL)"
@@ -111,8 +113,7 @@ def merge(
         By their UUIDs, the ids that its runs have here.
 
     Raises:
-        InvalidInputError: A controller still records there, or rows were purged, of which the
-            rollups would be lost.
+        InvalidInputError: A controller still records there, or what is there is damaged.
     """
     with _attached(connection, address or str(source)):
         _require_fit(connection, source, run_id)
@@ -159,13 +160,11 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
     ]
     if versions[0] != versions[1]:
         raise InvalidInputError(f"{source} has another schema: run 'webots-mcp migrate' on it")
-    recording, purged, nameless = connection.execute(_UNFIT, {"run": run_id}).fetchone()
+    recording, nameless = connection.execute(_UNFIT, {"run": run_id}).fetchone()
     subject = f"{source}" if run_id is None else f"run {run_id}"
     if recording:
         where = subject if run_id else f"in {subject}"
         raise InvalidInputError(f"a controller still records {where}: take it when it is over")
-    if purged:
-        raise InvalidInputError(f"{subject} has purged rows: of them only rollups are left")
     if nameless:
         raise InvalidInputError(
             f"{subject} has no UUID, which each bridge gives: no recording "
@@ -193,6 +192,7 @@ def _take_in(
     own = owner | {"session_id": here, "rolled_state_id": 0, "coarse_end": None}
     for run_id, run_uuid in runs:
         run = _insert(connection, "run", "id = ?", run_id, own)
+        _copy_states(connection, run_id, run, owner["robot_id"])
         for table in _OF_RUN:
             _insert(connection, table, "run_id = ?", run_id, {"run_id": run})
         _copy_image_rows(connection, run_id, run, run_uuid)
@@ -257,13 +257,29 @@ def _copy_commands(
     return ids
 
 
+def _copy_states(connection: sqlite3.Connection, run_id: int, run: int, robot_id: int) -> None:
+    """The rows; where some are gone, with the summaries of all."""
+    (is_purged,) = connection.execute(_IS_PURGED, (run,)).fetchone()
+    shift = take_in_summaries(connection, run_id, run, robot_id) if is_purged else None
+    _insert(connection, "state", "run_id = ?", run_id, {"run_id": run}, shift)
+
+
 def _insert(
-    connection: sqlite3.Connection, table: str, where: str, key: int, own: dict[str, Any]
+    connection: sqlite3.Connection,
+    table: str,
+    where: str,
+    key: int,
+    own: dict[str, Any],
+    shift: int | None = None,
 ) -> int:
-    """Copy rows, with values of their own in some columns; returns the id of the last one."""
+    """Copy rows, with values of their own in some columns.
+
+    Their ids are new ones, or those from there and so much more; returns that of the last one.
+    """
     listed = connection.execute("SELECT name FROM pragma_table_info(?)", (table,)).fetchall()
-    columns = [name for (name,) in listed if name != "id"]
-    values = ", ".join("?" if name in own else name for name in columns)
+    columns = [name for (name,) in listed if name != "id" or shift is not None]
+    named = {"id": f"id + {shift}"} | dict.fromkeys(own, "?")
+    values = ", ".join(named.get(name, name) for name in columns)
     given = [own[name] for name in columns if name in own]
     insert = "INSERT OR IGNORE" if table == "parameter" else "INSERT"  # as it is declared here
     cursor = connection.execute(

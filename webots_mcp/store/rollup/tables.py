@@ -44,6 +44,14 @@ _TEMPORARY: Final = {
     "new_change": "run_id, signal_id, state_id, sim_time_s, value",
     "new_count": ", ".join(Count._fields),
 }
+ADD_COUNTS: Final = (
+    "UPDATE signal SET kind = n.kind, unit = n.unit, rows = signal.rows + n.rows, "
+    "null_rows = signal.null_rows + n.null_rows, odd_rows = signal.odd_rows + n.odd_rows, "
+    "last_seen_wall_time_s = max(signal.last_seen_wall_time_s, n.seen_wall_time_s), "
+    "min = min(coalesce(signal.min, n.min), coalesce(n.min, signal.min)), "
+    "max = max(coalesce(signal.max, n.max), coalesce(n.max, signal.max)) "
+    "FROM new_count n WHERE signal.id = n.signal_id"
+)
 _STORE: Final = Step(
     "store_rollups",
     ("run_id", "mark", "recent_rows", "state_id", "first_coarse"),
@@ -51,12 +59,7 @@ _STORE: Final = Step(
     f"SELECT {_COLUMNS} FROM new_rollup WHERE NOT is_over",
     f"INSERT OR REPLACE INTO rollup ({_COLUMNS}) SELECT {_COLUMNS} FROM new_rollup WHERE is_over",
     f"INSERT OR IGNORE INTO change ({_TEMPORARY['new_change']}) SELECT * FROM new_change",
-    "UPDATE signal SET kind = n.kind, unit = n.unit, rows = signal.rows + n.rows, "
-    "null_rows = signal.null_rows + n.null_rows, odd_rows = signal.odd_rows + n.odd_rows, "
-    "last_seen_wall_time_s = max(signal.last_seen_wall_time_s, n.seen_wall_time_s), "
-    "min = min(coalesce(signal.min, n.min), coalesce(n.min, signal.min)), "
-    "max = max(coalesce(signal.max, n.max), coalesce(n.max, signal.max)) "
-    "FROM new_count n WHERE signal.id = n.signal_id",
+    ADD_COUNTS,
     "UPDATE run SET rolled_state_id = NEW.state_id, "
     "coarse_end = min(coarse_end, NEW.first_coarse) WHERE id = NEW.run_id",
     unless=f"({RUN_MARK.format('NEW.run_id')}) IS NOT NEW.mark "
@@ -128,9 +131,16 @@ class Addition(NamedTuple):
     counts: list[Count]
 
 
-def run_mark(connection: sqlite3.Connection, run_id: int) -> int | None:
-    """The id of the last state row of a run that the rollups hold; None without such a run."""
-    row = connection.execute(RUN_MARK.format("?"), (run_id,)).fetchone()
+def run_mark(connection: sqlite3.Connection, run_id: int, schema: str = "") -> int | None:
+    """The id of the last state row of a run that the rollups hold; None without such a run.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        schema: Of an attached database, with a dot.
+    """
+    query = RUN_MARK.format("?").replace("FROM ", f"FROM {schema}")
+    row = connection.execute(query, (run_id,)).fetchone()
     return int(row[0]) if row else None
 
 
@@ -161,13 +171,19 @@ def _prepare(connection: sqlite3.Connection, rows: dict[str, Sequence[tuple[Any,
     """Fill the temporary tables, in a transaction that locks nothing but them."""
     connection.execute("BEGIN")
     try:
-        for table, columns in _TEMPORARY.items():
-            connection.execute(f"CREATE TEMP TABLE IF NOT EXISTS {table} ({columns})")
-            connection.execute(f"DELETE FROM temp.{table}")
-            marks = ", ".join("?" * len(columns.split(",")))
-            connection.executemany(f"INSERT INTO temp.{table} VALUES ({marks})", rows[table])
+        for table in _TEMPORARY:
+            fill(connection, table, rows[table])
     finally:
         connection.execute("COMMIT")
+
+
+def fill(connection: sqlite3.Connection, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
+    """Let a temporary table hold these rows, and no others."""
+    columns = _TEMPORARY[table]
+    connection.execute(f"CREATE TEMP TABLE IF NOT EXISTS {table} ({columns})")
+    connection.execute(f"DELETE FROM temp.{table}")
+    marks = ", ".join("?" * len(columns.split(",")))
+    connection.executemany(f"INSERT INTO temp.{table} VALUES ({marks})", rows)
 
 
 def move(connection: sqlite3.Connection, pause_s: float) -> None:

@@ -1,0 +1,52 @@
+"""What the questions tell of a run, without what only names it in its recording."""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from dataclasses import fields, is_dataclass
+from typing import Any, Final, cast
+
+from webots_mcp.store.questions.compare import compare_runs
+from webots_mcp.store.questions.events import find_events
+from webots_mcp.store.questions.series import query_history
+from webots_mcp.store.questions.timeline import timeline
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.ranges import Scope, find_range
+
+_LOCAL: Final = {
+    "id", "ids", "run_id", "run_ids", "session_id", "robot_id", "cursor", "path",
+    "age_s",  # told by the clock
+}  # fmt: skip
+_RUN: Final = re.compile(r"\b(runs?) \d+")
+
+
+def answers(connection: sqlite3.Connection, run_id: int, part: tuple[float, float]) -> Any:
+    """Trends, events, timeline, history and comparison of a run; the first two also of a part."""
+    whole = find_range(connection, Scope(run_id=run_id))
+    some = find_range(connection, Scope(run_id=run_id, start_s=part[0], end_s=part[1]))
+    found = {
+        "trends": trends(connection, whole),
+        "trends of a part": trends(connection, some),
+        "events": find_events(connection, whole, limit=200),
+        "events of a part": find_events(connection, some, limit=200),
+        "timeline": timeline(connection, whole, limit=200),
+        "history": query_history(connection, whole, ["*"], max_points=40),
+        "comparison": compare_runs(connection, [run_id]),
+    }
+    return _portable(found)
+
+
+def _portable(value: Any) -> Any:
+    if is_dataclass(value):
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, dict):
+        named = cast("dict[Any, Any]", value)
+        return {key: _portable(each) for key, each in named.items() if key not in _LOCAL}
+    if isinstance(value, list | tuple):
+        return [_portable(each) for each in cast("list[Any]", value)]
+    if isinstance(value, str):
+        return _RUN.sub(r"\1 N", value)
+    if isinstance(value, float):
+        return float(f"{value:.9g}")  # sums of rows that were added in another order
+    return value

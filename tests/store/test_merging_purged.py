@@ -1,0 +1,225 @@
+"""Of a run that lost rows what is left comes along: its summaries, and all answers from them."""
+
+from __future__ import annotations
+
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.recordings.answers import answers
+from tests.recordings.rover import Recorder, rover_state, start_run
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATABASE_NAME, new_uuid
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.schema import create_schema
+from webots_mcp.store.bundle import unpacked, write_bundle
+from webots_mcp.store.merging import merge
+from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.rollup.rolling import roll
+
+ROWS = 5200  # 1040 s: two coarse buckets and some
+SIGNALS = (
+    "SELECT name, kind, unit, path, reduce, rows, null_rows, min, max FROM signal WHERE robot_id = "
+    "(SELECT id FROM robot WHERE name = 'rover') AND name NOT GLOB 'pose*' AND name <> 'mode'"
+)
+PART = (480.0, 720.0)
+
+
+@pytest.fixture(scope="module")
+def _whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of rounds of 120 s, rolled up, and a short one before it that lies between its ids."""
+    file = tmp_path_factory.mktemp("whole") / DATABASE_NAME
+    with closing(connect(file, "writer", create=True)) as connection:
+        create_schema(connection)
+        recorder = start_run(connection)
+        other = Recorder(connection)
+        robot_id = other.robot("drone")
+        other.run(other.session(robot_id, "b" * 64), robot_id)
+        connection.execute("BEGIN")
+        for step in range(ROWS):
+            recorder.publish(step * 0.2, *rover_state(step * 0.2 % 120))
+            if step % 500 == 0:
+                other.publish(step * 0.2, {"height": step})
+        for each in (recorder, other):
+            each.end_run("finished")
+        connection.execute("UPDATE session SET ended_wall_time_s = 2e9, end_reason = 'finished'")
+        for table in ("session", "run"):
+            for key in (1, 2):
+                connection.execute(f"UPDATE {table} SET uuid = ? WHERE id = ?", (new_uuid(), key))
+        connection.execute("COMMIT")
+        assert roll(connection, 100_000).done
+        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+    return file
+
+
+NONE_OR_SOME_LEFT = pytest.mark.parametrize("source", [0, 1500], indirect=True)
+
+
+@pytest.fixture
+def source(_whole: Path, tmp_path: Path, request: pytest.FixtureRequest) -> Path:
+    """With that many rows left of the long run: some, if nobody asks for others."""
+    left = getattr(request, "param", 1500)
+    folder = tmp_path / "there"
+    folder.mkdir()
+    shutil.copy(_whole, folder / DATABASE_NAME)
+    with closing(connect(folder / DATABASE_NAME, "writer")) as connection:
+        connection.execute("UPDATE run SET keep = 1 WHERE id = 2")
+        prune(connection, folder, Retention(state=Limit(rows=left), outlive=0), rest=False)
+    return folder / DATABASE_NAME
+
+
+@pytest.fixture
+def target(tmp_path: Path) -> Iterator[sqlite3.Connection]:
+    """The same robot recorded here before, after another: its signals have other ids."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as connection:
+        create_schema(connection)
+        for robot in ("truck", "rover"):
+            recorder = start_run(connection, robot)
+            for step in range(40):
+                recorder.publish(step * 1.0, {"mode": "cruise", "pose": [step, 0.0]})
+            recorder.end_run("finished")
+        connection.execute("UPDATE session SET ended_wall_time_s = 2e9, end_reason = 'finished'")
+        assert roll(connection, 1000).done
+        yield connection
+
+
+def rows_of(connection: sqlite3.Connection, table: str, run_id: int) -> list[Any]:
+    """Without ids: signals by their names."""
+    listed = connection.execute(f"PRAGMA table_info({table})").fetchall()
+    columns = [name for _, name, *_ in listed if name not in ("run_id", "signal_id", "state_id")]
+    shown = ", ".join("NULL" if each == "standstills" else f"t.{each}" for each in columns)
+    order = "t.state_id" if table == "change" else "t.bucket"
+    return connection.execute(
+        f"SELECT s.name, {shown} FROM {table} t JOIN signal s ON s.id = t.signal_id "
+        f"WHERE t.run_id = ? ORDER BY s.name, {order}",
+        (run_id,),
+    ).fetchall()
+
+
+@NONE_OR_SOME_LEFT
+def test_every_answer_about_a_purged_run_is_what_it_was_there(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    with closing(connect(source, "reader")) as there:
+        (uuid,) = there.execute("SELECT uuid FROM run WHERE id = 1").fetchone()
+        run = merge(target, tmp_path / "here", source)[uuid]
+        before, after = run_info(there, 1), run_info(target, run)
+        assert after.purged_rows == before.purged_rows > 0
+        for table in ("rollup", "recent_rollup", "coarse_rollup", "change"):
+            assert rows_of(target, table, run) == rows_of(there, table, 1)
+        assert answers(target, run, PART) == answers(there, 1, PART)
+        assert target.execute(SIGNALS).fetchall() == there.execute(SIGNALS).fetchall()
+
+
+@NONE_OR_SOME_LEFT
+def test_what_was_taken_in_is_not_counted_again_by_who_maintains_the_recording(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
+    before = [rows_of(target, table, run) for table in ("rollup", "change", "coarse_rollup")]
+    signals = target.execute("SELECT * FROM signal").fetchall()
+
+    assert roll(target, 100_000).done
+
+    assert [rows_of(target, each, run) for each in ("rollup", "change", "coarse_rollup")] == before
+    assert target.execute("SELECT * FROM signal").fetchall() == signals
+    recorder = start_run(target, "another")
+    recorder.publish(0.0, {"x": 1})
+    assert roll(target, 1000).done
+    assert rows_of(target, "recent_rollup", recorder.run_id) != []
+
+
+def test_rows_that_were_not_rolled_up_there_are_rolled_up_here(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    with closing(connect(source, "writer")) as there:
+        late = Recorder(there)
+        late.run_id, late.run_start_s = 1, late.wall_s
+        late.publish(ROWS * 0.2, *rover_state(0.0))
+        late.end_run("finished")
+        there.execute("UPDATE run SET rows = purged_rows + rows WHERE id = 1")
+    run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
+
+    assert roll(target, 100_000).done
+
+    rolled = (
+        "SELECT sum(a.rows), max(a.last_sim_time_s) FROM all_rollup a "
+        "JOIN signal s ON s.id = a.signal_id WHERE s.name = 'battery_v' AND a.run_id = ?"
+    )
+    assert target.execute(rolled, (run,)).fetchone() == (ROWS + 1, ROWS * 0.2)
+
+
+@NONE_OR_SOME_LEFT
+def test_a_purged_run_comes_once(target: sqlite3.Connection, source: Path, tmp_path: Path) -> None:
+    tables = ("state", "signal", "rollup", "coarse_rollup", "change", "run")
+    merged = merge(target, tmp_path / "here", source)
+    everything = [target.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
+
+    assert merge(target, tmp_path / "here", source) == merged
+    assert [target.execute(f"SELECT * FROM {each}").fetchall() for each in tables] == everything
+
+
+def test_what_broke_off_leaves_nothing_of_a_purged_run(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    tables = ("state", "signal", "rollup", "coarse_rollup", "change", "run")
+    before = [target.execute(f"SELECT * FROM {table}").fetchall() for table in tables]
+    target.execute(
+        "CREATE TEMP TRIGGER full BEFORE INSERT ON main.change "
+        "BEGIN SELECT raise(ABORT, 'the disk is full'); END"
+    )
+    with pytest.raises(sqlite3.Error, match="the disk is full"):
+        merge(target, tmp_path / "here", source)
+    assert [target.execute(f"SELECT * FROM {each}").fetchall() for each in tables] == before
+
+
+def test_a_purged_run_goes_as_a_bundle_from_one_to_the_next(source: Path, tmp_path: Path) -> None:
+    with closing(connect(source, "reader")) as there:
+        expected = answers(there, 1, PART)
+    database = source
+    for name in ("second", "third"):
+        folder = tmp_path / name
+        folder.mkdir()
+        with closing(connect(database, "reader")) as reader:
+            write_bundle(reader, database, database.parent, 1, folder / "run.zip")
+        database = folder / DATABASE_NAME
+        with (
+            closing(connect(database, "writer", create=True)) as writer,
+            unpacked(folder / "run.zip") as small,
+        ):
+            create_schema(writer)
+            merge(writer, folder, small)
+            assert answers(writer, 1, PART) == expected
+
+
+def test_a_signal_that_is_text_here_and_a_number_there_is_text(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    recorder = Recorder(target)
+    recorder.run_id, recorder.run_start_s = 2, recorder.wall_s
+    recorder.publish(41.0, {"battery_v": "full"})
+    assert roll(target, 1000).done
+
+    run = merge(target, tmp_path / "here", source, run_id=1).popitem()[1]
+
+    (kind,) = target.execute("SELECT kind FROM signal WHERE name = 'battery_v'").fetchone()
+    assert kind == "text"
+    assert answers(target, run, PART)["trends"]
+
+
+def test_ids_that_no_bridge_gives_are_refused(
+    target: sqlite3.Connection, source: Path, tmp_path: Path
+) -> None:
+    with closing(connect(source, "writer")) as there:
+        there.execute("UPDATE change SET state_id = ? WHERE state_id = 1", (2**52,))
+    with pytest.raises(InvalidInputError, match=f"to {2**52}, which no bridge gives"):
+        merge(target, tmp_path / "here", source)
+    assert target.execute("SELECT count(*) FROM run").fetchone() == (2,)

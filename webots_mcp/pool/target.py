@@ -216,6 +216,11 @@ def _class(kind: str) -> Callable[[str], Any]:
     return getattr(importlib.import_module(f"webots_mcp.pool.{module}"), name)
 
 
+def pause_of(url: str) -> float:
+    """How long to wait between two looks at a recording: of small files a pool has soon many."""
+    return 2.0 if _is_postgres(url) else 60.0
+
+
 def redacted(url: str) -> str:
     """A URL as it may be shown: without a password and without whatever looks like a secret."""
     scheme, sign, rest = url.partition("://")

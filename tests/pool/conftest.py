@@ -1,0 +1,72 @@
+"""A recording that is shipped, and where to."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.pool.sqlite_target import SQLiteTarget, pooled
+from tests.pool.sqlite_target import recorded as recorded_rows
+from tests.recordings.runs import Recorded
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATABASE_NAME, new_uuid
+from webots_mcp.pool.shipping import Order, Report, ship
+from webots_mcp.schema import create_schema
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.rollup.rolling import roll
+
+
+class Shipped:
+    """A recording in a folder, and a pool beside it."""
+
+    def __init__(self, folder: Path, connection: sqlite3.Connection, pool: Path) -> None:
+        self.folder, self.pool, self.connection = folder, pool, connection
+        self.order = Order(
+            Recording(folder / DATABASE_NAME, folder, read_only=True), lambda: SQLiteTarget(pool)
+        )
+
+    @cached_property
+    def recorded(self) -> Recorded:
+        """Records more, of a robot that is made with it."""
+        return Recorded(self.connection, self.folder)
+
+    @property
+    def uuid(self) -> str:
+        return self.connection.execute("SELECT uuid FROM recording").fetchone()[0]
+
+    def add_run(self, rows: int = 60, end: str | None = "reset") -> int:
+        """A run with a UUID, rolled up."""
+        run_id = self.recorded.add_run(rows, end)
+        self.connection.execute("UPDATE run SET uuid = ? WHERE id = ?", (new_uuid(), run_id))
+        self.roll()
+        return run_id
+
+    def roll(self) -> None:
+        while not roll(self.connection).done:
+            pass
+
+    def ship(self, **options: Any) -> Report:
+        report = Report()
+        ship(replace(self.order, **options), report)
+        return report
+
+    def pooled(self) -> dict[str, Any]:
+        return pooled(self.pool, self.uuid)
+
+    def rows(self) -> dict[str, Any]:
+        return recorded_rows(self.connection)
+
+
+@pytest.fixture
+def shipped(tmp_path: Path) -> Iterator[Shipped]:
+    folder = tmp_path / "robot"
+    with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as connection:
+        create_schema(connection)
+        yield Shipped(folder, connection, tmp_path / "pool.db")

@@ -1,0 +1,222 @@
+"""A pool comes to hold what a recording holds, whatever happens in between."""
+
+from __future__ import annotations
+
+import shutil
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.pool.conftest import Shipped
+from tests.pool.sqlite_target import SQLiteTarget
+from tests.recordings.runs import states
+from webots_mcp.connection import connect
+from webots_mcp.contract import new_uuid
+from webots_mcp.errors import DatabaseError, PoolBusyError, PoolError, SchemaTooOldError
+from webots_mcp.pool.shipped import read_shipped
+from webots_mcp.schema import create_schema
+from webots_mcp.store.merging import merge
+from webots_mcp.store.migrate import downgrade
+
+
+def test_a_pool_at_full_rate_holds_every_row_as_the_recording_does(shipped: Shipped) -> None:
+    shipped.add_run(2500)
+    shipped.add_run(60, end=None)
+    shipped.ship(full=True)
+    rows = shipped.rows()
+    assert shipped.pooled() == rows
+    assert all(rows[table] for table in ("state", "rollup", "coarse_rollup", "change", "signal"))
+
+
+def test_what_is_shipped_is_not_sent_again(shipped: Shipped) -> None:
+    shipped.add_run()
+    shipped.ship(full=True)
+    assert shipped.ship(full=True).rows.total() == 0
+
+
+def test_only_what_came_since_is_sent(shipped: Shipped) -> None:
+    shipped.add_run(2000, end=None)
+    shipped.ship(full=True)
+    shipped.recorded.publish(1000.0, {"x": 1, "mode": "c"})
+    shipped.roll()
+    sent = shipped.ship(full=True).rows
+    assert shipped.pooled() == shipped.rows()
+    assert (sent["state"], sent["event"], sent["change"]) == (1, 0, 1)
+    assert 0 < sent["rollup"] <= 4  # of two signals, the newest bucket and the one before
+
+
+def test_without_full_rate_no_states_are_sent_but_those_of_kept_stretches(
+    shipped: Shipped,
+) -> None:
+    run_id = shipped.add_run(60)
+    shipped.connection.execute(
+        "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, wall_time_s, "
+        "reason) VALUES (?, ?, 2, 4, 0, 'a bump')",
+        (run_id, new_uuid()),
+    )
+    shipped.ship()
+    pooled, rows = shipped.pooled(), shipped.rows()
+    sim_time_s = 2
+    assert pooled["state"] == [row for row in rows["state"] if 2 <= row[sim_time_s] <= 4]
+    assert {**pooled, "state": []} == {**rows, "state": []}
+    assert shipped.ship().rows.total() == 0
+    shipped.ship(full=True)
+    assert shipped.pooled() == rows
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_a_kept_state_that_retention_moved_is_in_the_pool_once(
+    shipped: Shipped, full: bool
+) -> None:
+    run_id = shipped.add_run(60)
+    shipped.connection.execute(
+        "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, wall_time_s, "
+        "reason) VALUES (?, ?, 2, 4, 0, 'a bump')",
+        (run_id, new_uuid()),
+    )
+    shipped.ship(full=full)
+    before = shipped.pooled()["state"]
+    shipped.recorded.prune(states(rows=10))
+    assert shipped.rows()["kept_state"]
+    shipped.ship(full=full)
+    assert shipped.pooled()["state"] == before
+    assert shipped.pooled()["kept_state"] == []
+
+
+def test_kept_states_that_were_moved_before_anything_was_shipped_are_in_the_pool(
+    shipped: Shipped,
+) -> None:
+    run_id = shipped.add_run(60)
+    shipped.connection.execute(
+        "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, wall_time_s, "
+        "reason) VALUES (?, ?, 2, 4, 0, 'a bump')",
+        (run_id, new_uuid()),
+    )
+    shipped.recorded.prune(states(rows=10))
+    shipped.ship()
+    assert shipped.pooled()["kept_state"] == shipped.rows()["kept_state"] != []
+
+
+def test_what_retention_deletes_stays_in_the_pool(shipped: Shipped) -> None:
+    shipped.add_run(60)
+    shipped.ship(full=True)
+    before = shipped.pooled()
+    shipped.connection.execute("DELETE FROM run")
+    shipped.connection.execute("DELETE FROM command")
+    shipped.ship(full=True)
+    assert shipped.pooled() == before
+
+
+def test_rows_that_retention_deleted_too_early_are_counted(shipped: Shipped) -> None:
+    shipped.add_run(60)
+    shipped.ship(full=True)
+    shipped.add_run(60)
+    shipped.add_run(60)
+    shipped.recorded.prune(states(rows=70))
+    assert shipped.ship(full=True).lost == {"state": 50}
+
+
+def test_a_run_that_another_recording_has_shipped_stays_that_ones(
+    shipped: Shipped, tmp_path: Path
+) -> None:
+    shipped.add_run(60)
+    folder = tmp_path / "other"
+    with closing(connect(folder / "webots.db", "writer", create=True)) as connection:
+        create_schema(connection)
+        other = Shipped(folder, connection, shipped.pool)
+        own = other.add_run(20)
+        shipped.connection.execute("UPDATE session SET uuid = ?", (new_uuid(),))
+        merge(connection, folder, shipped.folder / "webots.db")
+        other.roll()
+        shipped.ship(full=True)
+        report = other.ship(full=True)
+        (run,) = other.pooled()["run"]
+        assert run[0] == own
+        assert {row[1] for row in other.pooled()["state"]} == {own}
+        assert list(report.foreign.values()) == [shipped.uuid]
+    assert shipped.pooled() == shipped.rows()
+
+
+def test_pictures_are_shipped_when_they_are_asked_for_also_later(shipped: Shipped) -> None:
+    shipped.add_run()
+    shipped.ship()
+    assert shipped.ship(pictures=True).pictures == 1
+    assert shipped.ship(pictures=True).pictures == 0
+    shipped.add_run()
+    (shipped.folder / "camera" / "2.png").unlink()
+    assert shipped.ship(pictures=True).lost_pictures == 1
+
+
+def test_an_older_copy_is_refused_and_changes_nothing(shipped: Shipped, tmp_path: Path) -> None:
+    shipped.add_run()
+    copy = tmp_path / "copy.db"
+    shipped.connection.execute("VACUUM INTO ?", (str(copy),))
+    shipped.add_run()
+    shipped.ship(full=True)
+    before = shipped.pooled()
+    with closing(connect(copy, "writer")) as connection:
+        restored = Shipped(tmp_path, connection, shipped.pool)
+        shutil.copy(copy, tmp_path / "webots.db")
+        with pytest.raises(PoolError, match="is an older copy"):
+            restored.ship(full=True)
+    assert shipped.pooled() == before
+
+
+def test_a_copy_that_was_gone_on_with_elsewhere_is_refused(
+    shipped: Shipped, tmp_path: Path
+) -> None:
+    shipped.add_run()
+    shipped.connection.execute("VACUUM INTO ?", (str(tmp_path / "webots.db"),))
+    shipped.add_run()
+    shipped.ship(full=True)
+    before = shipped.pooled()
+    with closing(connect(tmp_path / "webots.db", "writer")) as connection:
+        copy = Shipped(tmp_path, connection, shipped.pool)
+        for table in ("log", "event", "state"):
+            of_the_copy = f"INSERT INTO {table} SELECT NULL, {{}} FROM {table}"
+            names = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")][1:]
+            connection.execute(of_the_copy.format(", ".join(names)))
+        connection.execute("UPDATE log SET message = 'elsewhere' WHERE id > 30")
+        with pytest.raises(PoolError, match="gone on with elsewhere"):
+            copy.ship(full=True)
+    assert shipped.pooled() == before
+
+
+def test_a_recording_without_uuid_is_refused(shipped: Shipped) -> None:
+    shipped.add_run()
+    shipped.connection.execute("DELETE FROM recording")
+    with pytest.raises(DatabaseError, match="no UUIDs"):
+        shipped.ship()
+    assert not shipped.pool.exists()
+
+
+def test_an_older_schema_is_not_migrated_by_a_shipper(shipped: Shipped) -> None:
+    downgrade(shipped.folder / "webots.db", "0008")
+    with pytest.raises(SchemaTooOldError, match="webots-mcp migrate"):
+        shipped.ship()
+    assert not shipped.pool.exists()
+
+
+def test_a_second_shipper_of_the_same_recording_is_refused(shipped: Shipped) -> None:
+    shipped.add_run()
+    with (
+        SQLiteTarget(shipped.pool) as target,
+        target.shipment(shipped.uuid),
+        pytest.raises(PoolBusyError),
+    ):
+        shipped.ship()
+
+
+def test_the_folder_tells_retention_what_is_shipped(shipped: Shipped) -> None:
+    shipped.add_run()
+    shipped.ship()
+    (told,) = read_shipped(shipped.folder, shipped.uuid).values()
+    assert told.last_ids["log"] == 30
+    assert "state" not in told.last_ids
+    assert told.complete_wall_time_s > 0
+    assert read_shipped(shipped.folder, new_uuid()) == {}
+    (shipped.folder / "shipped.json").write_text("{")
+    assert read_shipped(shipped.folder, shipped.uuid) == {}
+    shipped.ship()
+    assert read_shipped(shipped.folder, shipped.uuid)

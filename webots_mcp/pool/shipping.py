@@ -1,0 +1,457 @@
+"""Shipping a recording to a pool: once, or on and on while a robot records.
+
+What the pool holds is told by numbers that it stores in the same transaction as the rows. So a
+shipper may be killed anywhere, and the next one goes on; nothing at the edge has to be remembered.
+What changes is compared by digests, and sent again only where they differ.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Final
+
+from webots_mcp.connection import FrozenConnection
+from webots_mcp.errors import (
+    InvalidInputError,
+    NothingRecordedError,
+    PoolBusyError,
+    PoolError,
+    PoolUnavailableError,
+)
+from webots_mcp.pool.batch import Batch, Row, row_bytes
+from webots_mcp.pool.reading import (
+    NOT_YET,
+    ROLLED,
+    Mark,
+    Source,
+    Stretch,
+    coarse_after,
+    digest,
+)
+from webots_mcp.pool.shipped import Shipped, read_shipped, write_shipped
+from webots_mcp.pool.tables import Table, table, tables
+from webots_mcp.pool.target import Shipment, Target
+from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
+from webots_mcp.store.recording import Recording
+
+WRITE_BYTES: Final = 8_000_000
+MOST_BATCHES: Final = 8  # of a table in a round, before the others get their turn
+THOROUGH_S: Final = 30.0  # between two looks at all of what may change, and not only the newest
+_FIRST_WAIT_S: Final = 1.0
+_LONGEST_WAIT_S: Final = 60.0
+_UNCHECKED: Final = -1
+# Names of the progress, beside those of tables.
+_STATE_TIME: Final = "state.wall_time_us"  # of the newest state that was shipped
+_PICTURE: Final = "picture"
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be shipped.
+
+    Attributes:
+        recording: From where.
+        open_target: Opens the pool, each time that it is connected to.
+        full: States as well.
+        pictures: The files of pictures as well.
+    """
+
+    recording: Recording
+    open_target: Callable[[], Target]
+    full: bool = False
+    pictures: bool = False
+
+
+@dataclass
+class Report:
+    """What was shipped so far, and what was not.
+
+    Attributes:
+        rows: By table; a row that changed counts each time that it was sent.
+        pictures: Files.
+        lost: By table, rows that retention had deleted before they could be shipped.
+        lost_pictures: Files that were not there any more, or are no pictures of ours.
+        foreign: By their UUIDs, runs that another recording had shipped before, with its UUID.
+        notes: What else a person should know.
+    """
+
+    rows: Counter[str] = field(default_factory=Counter[str])
+    pictures: int = 0
+    lost: Counter[str] = field(default_factory=Counter[str])
+    lost_pictures: int = 0
+    foreign: dict[str, str] = field(default_factory=dict[str, str])
+    notes: list[str] = field(default_factory=list[str])
+
+    def note(self, text: str) -> None:
+        """Remember it, once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+
+def ship(order: Order, report: Report) -> None:
+    """Ship all that is there, and end.
+
+    Raises:
+        PoolError: The pool cannot be reached or written, or another ships this recording.
+        DatabaseError: The recording cannot be read.
+    """
+    with _shipper(order, report) as shipper:
+        while not shipper.round(thorough=True):
+            pass
+
+
+def follow(order: Order, report: Report, say: Say, pause_s: float) -> None:
+    """Ship what is there and what comes, until a KeyboardInterrupt.
+
+    A pool that is away is tried again, each time after a longer wait.
+
+    Args:
+        order: What.
+        report: Grows while it goes on.
+        say: Told in a sentence when the pool is away, and when it is back.
+        pause_s: Between two looks at the recording.
+
+    Raises:
+        PoolError: The pool will not be better by itself.
+        DatabaseError: The recording cannot be read.
+    """
+    wait_s, was_there = 0.0, False
+    while True:
+        try:
+            with _shipper(order, report) as shipper:
+                if wait_s:
+                    say(f"the pool {shipper.address} is there again")
+                was_there, wait_s = True, 0.0
+                _go_on(shipper, pause_s)
+        except PoolBusyError:
+            if not was_there:
+                raise
+            wait_s = _FIRST_WAIT_S  # a server finds out late that the connection of before is gone
+        except PoolUnavailableError as error:
+            wait_s = min(max(2 * wait_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
+            say(f"{error}; trying again in {wait_s:g} s, nothing is lost meanwhile")
+        time.sleep(wait_s)
+
+
+def _go_on(shipper: _Shipper, pause_s: float) -> None:
+    next_s = 0.0
+    while True:
+        is_thorough = time.monotonic() >= next_s
+        if is_thorough:
+            next_s = time.monotonic() + THOROUGH_S
+        if shipper.round(thorough=is_thorough):
+            time.sleep(pause_s)
+
+
+@contextmanager
+def _shipper(order: Order, report: Report) -> Generator[_Shipper]:
+    with order.recording.reader() as connection:
+        uuid = Source(connection).uuid()  # first: nothing is asked of the pool in vain
+    with order.open_target() as target:
+        target.prepare()
+        with target.shipment(uuid) as shipment:
+            yield _Shipper(order, report, uuid, target, shipment)
+
+
+class _Outbox:
+    """What waits to be written together, with the progress that it makes."""
+
+    def __init__(self, shipment: Shipment, report: Report, progress: dict[str, int]) -> None:
+        self._shipment = shipment
+        self._report = report
+        self._batches: list[Batch] = []
+        self._told = dict[str, int]()
+        self._size = 0
+        self.progress = progress
+
+    @property
+    def is_full(self) -> bool:
+        """Whether to send before anything is added."""
+        return self._size >= WRITE_BYTES
+
+    def add(self, batch: Batch | None, told: Mapping[str, int]) -> None:
+        """Rows, and the numbers that hold once they are written."""
+        if batch is not None and batch.rows:
+            self._batches.append(batch)
+            self._size += sum(map(row_bytes, batch.rows))
+        self._told |= told
+        self.progress |= told
+
+    def send(self) -> None:
+        """Write it all, in one transaction of the pool's."""
+        if not self._batches and not self._told:
+            return
+        self._shipment.write(self._batches, self._told)
+        for batch in self._batches:
+            self._report.rows[batch.table.name] += len(batch.rows)
+        self._batches, self._told, self._size = [], {}, 0
+
+
+class _Shipper:
+    """One connection to a pool, as long as it lasts."""
+
+    def __init__(
+        self, order: Order, report: Report, uuid: str, target: Target, shipment: Shipment
+    ) -> None:
+        self._order = order
+        self._report = report
+        self._uuid = uuid
+        self._shipment = shipment
+        self._outbox = _Outbox(shipment, report, shipment.progress())
+        self._progress = self._outbox.progress
+        self._owners = dict[str, str | None]()
+        self._is_checked = False
+        self._last_ids = dict[str, int]()
+        self.address = target.address
+
+    def round(self, *, thorough: bool) -> bool:
+        """Ship what is new.
+
+        Args:
+            thorough: Look at all rows that may have changed, and not only at the newest.
+
+        Returns:
+            Whether the pool holds all that was there when the round began.
+        """
+        started_s = time.time()
+        with self._order.recording.reader() as connection:
+            source = Source(connection)
+            self._require_the_same(source)
+            marks = self._ship_changing(source, thorough=thorough)
+            self._ship_rolled(source, marks)
+            all_of = [self._ship_appended(source, each) for each in self._appended()]
+            if not self._order.full:
+                self._ship_kept(source, thorough=thorough)
+            if self._order.pictures:
+                self._ship_pictures(source)
+            self._outbox.send()
+            is_frozen = isinstance(connection, FrozenConnection)
+        if not is_frozen:
+            self._leave_word(started_s, is_complete=all(all_of))
+        return all(all_of)
+
+    def _appended(self) -> list[Table]:
+        """States last: others should not wait for the largest table."""
+        wanted = [each for each in tables() if each.is_appended]
+        wanted = [each for each in wanted if self._order.full or not each.full_rate_only]
+        return sorted(wanted, key=lambda each: each.full_rate_only)
+
+    def _require_the_same(self, source: Source) -> None:
+        """That the recording is the one of before, and not an older copy of it.
+
+        Raises:
+            PoolError: It is not.
+        """
+        if (uuid := source.uuid()) != self._uuid:
+            raise PoolError(
+                f"another recording ({uuid}) stands where {self._uuid} was: ship it anew"
+            )
+        if self._is_checked:
+            return
+        for each in (table("run"), *self._appended()):
+            known = self._progress.get(each.name, 0)
+            if source.sequence(each) < known or self._is_other(source, each, known):
+                raise PoolError(
+                    f"the recording {self._uuid} is not the one that was shipped to {self.address} "
+                    f"before: its table {each.name!r} is not the same up to row {known}. It is an "
+                    "older copy, or one that was gone on with elsewhere: ship the newest one, or "
+                    "import this one into a new recording ('webots-mcp import FILE --data-dir "
+                    "NEW') and ship that"
+                )
+        self._is_checked = True
+
+    def _is_other(self, source: Source, each: Table, known: int) -> bool:
+        check = self._progress.get(f"{each.name}.check", _UNCHECKED)
+        row = source.row(each, known) if check != _UNCHECKED else None
+        return row is not None and digest([row]) != check
+
+    def _ship_changing(self, source: Source, *, thorough: bool) -> list[Mark]:
+        """Ship what differs in tables that change.
+
+        What the rows of the other tables refer to is there then, up to `_last_ids`.
+
+        Returns:
+            How far rollups were in that moment.
+        """
+        marks: list[Mark] = []
+
+        def read() -> bool:
+            if not self._knows_owners(source):
+                return False
+            for each in tables():
+                if each.is_appended:
+                    self._last_ids[each.name] = source.last_id(each)
+                elif each.name not in ROLLED and not self._compare(source, each, thorough=thorough):
+                    return False
+            marks.extend(source.marks())
+            return True
+
+        while not source.in_one_moment(read):
+            self._ask_for_owners(source)
+            self._outbox.send()
+        return marks
+
+    def _knows_owners(self, source: Source) -> bool:
+        """Whether the pool was asked whose the runs are; those of others are left out then."""
+        runs = {run_id: uuid for run_id, uuid in source.runs().items() if uuid}
+        if not self._owners.keys() >= set(runs.values()):
+            return False
+        source.foreign = {run_id for run_id, uuid in runs.items() if self._owners[uuid]}
+        return True
+
+    def _ask_for_owners(self, source: Source) -> None:
+        new = {uuid for uuid in source.runs().values() if uuid} - self._owners.keys()
+        found = self._shipment.foreign_runs(new) if new else {}
+        self._owners |= {uuid: found.get(uuid) for uuid in new}
+        self._report.foreign |= found
+
+    def _compare(self, source: Source, each: Table, *, thorough: bool) -> bool:
+        """Take the chunks whose digests differ from the pool's; False where they are too many."""
+        last = self._progress.get(each.name, 0)
+        for number in source.chunks(each, 0 if thorough else last):
+            rows = source.chunk(each, number)
+            name, value = f"{each.name}:{number}", digest(rows)
+            if rows and self._progress.get(name) != value:
+                if self._outbox.is_full:
+                    return False
+                ids = [row[0] for row in rows if isinstance(row[0], int)]
+                self._outbox.add(Batch(each, rows), {name: value, each.name: max([last, *ids])})
+                last = self._progress[each.name]
+        return True
+
+    def _ship_rolled(self, source: Source, marks: Iterable[Mark]) -> None:
+        for mark in marks:
+            names = (f"rollup/{mark.run_id}", f"coarse_rollup/{mark.run_id}")
+            told = dict(zip(names, (mark.state_id, mark.coarse_end), strict=True))
+            known, coarse_end = (self._progress.get(name) for name in names)
+            if (known, coarse_end) == (mark.state_id, mark.coarse_end):
+                continue
+            since = source.since_bucket(mark, known or 0)
+            after = {
+                "rollup": NOT_YET if since is None else since - 1,
+                "coarse_rollup": coarse_after(coarse_end, since),
+                "change": NOT_YET if since is None else known or 0,
+            }
+            for name in ROLLED:
+                for batch in source.rolled(table(name), mark, after[name]):
+                    self._put(batch, {})
+            self._put(None, told)
+
+    def _ship_appended(self, source: Source, each: Table) -> bool:
+        """Ship the next rows; returns whether these were all."""
+        after, upto = self._progress.get(each.name, 0), self._last_ids[each.name]
+        for _ in range(MOST_BATCHES):
+            if after >= upto:
+                return True
+            batch, last, found = source.appended(each, after, upto)
+            if lost := last - after - found:
+                self._report.lost[each.name] += lost
+            self._put(self._not_moved(source, batch), _told_of(batch, last))
+            after = last
+        return after >= upto
+
+    def _not_moved(self, source: Source, batch: Batch) -> Batch:
+        """Without those kept states that retention moved from `state` after they were shipped."""
+        if batch.table.name != "kept_state":
+            return batch
+        columns = batch.table.columns
+        call, run, sim, wall = map(columns.index, ("call", "run_id", "sim_time_s", "wall_time_s"))
+        shipped_us = self._progress.get(_STATE_TIME, -1)
+        known = [each for each in source.stretches() if _name_of(each) in self._progress]
+
+        def is_shipped(row: Row) -> bool:
+            wall_time_s = row[wall]
+            return row[call] is None and (
+                (isinstance(wall_time_s, int | float) and _microseconds(wall_time_s) <= shipped_us)
+                or any(each.holds(row[run], row[sim]) for each in known)
+            )
+
+        return Batch(batch.table, [row for row in batch.rows if not is_shipped(row)])
+
+    def _ship_kept(self, source: Source, *, thorough: bool) -> None:
+        """Ship the states of kept stretches: a stretch has both those and its kept states."""
+        states = table("state")
+        for stretch in source.stretches():
+            after, is_all = self._progress.get(_name_of(stretch)), False
+            if stretch.is_over and after is not None and not thorough:
+                continue
+            while not is_all:
+                upto = self._last_ids["state"]
+                batch, is_all = source.kept(states, stretch, after or 0, upto)
+                last = int(str(batch.rows[-1][0])) if batch.rows else after or 0
+                if after != last:
+                    self._put(batch, {_name_of(stretch): last})
+                after = last
+
+    def _ship_pictures(self, source: Source) -> None:
+        """Ship the files of the pictures whose rows are shipped."""
+        upto = self._progress.get("image", 0)
+        while some := source.pictures(self._progress.get(_PICTURE, 0), upto):
+            size = 0
+            for image_id, run_id, path in some:
+                if run_id not in source.foreign:
+                    size += self._ship_picture(path)
+                self._outbox.add(None, {_PICTURE: image_id})
+                if size >= WRITE_BYTES:
+                    break
+            self._outbox.send()
+
+    def _ship_picture(self, path: str) -> int:
+        """Returns how many bytes it has."""
+        try:
+            file = inside(self._order.recording.data_dir, path)
+            if file.suffix.lower() not in PICTURES or file.stat().st_size > MAX_FILE_BYTES:
+                raise InvalidInputError(f"{path!r} is no picture")
+            content = file.read_bytes()
+        except (InvalidInputError, NothingRecordedError, OSError):
+            self._report.lost_pictures += 1
+            return 0
+        self._shipment.write_picture(path, content)
+        self._report.pictures += 1
+        return len(content)
+
+    def _put(self, batch: Batch | None, told: Mapping[str, int]) -> None:
+        """Send it with others, when they have come to a size."""
+        self._outbox.add(batch, told)
+        if self._outbox.is_full:
+            self._outbox.send()
+
+    def _leave_word(self, started_s: float, *, is_complete: bool) -> None:
+        """Tell retention, by a file in the data folder."""
+        folder = self._order.recording.data_dir
+        before = read_shipped(folder, self._uuid).get(self.address)
+        complete_s = before.complete_wall_time_s if before else 0.0
+        last_ids = {each.name: self._progress.get(each.name, 0) for each in self._appended()}
+        shipped = Shipped(
+            self._uuid, last_ids, started_s if is_complete else complete_s, time.time()
+        )
+        try:
+            write_shipped(folder, self.address, shipped)
+        except OSError as error:
+            self._report.note(f"retention cannot learn here what is shipped: {error}")
+
+
+def _told_of(batch: Batch, last: int) -> dict[str, int]:
+    """The progress that these rows make, with a digest of the last one."""
+    name = batch.table.name
+    newest = batch.rows[-1] if batch.rows and batch.rows[-1][0] == last else None
+    told = {name: last, f"{name}.check": digest([newest]) if newest else _UNCHECKED}
+    if name == "state" and batch.rows:
+        wall_time_s = batch.rows[-1][batch.table.columns.index("wall_time_s")]
+        if isinstance(wall_time_s, int | float):
+            told[_STATE_TIME] = _microseconds(wall_time_s)
+    return told
+
+
+def _name_of(stretch: Stretch) -> str:
+    return f"kept_stretch/{stretch.id}"
+
+
+def _microseconds(time_s: float) -> int:
+    return round(time_s * 1e6)

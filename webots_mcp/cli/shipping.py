@@ -46,8 +46,8 @@ def ship(arguments: argparse.Namespace) -> None:
     started again at any time; a run that another recording has shipped stays that one's.
 
     Runs, commands, events, log lines, parameters, trials, rollups and kept stretches are shipped,
-    with --full each state. 'webots-mcp retain --keep-until-shipped SIZE' makes retention wait for
-    it. A password comes from PGPASSWORD, ~/.pgpass or a service file, never from the URL.
+    with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
+    from the URL.
     """
     from webots_mcp.pool.shipping import Order, Report, follow
     from webots_mcp.pool.shipping import ship as ship_once

@@ -43,7 +43,10 @@ def run(connection: Connection) -> None:
         render_as_batch=True,
         compare_type=True,
         compare_server_default=True,
+        **context.config.attributes.get("options", {}),
     )
+    if adapt := context.config.attributes.get("adapt"):  # a pool's tables differ a little
+        adapt(context.get_context())
     with context.begin_transaction():
         context.run_migrations()
 

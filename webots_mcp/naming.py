@@ -22,9 +22,9 @@ FARTHEST_M: Final = 1e9  # beyond, a number is no place (an infinity, an integer
 WORLD: Final = "world"  # the branch in which an observer publishes where each robot is
 SOLIDS: Final = "solid"  # the one of other bodies
 SEEN_SPEED: Final = "speed_mps"  # how fast it sees each to be
-_BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
+BRANCHES: Final = ("pose", "position", "pos", "gps", "odometry", "odom", "location")
 # Words of what is no place, or the place of something else.
-_ELSEWHERE: Final = frozenset((
+ELSEWHERE: Final = frozenset((
     "accel", "acceleration", "accelerometer", "angular", "axis", "cmd", "command", "compass",
     "error", "force", "gravity", "gyro", "imu", "linear", "magnetometer", "offset", "speed",
     "torque", "twist", "vel", "velocity", "wind", "ball", "blob", "box", "desired",
@@ -32,9 +32,9 @@ _ELSEWHERE: Final = frozenset((
     "reference", "setpoint", "solid", "target", "waypoint",
 ))  # fmt: skip
 # Words beside an x that leave it the robot's own, as in robot_x and currentPosX.
-_OWN: Final = frozenset((*_BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self"))
+OWN: Final = frozenset((*BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self"))
 _SEEN: Final = f"{WORLD}."
-_PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
+PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
 _LENGTHS: Final = ("m", "cm", "mm")  # units that a place is published in
 _AXES: Final = (("0", "1"), ("x", "y"), *((f"x_{unit}", f"y_{unit}") for unit in _LENGTHS))
 _TARGETS: Final = frozenset((
@@ -44,12 +44,12 @@ _MEASURED: Final = frozenset((
     "position", "pos", "actual", "measured", "current", "state", "feedback", "encoder", "sensor",
 ))  # fmt: skip
 _RATES: Final = frozenset(("speed", "velocity", "vel", "rate"))
-_MODES: Final = ("mode", "behaviour", "behavior", "action", "task", "phase")
-_STATES: Final = ("state", "status")  # of anything, often of an arm
-_SPELLINGS: Final = frozenset(("name", "label", "str"))  # after these words: of the same
+MODES: Final = ("mode", "behaviour", "behavior", "action", "task", "phase")
+STATES: Final = ("state", "status")  # of anything, often of an arm
+SPELLINGS: Final = frozenset(("name", "label", "str"))  # after these words: of the same
 USUAL_POSITIONS: Final = (
-    *((f"{branch}.{x}", f"{branch}.{y}") for branch in _BRANCHES for x, y in _AXES),
-    *((f"{branch}_{unit}.0", f"{branch}_{unit}.1") for branch in _BRANCHES for unit in _LENGTHS),
+    *((f"{branch}.{x}", f"{branch}.{y}") for branch in BRANCHES for x, y in _AXES),
+    *((f"{branch}_{unit}.0", f"{branch}_{unit}.1") for branch in BRANCHES for unit in _LENGTHS),
     *_AXES[1:],  # at the top
 )
 NO_POSITION: Final = "no position is known: publish pose: [x, y], position: {x, y} or gps in metres"
@@ -140,15 +140,15 @@ def _place_of(name: str) -> tuple[str, str, str] | None:
     """The branch of an x or y, the rest of its name and which of them it is; None of all else."""
     branch, _, last = name.rpartition(".")
     words = _branch_words(branch)
-    if not _ELSEWHERE.isdisjoint(words):
+    if not ELSEWHERE.isdisjoint(words):
         return None
     if last in ("0", "1"):
-        is_place = not set(_BRANCHES).isdisjoint(words_of(branch.rpartition(".")[2]))
+        is_place = not set(BRANCHES).isdisjoint(words_of(branch.rpartition(".")[2]))
         return (branch, "", "xy"[int(last)]) if is_place else None
     parts = words_of(last)
     axes = [word for word in parts if word in ("x", "y")]
     rest = [word for word in parts if word not in ("x", "y")]
-    if len(axes) != 1 or not _OWN.issuperset(rest) or not (branch or rest):
+    if len(axes) != 1 or not OWN.issuperset(rest) or not (branch or rest):
         return None
     return branch, "_".join(rest), axes[0]
 
@@ -206,11 +206,11 @@ def find_mode(texts: Collection[str], choices: Collection[str] = ()) -> str | No
 
 def _mode_among(texts: Collection[str]) -> str | None:
     last_words = {name: _without_spelling(words_of(name.rpartition(".")[2])) for name in texts}
-    for words in (_MODES, _STATES):
+    for words in (MODES, STATES):
         ending = [
             name
             for name, (*before, last) in last_words.items()
-            if last in words and _PAST_OR_FUTURE.isdisjoint(before)
+            if last in words and PAST_OR_FUTURE.isdisjoint(before)
         ]
         if ending:
             return next((word for word in words if word in texts), min(ending, key=_shortest))
@@ -218,7 +218,7 @@ def _mode_among(texts: Collection[str]) -> str | None:
 
 
 def _without_spelling(words: Sequence[str]) -> Sequence[str]:
-    return words[:-1] if words[1:] and words[-1] in _SPELLINGS else words
+    return words[:-1] if words[1:] and words[-1] in SPELLINGS else words
 
 
 def _shortest(name: str) -> tuple[int, str]:
@@ -227,7 +227,7 @@ def _shortest(name: str) -> tuple[int, str]:
 
 def _place_first(pair: tuple[str, tuple[str, str]]) -> tuple[bool, tuple[str, str]]:
     named = {*_branch_words(pair[0].rpartition(".")[2]), *words_of(pair[1][0].rpartition(".")[2])}
-    return named.isdisjoint(_BRANCHES), pair[1]
+    return named.isdisjoint(BRANCHES), pair[1]
 
 
 def listed(names: Collection[str], most: int = 10) -> str:

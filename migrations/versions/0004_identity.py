@@ -96,10 +96,7 @@ NEW_UUID = {
     "substr(hex(randomblob(2)), 2) || '-' || hex(randomblob(6)))",
     "postgresql": "gen_random_uuid()::text",
 }
-NOW_S = {
-    "sqlite": "(julianday('now') - 2440587.5) * 86400.0",
-    "postgresql": "extract(epoch FROM now())",
-}
+NOW_S = "(julianday('now') - 2440587.5) * 86400.0"
 
 
 def upgrade() -> None:
@@ -110,10 +107,11 @@ def upgrade() -> None:
         sa.Column("created_wall_time_s", sa.Float(), nullable=False),
         sa.PrimaryKeyConstraint("uuid"),
     )
-    op.execute(
-        f"INSERT INTO recording (uuid, created_wall_time_s) SELECT {NEW_UUID[dialect]}, "
-        f"coalesce(min(started_wall_time_s), {NOW_S[dialect]}) FROM session"
-    )
+    if dialect == "sqlite":  # PostgreSQL holds many recordings, each of which has one already
+        op.execute(
+            f"INSERT INTO recording (uuid, created_wall_time_s) SELECT {NEW_UUID[dialect]}, "
+            f"coalesce(min(started_wall_time_s), {NOW_S}) FROM session"
+        )
     op.create_table(
         "retention_limit",
         sa.Column("kind", sa.Text(), nullable=False, comment=KINDS),

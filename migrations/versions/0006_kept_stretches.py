@@ -103,7 +103,10 @@ def upgrade() -> None:
         op.add_column(table, sa.Column(STEP, sa.Float(), comment=STEP_COMMENT))
     replace_all_rollup((*FIGURES, STEP))
     for name, declared in REFERENCES.items():
-        op.execute(f"ALTER TABLE trial_set ADD COLUMN {name} {declared}")
+        if op.get_context().dialect.name == "sqlite":
+            op.execute(f"ALTER TABLE trial_set ADD COLUMN {name} {declared}")
+        else:
+            op.add_column("trial_set", sa.Column(name, sa.Integer()))
         op.create_index(op.f(f"ix_trial_set_{name}"), "trial_set", [name])
     for name, comment in TEXTS.items():
         op.add_column("trial_set", sa.Column(name, sa.Text(), comment=comment))

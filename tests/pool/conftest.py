@@ -14,6 +14,7 @@ import pytest
 
 from tests.pool.sqlite_target import SQLiteTarget, pooled
 from tests.pool.sqlite_target import recorded as recorded_rows
+from tests.postgres import Server, running_server
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
@@ -70,3 +71,10 @@ def shipped(tmp_path: Path) -> Iterator[Shipped]:
     with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as connection:
         create_schema(connection)
         yield Shipped(folder, connection, tmp_path / "pool.db")
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Server]:
+    """A server that all tests share; each makes a database of its own."""
+    with running_server() as server:
+        yield server

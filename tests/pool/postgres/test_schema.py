@@ -1,0 +1,146 @@
+"""The tables of a pool in PostgreSQL: made, brought forward, refused."""
+
+from __future__ import annotations
+
+import re
+from concurrent.futures import ThreadPoolExecutor
+
+import pytest
+
+from tests.postgres import Server
+from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.errors import PoolError, PoolUnavailableError
+from webots_mcp.pool.postgres.schema import prepare
+from webots_mcp.pool.postgres.views import VIEWS
+from webots_mcp.pool.tables import Table, tables
+
+COLUMNS = (
+    "SELECT column_name, data_type, is_nullable = 'YES' FROM information_schema.columns "
+    "WHERE table_schema = 'public' AND table_name = %s ORDER BY ordinal_position"
+)
+KEY = (
+    "SELECT a.attname FROM pg_index i, unnest(i.indkey) WITH ORDINALITY k (attnum, at) "
+    "JOIN pg_attribute a ON a.attnum = k.attnum "
+    "WHERE i.indisprimary AND i.indrelid = %s::regclass AND a.attrelid = i.indrelid ORDER BY k.at"
+)
+RELATIONS = (
+    "SELECT relname FROM pg_class WHERE relnamespace = 'public'::regnamespace "
+    "AND relkind IN ('r', 'p', 'v') ORDER BY relname"
+)
+TYPES = {int: "bigint", float: "double precision", str: "text"}
+
+
+def relations(server: Server, database: str) -> list[str]:
+    return [name for (name,) in server.execute(database, RELATIONS)]
+
+
+def refusal(server: Server, database: str, **options: str) -> str:
+    with pytest.raises(PoolError) as refused:
+        prepare(server.url(database, **options), "here")
+    assert not isinstance(refused.value, PoolUnavailableError)
+    return str(refused.value)
+
+
+@pytest.mark.parametrize("table", tables(), ids=lambda table: table.name)
+def test_a_pool_has_the_columns_of_a_recording_behind_the_recordings_uuid(
+    postgres: Server, pool_template: str, table: Table
+) -> None:
+    found = postgres.execute(pool_template, COLUMNS, table.name)
+    wanted = {
+        name: ("jsonb" if name in table.json_columns else TYPES[kind], name in table.nullable)
+        for name, kind in zip(table.columns, table.types, strict=True)
+    }
+    assert found[0] == ("recording_uuid", "uuid", False)
+    assert {name: (kind, may_be_null) for name, kind, may_be_null in found[1:]} == wanted
+    time = (table.time_column,) if table.time_column else ()
+    key = tuple(name for (name,) in postgres.execute(pool_template, KEY, table.name))
+    assert key == ("recording_uuid", *table.key, *time)
+
+
+def test_a_pool_has_the_views_of_a_recording(postgres: Server, pool_template: str) -> None:
+    said = (
+        "SELECT relname, obj_description(oid) FROM pg_class "
+        "WHERE relkind = 'v' AND relnamespace = 'public'::regnamespace"
+    )
+    found = dict(postgres.execute(pool_template, said))
+    assert {name: text for name, (text, _) in VIEWS.items()} == found
+
+
+def test_two_that_prepare_at_once_make_one_pool(postgres: Server, database: str) -> None:
+    with ThreadPoolExecutor() as both:
+        made = [both.submit(prepare, postgres.url(database), "here") for _ in range(3)]
+        assert [each.result() for each in made] == [None] * 3
+    assert postgres.execute(database, "SELECT version_num FROM pool_version") == [("0009",)]
+
+
+def test_an_older_pool_is_brought_forward_with_its_rows(postgres: Server, database: str) -> None:
+    url = postgres.url(database)
+    prepare(url, "here", "0005")
+    former = "11111111-2222-4333-8444-555555555555"
+    postgres.execute(
+        database,
+        "INSERT INTO robot (recording_uuid, id, name, kind, devices, first_seen_wall_time_s, "
+        f"last_seen_wall_time_s) VALUES ('{former}', 1, 'rover', 'Robot', '{{}}', 0, 0)",
+    )
+    prepare(url, "here")
+    version = f"{SCHEMA_VERSION:04}"
+    assert postgres.execute(database, "SELECT version_num FROM pool_version") == [(version,)]
+    assert postgres.execute(database, "SELECT robot, x_m FROM robot_now") == [("rover", None)]
+    assert "kept_state" in relations(postgres, database)
+
+
+def test_a_newer_pool_is_left_alone(postgres: Server, pool: str) -> None:
+    postgres.execute(pool, "UPDATE pool_version SET version_num = '0999'")
+    assert "schema 999" in refusal(postgres, pool)
+
+
+def test_tables_of_something_else_are_not_touched(postgres: Server, database: str) -> None:
+    postgres.execute(database, "CREATE TABLE run (distance_km integer)")
+    postgres.execute(database, "CREATE TABLE alembic_version (version_num text)")
+    assert "(run)" in refusal(postgres, database)
+    assert relations(postgres, database) == ["alembic_version", "run"]
+
+
+def test_a_pool_may_stand_in_a_schema_of_its_own(postgres: Server, database: str) -> None:
+    postgres.execute(database, "CREATE TABLE run (distance_km integer)")
+    postgres.execute(database, "CREATE SCHEMA robots")
+    prepare(postgres.url(database, options="-csearch_path=robots"), "here")
+    postgres.execute(database, "SELECT * FROM robots.robot_trajectory")
+    assert relations(postgres, database) == ["run"]
+    asked = refusal(postgres, database, options="-csearch_path=nowhere")
+    assert "search path" in asked
+
+
+def test_a_role_that_may_not_make_tables_is_told_what_to_grant(
+    postgres: Server, database: str
+) -> None:
+    postgres.execute(database, 'CREATE ROLE "Poor Shipper" LOGIN')
+    postgres.execute(database, "REVOKE CREATE ON SCHEMA public FROM PUBLIC")  # as from 15 on
+    said = refusal(postgres, database, user="Poor Shipper")
+    granted = re.search("'(GRANT .*)'", said)
+    assert granted, said
+    assert relations(postgres, database) == []
+    postgres.execute(database, granted[1])
+    prepare(postgres.url(database, user="Poor Shipper"), "here")
+    assert "state" in relations(postgres, database)
+
+
+def test_a_role_that_may_not_write_is_told_what_to_grant(postgres: Server, pool: str) -> None:
+    postgres.execute(pool, "CREATE ROLE reader LOGIN")
+    granted = re.search("'(GRANT .*)'", refusal(postgres, pool, user="reader"))
+    assert granted
+    postgres.execute(pool, granted[1])
+    prepare(postgres.url(pool, user="reader"), "here")
+
+
+def test_a_database_that_is_read_only_is_refused(postgres: Server, database: str) -> None:
+    postgres.execute(database, f"ALTER DATABASE {database} SET default_transaction_read_only = on")
+    assert "read-only" in refusal(postgres, database)
+
+
+def test_an_encoding_that_lacks_letters_is_refused(postgres: Server) -> None:
+    postgres.execute(
+        "postgres",
+        "CREATE DATABASE latin ENCODING 'LATIN1' LC_COLLATE 'C' LC_CTYPE 'C' TEMPLATE template0",
+    )
+    assert "LATIN1" in refusal(postgres, "latin")

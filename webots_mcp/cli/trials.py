@@ -59,6 +59,7 @@ def trials(arguments: argparse.Namespace) -> None:
     """
     from webots_mcp.trials.plan import read_plan
     from webots_mcp.trials.runner import Workshop, run_trials
+    from webots_mcp.trials.running import LocalSimulators
     from webots_mcp.trials.searching import next_parameters, require_optuna
     from webots_mcp.trials.simulators import stand_in, webots
 
@@ -72,9 +73,10 @@ def trials(arguments: argparse.Namespace) -> None:
     recording.create()
     set_id = _set_of(recording, plan, arguments)
     search = next_parameters if plan.search else None
-    workshop = Workshop(recording, plan, command_of, threading.Event(), search)
+    simulators = LocalSimulators(command_of, arguments.jobs)
+    workshop = Workshop(recording, plan, simulators, threading.Event(), search)
     with ending_by_event(workshop.stopping):
-        run_trials(workshop, set_id, arguments.jobs, _Progress(recording, set_id, plan).tell)
+        run_trials(workshop, set_id, _Progress(recording, set_id, plan).tell)
     _show(recording, set_id, plan, as_json=arguments.json)
     if picture is not None:
         picture(recording, set_id)

@@ -64,16 +64,22 @@ def argument(*flags: str, **options: Any) -> Argument:
 
 
 def count(
-    flag: str, what: str, *, default: int, least: int = 1, dest: str = "limit", metavar: str = "N"
+    flag: str,
+    what: str,
+    *,
+    default: int | None,
+    least: int = 1,
+    dest: str = "limit",
+    metavar: str = "N",
 ) -> Argument:
-    """An argument that says how many; `what` is its help, to which the default is added."""
+    """An argument that says how many; `what` is its help, to which a default is added."""
 
     def parse(text: str) -> int:
         if text.isascii() and text.isdecimal() and int(text) >= least:
             return int(text)
         raise argparse.ArgumentTypeError(f"{text!r} must be a whole number, {least} or more")
 
-    told = f"{what} ({default})"
+    told = what if default is None else f"{what} ({default})"
     return argument(flag, type=parse, default=default, dest=dest, metavar=metavar, help=told)
 
 

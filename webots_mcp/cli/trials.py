@@ -7,7 +7,7 @@ import json
 import sys
 import threading
 from collections.abc import Callable
-from contextlib import redirect_stdout
+from contextlib import AbstractContextManager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.trials import Result, Trial
     from webots_mcp.trials.plan import WorldPlan
+    from webots_mcp.trials.running import Command, Simulators
 
 
 _WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
@@ -38,8 +39,10 @@ _WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
 @command(
     "trials", DATA_DIR, DATABASE, JSON,
     argument("plan", metavar="PLAN", help="a .toml file: see docs/trials.md"),
-    count("--jobs", "at most N trials at once, each in a simulator of its own", default=1,
-          dest="jobs"),
+    count("--jobs", "at most N trials at once, each in a simulator of its own (1; with "
+          "--scheduler as many as its workers can run)", default=None, dest="jobs"),
+    argument("--scheduler", metavar="ADDRESS",
+             help="on the workers of a Dask cluster, such as tcp://HOST:8786"),
     argument("--search", metavar="SAMPLER",
              help="search the plan's [ranges]: tpe or random, by Optuna (pip install optuna)"),
     argument("--stand-in", action="store_true", help="on the stand-in instead of Webots"),
@@ -55,31 +58,46 @@ def trials(arguments: argparse.Namespace) -> None:
     Each trial runs in a simulator and a data folder of its own; what it recorded is merged into
     the recording, where its run can be looked at like any other.
 
+    With --scheduler the trials run on the workers of a Dask cluster, each of which has to have the
+    resource simulator=1: dask worker tcp://HOST:8786 --resources simulator=1 --nthreads 1
+
     Ended by Ctrl-C or killed, the same command goes on with what is left.
     """
     from webots_mcp.trials.plan import read_plan
     from webots_mcp.trials.runner import Workshop, run_trials
-    from webots_mcp.trials.running import LocalSimulators
     from webots_mcp.trials.searching import next_parameters, require_optuna
     from webots_mcp.trials.simulators import stand_in, webots
 
     plan = read_plan(Path(arguments.plan), arguments.search)
     command_of = stand_in if arguments.stand_in else webots
     picture = _picture_of(arguments)
-    command_of(plan.world)  # before anything is written: is there such a program?
     if plan.search:
         require_optuna()
-    recording = replace(open_recording(arguments), read_only=False)
-    recording.create()
-    set_id = _set_of(recording, plan, arguments)
-    search = next_parameters if plan.search else None
-    simulators = LocalSimulators(command_of, arguments.jobs)
-    workshop = Workshop(recording, plan, simulators, threading.Event(), search)
-    with ending_by_event(workshop.stopping):
-        run_trials(workshop, set_id, _Progress(recording, set_id, plan).tell)
+    with _simulators(arguments, plan, command_of) as simulators:
+        recording = replace(open_recording(arguments), read_only=False)
+        recording.create()
+        set_id = _set_of(recording, plan, arguments)
+        search = next_parameters if plan.search else None
+        workshop = Workshop(recording, plan, simulators, threading.Event(), search)
+        with ending_by_event(workshop.stopping):
+            run_trials(workshop, set_id, _Progress(recording, set_id, plan).tell)
     _show(recording, set_id, plan, as_json=arguments.json)
     if picture is not None:
         picture(recording, set_id)
+
+
+def _simulators(
+    arguments: argparse.Namespace, plan: WorldPlan, command_of: Command
+) -> AbstractContextManager[Simulators]:
+    """Where the trials run; that there is such a program is seen before anything is written."""
+    from webots_mcp.trials.running import LocalSimulators
+
+    if arguments.scheduler is not None:
+        from webots_mcp.trials.cluster import cluster
+
+        return cluster(arguments.scheduler, plan, command_of, arguments.jobs)
+    command_of(plan.world)
+    return nullcontext(LocalSimulators(command_of, arguments.jobs or 1))
 
 
 def _picture_of(arguments: argparse.Namespace) -> Callable[[Recording, int], None] | None:

@@ -66,11 +66,18 @@ def write_bundle(
             address = f"{database.absolute().as_uri()}?mode=ro{frozen}"
             merge(writer, folder, database, run_id=run_id, address=address, pictures=data_dir)
             writer.execute(_END_SESSION)
-        _pack(folder, file, progress)
+        pack(folder, file, progress)
 
 
-def _pack(folder: Path, file: Path, progress: Progress | None) -> None:
-    found = [each for each in sorted(folder.rglob("*")) if each.is_file()]
+def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:
+    """Write the database of a folder, which nobody has open, and its pictures, and nothing else.
+
+    Args:
+        folder: Of the recording.
+        file: To write to.
+        progress: As in `write_bundle`.
+    """
+    found = [each for each in sorted(folder.rglob("*.*")) if _is_packed(each.relative_to(folder))]
     packed, of = 0, sum(each.stat().st_size for each in found)
     with zipfile.ZipFile(file, "w") as archive:
         for each in found:
@@ -83,6 +90,10 @@ def _pack(folder: Path, file: Path, progress: Progress | None) -> None:
                     packed += len(piece)
                     if progress is not None:
                         progress(packed, of)
+
+
+def _is_packed(path: Path) -> bool:
+    return str(path) == DATABASE_NAME or (len(path.parts) > 1 and path.suffix.lower() in PICTURES)
 
 
 def is_bundle(file: Path) -> bool:
@@ -101,20 +112,32 @@ def unpacked(file: Path) -> Generator[Path]:
         InvalidInputError: It is damaged or no bundle, or there is no room to unpack it.
     """
     with tempfile.TemporaryDirectory(prefix="webots-mcp-") as name:
-        try:
-            with zipfile.ZipFile(file) as archive:
-                _require_ours(file, archive)
-                for entry in archive.infolist():
-                    target = Path(name) / entry.filename
-                    target.parent.mkdir(parents=True, exist_ok=True)
-                    with archive.open(entry) as source, target.open("wb") as sink:
-                        target.chmod(PRIVATE_FILE)
-                        shutil.copyfileobj(source, sink, _PIECE_BYTES)
-        except _DAMAGED as error:
-            raise InvalidInputError(f"{file} is damaged, or no ZIP archive: {error}") from error
-        except OSError as error:
-            raise InvalidInputError(f"{file} cannot be unpacked in {name}: {error}") from error
+        unpack(file, Path(name))
         yield Path(name) / DATABASE_NAME
+
+
+def unpack(file: Path, folder: Path) -> None:
+    """Unpack a bundle as `unpacked` does; whoever is killed meanwhile leaves no database there.
+
+    Raises:
+        InvalidInputError: As there.
+    """
+    aside = folder / f"{DATABASE_NAME}.part"
+    try:
+        with zipfile.ZipFile(file) as archive:
+            _require_ours(file, archive)
+            for entry in archive.infolist():
+                is_database = entry.filename == DATABASE_NAME
+                target = aside if is_database else folder / entry.filename
+                target.parent.mkdir(parents=True, exist_ok=True)
+                with archive.open(entry) as source, target.open("wb") as sink:
+                    target.chmod(PRIVATE_FILE)
+                    shutil.copyfileobj(source, sink, _PIECE_BYTES)
+        aside.replace(folder / DATABASE_NAME)
+    except _DAMAGED as error:
+        raise InvalidInputError(f"{file} is damaged, or no ZIP archive: {error}") from error
+    except OSError as error:
+        raise InvalidInputError(f"{file} cannot be unpacked in {folder}: {error}") from error
 
 
 def _require_ours(file: Path, archive: zipfile.ZipFile) -> None:

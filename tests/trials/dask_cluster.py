@@ -1,0 +1,127 @@
+"""A Dask scheduler and its workers as processes of this machine, each ended by its pid."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import psutil
+
+T = TypeVar("T")
+
+_PATIENCE_S = 120.0
+_ADDRESS = re.compile(r"Scheduler at:\s+(tcp://\S+)")
+
+
+def found(look: Callable[[], T | None]) -> T:
+    """What is there once it is; False and None are nothing."""
+    until_s, moment = time.monotonic() + _PATIENCE_S, threading.Event()
+    while not (thing := look()):
+        assert time.monotonic() < until_s
+        moment.wait(0.02)
+    return thing
+
+
+class Process:
+    """A program of Dask's, which prints to a file."""
+
+    def __init__(self, folder: Path, program: str, *words: str) -> None:
+        folder.mkdir(parents=True)
+        self.folder = folder
+        self._log = folder / "log.txt"
+        line = [sys.executable, "-m", f"distributed.cli.dask_{program}", "--no-dashboard", *words]
+        # One death of a worker is an accident, two are the trial's fault.
+        environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1"}
+        with self._log.open("wb") as log:
+            self.process = subprocess.Popen(
+                line, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,
+                env=environment, cwd=folder,
+            )  # fmt: skip
+
+    def said(self, pattern: str | re.Pattern[str]) -> re.Match[str]:
+        """What it prints, once it has."""
+
+        def look() -> re.Match[str] | None:
+            text = self._log.read_text("utf-8", "replace")
+            assert self.process.poll() is None, text
+            return re.search(pattern, text)
+
+        return found(look)
+
+    def end(self) -> None:
+        """Hard, with what it has started."""
+        with contextlib.suppress(psutil.NoSuchProcess):
+            for each in psutil.Process(self.process.pid).children(recursive=True):
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    each.kill()
+        self.process.kill()
+        self.process.wait()
+
+
+class Worker(Process):
+    """One that runs a simulator."""
+
+    def __init__(self, folder: Path, address: str, *words: str) -> None:
+        super().__init__(
+            folder, "worker", address, "--no-nanny", "--nthreads", "1", "--host", "127.0.0.1",
+            "--local-directory", str(folder), *words,
+        )  # fmt: skip
+
+    @property
+    def trials(self) -> list[Path]:
+        """The scratch folders of the trials that it runs."""
+        return list(self.folder.glob("**/trial-*"))
+
+    @property
+    def recording(self) -> Path | None:
+        """Of the trial that it runs, once there is one."""
+        return next(iter(self.folder.glob("**/trial-*/data/webots.db")), None)
+
+    def kill(self) -> list[psutil.Process]:
+        """By SIGKILL; returns what it had started, which is to end by itself."""
+        children = psutil.Process(self.process.pid).children(recursive=True)
+        self.process.kill()
+        self.process.wait()
+        return children
+
+
+class Cluster:
+    """A scheduler, and workers as a test needs them."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._started = 0
+        self.scheduler = Process(
+            folder / "scheduler", "scheduler", "--host", "127.0.0.1", "--port", "0"
+        )
+        self.address = self.scheduler.said(_ADDRESS)[1]
+        self._workers: list[Worker] = []
+
+    @property
+    def workers(self) -> list[Worker]:
+        """Those that live."""
+        return [each for each in self._workers if each.process.poll() is None]
+
+    def start(self, number: int, *words: str) -> list[Worker]:
+        """Have so many workers with a simulator."""
+        for _ in range(number - len(self.workers)):
+            self._started += 1
+            options = words or ("--resources", "simulator=1")
+            self._workers.append(
+                Worker(self._folder / f"worker{self._started}", self.address, *options)
+            )
+        for each in self.workers:
+            each.said("Registered to:")
+        return self.workers
+
+    def end(self) -> None:
+        for each in (*self._workers, self.scheduler):
+            each.end()

@@ -1,0 +1,147 @@
+"""Trials on a Dask cluster: a real scheduler, and workers as processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.trials.conftest import Run, command, rows
+from tests.trials.dask_cluster import Cluster, found
+from webots_mcp import __version__
+from webots_mcp.trials import cluster
+from webots_mcp.trials.cluster import Needs, digest_of, what_lacks
+from webots_mcp.trials.simulators import stand_in
+
+Write = Callable[[str], Path]
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
+
+GRID = 'score = "last(x)"\nfor_s = 0.3\nrepeats = {}\n[grid]\nspeed = [1.0, 2.0, 5.0]'
+
+
+@pytest.fixture(scope="module")
+def dask_cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    started = Cluster(tmp_path_factory.mktemp("cluster"))
+    yield started
+    started.end()
+
+
+@pytest.fixture
+def started(project: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
+    """Start the plan; whoever still works on it afterwards is ended."""
+    running: list[subprocess.Popen[str]] = []
+
+    def start(*options: str) -> subprocess.Popen[str]:
+        line = command(project, *options)
+        process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        running.append(process)
+        return process
+
+    yield start
+    for process in running:
+        process.kill()
+        process.communicate()
+
+
+def scores(answer: dict[str, Any]) -> dict[float, set[float]]:
+    """By the speed."""
+    return {each["parameters"]["speed"]: set(each["scores"]) for each in answer["sets"]}
+
+
+def test_a_worker_that_is_killed_costs_nothing_and_the_scores_are_those_of_this_machine(
+    project: Path,
+    plan: Write,
+    run: Run,
+    started: Callable[..., subprocess.Popen[str]],
+    dask_cluster: Cluster,
+) -> None:
+    workers = dask_cluster.start(4)
+    plan(GRID.format(4))
+    process = started("--scheduler", dask_cluster.address, "--json")
+    busy = found(lambda: next((each for each in workers if each.recording), None))
+    simulator = busy.kill()
+    out, said = process.communicate(timeout=120)
+
+    answer = json.loads(out)
+    assert "12/12  speed " in said
+    assert [len(each["scores"]) for each in answer["sets"]] == [4, 4, 4]
+    counted = "SELECT count(*), count(DISTINCT uuid), count(DISTINCT label) FROM run"
+    assert rows(project, counted) == [(12, 12, 12)]
+    assert list((project / "data" / "trials").iterdir()) == []
+    assert [each.trials for each in dask_cluster.workers] == [[], [], []]
+    found(lambda: not any(each.is_running() for each in simulator))
+    plan(GRID.format(1))
+    assert scores(json.loads(run("--json").stdout)) == scores(answer)
+
+
+def test_who_handed_them_out_may_be_ended_and_gone_on_from(
+    project: Path,
+    plan: Write,
+    run: Run,
+    started: Callable[..., subprocess.Popen[str]],
+    dask_cluster: Cluster,
+) -> None:
+    workers = dask_cluster.start(2)
+    plan('score = "last(x)"\nfor_s = 3\n[grid]\nspeed = [1.0, 2.0]')
+    for number, code in ((signal.SIGINT, 130), (signal.SIGKILL, -signal.SIGKILL)):
+        process = started("--scheduler", dask_cluster.address)
+        found(lambda: any(each.recording for each in workers))
+        process.send_signal(number)
+        _, said = process.communicate(timeout=60)
+
+        assert process.returncode == code
+        assert "Traceback" not in said
+        found(lambda: not any(each.trials for each in workers))
+    answer = json.loads(run("--scheduler", dask_cluster.address, "--json").stdout)
+
+    assert answer["trial_set_id"] == 1
+    assert sorted(len(each["scores"]) for each in answer["sets"]) == [1, 2]
+    assert rows(project, "SELECT count(*), count(DISTINCT uuid) FROM run") == [(3, 3)]
+    assert list((project / "data" / "trials").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("HOST:8786", "'HOST:8786' is no address, such as tcp://HOST:8786"),
+        ("tcp://127.0.0.1:1", "no Dask scheduler answers at tcp://127.0.0.1:1"),
+    ],
+)
+def test_what_is_no_scheduler_is_refused_before_anything_is_written(
+    project: Path,
+    plan: Write,
+    refused: Callable[..., str],
+    monkeypatch: pytest.MonkeyPatch,
+    address: str,
+    said: str,
+) -> None:
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    plan(GRID.format(1))
+
+    assert said in refused("--scheduler", address)
+    assert not (project / "data").exists()
+
+
+def needs(world: Path, **other: Any) -> Needs:
+    """What a worker has to have, as its client says."""
+    said: dict[str, Any] = {"version": __version__, "digest": digest_of(str(world))}
+    return Needs(world=str(world), command=stand_in, **(said | other))
+
+
+def test_a_worker_says_what_it_lacks(project: Path) -> None:
+    world = project / "worlds" / "table.wbt"
+
+    assert what_lacks(needs(world)) is None
+    assert "it has webots-mcp" in (what_lacks(needs(world, version="0.1")) or "")
+    asked = needs(world)
+    (project / "controllers" / "rover" / "rover.py").write_text("print('another')")
+    assert "are not the same there" in (what_lacks(asked) or "")
+    world.unlink()
+    assert f"there is no file {world}: all workers need" in (what_lacks(asked) or "")

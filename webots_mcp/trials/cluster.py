@@ -1,0 +1,345 @@
+"""Trials on a Dask cluster: a worker runs a simulator, and returns its score and its recording.
+
+Workers have to have Dask's resource `simulator`: a task of ours takes one of it, so that no machine
+runs more simulators than its owner says. Dask runs a trial again whose worker died, and says when
+that happened too often. Needs the extra `cluster`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import tempfile
+import time
+from collections.abc import Generator, Iterator
+from concurrent.futures import CancelledError, Executor, Future, wait
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from importlib import import_module
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from webots_mcp import __version__
+from webots_mcp.contract import host_name
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+from webots_mcp.store.bundle import pack, unpack
+from webots_mcp.store.trials import Result
+from webots_mcp.trials.plan import WorldPlan
+from webots_mcp.trials.running import Attempt, Command, StoppedError, run_attempt
+
+RESOURCE: Final = "simulator"
+MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler
+_CONNECT_S: Final = 10.0
+_PATIENCE_S: Final = 0.5  # between two looks at whether somebody wants to stop
+_COUNT_EVERY_S: Final = 2.0
+_WITHOUT_WORKERS_S: Final = 60.0
+_SOURCES: Final = (".py", ".c", ".cc", ".cpp", ".h", ".hpp", ".java", ".m")
+_ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss)://[^\s/]+:[0-9]{1,5}")
+_BUNDLE: Final = "recording.zip"
+_LOST: Final = "the scheduler {} was lost: what is left can be gone on with once it is back"
+_SHARED: Final = "all workers need the project under the same path, such as in a shared folder"
+
+
+# -- on a worker ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a worker has to have.
+
+    Attributes:
+        version: Of webots-mcp.
+        world: The path of the world file.
+        digest: Of that file and the sources of the project's controllers.
+        command: Of the simulator.
+    """
+
+    version: str
+    world: str
+    digest: str
+    command: Command
+
+
+class Returned(NamedTuple):
+    """What a worker returns: what became of a trial, and its recording, packed."""
+
+    result: Result
+    recording: bytes | None
+
+
+def what_lacks(needs: Needs) -> str | None:
+    """What keeps this machine from running a trial; None where nothing does."""
+    if needs.version != __version__:
+        return f"it has webots-mcp {__version__}, not {needs.version}"
+    if not Path(needs.world).is_file():
+        return f"there is no file {needs.world}: {_SHARED}"
+    if digest_of(needs.world) != needs.digest:
+        return f"{needs.world}, or its controllers, are not the same there: {_SHARED}"
+    try:
+        needs.command(needs.world)
+    except CommandRefusedError as error:
+        return str(error)
+    return None
+
+
+def digest_of(world: str) -> str:
+    """Of a world and of the sources of its project's controllers."""
+    controllers = Path(world).parent.parent / "controllers"
+    sources = (each for each in controllers.rglob("*.*") if each.suffix in _SOURCES)
+    digest = hashlib.sha256()
+    for file in (Path(world), *sorted(sources)):
+        digest.update(f"{file}\0".encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def run_here(needs: Needs, plan_text: str) -> Returned:
+    """Run the only trial of a plan on this worker, in a scratch folder of its own.
+
+    Raises:
+        CommandRefusedError: This machine cannot run it.
+        InvalidInputError: No trial of the set can succeed.
+    """
+    from distributed import get_worker
+
+    worker: Any = get_worker()
+    unwanted = _Unwanted(worker)
+    where = f"worker {worker.address} on {host_name()}"
+    if (lack := what_lacks(needs)) is not None:
+        raise CommandRefusedError(f"{where}: {lack}")
+    plan = WorldPlan(**json.loads(plan_text))
+    try:
+        with tempfile.TemporaryDirectory(prefix="trial-", dir=worker.local_directory) as name:
+            folder = Path(name) / "data"
+            folder.mkdir()
+            attempt = Attempt(plan, plan.parameters[0], folder, unwanted, _note_nothing)
+            return _returned(run_attempt(attempt, needs.command), folder)
+    except StoppedError:
+        raise unwanted.as_dask_says() from None
+    except OSError as error:
+        raise CommandRefusedError(f"{where}: {error}") from error
+
+
+def _note_nothing(pid: int | None) -> None:
+    """Whoever handed the trial out cannot end a process of this machine; its keeper does."""
+
+
+def _returned(result: Result, folder: Path) -> Returned:
+    if result.run_id is None:
+        return Returned(result, None)
+    bundle = folder.parent / _BUNDLE
+    pack(folder, bundle)
+    size = bundle.stat().st_size
+    if size > MOST_BYTES:
+        why = (
+            f"its recording has {size:,} bytes packed, and a worker returns at most "
+            f"{MOST_BYTES:,}: have the controller publish less, or less often"
+        )
+        return Returned(replace(result, run_id=None, score=None, error=why, pruned=False), None)
+    return Returned(result, bundle.read_bytes())
+
+
+class _Unwanted:
+    """Whether nobody wants the current task any more: it was cancelled, or its worker closes.
+
+    A client that is gone, killed or not, cancels what it asked for.
+    """
+
+    def __init__(self, worker: Any) -> None:
+        self._worker = worker
+        self._key = worker.get_current_task()
+
+    def wait(self, timeout: float | None = None, /) -> bool:
+        """Wait for so long; returns whether nobody wants it."""
+        time.sleep(timeout or 0.0)
+        task = self._worker.state.tasks.get(self._key)
+        return task is None or task.state == "cancelled" or self._closes
+
+    @property
+    def _closes(self) -> bool:
+        return self._worker.status.name in ("closing", "closed", "failed")
+
+    def as_dask_says(self) -> Exception:
+        """What tells Dask that the task is not done; one whose worker closes runs elsewhere."""
+        from distributed import Reschedule
+
+        return Reschedule() if self._closes else StoppedError()
+
+
+# -- where the set is -------------------------------------------------------------------------
+
+
+class ClusterSimulators:
+    """The simulators of a cluster's workers.
+
+    Attributes:
+        client: Dask's.
+        address: Of the scheduler.
+        needs: What each worker has to have.
+        most: How many trials run at once at most; None for as many as there are workers.
+    """
+
+    def __init__(self, client: Any, address: str, needs: Needs, most: int | None) -> None:
+        self._client = client
+        self._address = address
+        self._needs = needs
+        self._most = most
+        self._executor: Executor = client.get_executor(pure=False, resources={RESOURCE: 1})
+        self._count = 0
+        self._seen_s = time.monotonic()
+        self._look_again_s = 0.0
+
+    @property
+    def count(self) -> int:
+        """How many can run at once, now; one where workers may come back.
+
+        Raises:
+            CommandRefusedError: The scheduler is gone, or its workers for a minute.
+        """
+        now_s = time.monotonic()
+        if now_s >= self._look_again_s:
+            self._look_again_s = now_s + _COUNT_EVERY_S
+            self._count = sum(_simulators_of(self._client, self._address).values())
+        if self._count:
+            self._seen_s = now_s
+        elif now_s > self._seen_s + _WITHOUT_WORKERS_S:
+            raise CommandRefusedError(_no_workers(self._address, "any more"))
+        return max(1, min(self._count, self._most or self._count))
+
+    def run(self, attempt: Attempt) -> Result:
+        """As `Simulators.run`."""
+        attempt.begun(None)
+        text = _alone(attempt.plan, attempt.values).text
+        future = self._executor.submit(run_here, self._needs, text)
+        while not wait([future], _PATIENCE_S).done:
+            if attempt.stopping.wait(0):
+                future.cancel()
+                raise StoppedError
+        returned = self._returned(future)
+        if returned.recording is not None:
+            bundle = attempt.folder / _BUNDLE
+            bundle.write_bytes(returned.recording)
+            unpack(bundle, attempt.folder)
+            bundle.unlink()
+        return returned.result
+
+    def _returned(self, future: Future[Returned]) -> Returned:
+        from distributed import KilledWorker
+
+        try:
+            return future.result()
+        except KilledWorker as error:
+            why = (
+                f"{error.allowed_failures + 1} workers died while they ran it, the last one "
+                f"{error.last_worker.address}: see their logs"
+            )
+            return Returned(Result(None, None, why), None)
+        except CancelledError as error:
+            raise CommandRefusedError(_LOST.format(self._address)) from error
+        except WebotsMCPError:
+            raise
+        except Exception as error:
+            raise CommandRefusedError(
+                f"a worker of {self._address} failed ({type(error).__name__}: {error})"
+            ) from error
+
+
+@contextmanager
+def cluster(
+    address: str, plan: WorldPlan, command: Command, most: int | None
+) -> Generator[ClusterSimulators]:
+    """The simulators of a cluster, as long as the block goes on.
+
+    Args:
+        address: Of the scheduler.
+        plan: Of the trials.
+        command: Of a world's simulator, where it runs.
+        most: How many trials run at once at most; None for as many as there are workers.
+
+    Raises:
+        CommandRefusedError: Nobody answers there, no worker has a simulator, or one lacks
+            something.
+        InvalidInputError: It is no address, or Dask is not installed.
+    """
+    with _connected(address) as client:
+        needs = Needs(__version__, plan.world, digest_of(plan.world), command)
+        _require_fit(client, address, needs)
+        yield ClusterSimulators(client, address, needs, most)
+
+
+@contextmanager
+def _connected(address: str) -> Generator[Any]:
+    try:
+        distributed: Any = import_module("distributed")
+    except ImportError as error:
+        raise InvalidInputError(
+            "trials on a cluster need Dask: pip install 'distributed>=2024.12' (the extra "
+            "[cluster] of webots-mcp)"
+        ) from error
+    if not _ADDRESS.fullmatch(address):
+        raise InvalidInputError(
+            f"scheduler {address!r} is no address, such as tcp://HOST:8786 or tls://HOST:8786"
+        )
+    try:
+        client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
+    except OSError as error:
+        raise CommandRefusedError(f"no Dask scheduler answers at {address}: {error}") from error
+    try:
+        yield client
+    finally:
+        client.close(timeout=_PATIENCE_S)
+
+
+def _require_fit(client: Any, address: str, needs: Needs) -> None:
+    """See that there are workers with simulators, which have what they need.
+
+    Raises:
+        CommandRefusedError: There is none, or one lacks something.
+    """
+    workers = list(_simulators_of(client, address))
+    if not workers:
+        raise CommandRefusedError(_no_workers(address, "yet"))
+    lacks = [*_other_versions(client, workers)]
+    if not lacks:
+        found = client.run(what_lacks, needs, workers=workers)
+        lacks = [f"worker {each}: {lack}" for each, lack in found.items() if lack is not None]
+    if lacks:
+        more = f" (and {len(lacks) - 1} other workers)" if len(lacks) > 1 else ""
+        raise CommandRefusedError(f"{lacks[0]}{more}")
+
+
+def _other_versions(client: Any, workers: list[str]) -> Iterator[str]:
+    """Workers of which Dask tells that they cannot even be asked: ours is not what is there."""
+    told = client.get_versions(packages=["webots_mcp"])["workers"]
+    for each in workers:
+        version = told[each]["packages"].get("webots_mcp")
+        if version != __version__:
+            has = f"webots-mcp {version}" if version else "no webots-mcp"
+            python = told[each]["host"]["python"]
+            yield f"worker {each} (Python {python}) has {has}: here is {__version__}"
+
+
+def _simulators_of(client: Any, address: str) -> dict[str, int]:
+    """How many simulators each worker runs at once, by its address."""
+    try:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+    except Exception as error:
+        raise CommandRefusedError(_LOST.format(address)) from error
+    found = {
+        each: min(int(told["resources"].get(RESOURCE, 0)), told["nthreads"])
+        for each, told in workers.items()
+    }
+    return {each: number for each, number in found.items() if number}
+
+
+def _no_workers(address: str, when: str) -> str:
+    return (
+        f"the scheduler {address} has no worker with the resource {RESOURCE!r} {when}: start some "
+        f"with 'dask worker {address} --resources {RESOURCE}=1 --nthreads 1'"
+    )
+
+
+def _alone(plan: WorldPlan, values: dict[str, Any]) -> WorldPlan:
+    """A plan of one trial: a worker need not know of the others."""
+    return replace(plan, parameters=[values], repeats=1, ranges={}, search=None, sets=0, seed=0)

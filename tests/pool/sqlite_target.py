@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import sqlite3
-from collections.abc import Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -14,9 +14,10 @@ from webots_mcp.pool.tables import SQLValue, Table, tables
 
 
 class SQLiteTarget:
-    """As `open_target` gives one, for a file."""
+    """As `open_target` gives one, for a file; it calls `before_write` before each transaction."""
 
-    def __init__(self, file: Path) -> None:
+    def __init__(self, file: Path, before_write: Callable[[], object] = lambda: None) -> None:
+        self._before_write = before_write
         self.address = f"sqlite:{file}"
         self._file = file
         self._connection: sqlite3.Connection
@@ -53,11 +54,14 @@ class SQLiteTarget:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 raise PoolBusyError(f"another ships {recording_uuid}") from error
-            yield SQLiteShipment(self._connection, recording_uuid)
+            yield SQLiteShipment(self._connection, recording_uuid, self._before_write)
 
 
 class SQLiteShipment:
-    def __init__(self, connection: sqlite3.Connection, recording: str) -> None:
+    def __init__(
+        self, connection: sqlite3.Connection, recording: str, before_write: Callable[[], object]
+    ) -> None:
+        self._before_write = before_write
         self._connection = connection
         self._recording = recording
         self._pictures: list[tuple[str, str, bytes]] = []
@@ -75,6 +79,7 @@ class SQLiteShipment:
         self._pictures.append((self._recording, path, content))
 
     def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
+        self._before_write()
         with _transaction(self._connection):
             for batch in batches:
                 rows = [(self._recording, *row) for row in batch.rows]

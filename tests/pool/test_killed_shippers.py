@@ -29,12 +29,9 @@ def order_of(folder: Path, pool: Path) -> Order:
     return Order(recording, functools.partial(SQLiteTarget, pool), full=True, pictures=True)
 
 
-def ship_on_and_on(folder: Path, pool: Path, begun: Connection) -> None:
-    def open_target() -> SQLiteTarget:
-        begun.send("connecting")
-        return SQLiteTarget(pool)
-
-    order = replace(order_of(folder, pool), open_target=open_target)
+def ship_on_and_on(folder: Path, pool: Path, writing: Connection) -> None:
+    tell = functools.partial(writing.send, "about to write")
+    order = replace(order_of(folder, pool), open_target=lambda: SQLiteTarget(pool, tell))
     follow(order, Report(), lambda _: None, 0.0)
 
 
@@ -50,17 +47,26 @@ def test_of_fifty_shippers_that_are_killed_while_a_bridge_records_no_row_is_lost
     tmp_path: Path, processes: ForkServerContext
 ) -> None:
     folder, pool = tmp_path / "robot", tmp_path / "pool.db"
-    rover, random_steps = Rover(folder / "webots.db"), random.Random(11)
+    rover, chance = Rover(folder / "webots.db"), random.Random(11)
     steps = 0
+
+    def drive(most: int) -> None:
+        nonlocal steps
+        steps += chance.randint(2, most)
+        rover.drive(steps * STEP_MS / 1000, {}, (0.0, 0.0))
+
     with closing(connect(rover.database, "writer")) as connection:
         for _ in range(KILLS):
-            ours, theirs = processes.Pipe()
+            drive(10)
+            writing, theirs = processes.Pipe()
             shipper = processes.Process(target=ship_on_and_on, args=(folder, pool, theirs))
             shipper.start()
-            assert ours.recv() == "connecting"
-            steps += random_steps.randint(1, 60)
-            rover.drive(steps * STEP_MS / 1000, {}, (0.0, 0.0))
+            writing.recv()
+            drive(40)
             roll(connection)
+            if chance.random() < 0.5:
+                writing.recv()  # what was recorded since
+            drive(4)
             shipper.kill()
             shipper.join()
         rover.bridge.close()

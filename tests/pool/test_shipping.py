@@ -14,10 +14,10 @@ from tests.recordings.runs import states
 from webots_mcp.connection import connect
 from webots_mcp.contract import new_uuid
 from webots_mcp.errors import DatabaseError, PoolBusyError, PoolError, SchemaTooOldError
-from webots_mcp.pool.shipped import read_shipped
 from webots_mcp.schema import create_schema
 from webots_mcp.store.merging import merge
 from webots_mcp.store.migrate import downgrade
+from webots_mcp.store.retention.shipped import read_shipped
 
 
 def test_a_pool_at_full_rate_holds_every_row_as_the_recording_does(shipped: Shipped) -> None:
@@ -211,12 +211,12 @@ def test_a_second_shipper_of_the_same_recording_is_refused(shipped: Shipped) -> 
 def test_the_folder_tells_retention_what_is_shipped(shipped: Shipped) -> None:
     shipped.add_run()
     shipped.ship()
-    (told,) = read_shipped(shipped.folder, shipped.uuid).values()
+    (told,) = read_shipped(shipped.folder / "webots.db", shipped.uuid).values()
     assert told.last_ids["log"] == 30
     assert "state" not in told.last_ids
     assert told.complete_wall_time_s > 0
-    assert read_shipped(shipped.folder, new_uuid()) == {}
-    (shipped.folder / "shipped.json").write_text("{")
-    assert read_shipped(shipped.folder, shipped.uuid) == {}
+    assert read_shipped(shipped.folder / "webots.db", new_uuid()) == {}
+    (shipped.folder / "webots.db-shipped.json").write_text("{")
+    assert read_shipped(shipped.folder / "webots.db", shipped.uuid) == {}
     shipped.ship()
-    assert read_shipped(shipped.folder, shipped.uuid)
+    assert read_shipped(shipped.folder / "webots.db", shipped.uuid)

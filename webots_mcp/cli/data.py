@@ -322,6 +322,12 @@ def _print_plan(wanted: Plan, going: str) -> None:
             for each in wanted.spared
         ]
     )
+    print_notes(
+        [
+            f"goes although it is {each.why}: {each.rows} rows of {each.table}"
+            for each in wanted.unshipped
+        ]
+    )
     if wanted.kept_run_ids:
         ids, size = _ranges(wanted.kept_run_ids), size_text(wanted.kept_bytes)
         why = "kept because of a label, a note or a mark, and not counted"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.cli.command import argument
@@ -20,6 +21,7 @@ _KINDS: Final = {
     "event": "events; its age also holds for commands",
     "image": "pictures with their files",
 }
+_SIZE: Final = "unshipped"  # a limit of its own, whose size alone can be given
 
 
 class _Default:
@@ -66,6 +68,14 @@ LIMITS: Final = (
         for kind, what in _KINDS.items()
     ),
     argument(
+        "--keep-until-shipped",
+        metavar="SIZE",
+        dest=_SIZE,
+        default=_Default(_SIZE),
+        help="how much of what is beyond these limits to keep until 'webots-mcp ship' has shipped "
+        "it (%(default)s)",
+    ),
+    argument(
         "--keep-runs",
         type=_times,
         metavar="TIMES",
@@ -86,9 +96,11 @@ def limits_of(arguments: argparse.Namespace) -> dict[str, Limit | float | None]:
     from webots_mcp.store.retention import DEFAULT
     from webots_mcp.store.retention.notation import parse_limit
 
-    asked = {name: getattr(arguments, name) for name in (*_KINDS, "outlive")}
+    asked = {name: getattr(arguments, name) for name in (*_KINDS, _SIZE, "outlive")}
     given = {name: value for name, value in asked.items() if not isinstance(value, _Default)}
-    for kind in given.keys() & _KINDS.keys():
+    for kind in given.keys() & {*_KINDS, _SIZE}:
         text = given[kind]
         given[kind] = None if text == _BACK else parse_limit(text, getattr(DEFAULT, kind))
+    if given.get(_SIZE) is not None:
+        replace(DEFAULT, **{_SIZE: given[_SIZE]})  # refuses what is no size
     return given

@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Final
 
 from webots_mcp.connection import FrozenConnection
@@ -32,11 +33,11 @@ from webots_mcp.pool.reading import (
     coarse_after,
     digest,
 )
-from webots_mcp.pool.shipped import Shipped, read_shipped, write_shipped
 from webots_mcp.pool.tables import Table, table, tables
 from webots_mcp.pool.target import Shipment, Target
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_shipped
 
 WRITE_BYTES: Final = 8_000_000
 MOST_BATCHES: Final = 8  # of a table in a round, before the others get their turn
@@ -423,16 +424,17 @@ class _Shipper:
             self._outbox.send()
 
     def _leave_word(self, started_s: float, *, is_complete: bool) -> None:
-        """Tell retention, by a file in the data folder."""
-        folder = self._order.recording.data_dir
-        before = read_shipped(folder, self._uuid).get(self.address)
+        """Tell retention, by a file beside the database."""
+        database = self._order.recording.database
+        assert isinstance(database, Path)
+        before = read_shipped(database, self._uuid).get(self.address)
         complete_s = before.complete_wall_time_s if before else 0.0
         last_ids = {each.name: self._progress.get(each.name, 0) for each in self._appended()}
         shipped = Shipped(
             self._uuid, last_ids, started_s if is_complete else complete_s, time.time()
         )
         try:
-            write_shipped(folder, self.address, shipped)
+            write_shipped(database, self.address, shipped)
         except OSError as error:
             self._report.note(f"retention cannot learn here what is shipped: {error}")
 

@@ -23,9 +23,10 @@ Asked = Mapping[str, "Limit | float | None"]
 """Limits by the names that they have in `Retention`; None is back to the default."""
 
 SERVE: Final = "serve"
-KINDS: Final = ("state", "kept_state", "rollup", "log", "event", "image")
+KINDS: Final = ("state", "kept_state", "rollup", "log", "event", "image", "unshipped")
 _KIND_OF: Final = {**{kind: kind for kind in KINDS}, "outlive": "run"}
 _NAME_OF: Final = {kind: name for name, kind in _KIND_OF.items()}
+_SHOWN: Final = {"unshipped": "until_shipped"}  # only where somebody has set it
 _READ: Final = (
     "SELECT kind, size_bytes, rows, age_s, times, set_by, set_wall_time_s FROM retention_limit"
 )
@@ -139,10 +140,11 @@ def described(connection: sqlite3.Connection) -> dict[str, str]:
     """Each limit in force as a person reads it, with who set it and when."""
     settings, retention = read_settings(connection), in_force(connection)
     return {
-        f"{kind}s": _said(settings[name])
+        _SHOWN.get(kind, f"{kind}s"): _said(settings[name])
         if name in settings
         else f"{_text(getattr(retention, name))} (default)"
         for name, kind in _KIND_OF.items()
+        if kind not in _SHOWN or name in settings
     }
 
 

@@ -13,12 +13,13 @@ _PART: Final = re.compile(r"(\d+(?:\.\d+)?)\s*([a-z]+)", re.IGNORECASE)
 _BYTES: Final = {"b": 1, "kb": 10**3, "mb": 10**6, "gb": 10**9, "tb": 10**12}
 _SECONDS: Final = {"s": 1, "min": 60, "h": 3600, "d": 86_400, "w": 604_800}
 NO_LIMIT: Final = "all"  # is kept
+_OPTIONS: Final = {"kept_state": "--keep-stretches", "unshipped": "--keep-until-shipped"}
 _ROWS: Final = {"row": 1, "rows": 1}
 
 
 def option_of(kind: str) -> str:
     """The option of the command line that limits a kind of row."""
-    return "--keep-stretches" if kind == "kept_state" else f"--keep-{kind}s"
+    return _OPTIONS.get(kind, f"--keep-{kind}s")
 
 
 def parse_limit(text: str, default: Limit) -> Limit:

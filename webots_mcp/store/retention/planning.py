@@ -6,13 +6,19 @@ import math
 import sqlite3
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Final
 
 from webots_mcp.contract import FINAL_STATUSES
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Limit, Retention
+from webots_mcp.store.retention.shipped import (
+    Shipped,
+    complete_until_s,
+    last_shipped,
+    shipped_of,
+)
 from webots_mcp.store.retention.usage import (
     TABLES,
     Holding,
@@ -59,6 +65,11 @@ class Step:
     size_bytes: int = 0
     bound: float = math.inf
 
+    @property
+    def row_bytes(self) -> float:
+        """About what one of them takes; at least a byte."""
+        return max(self.size_bytes / max(self.rows, 1), 1.0)
+
 
 @dataclass(frozen=True)
 class Spared:
@@ -81,6 +92,7 @@ class Plan:
         kept_run_ids: Runs that a person named, described or marked: nothing of them goes, and
             they do not count.
         kept_bytes: About what they take.
+        unshipped: Of what goes, what no pool holds, because more waits than is kept until then.
     """
 
     steps: tuple[Step, ...]
@@ -88,6 +100,7 @@ class Plan:
     spared: tuple[Spared, ...]
     kept_run_ids: tuple[int, ...]
     kept_bytes: int
+    unshipped: tuple[Spared, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -143,6 +156,7 @@ class _Planner:
         self._free = [run for run in self._runs if not run.is_kept]
         self._held = {table: holdings(connection, table, self._runs) for table in TABLES}
         self._spared: list[Spared] = []
+        self._unshipped: list[Spared] = []
         self._forgotten = self._find_forgotten() if retention.outlive else set[int]()
 
     def plan(self) -> Plan:
@@ -155,6 +169,8 @@ class _Planner:
         steps += (Step("run", run.id, 1) for run in self._free if run.id in self._forgotten)
         for robot_id in {run.robot_id: None for run in self._runs}:
             steps += self._commands(robot_id)
+        if limit_bytes := self._retention.unshipped.size_bytes:
+            steps = [step for step in self._after_shipping(steps, limit_bytes) if step.rows]
         held_bytes = {table: round(_size_of(held)) for table, held in self._held.items()}
         free_bytes = sum(_size_of(self._of_free_runs(table)) for table in TABLES)
         return Plan(
@@ -163,6 +179,7 @@ class _Planner:
             tuple(self._spared),
             tuple(run.id for run in self._runs if run.is_kept),
             max(sum(held_bytes.values()) - round(free_bytes), 0),
+            tuple(self._unshipped),
         )
 
     def _of_free_runs(self, table: str) -> list[Holding]:
@@ -309,8 +326,57 @@ class _Planner:
         if rows := int(self._connection.execute(query, values).fetchone()[0]):
             yield Step("command", robot_id, rows, rows * _COMMAND_BYTES, before_s)
 
+    def _after_shipping(self, steps: Sequence[Step], limit_bytes: float) -> Iterator[Step]:
+        """Without what waits to be shipped: the newest of it stays, up to that size."""
+        pools, left_bytes = shipped_of(self._connection), limit_bytes
+        times = {run.id: run.last_wall_time_s for run in self._runs}
+        waiting = {step: self._waiting(step, pools, times) for step in steps}
+        kept = dict.fromkeys(steps, 0)
+        newest_first = sorted(steps, key=lambda each: times.get(each.owner_id, 0), reverse=True)
+        for step in newest_first:
+            if step.table != "run":
+                kept[step] = min(waiting[step], int(left_bytes / step.row_bytes))
+                left_bytes -= kept[step] * step.row_bytes
+        owners = {step.owner_id for step in steps if kept[step] and step.table != "command"}
+        for step in steps:
+            if step.table in ROLLED and step.owner_id in owners:
+                kept[step] = step.rows  # they stand for states that may stay
+            elif step.table == "run" and (step.owner_id in owners or left_bytes > 0):
+                kept[step] = 1 if step.owner_id in owners else waiting[step]
+        self._spared += _spared({step: kept[step] for step in steps}, "not shipped yet")
+        lost = {step: max(waiting[step] - kept[step], 0) for step in steps}
+        self._unshipped += _spared(lost, "not shipped, and more waits than is kept for it")
+        return (
+            replace(
+                step,
+                rows=step.rows - kept[step],
+                size_bytes=round(step.row_bytes * (step.rows - kept[step])),
+            )
+            for step in steps
+        )
+
+    def _waiting(self, step: Step, pools: Sequence[Shipped], times: Mapping[int, float]) -> int:
+        """How many of a step's rows are not in all pools."""
+        if step.table not in TABLES:
+            newest_s = step.bound if step.table == "command" else times[step.owner_id]
+            return step.rows if newest_s > complete_until_s(pools) else 0
+        last = last_shipped(pools, step.table)
+        if math.isinf(last):
+            return 0
+        (holding,) = (each for each in self._held[step.table] if each.run.id == step.owner_id)
+        return max(step.rows - rows_below(self._connection, holding, int(last) + 1), 0)
+
     def _count(self, table: str, run_id: int) -> int:
         return count_rows(self._connection, table, run_id)
+
+
+def _spared(rows: Mapping[Step, int], why: str) -> Iterator[Spared]:
+    """By table, rows of steps as what is told of them."""
+    for table in dict.fromkeys(step.table for step in rows):
+        of_table = {step: count for step, count in rows.items() if step.table == table and count}
+        if of_table:
+            size_bytes = sum(step.row_bytes * count for step, count in of_table.items())
+            yield Spared(table, sum(of_table.values()), round(size_bytes), why)
 
 
 def _size_of(held: Sequence[Holding]) -> float:

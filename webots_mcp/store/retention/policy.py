@@ -78,6 +78,8 @@ class Retention:
             runs for ever.
         kept_state: Rows of kept stretches: those that the throttle dropped, and those that went
             from `state`. A stretch that loses a row is none any more.
+        unshipped: What is beyond these limits stays until it is shipped to a pool; of more than
+            this size the oldest goes all the same.
     """
 
     state: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50_000)
@@ -87,10 +89,17 @@ class Retention:
     image: Limit = Limit(size_bytes=1_000_000_000, spared_rows=50)
     outlive: float = 10.0
     kept_state: Limit = Limit(size_bytes=100_000_000)
+    unshipped: Limit = Limit(size_bytes=0)
 
     def __post_init__(self) -> None:
         if not (self.outlive == 0 or 1 <= self.outlive < math.inf):
             raise InvalidInputError(f"outlive={self.outlive} must be 1 or more, or 0 for ever")
+        waiting = self.unshipped
+        if waiting.size_bytes is None or (waiting.rows, waiting.age_s) != (None, None):
+            raise InvalidInputError(
+                "what waits to be shipped is kept up to a size, so that a pool that is away does "
+                "not fill the disk: --keep-until-shipped 2GB"
+            )
 
 
 DEFAULT: Final = Retention()

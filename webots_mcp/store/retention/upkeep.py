@@ -8,8 +8,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
+from webots_mcp.notice import warn
 from webots_mcp.store.retention.limits import in_force
-from webots_mcp.store.retention.planning import plan
+from webots_mcp.store.retention.planning import Plan, plan
 from webots_mcp.store.retention.policy import Retention
 from webots_mcp.store.retention.purge import Purged, purge
 
@@ -48,6 +49,7 @@ class Upkeep:
         self._next_plan_s = 0.0
         self._connection: sqlite3.Connection | None = None
         self._under_way: Iterator[Purged] | None = None
+        self._has_warned = False
 
     def __call__(self, connection: sqlite3.Connection) -> None:
         """Delete for a moment, if anything is beyond the limits.
@@ -75,9 +77,20 @@ class Upkeep:
             time.sleep(purged.rest_s)
         self._under_way = None
 
+    def _warn_of(self, wanted: Plan) -> None:
+        """Once, until there is nothing of the kind any more."""
+        if wanted.unshipped and not self._has_warned:
+            tables = ", ".join(f"{each.table} {each.rows}" for each in wanted.unshipped)
+            warn(
+                f"rows are deleted that were not shipped yet ({tables}), because more wait than "
+                "--keep-until-shipped keeps: look whether 'webots-mcp ship --follow' runs"
+            )
+        self._has_warned = bool(wanted.unshipped)
+
     def _planned(self, connection: sqlite3.Connection) -> Iterator[Purged]:
         started_s = time.monotonic()
         wanted = plan(connection, self._limits(connection))
+        self._warn_of(wanted)
         took_s = time.monotonic() - started_s
         self._next_plan_s = started_s + max(self._interval_s, took_s / PLANNING_SHARE)
         pages = int(connection.execute("PRAGMA page_count").fetchone()[0])

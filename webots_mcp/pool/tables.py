@@ -27,6 +27,7 @@ class Table:
         columns: All columns, those of the key included, by their names in the recording.
         types: Of the columns, as the model declares them; SQLite may hold others.
         json_columns: Those that hold JSON as text.
+        json_values: Of them, those in which a text is as good as an object.
         nullable: Those that may be null.
         lasting: References that retention sets to null where it deletes what they name: a null
             does not replace the value that the pool has.
@@ -42,6 +43,7 @@ class Table:
     columns: tuple[str, ...]
     types: tuple[type[int | float | str], ...]
     json_columns: frozenset[str]
+    json_values: frozenset[str]
     nullable: frozenset[str]
     lasting: frozenset[str]
     is_appended: bool
@@ -79,6 +81,7 @@ def _table(model: Any) -> Table:
         columns=columns,
         types=tuple(_TYPES[str(column.type)] for column in model.columns),
         json_columns=frozenset(column.name for column in model.columns if _is_json(column)),
+        json_values=frozenset(column.name for column in model.columns if _is_value(column)),
         nullable=frozenset(column.name for column in model.columns if column.nullable),
         lasting=frozenset(column.name for column in model.columns if _is_lasting(column)),
         is_appended=is_appended,
@@ -90,6 +93,10 @@ def _table(model: Any) -> Table:
 
 def _is_json(column: Any) -> bool:
     return (column.comment or "").startswith("JSON") or column.name == "odd"
+
+
+def _is_value(column: Any) -> bool:
+    return (column.comment or "").startswith("JSON value")
 
 
 def _is_lasting(column: Any) -> bool:

@@ -60,7 +60,7 @@ def connect(url: str, address: str, *, autocommit: bool = True) -> Connection:
 
 
 def _refusal(error: psycopg.Error, address: str) -> PoolError:
-    said = _one_line(str(error))
+    said = one_line(str(error))
     asked = error.pgconn
     if asked is not None and asked.needs_password:
         return PoolError(
@@ -83,7 +83,7 @@ def clear_errors(address: str) -> Generator[None]:
 def told(error: psycopg.Error, address: str) -> PoolError:
     """An error of PostgreSQL as ours."""
     state = error.sqlstate or ""
-    said = _one_line(error.diag.message_primary or str(error))
+    said = one_line(error.diag.message_primary or str(error))
     if state == _PRIVILEGE:
         return PoolError(f"{address} forbids it: {said}; see docs/pool.md for what to grant")
     if state == _READ_ONLY:
@@ -103,5 +103,6 @@ def _is_lost(error: psycopg.Error, state: str) -> bool:
     return not state and isinstance(error, psycopg.OperationalError)
 
 
-def _one_line(text: str) -> str:
+def one_line(text: str) -> str:
+    """A text without line breaks."""
     return " ".join(text.split())

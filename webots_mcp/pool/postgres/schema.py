@@ -46,11 +46,16 @@ _ENCODING: Final = "UTF8"
 _OWN: Final = f"""
 CREATE TABLE shipment (
   {OWNER} uuid PRIMARY KEY,
-  progress jsonb NOT NULL DEFAULT '{{}}',
   replaced_values bigint NOT NULL DEFAULT 0,
   shipped_wall_time_s double precision
 );
-COMMENT ON COLUMN shipment.progress IS 'how far the recording was shipped';
+CREATE TABLE progress (
+  {OWNER} uuid NOT NULL,
+  name text NOT NULL,
+  value bigint NOT NULL,
+  PRIMARY KEY ({OWNER}, name)
+);
+COMMENT ON TABLE progress IS 'how far each recording was shipped';
 COMMENT ON COLUMN shipment.replaced_values IS 'values that PostgreSQL cannot hold as they were';
 CREATE TABLE run_owner (
   uuid text PRIMARY KEY,
@@ -209,7 +214,13 @@ def _require_writable(connection: Connection, address: str) -> None:
 
 def _names() -> list[str]:
     """Of all tables of a pool."""
-    return [each.name for each in tables()] + ["shipment", "run_owner", "picture", VERSION]
+    return [each.name for each in tables()] + [
+        "shipment",
+        "progress",
+        "run_owner",
+        "picture",
+        VERSION,
+    ]
 
 
 def _require_create(connection: Connection, address: str) -> None:

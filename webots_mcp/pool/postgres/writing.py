@@ -16,7 +16,6 @@ from typing import Any, Final, TypeVar, cast
 
 import psycopg
 from psycopg.adapt import Buffer, Dumper
-from psycopg.types.json import Jsonb
 
 from webots_mcp.errors import PoolBusyError, PoolError
 from webots_mcp.pool.batch import Batch, Row
@@ -92,10 +91,8 @@ class PostgresShipment:
     def progress(self) -> dict[str, int]:
         """What the last `write` left."""
         with clear_errors(self._address):
-            found = self._connection.execute(
-                f"SELECT progress FROM shipment WHERE {OWNER} = %s".encode(), (self._uuid,)
-            ).fetchone()
-        return dict(found[0]) if found else {}
+            query = f"SELECT name, value FROM progress WHERE {OWNER} = %s"
+            return dict(self._connection.execute(query.encode(), (self._uuid,)).fetchall())
 
     def foreign_runs(self, run_uuids: Collection[str]) -> dict[str, str]:
         """Those that another recording has shipped."""
@@ -125,26 +122,29 @@ class PostgresShipment:
 
     def _write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
         self._replaced = 0
-        held = self._locked_progress()
+        self._lock()
         for batch in batches:
             if batch.rows:
                 self._write_batch(batch)
         self._connection.execute(
-            f"UPDATE shipment SET progress = %s, replaced_values = replaced_values + %s, "
-            f"shipped_wall_time_s = %s WHERE {OWNER} = %s".encode(),
-            (Jsonb({**held, **progress}), self._replaced, time.time(), self._uuid),
+            f"INSERT INTO progress ({OWNER}, name, value) "
+            "SELECT %s, unnest(%s::text[]), unnest(%s::bigint[]) "
+            f"ON CONFLICT ({OWNER}, name) DO UPDATE SET value = EXCLUDED.value".encode(),
+            (self._uuid, list(progress), list(progress.values())),
+        )
+        self._connection.execute(
+            "UPDATE shipment SET replaced_values = replaced_values + %s, shipped_wall_time_s = %s "
+            f"WHERE {OWNER} = %s".encode(),
+            (self._replaced, time.time(), self._uuid),
         )
 
-    def _locked_progress(self) -> dict[str, int]:
-        """The progress, which nobody else changes or reads for this until the end."""
-        self._connection.execute(
-            f"INSERT INTO shipment ({OWNER}) VALUES (%s) ON CONFLICT DO NOTHING".encode(),
-            (self._uuid,),
-        )
-        found = self._connection.execute(
-            f"SELECT progress FROM shipment WHERE {OWNER} = %s FOR UPDATE".encode(), (self._uuid,)
-        ).fetchone()
-        return dict(found[0]) if found else {}
+    def _lock(self) -> None:
+        """Keep all others who ship this recording waiting until the end of the transaction."""
+        values = (self._uuid,)
+        insert = f"INSERT INTO shipment ({OWNER}) VALUES (%s) ON CONFLICT DO NOTHING"
+        self._connection.execute(insert.encode(), values)
+        lock = f"SELECT 1 FROM shipment WHERE {OWNER} = %s FOR UPDATE"
+        self._connection.execute(lock.encode(), values)
 
     def _write_batch(self, batch: Batch) -> None:
         if batch.table.name == "run":

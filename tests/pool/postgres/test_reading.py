@@ -1,0 +1,183 @@
+"""What is read from a pool in PostgreSQL."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.memory import memory_connection
+from tests.pool.postgres.shipped import rows_of, ship, uuid_of
+from tests.postgres import Server
+from tests.recordings.rover import Recorder, record_rover
+from webots_mcp.errors import InvalidInputError, PoolError
+from webots_mcp.pool.postgres import reading
+from webots_mcp.pool.postgres.reading import PostgresPool
+from webots_mcp.pool.tables import Table, table, tables
+from webots_mcp.store.rollup.rolling import roll
+
+# What jsonb has not, or has otherwise; each comes back as it was, also where it is no JSON object.
+ODD_OBJECTS = ["", "no JSON", '{"a":', '{"a": "\\u0000"}', '"\\ud800"', "NaN", "[1, 2.50]", "-0.0"]
+VALUES = ['"text"', '"3"', "3", "true", "null", '{"a": 1}', '"\\u0000"', '["\\u0000"]', '"\\n\\""']
+
+
+@pytest.fixture(scope="module")
+def recording() -> Iterator[sqlite3.Connection]:
+    """The known story, rolled up, with parameters, a trial set and odd values."""
+    with memory_connection() as connection:
+        record_rover(connection)
+        assert roll(connection, 100_000).done
+        connection.execute("UPDATE run SET uuid = 'run ' || id, label = 'first' WHERE id < 3")
+        recorder = Recorder(connection)
+        recorder.run_id, recorder.run_start_s = 3, recorder.wall_s
+        for number, text in enumerate(ODD_OBJECTS):
+            recorder.insert("event", **recorder.at(float(number)), kind="odd", data=text)
+        for text in VALUES:
+            recorder.insert(
+                "parameter_value", **recorder.at(1.0), name="p", value=text, is_default=0,
+                set_by="code",
+            )  # fmt: skip
+        recorder.insert("trial_set", uuid="set", plan="{}", created_wall_time_s=5.0)
+        for number, run_id in ((1, 2), (2, None), (3, 1)):
+            recorder.insert(
+                "trial", trial_set_id=1, uuid=f"trial {number}", number=number, parameters="{}",
+                status="done", run_id=run_id,
+            )  # fmt: skip
+        yield connection
+
+
+@pytest.fixture(scope="module")
+def shipped_url(postgres: Server, pool_template: str, recording: sqlite3.Connection) -> str:
+    pool = postgres.new_database(pool_template)
+    ship(postgres, pool, recording)
+    return postgres.url(pool)
+
+
+@pytest.fixture
+def pool(shipped_url: str) -> Iterator[PostgresPool]:
+    with PostgresPool(shipped_url) as opened:
+        yield opened
+
+
+def parsed(table: Table, rows: list[tuple[Any, ...]]) -> list[list[Any]]:
+    """JSON as the values that it stands for; what is none as it is."""
+    return [
+        [
+            meant(value) if column in table.json_columns else value
+            for column, value in zip(table.columns, row, strict=True)
+        ]
+        for row in rows
+    ]
+
+
+def meant(text: str | None) -> Any:
+    try:
+        return None if text is None else ("JSON", json.loads(text, parse_constant=lambda _: text))
+    except ValueError:
+        return text
+
+
+@pytest.mark.parametrize("table", tables(), ids=lambda table: table.name)
+def test_every_row_comes_back_as_it_was_recorded(
+    pool: PostgresPool, recording: sqlite3.Connection, table: Table
+) -> None:
+    found = [row for batch in pool.rows(uuid_of(recording), table, {}) for row in batch.rows]
+    assert parsed(table, found) == parsed(table, rows_of(recording, table))
+
+
+def test_rows_are_chosen_and_come_in_the_order_of_their_key(
+    pool: PostgresPool, recording: sqlite3.Connection
+) -> None:
+    uuid, states, rollups = uuid_of(recording), table("state"), table("rollup")
+    batches = list(pool.rows(uuid, states, {"run_id": [3, 2]}))
+    ids = [row[0] for batch in batches for row in batch.rows]
+    wanted = recording.execute("SELECT id FROM state WHERE run_id > 1 ORDER BY id").fetchall()
+    assert ids == [row_id for (row_id,) in wanted]
+    (signal_id,) = recording.execute("SELECT id FROM signal WHERE name = 'ir'").fetchone()
+    where = {"run_id": [1], "signal_id": [signal_id], "bucket": [1, 0, 99]}
+    some = pool.rows(uuid, rollups, where)
+    places = [rollups.columns.index(each) for each in rollups.key]
+    keys = [tuple(row[at] for at in places) for batch in some for row in batch.rows]
+    assert keys == [(1, signal_id, 0), (1, signal_id, 1)]
+    assert list(pool.rows("00000000-0000-4000-8000-000000000000", states, {})) == []
+
+
+def test_two_tables_can_be_read_at_once(pool: PostgresPool, recording: sqlite3.Connection) -> None:
+    logs, events = (pool.rows(uuid_of(recording), table(name), {}) for name in ("log", "event"))
+    first, second = next(logs), next(events)
+    assert (len(first.rows), len(second.rows)) == (3, 4 + len(ODD_OBJECTS))
+
+
+def test_what_is_there_is_listed(pool: PostgresPool, recording: sqlite3.Connection) -> None:
+    (found,) = pool.recordings()
+    assert (found.uuid, found.robots, found.runs) == (uuid_of(recording), ("rover",), 3)
+    runs = list(pool.runs())
+    assert [(run.run_id, run.uuid, run.label) for run in runs] == [
+        (1, "run 1", "first"), (2, "run 2", "first"), (3, "", None)
+    ]  # fmt: skip
+    assert list(pool.runs(found.uuid)) == runs
+    assert list(pool.runs("00000000-0000-4000-8000-000000000000")) == []
+    (trials,) = pool.trial_sets()
+    assert (trials.trials, trials.runs) == (3, ((found.uuid, 2), (found.uuid, 1)))
+    sizes = {size.table: size for size in pool.sizes()}
+    assert (sizes["state"].rows, sizes["trial"].rows, sizes["picture"].rows) == (2050, 3, 0)
+    assert (sizes["state"].size_bytes or 0) > 2050 * 100
+    assert pool.progress(found.uuid) == {"shipped": 1}
+    assert pool.picture(found.uuid, "camera/1.png") is None
+
+
+def test_one_select_is_answered_up_to_its_limit(pool: PostgresPool) -> None:
+    sql = "SELECT robot, mode, x_m FROM robot_trajectory WHERE mode LIKE 'cr%' ORDER BY state_id;"
+    columns, rows = pool.select(sql, 2)
+    assert columns == ["robot", "mode", "x_m"]
+    assert rows == [("rover", "cruise", 0.0), ("rover", "cruise", pytest.approx(0.02))]
+    assert pool.select("SELECT 1.5 AS number, NULL", 9) == (["number", "?column?"], [(1.5, None)])
+    _, ((uuid,),) = pool.select("SELECT recording_uuid FROM robot", 1)
+    assert isinstance(uuid, str)
+
+
+@pytest.mark.parametrize(
+    ("sql", "said"),
+    [
+        ("SELECT 1; DROP TABLE run", "multiple commands"),
+        ("SELECT 1; COMMIT; DROP TABLE run", "multiple commands"),
+        ("DROP TABLE run", "syntax error"),
+        ("WITH gone AS (DELETE FROM run RETURNING id) SELECT * FROM gone", "WITH"),
+        ("SELECT make_partition('state', 2031, 1)", "read-only"),
+        ("SELECT nothing FROM run", 'column "nothing" does not exist'),
+        ("SELECT 1 / 0", "division by zero"),
+        ("", "syntax error"),
+    ],
+)
+def test_anything_else_than_a_select_is_refused(pool: PostgresPool, sql: str, said: str) -> None:
+    with pytest.raises(InvalidInputError, match=said):
+        pool.select(sql, 10)
+    assert pool.select("SELECT count(*) FROM run", 1)[1] == [(3,)]
+
+
+def test_a_select_that_takes_too_long_is_ended(
+    pool: PostgresPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(reading, "SELECT_S", 0.1)
+    with pytest.raises(InvalidInputError, match="timeout"):
+        pool.select("SELECT pg_sleep(60)", 1)
+
+
+def test_an_empty_database_is_no_pool(postgres: Server, database: str) -> None:
+    with (
+        pytest.raises(PoolError, match="nothing was shipped"),
+        PostgresPool(postgres.url(database)),
+    ):
+        pass
+
+
+def test_a_server_that_is_not_there_is_said(tmp_path: Path) -> None:
+    with (
+        pytest.raises(PoolError, match="does not answer"),
+        PostgresPool(f"postgresql:///robots?host={tmp_path}"),
+    ):
+        pass

@@ -1,0 +1,190 @@
+"""Reading a pool in PostgreSQL: what is there, rows to bring back, and one SELECT."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Collection, Generator, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any, Final, cast
+
+import psycopg
+from psycopg.types.numeric import FloatLoader
+from psycopg.types.string import TextLoader
+
+from webots_mcp.errors import InvalidInputError, PoolError
+from webots_mcp.pool.batch import Batch, Row, batches
+from webots_mcp.pool.postgres.connecting import Connection, clear_errors, connect, one_line
+from webots_mcp.pool.postgres.schema import OWNER, require_current
+from webots_mcp.pool.tables import Table, tables
+from webots_mcp.pool.target import (
+    PooledRecording,
+    PooledRun,
+    PooledSize,
+    PooledTrialSet,
+    redacted,
+)
+
+SELECT_S: Final = 60
+_FETCHED: Final = 2000  # rows that are asked of the server at a time
+_COUNTED_BYTES: Final = 200_000_000  # larger tables are not counted, which would take long
+_SESSION: Final = "SET idle_in_transaction_session_timeout = '15min'"
+_RECORDINGS: Final = f"""
+SELECT e.{OWNER}::text, e.created_wall_time_s,
+  ARRAY(SELECT DISTINCT name FROM robot r WHERE r.{OWNER} = e.{OWNER} ORDER BY name),
+  (SELECT count(*) FROM run u WHERE u.{OWNER} = e.{OWNER}),
+  EXISTS (SELECT 1 FROM progress p WHERE p.{OWNER} = e.{OWNER} AND p.name = 'state')
+FROM recording e ORDER BY e.created_wall_time_s, e.{OWNER}"""
+_RUNS: Final = f"""
+SELECT u.{OWNER}::text, u.id, coalesce(u.uuid, ''), r.name, u.label, u.world,
+  u.started_wall_time_s, u.last_wall_time_s, u.started_sim_time_s, u.last_sim_time_s,
+  u.end_reason, u.rows
+FROM run u JOIN robot r ON r.{OWNER} = u.{OWNER} AND r.id = u.robot_id
+WHERE %(uuid)s::uuid IS NULL OR u.{OWNER} = %(uuid)s::uuid
+ORDER BY u.started_wall_time_s, u.{OWNER}, u.id"""
+_TRIAL_SETS: Final = f"""
+SELECT s.{OWNER}::text, s.id, s.uuid, s.created_wall_time_s,
+  (SELECT count(*) FROM trial t WHERE t.{OWNER} = s.{OWNER} AND t.trial_set_id = s.id),
+  ARRAY(SELECT t.run_id FROM trial t WHERE t.{OWNER} = s.{OWNER} AND t.trial_set_id = s.id
+    AND t.run_id IS NOT NULL ORDER BY t.number)
+FROM trial_set s ORDER BY s.created_wall_time_s, s.{OWNER}, s.id"""
+_SIZE: Final = """
+SELECT coalesce(sum(pg_total_relation_size(p.relid)), 0)::bigint,
+  coalesce(sum(c.reltuples) FILTER (WHERE p.isleaf), 0)::bigint,
+  coalesce(bool_and(c.reltuples >= 0) FILTER (WHERE p.isleaf), false)
+FROM pg_partition_tree(%s) p JOIN pg_class c ON c.oid = p.relid"""
+_ASKED_WRONG: Final = ("22", "25006", "42", "57014", "0A")  # SQLSTATEs that a question has
+
+
+class PostgresPool:
+    """A PostgreSQL database as a pool to read from, in one moment of it; see `target.Pool`."""
+
+    keeps_order = False  # jsonb has an order of its own
+
+    def __init__(self, url: str) -> None:
+        self._url, self.address = url, redacted(url)
+        self._names = (f"rows_{number}" for number in itertools.count())
+        self._opened: Connection | None = None
+
+    def __enter__(self) -> PostgresPool:
+        self._opened = connect(self._url, self.address)
+        try:
+            with clear_errors(self.address):
+                self._opened.execute(_SESSION)
+                require_current(self._opened, self.address)
+                self._opened.read_only = True
+                self._opened.isolation_level = psycopg.IsolationLevel.REPEATABLE_READ
+                self._opened.autocommit = False
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if self._opened is not None:
+            self._opened.close()
+            self._opened = None
+
+    @property
+    def _connection(self) -> Connection:
+        if self._opened is None:
+            raise PoolError(f"{self.address} is not open")
+        return self._opened
+
+    def recordings(self) -> Iterator[PooledRecording]:
+        """All, by when they were made."""
+        for uuid, created_s, robots, *others in self._asked(_RECORDINGS):
+            yield PooledRecording(uuid, created_s, tuple(robots), *others)
+
+    def runs(self, recording_uuid: str | None = None) -> Iterator[PooledRun]:
+        """All, or those of a recording, by when they began."""
+        for row in self._asked(_RUNS, {"uuid": recording_uuid}):
+            yield PooledRun(*row)
+
+    def trial_sets(self) -> Iterator[PooledTrialSet]:
+        """All, by when they were made."""
+        for owner, *of_set, run_ids in self._asked(_TRIAL_SETS):
+            runs = tuple((str(owner), int(run_id)) for run_id in run_ids)
+            yield PooledTrialSet(owner, *of_set, runs=runs)
+
+    def sizes(self) -> Iterator[PooledSize]:
+        """Bytes with those of indexes; rows of large tables as PostgreSQL last estimated them."""
+        for each in (*(table.name for table in tables()), "picture"):
+            ((size_bytes, estimate, is_estimated),) = self._asked(_SIZE, (each,))
+            rows = estimate
+            if size_bytes < _COUNTED_BYTES or not is_estimated:
+                ((rows,),) = self._asked(f"SELECT count(*) FROM {each}")
+            yield PooledSize(each, rows, size_bytes)
+
+    def progress(self, recording_uuid: str) -> dict[str, int]:
+        """How far the recording was shipped."""
+        query = f"SELECT name, value FROM progress WHERE {OWNER} = %s"
+        return dict(cast("list[tuple[str, int]]", list(self._asked(query, (recording_uuid,)))))
+
+    def rows(
+        self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
+    ) -> Iterator[Batch]:
+        """Rows with their JSON as text, in PostgreSQL's notation."""
+        conditions = "".join(f' AND "{column}" = ANY(%s)' for column in where)
+        query = (
+            f"SELECT {', '.join(_as_recorded(table, each) for each in table.columns)} "
+            f"FROM {table.name} WHERE {OWNER} = %s{conditions} "
+            f"ORDER BY {', '.join(table.key)}"
+        )
+        asked = (recording_uuid, *(list(ids) for ids in where.values()))
+        yield from batches(table, cast("Iterator[Row]", self._asked(query, asked)))
+
+    def picture(self, recording_uuid: str, path: str) -> bytes | None:
+        """The file of a picture."""
+        query = f"SELECT content FROM picture WHERE {OWNER} = %s AND path = %s"
+        found = list(self._asked(query, (recording_uuid, path)))
+        return bytes(found[0][0]) if found else None
+
+    def select(self, sql: str, limit: int) -> tuple[list[str], list[tuple[Any, ...]]]:
+        """The first rows of one SELECT.
+
+        Raises:
+            InvalidInputError: It is no SELECT, is wrong, or takes longer than a minute.
+        """
+        with clear_errors(self.address), _clear_question(), self._connection.transaction():
+            self._connection.execute(f"SET LOCAL statement_timeout = '{SELECT_S}s'".encode())
+            # With values, even none, PostgreSQL takes no more than one statement.
+            with self._connection.cursor(next(self._names)) as cursor:
+                cursor.adapters.register_loader("numeric", FloatLoader)
+                cursor.adapters.register_loader("uuid", TextLoader)
+                cursor.execute(sql.strip().rstrip(";").replace("%", "%%").encode(), ())
+                rows = cursor.fetchmany(limit)
+                return [each.name for each in cursor.description or ()], rows
+
+    def _asked(self, query: str, values: Any = None) -> Iterator[tuple[Any, ...]]:
+        """The rows of a query, a few of them in memory."""
+        with clear_errors(self.address), self._connection.cursor(next(self._names)) as cursor:
+            cursor.itersize = _FETCHED
+            cursor.execute(query.encode(), values)
+            yield from cursor
+
+
+@contextmanager
+def _clear_question() -> Generator[None]:
+    """Inside the block, errors that the question has are said as such."""
+    try:
+        yield
+    except psycopg.Error as error:
+        if not (error.sqlstate or "").startswith(_ASKED_WRONG):
+            raise
+        said = one_line(error.diag.message_primary or str(error))
+        hint = f"; {one_line(error.diag.message_hint)}" if error.diag.message_hint else ""
+        raise InvalidInputError(
+            f"PostgreSQL does not answer this: {said}{hint}. Ask one SELECT, which ends within "
+            f"{SELECT_S} s, of the tables and views of docs/pool.md"
+        ) from None
+
+
+def _as_recorded(table: Table, column: str) -> str:
+    """A column as SQLite holds it: JSON is text, and what was no JSON is that text again."""
+    name = f'"{column}"'
+    if column not in table.json_columns:
+        return name
+    is_text = f"jsonb_typeof({name}) = 'string'"
+    if column in table.json_values:  # where a text is JSON as well
+        is_text += f" AND position('\\u0000' in {name} #>> '{{}}') > 0"
+    return f"CASE WHEN {is_text} THEN {name} #>> '{{}}' ELSE {name}::text END"

@@ -3,17 +3,28 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from tests import unprivileged
 from tests.pool.conftest import Shipped
-from tests.pool.sqlite_target import SQLiteTarget
+from tests.pool.sqlite_target import SQLiteTarget, pooled
 from tests.recordings.runs import states
 from webots_mcp.connection import connect
 from webots_mcp.contract import new_uuid
-from webots_mcp.errors import DatabaseError, PoolBusyError, PoolError, SchemaTooOldError
+from webots_mcp.errors import (
+    DatabaseError,
+    PoolBusyError,
+    PoolError,
+    PoolUnavailableError,
+    SchemaTooOldError,
+)
+from webots_mcp.pool.batch import BATCH_BYTES
+from webots_mcp.pool.shipping import Report, follow
 from webots_mcp.schema import create_schema
 from webots_mcp.store.merging import merge
 from webots_mcp.store.migrate import downgrade
@@ -220,3 +231,79 @@ def test_the_folder_tells_retention_what_is_shipped(shipped: Shipped) -> None:
     assert read_shipped(shipped.folder / "webots.db", shipped.uuid) == {}
     shipped.ship()
     assert read_shipped(shipped.folder / "webots.db", shipped.uuid)
+
+
+def test_a_pool_that_is_away_is_tried_again_and_then_gets_everything(shipped: Shipped) -> None:
+    shipped.add_run()
+    away = shipped.pool.parent / "away" / "pool.db"
+    said: list[str] = []
+
+    def hear(text: str) -> None:
+        said.append(text)
+        away.parent.mkdir(exist_ok=True)
+        if "is there again" in text:
+            raise KeyboardInterrupt
+
+    order = replace(shipped.order, open_target=lambda: SQLiteTarget(away), full=True)
+    with pytest.raises(KeyboardInterrupt):
+        follow(order, Report(), hear, 0.0)
+    assert "does not answer; trying again in 1 s" in said[0]
+    with pytest.raises(PoolUnavailableError):
+        shipped.ship(open_target=lambda: SQLiteTarget(shipped.pool.parent / "gone" / "pool.db"))
+    shipped.ship(open_target=lambda: SQLiteTarget(away), full=True)
+    assert pooled(away, shipped.uuid) == shipped.rows()
+
+
+@pytest.mark.skipif(not unprivileged.POSSIBLE, reason="root may write everywhere")
+def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
+    shipped.add_run()
+    uuid, rows = shipped.uuid, shipped.rows()
+    shipped.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    shipped.connection.close()
+    code = (
+        "import functools, sys; from pathlib import Path; "
+        "from tests.pool.sqlite_target import SQLiteTarget; "
+        "from webots_mcp.pool.shipping import Order, Report, ship; "
+        "from webots_mcp.store.recording import Recording; folder, pool = map(Path, sys.argv[1:]); "
+        "recording = Recording(folder / 'webots.db', folder, read_only=True); "
+        "ship(Order(recording, functools.partial(SQLiteTarget, pool), full=True), Report())"
+    )
+    with unprivileged.unwritable(shipped.folder):
+        line = unprivileged.line("-c", code, str(shipped.folder), str(shipped.pool))
+        subprocess.run(line, check=True)
+    assert pooled(shipped.pool, uuid) == rows
+    assert not list(shipped.folder.glob("*shipped.json"))
+
+
+def test_rows_of_other_programs_that_are_no_text_and_no_json_are_shipped_as_what_is_near(
+    shipped: Shipped,
+) -> None:
+    run_id = shipped.add_run()
+    shipped.connection.execute(
+        "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
+        "VALUES (?, 1, 'soon', 'info', 'controller', CAST(x'61ff62' AS TEXT))",
+        (run_id,),
+    )
+    shipped.ship()
+    assert shipped.pooled()["log"][-1][3:] == ("soon", "info", "controller", "a\ufffdb", None)
+
+
+def test_a_row_that_is_larger_than_a_batch_is_shipped(shipped: Shipped) -> None:
+    shipped.add_run()
+    for _ in range(3):
+        shipped.recorded.publish(100.0, {"x": "y" * (BATCH_BYTES + 1)})
+    shipped.roll()
+    shipped.ship(full=True)
+    assert shipped.pooled() == shipped.rows()
+
+
+def test_more_changes_than_a_transaction_takes_are_shipped_in_several(shipped: Shipped) -> None:
+    shipped.add_run()
+    shipped.connection.execute(
+        "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n WHERE i < 200) "
+        "INSERT INTO command (robot_id, action, params, status, created_wall_time_s, "
+        "expires_wall_time_s, result) SELECT 1, 'a', '{}', 'done', i, i, hex(zeroblob(60000)) "
+        "FROM n"
+    )
+    shipped.ship(full=True)
+    assert shipped.pooled() == shipped.rows()

@@ -29,6 +29,7 @@ from webots_mcp.schema import create_schema
 from webots_mcp.store.merging import merge
 from webots_mcp.store.migrate import downgrade
 from webots_mcp.store.retention.shipped import read_shipped
+from webots_mcp.store.rollup.rolling import forget
 
 
 def test_a_pool_at_full_rate_holds_every_row_as_the_recording_does(shipped: Shipped) -> None:
@@ -307,3 +308,35 @@ def test_more_changes_than_a_transaction_takes_are_shipped_in_several(shipped: S
     )
     shipped.ship(full=True)
     assert shipped.pooled() == shipped.rows()
+
+
+def test_a_shipper_that_starts_again_sends_only_the_rollups_that_went_on(shipped: Shipped) -> None:
+    shipped.add_run(2500)
+    shipped.add_run(2500, end=None)
+    shipped.ship()
+    shipped.recorded.publish(1300.0, {"x": 1, "mode": "c"})
+    shipped.roll()
+    sent = shipped.ship().rows
+    assert shipped.pooled()["coarse_rollup"] == shipped.rows()["coarse_rollup"]
+    assert shipped.pooled()["rollup"] == shipped.rows()["rollup"]
+    assert 0 < sent["rollup"] <= 4
+    assert sent["coarse_rollup"] <= 8
+
+
+def test_rollups_that_are_made_anew_are_shipped_anew(shipped: Shipped) -> None:
+    shipped.add_run(2500)
+    shipped.ship()
+    forget(shipped.connection)
+    shipped.connection.execute("DELETE FROM state WHERE id % 2")
+    shipped.ship()
+    shipped.roll()
+    shipped.ship()
+    assert shipped.pooled()["rollup"] == shipped.rows()["rollup"]
+    assert shipped.pooled()["coarse_rollup"] == shipped.rows()["coarse_rollup"]
+
+
+def test_rollups_of_an_older_version_that_marked_no_runs_are_shipped(shipped: Shipped) -> None:
+    shipped.add_run(100)
+    shipped.connection.execute("UPDATE run SET rolled_state_id = 0")
+    shipped.ship()
+    assert shipped.pooled()["rollup"] == shipped.rows()["rollup"] != []

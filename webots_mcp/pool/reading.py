@@ -15,6 +15,7 @@ from webots_mcp.errors import DatabaseError
 from webots_mcp.pool.batch import BATCH_BYTES, BATCH_ROWS, Batch, Row, row_bytes
 from webots_mcp.pool.tables import SQLValue, Table
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, bucket_of
+from webots_mcp.store.rollup.rolling import watermark
 
 CHUNK_ROWS: Final = 32
 NOT_YET: Final = -(2**62)  # before the first bucket
@@ -24,8 +25,8 @@ _RUNS: Final = "SELECT id, uuid FROM run"
 _SEQUENCE: Final = "SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = ?"
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
 _MARKS: Final = (
-    "SELECT id, robot_id, rolled_state_id, coalesce(coarse_end, -1) FROM run "
-    "WHERE typeof(rolled_state_id) = 'integer' AND rolled_state_id > 0"
+    "SELECT id, robot_id, iif(typeof(rolled_state_id) = 'integer', rolled_state_id, 0), "
+    "iif(typeof(coarse_end) = 'integer', coarse_end, NULL) FROM run ORDER BY id"
 )
 # By the id of the rows, not by the index of a run: only what came since is looked at.
 _EARLIEST: Final = (
@@ -52,12 +53,12 @@ _RECENT: Final = "SELECT {columns} FROM recent_rollup WHERE run_id = ? AND bucke
 
 
 class Mark(NamedTuple):
-    """How far the rollups of a run have come."""
+    """How far the rollups of a run have come; as columns of `run`."""
 
     run_id: int
     robot_id: int
     state_id: int
-    coarse_end: int
+    coarse_end: int | None
 
 
 class Stretch(NamedTuple):
@@ -162,14 +163,18 @@ class Source:
             return range(1)
         return range(since // CHUNK_ROWS, self.last_id(table) // CHUNK_ROWS + 1)
 
+    def watermark(self) -> int:
+        """The id of the last state row that is in the rollups of all runs."""
+        return watermark(self._connection)
+
     def marks(self) -> list[Mark]:
-        """How far the rollups have come, of the runs that are ours to ship."""
+        """How far the rollups have come, of the runs that are ours to ship, in their order."""
         found = map(Mark._make, self._connection.execute(_MARKS).fetchall())
         return [mark for mark in found if mark.run_id not in self.foreign]
 
     def since_bucket(self, mark: Mark, known: int) -> int | None:
         """The first bucket that state rows after `known` may have changed; None for all."""
-        if not 0 < known <= mark.state_id or self._first(_FIRST_STATE) > known + 1:
+        if not 0 < known < mark.state_id or self._first(_FIRST_STATE) > known + 1:
             return None  # rolled up anew, or rows that would tell are deleted
         asked = (known, mark.state_id, mark.run_id)
         earliest = self._connection.execute(_EARLIEST, asked).fetchone()[0]

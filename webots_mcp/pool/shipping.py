@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -25,14 +25,13 @@ from webots_mcp.errors import (
 )
 from webots_mcp.pool.batch import Batch, Row, row_bytes
 from webots_mcp.pool.reading import (
-    NOT_YET,
     ROLLED,
     Mark,
     Source,
     Stretch,
-    coarse_after,
     digest,
 )
+from webots_mcp.pool.summaries import Summaries
 from webots_mcp.pool.tables import Table, table, tables
 from webots_mcp.pool.target import Shipment, Target
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
@@ -209,6 +208,9 @@ class _Shipper:
         self._owners = dict[str, str | None]()
         self._is_checked = False
         self._last_ids = dict[str, int]()
+        self._marks: list[Mark] = []
+        self._watermark = 0
+        self._summaries = Summaries(self._progress, self._put)
         self.address = target.address
 
     def round(self, *, thorough: bool) -> bool:
@@ -224,8 +226,8 @@ class _Shipper:
         with self._order.recording.reader() as connection:
             source = Source(connection)
             self._require_the_same(source)
-            marks = self._ship_changing(source, thorough=thorough)
-            self._ship_rolled(source, marks)
+            self._ship_changing(source, thorough=thorough)
+            self._summaries.ship(source, self._marks, self._watermark)
             all_of = [self._ship_appended(source, each) for each in self._appended()]
             if not self._order.full:
                 self._ship_kept(source, thorough=thorough)
@@ -272,15 +274,12 @@ class _Shipper:
         row = source.row(each, known) if check != _UNCHECKED else None
         return row is not None and digest([row]) != check
 
-    def _ship_changing(self, source: Source, *, thorough: bool) -> list[Mark]:
+    def _ship_changing(self, source: Source, *, thorough: bool) -> None:
         """Ship what differs in tables that change.
 
-        What the rows of the other tables refer to is there then, up to `_last_ids`.
-
-        Returns:
-            How far rollups were in that moment.
+        What the rows of the others refer to is at the pool then, up to where they were read: to
+        `_last_ids`, `_marks` and `_watermark`.
         """
-        marks: list[Mark] = []
 
         def read() -> bool:
             if not self._knows_owners(source):
@@ -290,13 +289,12 @@ class _Shipper:
                     self._last_ids[each.name] = source.last_id(each)
                 elif each.name not in ROLLED and not self._compare(source, each, thorough=thorough):
                     return False
-            marks.extend(source.marks())
+            self._marks, self._watermark = source.marks(), source.watermark()
             return True
 
         while not source.in_one_moment(read):
             self._ask_for_owners(source)
             self._outbox.send()
-        return marks
 
     def _knows_owners(self, source: Source) -> bool:
         """Whether the pool was asked whose the runs are; those of others are left out then."""
@@ -325,24 +323,6 @@ class _Shipper:
                 self._outbox.add(Batch(each, rows), {name: value, each.name: max([last, *ids])})
                 last = self._progress[each.name]
         return True
-
-    def _ship_rolled(self, source: Source, marks: Iterable[Mark]) -> None:
-        for mark in marks:
-            names = (f"rollup/{mark.run_id}", f"coarse_rollup/{mark.run_id}")
-            told = dict(zip(names, (mark.state_id, mark.coarse_end), strict=True))
-            known, coarse_end = (self._progress.get(name) for name in names)
-            if (known, coarse_end) == (mark.state_id, mark.coarse_end):
-                continue
-            since = source.since_bucket(mark, known or 0)
-            after = {
-                "rollup": NOT_YET if since is None else since - 1,
-                "coarse_rollup": coarse_after(coarse_end, since),
-                "change": NOT_YET if since is None else known or 0,
-            }
-            for name in ROLLED:
-                for batch in source.rolled(table(name), mark, after[name]):
-                    self._put(batch, {})
-            self._put(None, told)
 
     def _ship_appended(self, source: Source, each: Table) -> bool:
         """Ship the next rows; returns whether these were all."""

@@ -1,0 +1,84 @@
+"""Rows of recordings as batches, and back."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from importlib import import_module
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from webots_mcp.pool.batch import Batch, Row, batches
+from webots_mcp.pool.parquet.reading import ParquetPool
+from webots_mcp.pool.parquet.writing import ParquetTarget
+from webots_mcp.pool.tables import Table, table, tables
+
+parquet: Any = import_module("pyarrow.parquet")  # it has no types
+
+OTHER_UUID = "0e7f2b1c-0000-4000-8000-000000000002"
+UUID = "0e7f2b1c-0000-4000-8000-000000000001"
+
+
+def uuid_of(file: Path) -> str:
+    with closing(sqlite3.connect(file)) as connection:
+        return str(connection.execute("SELECT uuid FROM recording").fetchone()[0])
+
+
+def rows_of(file: Path, each: Table) -> list[Row]:
+    """As SQLite has them, in the order of the key; recent rollups are rollups."""
+    columns, key = ", ".join(each.columns), ", ".join(each.key)
+    select = f"SELECT {columns} FROM {each.name}"
+    if each.name == "rollup":
+        select += f" UNION ALL SELECT {columns} FROM recent_rollup"
+    with closing(sqlite3.connect(file)) as connection:
+        return connection.execute(f"{select} ORDER BY {key}").fetchall()
+
+
+def batches_of(file: Path) -> Iterator[Batch]:
+    """All of a recording."""
+    for each in tables():
+        yield from batches(each, rows_of(file, each))
+
+
+def ship(file: Path, url: str) -> None:
+    """All of a recording in one write."""
+    with ParquetTarget(url) as target:
+        target.prepare()
+        with target.shipment(uuid_of(file)) as shipment:
+            shipment.write(list(batches_of(file)), {})
+
+
+def pooled(
+    url: str, uuid: str, name: str, where: Mapping[str, tuple[int, ...]] | None = None
+) -> list[Row]:
+    """Rows of a table as the pool gives them."""
+    with ParquetPool(url) as pool:
+        found = pool.rows(uuid, table(name), where or {})
+        return [row for batch in found for row in batch.rows]
+
+
+def logs(*ids: int, wall_time_s: float = 1_700_000_000.0, message: str = "driving") -> Batch:
+    """Rows of `log` with these ids, a second apart."""
+    each = table("log")
+    rows: list[Row] = []
+    for row_id in ids:
+        values: dict[str, int | float | str | None] = {
+            "id": row_id, "run_id": 1, "sim_time_s": float(row_id),
+            "wall_time_s": wall_time_s + row_id, "level": "info", "source": "controller",
+            "message": f"{message} {row_id}", "logger": None,
+        }  # fmt: skip
+        rows.append(tuple(values[column] for column in each.columns))
+    return Batch(each, rows)
+
+
+def globbed(folder: Path, name: str) -> list[dict[str, Any]]:
+    """What somebody reads who knows nothing but the names of the files."""
+    files = sorted(folder.glob(f"recording=*/table={name}/**/*.parquet"))
+    return [row for file in files for row in records(file)]
+
+
+def records(file: Path | BytesIO) -> list[dict[str, Any]]:
+    """The rows of one file."""
+    return parquet.ParquetFile(file).read().to_pylist()

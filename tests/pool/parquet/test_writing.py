@@ -1,0 +1,444 @@
+"""Shipping to a pool of Parquet files: each row once, whatever happens between."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import os
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests import unprivileged
+from tests.pool.parquet import bucket
+from tests.pool.parquet.bucket import Bucket, KilledError
+from tests.pool.parquet.rows import (
+    OTHER_UUID,
+    UUID,
+    globbed,
+    logs,
+    parquet,
+    pooled,
+    records,
+    rows_of,
+    ship,
+    uuid_of,
+)
+from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
+from webots_mcp.pool.batch import Batch, Row
+from webots_mcp.pool.parquet.reading import ParquetPool
+from webots_mcp.pool.parquet.writing import PART_BYTES, ParquetShipment, ParquetTarget
+from webots_mcp.pool.tables import SQLValue, table, tables
+
+DAY_S = 86_400.0
+MIDNIGHT_S = 19_700 * DAY_S
+
+HOLDER = """
+import os, sys
+from webots_mcp.pool.parquet.writing import ParquetTarget
+with ParquetTarget(sys.argv[1]) as target:
+    target.prepare()
+    with target.shipment(sys.argv[2]):
+        print("ships", flush=True)
+        sys.stdin.read()
+        os._exit(9)
+"""
+
+
+@contextmanager
+def shipping(url: str | Path, uuid: str = UUID) -> Generator[ParquetShipment]:
+    with ParquetTarget(str(url)) as target:
+        target.prepare()
+        with target.shipment(uuid) as shipment:
+            yield shipment
+
+
+def batch(name: str, *rows: Mapping[str, SQLValue]) -> Batch:
+    each = table(name)
+    return Batch(each, [tuple(row.get(column) for column in each.columns) for row in rows])
+
+
+def ids(rows: Sequence[Row]) -> list[SQLValue]:
+    return [row[0] for row in rows]
+
+
+@pytest.mark.parametrize("kind", ["folder", "object store"])
+def test_each_table_of_a_recording_is_in_the_pool_row_by_row(
+    bridge_recording: Path, tmp_path: Path, kind: str
+) -> None:
+    url = str(tmp_path / "pool") if kind == "folder" else bucket.empty()
+    ship(bridge_recording, url)
+    for each in tables():
+        assert pooled(url, uuid_of(bridge_recording), each.name) == rows_of(bridge_recording, each)
+
+
+def write_all(url: str, steps: Sequence[list[Batch]]) -> None:
+    """As a shipper does: it begins behind the progress that the pool tells."""
+    with shipping(url) as shipment:
+        for number, step in enumerate(steps, 1):
+            if number > shipment.progress().get("step", 0):
+                shipment.write(step, {"step": number})
+
+
+def run_row(row_id: int, rows: int) -> dict[str, SQLValue]:
+    return {
+        "id": row_id, "session_id": 1, "robot_id": 1, "start_reason": "start", "rows": rows,
+        "started_wall_time_s": 1.0, "started_sim_time_s": 0.0, "last_wall_time_s": 2.0,
+        "last_sim_time_s": 1.0, "keep": 0, "purged_rows": 0, "rolled_state_id": 0,
+        "uuid": f"run-{row_id}",
+    }  # fmt: skip
+
+
+STEPS = [
+    [batch("run", run_row(1, 3)), logs(1, 2, 3, wall_time_s=MIDNIGHT_S - 3)],
+    [batch("run", run_row(1, 5)), logs(4, 5, wall_time_s=MIDNIGHT_S - 3)],
+    [batch("run", run_row(1, 6), run_row(2, 0)), logs(6, wall_time_s=MIDNIGHT_S - 3)],
+]
+
+
+def globbed_ids(name: str) -> list[int]:
+    contents = [content for path, content in Bucket.store.items() if f"/table={name}/" in path]
+    return [row["id"] for content in contents for row in records(io.BytesIO(content.getvalue()))]
+
+
+def test_killed_at_any_put_a_shipper_goes_on_and_each_row_is_there_once() -> None:
+    write_all(bucket.empty(), STEPS)
+    puts = Bucket.puts
+    assert puts > 12
+    for after in range(puts):
+        url = bucket.empty()
+        with bucket.failing(after, KilledError()), pytest.raises(KilledError):
+            write_all(url, STEPS)
+        assert not [n for n in Counter(globbed_ids("log")).values() if n > 1]
+        Bucket.store.pop(f"/pool/robots/recording={UUID}/_lease", None)  # it has run out
+        write_all(url, STEPS)
+        assert ids(pooled(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 4, 5, 6]
+        at = table("run").columns.index("rows")
+        assert [row[at] for row in pooled(url, UUID, "run")] == [6, 0]
+
+
+def test_rows_that_never_counted_and_were_purged_meanwhile_are_not_there_twice_or_half() -> None:
+    url = bucket.empty()
+    write_all(url, STEPS[:1])
+    puts = Bucket.puts
+    with bucket.failing(3, KilledError()), pytest.raises(KilledError):
+        write_all(url, [STEPS[0], [logs(4, 5, 6), batch("run", run_row(1, 6))]])
+    assert Bucket.puts > puts
+    Bucket.store.pop(f"/pool/robots/recording={UUID}/_lease", None)
+    assert ids(pooled(url, UUID, "log")) == [1, 2, 3]  # the others do not count yet
+    write_all(url, [STEPS[0], [logs(6, 7)]])
+    assert ids(pooled(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 6, 7]
+
+
+def test_who_reads_all_files_while_somebody_ships_sees_no_row_twice(tmp_path: Path) -> None:
+    seen: list[Counter[int]] = []
+    over = threading.Event()
+
+    def read() -> None:
+        while not over.is_set():
+            seen.append(Counter(row["id"] for row in globbed(tmp_path, "log")))
+
+    reader = threading.Thread(target=read)
+    reader.start()
+    try:
+        with shipping(tmp_path) as shipment:
+            for first in range(1, 400, 10):
+                shipment.write([logs(*range(first, first + 10))], {})
+    finally:
+        over.set()
+        reader.join()
+    assert any(counts for counts in seen)
+    assert all(set(counts.values()) <= {1} for counts in seen)
+
+
+def test_small_batches_are_gathered_in_one_file_a_day(tmp_path: Path) -> None:
+    with shipping(tmp_path) as shipment:
+        for row_id in range(1, 31):
+            shipment.write([logs(row_id, wall_time_s=MIDNIGHT_S - 20)], {})
+    names = [file.parent.name for file in tmp_path.rglob("table=log/*/*.parquet")]
+    assert sorted(names) == ["day=2023-12-08", "day=2023-12-09"]
+    assert ids(pooled(str(tmp_path), UUID, "log")) == list(range(1, 31))
+
+
+def test_a_large_file_is_over_and_another_begins(tmp_path: Path) -> None:
+    with shipping(tmp_path) as shipment:
+        for row_id in range(1, 8):
+            noise = os.urandom(PART_BYTES // 2).hex()
+            shipment.write([logs(row_id, message=noise)], {})
+    names = sorted(file.name for file in tmp_path.rglob("table=log/*/*.parquet"))
+    assert names == [f"part-{number:06}.parquet" for number in (1, 2, 3, 4)]
+    assert ids(pooled(str(tmp_path), UUID, "log")) == list(range(1, 8))
+
+
+def test_rows_that_are_there_are_left_alone_and_a_table_may_come_twice_in_a_write(
+    tmp_path: Path,
+) -> None:
+    with shipping(tmp_path) as shipment:
+        shipment.write([logs(1, 2), logs(2, 3)], {})
+        shipment.write([logs(1, 2, 3, message="another")], {})
+    rows = globbed(tmp_path, "log")
+    assert [row["message"] for row in rows] == ["driving 1", "driving 2", "driving 3"]
+
+
+def test_rows_may_come_that_lie_before_others_and_each_is_there_once_in_order(
+    tmp_path: Path,
+) -> None:
+    with shipping(tmp_path) as shipment:
+        shipment.write([logs(*range(1, 900, 9), message="kept")], {})
+        shipment.write([logs(500, 501, 505, message="kept")], {})
+        for first in range(1, 1000, 100):
+            noise = os.urandom(PART_BYTES // 2).hex() if first % 300 == 1 else ""
+            shipment.write([logs(*range(first, first + 99)), logs(first + 99, message=noise)], {})
+    assert len(list(tmp_path.rglob("table=log/*/*.parquet"))) > 1
+    assert ids(pooled(str(tmp_path), UUID, "log")) == list(range(1, 1001))
+    rows = globbed(tmp_path, "log")
+    assert Counter(row["id"] for row in rows) == Counter(range(1, 1001))
+    kept = [row["id"] for row in rows if row["message"].startswith("kept")]
+    assert len(kept) == 100 + 2
+
+
+def test_a_row_replaces_the_one_of_its_key_but_what_lasts_is_not_lost(tmp_path: Path) -> None:
+    command = {
+        "id": 1, "robot_id": 1, "action": "grasp", "params": "{}", "status": "claimed",
+        "created_wall_time_s": 1.0, "expires_wall_time_s": 2.0, "session_id": 4,
+    }  # fmt: skip
+    with shipping(tmp_path) as shipment:
+        shipment.write([batch("command", command, command | {"id": 2})], {})
+        done = command | {"status": "done", "session_id": None}
+        shipment.write([batch("command", done)], {})
+        shipment.write([batch("command", done | {"id": 3}, done | {"id": 3, "error": "e"})], {})
+    found = [
+        (row["id"], row["status"], row["session_id"], row["error"])
+        for row in globbed(tmp_path, "command")
+    ]
+    assert found == [(1, "done", 4, None), (2, "claimed", 4, None), (3, "done", None, "e")]
+
+
+def rollup(run_id: int, bucket_number: int) -> dict[str, SQLValue]:
+    counts = {"rows": 1, "present": 1, "changes": 1}
+    return {"run_id": run_id, "signal_id": 1, "bucket": bucket_number, **counts}
+
+
+def test_short_runs_share_files_and_long_runs_have_some_of_their_own(tmp_path: Path) -> None:
+    with shipping(tmp_path) as shipment:
+        short = [rollup(run_id, number) for run_id in range(1, 60) for number in range(5)]
+        shipment.write([batch("rollup", *short)], {})
+        shipment.write([batch("rollup", *(rollup(3, number) for number in range(1000)))], {})
+    names = [file.name for file in (tmp_path / f"recording={UUID}/table=rollup").iterdir()]
+    assert len(names) == 4 + 3
+    found = pooled(str(tmp_path), UUID, "rollup", {"run_id": (3,)})
+    at = table("rollup").columns.index("bucket")
+    assert [row[at] for row in found] == list(range(1000))
+    assert len(globbed(tmp_path, "rollup")) == 58 * 5 + 1000
+
+
+def test_what_a_column_cannot_hold_becomes_what_comes_nearest(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    odd = {
+        "id": 1, "run_id": "one", "sim_time_s": "soon", "wall_time_s": 2**60 + 1, "level": 5,
+        "source": b"\xff", "message": "lone \ud800", "logger": None,
+    }  # fmt: skip
+    with shipping(tmp_path) as shipment:
+        shipment.write([batch("log", odd)], {})
+    (row,) = globbed(tmp_path, "log")
+    assert row == {
+        "id": 1, "run_id": None, "sim_time_s": None, "wall_time_s": float(2**60), "level": "5",
+        "source": "\ufffd", "message": "lone ?", "logger": None,
+    }  # fmt: skip
+    assert "1 values of log.run_id became what comes nearest" in caplog.text
+    assert [file.parent.name for file in tmp_path.rglob("table=log/*/*.parquet")] == [
+        "day=__HIVE_DEFAULT_PARTITION__"
+    ]
+
+
+def test_a_column_without_values_has_its_type_and_each_its_unit(tmp_path: Path) -> None:
+    with shipping(tmp_path) as shipment:
+        shipment.write([logs(1)], {})
+    (file,) = tmp_path.rglob("table=log/*/*.parquet")
+    schema: Any = parquet.read_schema(file)
+    assert str(schema.field("logger").type) == "string"
+    assert schema.field("sim_time_s").metadata == {b"unit": b"s"}
+    assert b"name of the Python logger" in schema.field("logger").metadata[b"comment"]
+
+
+def test_a_second_shipper_is_refused_until_the_first_is_gone(tmp_path: Path) -> None:
+    line = [sys.executable, "-c", HOLDER, str(tmp_path), UUID]
+    first = subprocess.Popen(line, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert first.stdout is not None
+    assert first.stdout.readline() == "ships\n"
+    with pytest.raises(PoolBusyError, match=f"process {first.pid} on .* ships this recording"):
+        write_all(str(tmp_path), STEPS)
+    with shipping(tmp_path, OTHER_UUID):  # of another recording it is free
+        pass
+    first.kill()
+    first.communicate()
+    write_all(str(tmp_path), STEPS)
+    assert len(globbed(tmp_path, "log")) == 6
+
+
+def test_who_lost_the_lease_writes_nothing_that_counts(tmp_path: Path) -> None:
+    with shipping(tmp_path) as shipment:
+        shipment.write([logs(1)], {"log": 1})
+        lease = tmp_path / f"recording={UUID}" / "_lease"
+        lease.write_text(json.dumps(json.loads(lease.read_text()) | {"token": "another"}))
+        with pytest.raises(PoolBusyError, match="ships this recording"):
+            shipment.write([logs(2)], {"log": 2})
+        lease.unlink()
+    with shipping(tmp_path) as shipment:
+        assert shipment.progress() == {"log": 1}
+
+
+def test_a_run_that_another_recording_has_shipped_is_told_and_not_taken(tmp_path: Path) -> None:
+    with shipping(tmp_path) as shipment:
+        assert shipment.foreign_runs(["run-1"]) == {}
+        shipment.write([batch("run", run_row(1, 3))], {})
+        assert shipment.foreign_runs(["run-1"]) == {}
+    with shipping(tmp_path, OTHER_UUID) as shipment:
+        assert shipment.foreign_runs(["run-1", "run-2"]) == {"run-1": UUID}
+        with pytest.raises(PoolError, match=f"run-1 is in .* as one of recording {UUID}"):
+            shipment.write([batch("run", run_row(1, 3)), logs(1)], {})
+        shipment.write([batch("run", run_row(2, 3))], {})
+    assert len(globbed(tmp_path, "run")) == 2
+    assert globbed(tmp_path, "log") == []
+
+
+def test_a_folder_that_holds_other_things_is_refused_and_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("important")
+    with pytest.raises(PoolError, match="holds other things and is no pool"):
+        write_all(str(tmp_path), STEPS)
+    assert [file.name for file in tmp_path.rglob("*")] == ["thesis.tex"]
+    with pytest.raises(PoolError, match=r"thesis.tex.* cannot be a pool"):
+        write_all(str(tmp_path / "thesis.tex"), STEPS)
+
+
+def test_a_pool_that_a_newer_version_made_is_refused(tmp_path: Path) -> None:
+    write_all(str(tmp_path), STEPS)
+    (tmp_path / "_pool").write_text('{"format": 1, "schema": 99}')
+    with pytest.raises(PoolError, match=r"schema 99.*update webots-mcp"):
+        write_all(str(tmp_path), STEPS)
+
+
+def test_a_pool_of_an_older_version_gets_the_columns_that_it_lacks(tmp_path: Path) -> None:
+    write_all(str(tmp_path), STEPS[:1])
+    (tmp_path / "_pool").write_text('{"format": 1, "schema": 8}')
+    for file in tmp_path.rglob("*/part-*.parquet"):
+        held: Any = parquet.ParquetFile(file).read()
+        lacking = [name for name in held.column_names if name not in ("logger", "coarse_end")]
+        parquet.write_table(held.select(lacking), file)
+    write_all(str(tmp_path), STEPS)
+    assert ids(pooled(str(tmp_path), UUID, "log")) == [1, 2, 3, 4, 5, 6]
+    assert json.loads((tmp_path / "_pool").read_text())["schema"] > 8
+
+
+@pytest.mark.parametrize("name", ["_progress", "part"])
+def test_what_is_damaged_is_named_and_nothing_is_written_over_it(tmp_path: Path, name: str) -> None:
+    write_all(str(tmp_path), STEPS[:2])
+    pattern = "_progress" if name == "_progress" else "table=log/day=2023-12-09/*.parquet"
+    (file,) = (tmp_path / f"recording={UUID}").glob(pattern)
+    file.write_bytes(b"PAR1 and no more")
+    with pytest.raises(PoolError, match=r"_progress .*cannot be read|is damaged"):
+        write_all(str(tmp_path), STEPS)
+    assert file.read_bytes() == b"PAR1 and no more"
+
+
+@pytest.mark.parametrize(
+    ("error", "expected", "text"),
+    [
+        (
+            OSError(errno.ENOSPC, "No space left"),
+            PoolUnavailableError,
+            "there is no room",
+        ),
+        (PermissionError(errno.EACCES, "Access Denied"), PoolError, "cannot be used by this user"),
+        (OSError(errno.EROFS, "Read-only file system"), PoolError, "cannot be used by this user"),
+        (ConnectionResetError(errno.ECONNRESET, "reset"), PoolUnavailableError, "not answer"),
+        (RuntimeError("a client's own error"), PoolUnavailableError, "not answer"),
+    ],
+)
+def test_a_storage_that_fails_is_told_and_nothing_is_lost(
+    error: Exception, expected: type[PoolError], text: str
+) -> None:
+    for after in range(3):
+        url = bucket.empty()
+        write_all(url, STEPS[:1])
+        with (
+            shipping(url) as shipment,
+            bucket.failing(after, error),
+            pytest.raises(PoolError, match=text) as raised,
+        ):
+            shipment.write(STEPS[1], {"step": 2})
+        assert type(raised.value) is expected
+        write_all(url, STEPS)
+        assert ids(pooled(url, UUID, "log")) == sorted(globbed_ids("log")) == [1, 2, 3, 4, 5, 6]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limits of this kind")
+def test_a_full_folder_is_told_and_the_same_shipment_goes_on_once_there_is_room(
+    tmp_path: Path,
+) -> None:
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with shipping(tmp_path) as shipment:
+        shipment.write([logs(1)], {"log": 1})
+        resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, hard))
+        try:
+            with pytest.raises(PoolUnavailableError, match="there is no room"):
+                shipment.write([logs(2), logs(3, message=os.urandom(20_000).hex())], {"log": 3})
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert len(globbed(tmp_path, "log")) == 1
+        shipment.write([logs(2, 3)], {"log": 3})
+    assert [row["id"] for row in globbed(tmp_path, "log")] == [1, 2, 3]
+    assert list((tmp_path / "_incoming").iterdir()) == []
+
+
+@pytest.mark.skipif(not unprivileged.POSSIBLE, reason="this user may write everywhere")
+def test_a_folder_that_may_not_be_written_is_told(tmp_path: Path) -> None:
+    with unprivileged.unwritable(tmp_path):
+        line = unprivileged.line("-c", HOLDER, str(tmp_path / "pool"), UUID)
+        done = subprocess.run(line, capture_output=True, text=True, stdin=subprocess.DEVNULL)
+    assert "PoolError" in done.stderr
+    assert "cannot be used by this user" in done.stderr
+
+
+@pytest.mark.skipif(find_spec("s3fs") is not None, reason="s3fs is installed")
+def test_a_filesystem_whose_package_is_missing_names_it() -> None:
+    with pytest.raises(PoolError, match="s3fs"):
+        ParquetTarget("s3://lab/pool")
+
+
+def test_a_filesystem_that_nobody_knows_is_refused() -> None:
+    with pytest.raises(InvalidInputError, match="on no filesystem that fsspec knows"):
+        ParquetTarget("carrier-pigeon://lab/pool")
+
+
+def test_pictures_come_back_and_none_leads_out_of_the_recording(tmp_path: Path) -> None:
+    with shipping(tmp_path) as shipment:
+        shipment.write_picture("camera/1.png", b"a picture")
+        for path in ("../../x.png", "/etc/x.png", "", "a\\..\\b.png"):
+            with pytest.raises(PoolError, match="no path of a picture"):
+                shipment.write_picture(path, b"")
+    with ParquetPool(str(tmp_path)) as pool:
+        assert pool.picture(UUID, "camera/1.png") == b"a picture"
+        assert pool.picture(UUID, "camera/2.png") is None
+
+
+def test_a_folder_with_signs_of_patterns_in_its_name_is_a_pool_like_others(
+    tmp_path: Path,
+) -> None:
+    folder = tmp_path / "trials [a-c] *?"
+    write_all(str(folder), STEPS)
+    assert ids(pooled(str(folder), UUID, "log")) == [1, 2, 3, 4, 5, 6]
+    with ParquetPool(str(folder)) as pool:
+        assert pool.select("SELECT count(*) FROM log", 1)[1] == [(6,)]

@@ -1,0 +1,111 @@
+"""One SELECT over a pool of Parquet files, by DuckDB.
+
+Each table is a view of its name, with `recording_uuid` before its columns. What keeps a statement
+harmless: it is one SELECT, DuckDB may open files below the root of the pool only, and it has a
+deadline and a limit of memory.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Generator
+from contextlib import closing, contextmanager
+from typing import Any, Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.pool.parquet.layout import files_of
+from webots_mcp.pool.parquet.packages import package
+from webots_mcp.pool.parquet.storage import Storage
+from webots_mcp.pool.tables import Table, tables
+
+DEADLINE_S: Final = 60.0
+_MEMORY: Final = "2GB"
+_TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
+
+
+def select(storage: Storage, sql: str, limit: int) -> tuple[list[str], list[tuple[Any, ...]]]:
+    """The columns and the first rows of one SELECT.
+
+    Raises:
+        InvalidInputError: It is no single SELECT, is wrong, or takes too long.
+        PoolError: DuckDB is not installed.
+    """
+    duckdb = package("duckdb")
+    with closing(duckdb.connect()) as connection:
+        _prepare(connection, storage, sql)
+        try:
+            _require_select(duckdb, connection, sql)
+            with _deadline(connection):
+                cursor = connection.execute(sql)
+                columns = [str(column[0]) for column in cursor.description]
+                return columns, list(cursor.fetchmany(limit))
+        except duckdb.InterruptException as error:
+            raise InvalidInputError(
+                f"no answer within {DEADLINE_S:g} s: narrow it by recording_uuid and by day"
+            ) from error
+        except duckdb.Error as error:
+            raise InvalidInputError(f"DuckDB says: {error}") from error
+
+
+def _prepare(connection: Any, storage: Storage, sql: str) -> None:
+    """The views, and then the bounds, which nothing takes back."""
+    if not storage.is_local:
+        connection.register_filesystem(storage.files)
+    for table in tables():
+        is_named = re.search(rf"\b{table.name}\b", sql, re.IGNORECASE)
+        paths = storage.find(files_of(table)) if is_named else []
+        connection.execute(_view(table, [storage.url_of(path) for path in paths]))
+    connection.execute(f"SET memory_limit = '{_MEMORY}'")
+    connection.execute("SET TimeZone = 'UTC'")
+    connection.execute(f"SET allowed_directories = [{_quoted(storage.url_of('') + '/')}]")
+    connection.execute("SET enable_external_access = false")
+    connection.execute("SET lock_configuration = true")
+
+
+def _view(table: Table, paths: list[str]) -> str:
+    """A table over its files; without any, a table without rows."""
+    if not paths:
+        columns = ", ".join(
+            f'CAST(NULL AS {_TYPES[kind]}) AS "{name}"'
+            for name, kind in zip(table.columns, table.types, strict=True)
+        )
+        day = ", CAST(NULL AS DATE) AS day" if table.is_appended else ""
+        return (
+            f'CREATE VIEW "{table.name}" AS SELECT CAST(NULL AS VARCHAR) AS recording_uuid, '
+            f"{columns}{day} WHERE false"
+        )
+    columns = ", ".join(f'"{name}"' for name in table.columns)
+    day = ", day" if table.is_appended else ""
+    types = "{'recording': VARCHAR, 'table': VARCHAR" + (", 'day': DATE}" if day else "}")
+    files = ", ".join(map(_quoted, paths))
+    return (
+        f'CREATE VIEW "{table.name}" AS SELECT recording AS recording_uuid, {columns}{day} '
+        f"FROM read_parquet([{files}], union_by_name = true, hive_partitioning = true, "
+        f"hive_types = {types})"
+    )
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
+
+
+def _require_select(duckdb: Any, connection: Any, sql: str) -> None:
+    statements = connection.extract_statements(sql)
+    kinds = [statement.type for statement in statements]
+    if kinds != [duckdb.StatementType.SELECT]:
+        raise InvalidInputError(
+            "only one SELECT is allowed, this has "
+            + (", ".join(kind.name for kind in kinds) or "no statement")
+        )
+
+
+@contextmanager
+def _deadline(connection: Any) -> Generator[None]:
+    timer = threading.Timer(DEADLINE_S, connection.interrupt)
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()

@@ -6,6 +6,7 @@ may.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import shutil
@@ -28,7 +29,6 @@ OWNER: Final = "postgres"
 CONFIGURATION: Final = """
 fsync = off
 full_page_writes = off
-synchronous_commit = off
 shared_buffers = 32MB
 max_connections = 40
 autovacuum = off
@@ -60,6 +60,23 @@ def _debian_version(program: Path) -> float:
 def _version(program: Path) -> int:
     said = subprocess.run([program, "--version"], capture_output=True, text=True, check=True)
     return int(said.stdout.split()[2].split(".")[0].split("devel")[0])
+
+
+class Disk:
+    """A disk of a few megabytes, and the tablespace on it."""
+
+    def __init__(self, folder: Path, tablespace: str) -> None:
+        self._filling, self.tablespace = folder / "filling", tablespace
+
+    def fill(self) -> None:
+        """Leave no byte of it."""
+        with contextlib.suppress(OSError), self._filling.open("wb", buffering=0) as file:
+            while True:
+                file.write(bytes(4096))
+
+    def empty(self) -> None:
+        """Give the room back."""
+        self._filling.unlink()
 
 
 class Server:
@@ -100,11 +117,32 @@ class Server:
         asked = {"host": str(self.folder), "port": str(self.port), **options}
         return f"postgresql://{quote(user)}@/{database}?{urlencode(asked, quote_via=quote)}"
 
-    def new_database(self, template: str = "template1") -> str:
+    def new_database(self, template: str = "template1", tablespace: str = "pg_default") -> str:
         """The name of a new one, as a template is."""
         name = f"pool_{next(self._names)}"
-        self.execute("postgres", f"CREATE DATABASE {name} TEMPLATE {template}")
+        made = f"CREATE DATABASE {name} TEMPLATE {template} TABLESPACE {tablespace}"
+        self.execute("postgres", made)
         return name
+
+    @contextmanager
+    def small_disk(self, size_mb: int) -> Generator[Disk]:
+        """A disk of its own, for a database; skips the test where none can be mounted."""
+        folder = self.folder / "disk"
+        folder.mkdir()
+        options = f"size={size_mb}m,mode=0777"
+        mount = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+        if shutil.which("mount") is None or subprocess.run(mount, capture_output=True).returncode:
+            pytest.skip("no disk of a few megabytes can be mounted here")
+        try:
+            (folder / "tables").mkdir()
+            if os.geteuid() == 0:
+                shutil.chown(folder / "tables", OWNER, OWNER)
+            self.execute("postgres", f"CREATE TABLESPACE small LOCATION '{folder / 'tables'}'")
+            yield Disk(folder, "small")
+            self.execute("postgres", "DROP TABLESPACE small")
+        finally:
+            subprocess.run(["umount", "--lazy", str(folder)], check=True)
+            folder.rmdir()
 
     def execute(self, database: str, sql: str, *arguments: Any) -> list[tuple[Any, ...]]:
         """What a statement of the superuser gives."""

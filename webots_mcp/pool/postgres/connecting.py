@@ -25,7 +25,8 @@ _CLIENT: Final[dict[str, Any]] = {
 }  # fmt: skip
 _SERVER: Final = """
     SET tcp_keepalives_idle = 30; SET tcp_keepalives_interval = 10; SET tcp_keepalives_count = 3;
-    SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s'"""
+    SET idle_in_transaction_session_timeout = '60s'; SET lock_timeout = '30s';
+    SET synchronous_commit = on"""
 # What is said of a connection that is not made for reasons that last.
 _LASTING: Final = re.compile(
     "password|authentication|does not exist|permission denied|pg_hba|certificate|"
@@ -46,17 +47,26 @@ def connect(url: str, address: str, *, autocommit: bool = True) -> Connection:
         PoolUnavailableError: Nobody answers.
         PoolError: Who answers does not let us in.
     """
-    try:
-        connection = psycopg.connect(
-            url, autocommit=True, fallback_application_name="webots-mcp", **_CLIENT
-        )
-    except psycopg.Error as error:
-        # Not `from error`: psycopg's error holds what it connected with, the password as well.
-        raise _refusal(error, address) from None
+    connection = _connected(url, address)
+    if isinstance(connection, PoolError):
+        raise connection
     with clear_errors(address):
         connection.execute(_SERVER.encode())
     connection.autocommit = autocommit
     return connection
+
+
+def _connected(url: str, address: str) -> Connection | PoolError:
+    """A connection, or why there is none.
+
+    That is not raised here, as psycopg's error would go with it, which holds the password.
+    """
+    try:
+        return psycopg.connect(
+            url, autocommit=True, fallback_application_name="webots-mcp", **_CLIENT
+        )
+    except psycopg.Error as error:
+        return _refusal(error, address)
 
 
 def _refusal(error: psycopg.Error, address: str) -> PoolError:

@@ -7,6 +7,7 @@ table, where JSON is text still, and from there row by row.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
@@ -29,7 +30,10 @@ _SHIPPER: Final = 1_463_962_947  # the first half of the lock of who ships a rec
 _TYPES: Final = {int: "bigint", float: "double precision", str: "text"}
 _REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
 # Of values, where a batch has one that PostgreSQL cannot hold; and of rows that are there already.
-_REFUSED: Final = (psycopg.DataError, psycopg.IntegrityError, UnicodeEncodeError)
+_REFUSED: Final = (
+    psycopg.DataError, psycopg.IntegrityError, psycopg.errors.ProgramLimitExceeded,
+    psycopg.errors.StatementTooComplex, UnicodeEncodeError,
+)  # fmt: skip
 
 
 class PostgresTarget:
@@ -67,10 +71,9 @@ class PostgresTarget:
         try:
             yield PostgresShipment(connection, self.address, recording_uuid)
         finally:
-            if not connection.closed:
-                unlock = "SELECT pg_advisory_unlock(%s, hashtext(%s))"
-                with clear_errors(self.address):
-                    connection.execute(unlock, (_SHIPPER, recording_uuid))
+            unlock = "SELECT pg_advisory_unlock(%s, hashtext(%s))"
+            with contextlib.suppress(psycopg.Error):  # it is lost, and the lock with it
+                connection.execute(unlock, (_SHIPPER, recording_uuid))
 
     def _connected(self) -> Connection:
         """The connection; a new one in the place of one that was lost."""
@@ -112,13 +115,20 @@ class PostgresShipment:
         """Write rows and how far they go, or nothing."""
         with clear_errors(self._address):
             try:
-                self._make_partitions(batches)
-                with self._connection.transaction():
-                    self._write(batches, progress)
-            except BaseException:
-                self._parts.clear()  # somebody may have dropped one
-                self._staged.clear()
-                raise
+                self._write_all(batches, progress)
+            except psycopg.errors.CheckViolation:  # somebody dropped the months that are over
+                self._parts.clear()
+                self._write_all(batches, progress)
+
+    def _write_all(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
+        self._make_partitions(batches)
+        self._staged, before = set(self._staged), self._staged
+        try:
+            with self._connection.transaction():
+                self._write(batches, progress)
+        except BaseException:
+            self._staged = before  # those that were made in it are gone
+            raise
 
     def _write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
         self._replaced = 0
@@ -284,7 +294,7 @@ def _parts(batch: Batch) -> set[tuple[str, int, int]]:
 
 def _day(value: SQLValue) -> int | None:
     """The day of a wall time; None of those that are in no month of a pool."""
-    number = value if isinstance(value, float | int) else 0.0
+    number = value if isinstance(value, float | int) else _number(value) or 0.0
     return int(number // 86_400) if FIRST_S <= number < END_S else None
 
 

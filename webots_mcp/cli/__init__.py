@@ -24,6 +24,7 @@ from webots_mcp.cli import (
     launching,
     looking,
     observing,
+    pooling,
     reporting,
     scene,
     serving,
@@ -60,6 +61,7 @@ FAMILIES: Final = (
     scene,
     breakpoints,
     viewing,
+    pooling,
 )
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2

@@ -200,3 +200,18 @@ def open_recording(arguments: argparse.Namespace) -> Recording:
     from webots_mcp.store.recording import Recording
 
     return Recording(*resolve_database(arguments.database, arguments.data_dir), read_only=True)
+
+
+@contextmanager
+def writing(
+    arguments: argparse.Namespace, *, create: bool = False
+) -> Generator[tuple[Recording, sqlite3.Connection]]:
+    """The recording, migrated where it has to be, and a connection that may write to it."""
+    from webots_mcp.contract import resolve_database
+    from webots_mcp.store.recording import Recording
+
+    recording = Recording(*resolve_database(arguments.database, arguments.data_dir))
+    if create:
+        recording.create()
+    with recording.writer() as connection:
+        yield recording, connection

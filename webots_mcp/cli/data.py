@@ -7,8 +7,6 @@ import functools
 import sqlite3
 import sys
 import time
-from collections.abc import Generator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,11 +21,12 @@ from webots_mcp.cli.command import (
     past_wrong_values,
     reading,
     row_id,
+    writing,
 )
 from webots_mcp.cli.limits import LIMITS, limits_of
 from webots_mcp.cli.progress import shown_progress
 from webots_mcp.cli.ranges import RANGE, range_of, scope_of
-from webots_mcp.cli.tables import print_json, print_notes, print_table
+from webots_mcp.cli.tables import id_ranges, print_json, print_notes, print_table
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -160,7 +159,7 @@ def import_(arguments: argparse.Namespace) -> None:
     if (source := Path(arguments.source)).is_file():
         return _import_file(arguments, source)
     read_folder(source)  # first: no database is made for what cannot be imported
-    with _writable(arguments, create=True) as (recording, connection):
+    with writing(arguments, create=True) as (recording, connection):
         with shown_progress("importing") as progress:
             made = import_folder(connection, source, recording.data_dir, arguments.robot, progress)
         print(
@@ -182,11 +181,11 @@ def _import_recording(arguments: argparse.Namespace, source: Path, told: Path) -
     from webots_mcp.store.merging import merge, settled
 
     settled(source)  # first: no database is made for what is no recording
-    with _writable(arguments, create=True) as (recording, connection):
+    with writing(arguments, create=True) as (recording, connection):
         if isinstance(recording.database, Path) and source.samefile(recording.database):
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
         runs = merge(connection, recording.data_dir, source)
-    print(f"of {told} there are here: run {_ranges(list(runs.values())) or 'none'}")
+    print(f"of {told} there are here: run {id_ranges(list(runs.values())) or 'none'}")
 
 
 @command(
@@ -219,7 +218,7 @@ def prune(arguments: argparse.Namespace) -> None:
 
     if arguments.dry_run:
         return past_wrong_values(look)
-    with _writable(arguments) as (recording, connection):
+    with writing(arguments) as (recording, connection):
         set_limits(connection, limits, "prune")
         retention = in_force(connection)
         _print_plan(plan(connection, retention), "goes")
@@ -244,7 +243,7 @@ def retain(arguments: argparse.Namespace) -> None:
     limits = limits_of(arguments)
     if not arguments.run_ids and not limits:
         raise InvalidInputError("name runs to retain, or a limit to set: --keep-states 20GB")
-    with _writable(arguments) as (_, connection):
+    with writing(arguments) as (_, connection):
         mark_kept(connection, arguments.run_ids, keep=not arguments.release)
         set_limits(connection, limits, "retain")
 
@@ -261,27 +260,12 @@ def label(arguments: argparse.Namespace) -> None:
 
     said = {name: getattr(arguments, name) for name in ("label", "note")}
     changes = {name: "" if text == "-" else text for name, text in said.items()}
-    with _writable(arguments) as (_, connection):
+    with writing(arguments) as (_, connection):
         annotate_run(connection, arguments.run_id, **changes)
         run = run_info(connection, arguments.run_id)
     if arguments.json:
         return print_json(run)
     print_table(("run", "robot", "label", "note"), [[run.run_id, run.robot, run.label, run.note]])
-
-
-@contextmanager
-def _writable(
-    arguments: argparse.Namespace, *, create: bool = False
-) -> Generator[tuple[Recording, sqlite3.Connection]]:
-    """The recording, migrated where it has to be, and a connection that may write to it."""
-    from webots_mcp.contract import resolve_database
-    from webots_mcp.store.recording import Recording
-
-    recording = Recording(*resolve_database(arguments.database, arguments.data_dir))
-    if create:
-        recording.create()
-    with recording.writer() as connection:
-        yield recording, connection
 
 
 def _prune(recording: Recording, connection: sqlite3.Connection, retention: Retention) -> Purged:
@@ -308,7 +292,7 @@ def _print_plan(wanted: Plan, going: str) -> None:
 
     rows = wanted.rows_by_table()
     table = [
-        [kind, rows[kind], size_text(wanted.size_of(kind)), _ranges(wanted.runs_of(kind))]
+        [kind, rows[kind], size_text(wanted.size_of(kind)), id_ranges(wanted.runs_of(kind))]
         for kind in rows
     ]
     if table:
@@ -329,7 +313,7 @@ def _print_plan(wanted: Plan, going: str) -> None:
         ]
     )
     if wanted.kept_run_ids:
-        ids, size = _ranges(wanted.kept_run_ids), size_text(wanted.kept_bytes)
+        ids, size = id_ranges(wanted.kept_run_ids), size_text(wanted.kept_bytes)
         why = "kept because of a label, a note or a mark, and not counted"
         print_notes([f"{why}: run {ids}, about {size}"])
 
@@ -348,17 +332,6 @@ def _print_disk(wanted: Plan, sizes: dict[str, int]) -> None:
     others = ", ".join(f"{name} {size_text(size)}" for name, size in beside.items())
     whole = size_text(sizes["file_bytes"])
     print_notes([f"the file has {whole}, about: {parts}; beside it {others}"])
-
-
-def _ranges(numbers: Sequence[int]) -> str | None:
-    """Numbers as a person lists them: 1 to 7, 9."""
-    parts: list[list[int]] = []
-    for number in sorted(numbers):
-        if parts and number == parts[-1][-1] + 1:
-            parts[-1][1:] = [number]
-        else:
-            parts.append([number])
-    return ", ".join(" to ".join(map(str, part)) for part in parts) or None
 
 
 def _print_purged(purged: Purged) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -23,7 +22,7 @@ from webots_mcp.cli.command import (
 )
 from webots_mcp.cli.comparison import print_comparison
 from webots_mcp.cli.ranges import RANGE, range_of, scope_of
-from webots_mcp.cli.tables import print_json, print_notes, print_table
+from webots_mcp.cli.tables import clock_text, print_json, print_notes, print_table
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -63,7 +62,7 @@ def runs(arguments: argparse.Namespace) -> None:
     rows = [
         [
             run.run_id, run.robot, run.label, run.parameters or None,
-            _clock(run.started_wall_time_s), run.duration_s, run.real_time_factor, run.rows,
+            clock_text(run.started_wall_time_s), run.duration_s, run.real_time_factor, run.rows,
             run.end_reason or "going on",
             (run.controller_sha256 or "")[:8] or None, run.notable or None, run.note,
         ]
@@ -275,11 +274,6 @@ def _options(arguments: argparse.Namespace) -> EventOptions:
         position=both_of(arguments.position),
         mode=arguments.mode,
     )
-
-
-def _clock(wall_time_s: float) -> str:
-    """Local time."""
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(wall_time_s))
 
 
 def _print_heading(run_id: int, start_s: float, end_s: float, more: str = "") -> None:

@@ -153,9 +153,14 @@ class Pool(Protocol):
     """A pool as it is read; a context manager, connected as long as it is open.
 
     `run.purged_rows` is as the edge last said it: how many states a pool lacks is counted.
+
+    Attributes:
+        address: Its URL without secrets.
+        keeps_order: Whether the keys of JSON objects come in the order in which they were shipped.
     """
 
     address: str
+    keeps_order: bool
 
     def __enter__(self) -> Pool: ...
     def __exit__(self, *exception: object) -> None: ...

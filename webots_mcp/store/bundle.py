@@ -57,16 +57,22 @@ def write_bundle(
     """
     with tempfile.TemporaryDirectory(prefix=".bundle-", dir=file.parent) as name:
         folder = Path(name)
-        small = folder / DATABASE_NAME
-        with closing(connect(small, "writer", create=True)) as writer:
-            create_schema(writer)
-            writer.execute("PRAGMA journal_mode=DELETE")  # all of it in the one file, written once
-            writer.execute("PRAGMA synchronous=OFF")  # whoever is killed leaves nothing to keep
+        with small_recording(folder) as writer:
             frozen = "&immutable=1" if isinstance(connection, FrozenConnection) else ""
             address = f"{database.absolute().as_uri()}?mode=ro{frozen}"
             merge(writer, folder, database, run_id=run_id, address=address, pictures=data_dir)
             writer.execute(_END_SESSION)
         pack(folder, file, progress)
+
+
+@contextmanager
+def small_recording(folder: Path) -> Generator[sqlite3.Connection]:
+    """A new recording to write in that folder, in one file, and not to keep."""
+    with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as writer:
+        create_schema(writer)
+        writer.execute("PRAGMA journal_mode=DELETE")  # all of it in the one file, written once
+        writer.execute("PRAGMA synchronous=OFF")  # whoever is killed leaves nothing to keep
+        yield writer
 
 
 def pack(folder: Path, file: Path, progress: Progress | None = None) -> None:

@@ -1,0 +1,217 @@
+"""Commands about a pool: what is in it, and runs of it brought back."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, Final
+
+from webots_mcp.cli.command import (
+    DATA_DIR,
+    DATABASE,
+    JSON,
+    Argument,
+    argument,
+    command,
+    count,
+    writing,
+)
+from webots_mcp.cli.progress import shown_progress
+from webots_mcp.cli.tables import clock_text, id_ranges, print_notes, print_table
+
+if TYPE_CHECKING:
+    from webots_mcp.pool.catalogue import Choice
+    from webots_mcp.pool.fetching import Fetched
+    from webots_mcp.pool.target import Pool
+
+_SHORT: Final = 8  # of a UUID: as much of it as tells one from the others
+_CHOICE: Final[tuple[Argument, ...]] = (
+    argument("--run", metavar="UUID", help="the run of that UUID, or that begins so"),
+    argument("--label", metavar="TEXT", help="runs with that label, with '*'"),
+    argument("--trials", metavar="UUID", help="the runs of that trial set, and its trials"),
+    argument("--robot", metavar="NAME", help="runs of that robot"),
+    argument("--since", metavar="TIME",
+             help="runs that went on after this wall time (ISO 8601 or Unix seconds)"),
+    argument("--until", metavar="TIME", help="runs that began before this wall time"),
+)  # fmt: skip
+
+
+@command(
+    "fetch", DATA_DIR, DATABASE, *_CHOICE,
+    argument("--from", dest="url", metavar="URL", required=True,
+             help="the pool: postgresql://HOST/DATABASE, a folder, s3://BUCKET/PREFIX, ..."),
+)  # fmt: skip
+def fetch(arguments: argparse.Namespace) -> int:
+    """Bring runs of a pool back into a recording here, for every command, tool and plot.
+
+    They come with their sessions, commands, trials and what was shipped of their pictures, each
+    once however often it is fetched; what is here is left as it is. Of a run of which summaries
+    were shipped and no rows, the summaries come, and every answer says so. A run that goes on or is
+    still being shipped is not taken: fetch it again when it is whole.
+    """
+    from webots_mcp.pool.fetching import fetch as fetch_runs
+    from webots_mcp.pool.target import open_pool
+
+    choice = _choice(arguments)
+    with open_pool(arguments.url) as pool, writing(arguments, create=True) as (here, connection):
+        with shown_progress("fetching") as progress:
+            found = fetch_runs(pool, connection, here.data_dir, choice, progress)
+        _print_fetched(found, pool.address)
+    return 0 if found.runs else 1
+
+
+def _print_fetched(found: Fetched, address: str) -> None:
+    come, known = found.come, [found.runs[uuid] for uuid in found.known]
+    print(f"of {address} came: run {id_ranges(come) or 'none'}")
+    if known:
+        print(f"here already: run {id_ranges(known)}")
+    if found.summaries:
+        ids = id_ranges([found.runs[uuid] for uuid in found.summaries])
+        print(f"of run {ids} only summaries were shipped, no rows ('webots-mcp ship --full' does)")
+    for uuid in found.going_on:
+        print(f"not taken: run {uuid} goes on where it is recorded, or nobody has shipped its end")
+    for uuid, (left, of) in found.arriving.items():
+        print(
+            f"not taken: of run {uuid} {left:,} of {of:,} rows are shipped so far; where it was "
+            "recorded, 'webots-mcp ship' goes on (with --follow until all is shipped)"
+        )
+    print_notes(found.notes)
+
+
+@command(
+    "pool", JSON, *_CHOICE,
+    argument("url", metavar="URL", help="postgresql://HOST/DATABASE, a folder, s3://..."),
+    argument("part", nargs="?", choices=("robots", "runs", "trials", "sizes"), default="robots",
+             help="what to list (robots)"),
+    argument("--sql", metavar="SELECT", help="one SELECT in the language of the pool, in quotes"),
+    count("-n", "the newest N, or N rows", default=20),
+)  # fmt: skip
+def pool(arguments: argparse.Namespace) -> None:
+    """List what is in a pool, or ask it one SELECT; nothing is changed.
+
+    webots-mcp pool ./pool runs --robot rover
+
+    webots-mcp pool postgresql:///lab --sql 'SELECT count(*) FROM run'
+    """
+    from webots_mcp.pool.target import open_pool
+
+    with open_pool(arguments.url) as opened:
+        if arguments.sql is not None:
+            return _print_selected(opened, arguments)
+        return _LISTS[arguments.part](opened, arguments)
+
+
+def _print_selected(pool: Pool, arguments: argparse.Namespace) -> None:
+    columns, rows = pool.select(arguments.sql, arguments.limit + 1)
+    shown = rows[: arguments.limit]
+    notes = [] if shown else ["no row"]
+    if len(rows) > len(shown):
+        notes = [f"only the first {len(shown)} rows: -n shows more"]
+    if arguments.json:
+        return _print({"columns": columns, "rows": [list(row) for row in shown], "notes": notes})
+    print_table(columns, [[_plain(cell) for cell in row] for row in shown])
+    print_notes(notes)
+
+
+def _print_robots(pool: Pool, arguments: argparse.Namespace) -> None:
+    from webots_mcp.pool.catalogue import chosen_runs, robots
+
+    found = robots(chosen_runs(pool, _choice(arguments)))
+    shown = found[: arguments.limit]
+    if arguments.json:
+        return _print({"robots": [vars(robot) for robot in shown], "total": len(found)})
+    print_table(
+        ("robot", "recordings", "runs", "rows", "first", "last"),
+        [
+            [
+                each.robot, each.recordings, each.runs, each.rows,
+                clock_text(each.started_wall_time_s), clock_text(each.last_wall_time_s),
+            ]
+            for each in shown
+        ],
+    )  # fmt: skip
+    _say_more(shown, found, "robots")
+
+
+def _print_runs(pool: Pool, arguments: argparse.Namespace) -> None:
+    from webots_mcp.pool.catalogue import chosen_runs
+
+    found = chosen_runs(pool, _choice(arguments))[::-1]
+    shown = found[: arguments.limit]
+    if arguments.json:
+        return _print({"runs": [vars(run) for run in shown], "total": len(found)})
+    print_table(
+        ("run", "robot", "label", "started", "duration_s", "rows", "ended by", "recording"),
+        [
+            [
+                run.uuid[:_SHORT], run.robot, run.label, clock_text(run.started_wall_time_s),
+                run.last_sim_time_s - run.started_sim_time_s, run.rows,
+                run.end_reason or "going on", run.recording_uuid[:_SHORT],
+            ]
+            for run in shown
+        ],
+    )  # fmt: skip
+    _say_more(shown, found, "runs")
+
+
+def _print_trials(pool: Pool, arguments: argparse.Namespace) -> None:
+    from webots_mcp.pool.catalogue import chosen_trial_sets
+
+    found = chosen_trial_sets(pool, _choice(arguments))[::-1]
+    shown = found[: arguments.limit]
+    if arguments.json:
+        return _print({"trial_sets": [vars(each) for each in shown], "total": len(found)})
+    print_table(
+        ("set", "made", "trials", "runs", "recording"),
+        [
+            [
+                each.uuid[:_SHORT], clock_text(each.created_wall_time_s), each.trials,
+                len(each.runs), each.recording_uuid[:_SHORT],
+            ]
+            for each in shown
+        ],
+    )  # fmt: skip
+    _say_more(shown, found, "trial sets")
+
+
+def _print_sizes(pool: Pool, arguments: argparse.Namespace) -> None:
+    from webots_mcp.store.retention.notation import size_text
+
+    found = list(pool.sizes())
+    if arguments.json:
+        return _print({"tables": [vars(each) for each in found]})
+    sizes = [each.size_bytes for each in found if each.size_bytes is not None]
+    rows: list[list[Any]] = [
+        [each.table, each.rows, None if each.size_bytes is None else size_text(each.size_bytes)]
+        for each in found
+    ]
+    print_table(("table", "rows", "size"), rows)
+    print_notes([f"{size_text(sum(sizes))} in all"] if sizes else [])
+
+
+_LISTS: Final = {
+    "robots": _print_robots, "runs": _print_runs, "trials": _print_trials, "sizes": _print_sizes,
+}  # fmt: skip
+
+
+def _choice(arguments: argparse.Namespace) -> Choice:
+    from webots_mcp.pool.catalogue import Choice
+
+    return Choice(**{each.name: getattr(arguments, each.name) for each in fields(Choice)})
+
+
+def _say_more(shown: Sequence[object], found: Sequence[object], what: str) -> None:
+    print_notes([f"{len(found)} {what} in all: -n shows more"] if len(found) > len(shown) else [])
+
+
+def _print(found: dict[str, Any]) -> None:
+    print(json.dumps(found, ensure_ascii=False, default=str))
+
+
+def _plain(cell: Any) -> Any:
+    """A value as a table shows it: of a type that JSON lacks its text."""
+    if cell is None:
+        return "NULL"
+    return cell if isinstance(cell, int | float | str | list | dict) else str(cell)

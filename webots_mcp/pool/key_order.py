@@ -1,0 +1,55 @@
+"""The keys of a state in the order in which its controller gave them.
+
+A pool that holds JSON parsed (PostgreSQL's jsonb) has an order of its own. The register of signals
+knows the one from before: names are entered as they first come.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterable
+from typing import Any, Final, cast
+
+_STEP: Final = re.compile(r'\.("(?:[^"\\]|\\.)*"|[^."\[\]]+)|\[(\d+)\]')
+
+Order = dict[str, Any]
+
+
+def order_of(paths: Iterable[str]) -> Order:
+    """The order of keys that the paths of a robot's signals tell, in the order of their ids."""
+    order: Order = {}
+    for path in paths:
+        level = order
+        for key, index in _STEP.findall(path):
+            level = level.setdefault(_key(key) if key else index, {})
+    return order
+
+
+def _key(step: str) -> str:
+    try:
+        return str(json.loads(step)) if step.startswith('"') else step
+    except ValueError:
+        return step[1:-1]
+
+
+def in_order(text: str, order: Order) -> str:
+    """A state as JSON text with its keys in that order; what the order lacks comes last."""
+    try:
+        state = json.loads(text)
+    except (ValueError, RecursionError):
+        return text
+    return json.dumps(_sorted(state, order), ensure_ascii=False, separators=(",", ":"))
+
+
+def _sorted(value: Any, order: Order) -> Any:
+    if isinstance(value, dict):
+        places = {key: place for place, key in enumerate(order)}
+        members = cast("dict[str, Any]", value)
+        keys = sorted(members, key=lambda key: places.get(key, math.inf))
+        return {key: _sorted(members[key], order.get(key, {})) for key in keys}
+    if isinstance(value, list):
+        items = cast("list[Any]", value)
+        return [_sorted(item, order.get(str(at), {})) for at, item in enumerate(items)]
+    return value

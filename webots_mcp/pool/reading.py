@@ -22,6 +22,7 @@ NOT_YET: Final = -(2**62)  # before the first bucket
 ROLLED: Final = ("rollup", "coarse_rollup", "change")
 _UUID: Final = "SELECT uuid FROM recording LIMIT 2"
 _RUNS: Final = "SELECT id, uuid FROM run"
+_ENDED: Final = "SELECT id FROM run WHERE ended_wall_time_s IS NOT NULL"
 _SEQUENCE: Final = "SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = ?"
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
 _MARKS: Final = (
@@ -109,6 +110,10 @@ class Source:
     def runs(self) -> dict[int, str | None]:
         """The UUIDs of the runs; those that an old version has recorded have none."""
         return dict(self._connection.execute(_RUNS).fetchall())
+
+    def ended_runs(self) -> set[int]:
+        """The runs that are over."""
+        return {run_id for (run_id,) in self._connection.execute(_ENDED)}
 
     def sequence(self, table: Table) -> int:
         """The largest id that a row of the table ever had."""

@@ -33,7 +33,7 @@ from webots_mcp.pool.reading import (
 )
 from webots_mcp.pool.summaries import Summaries
 from webots_mcp.pool.tables import Table, table, tables
-from webots_mcp.pool.target import Shipment, Target
+from webots_mcp.pool.target import Shipment, Target, whole_name
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_shipped
@@ -211,6 +211,7 @@ class _Shipper:
         self._marks: list[Mark] = []
         self._watermark = 0
         self._summaries = Summaries(self._progress, self._put)
+        self._ended = set[int]()
         self.address = target.address
 
     def round(self, *, thorough: bool) -> bool:
@@ -233,6 +234,8 @@ class _Shipper:
                 self._ship_kept(source, thorough=thorough)
             if self._order.pictures:
                 self._ship_pictures(source)
+            if all(all_of):
+                self._tell_whole(source)
             self._outbox.send()
             is_frozen = isinstance(connection, FrozenConnection)
         if not is_frozen:
@@ -290,6 +293,7 @@ class _Shipper:
                 elif each.name not in ROLLED and not self._compare(source, each, thorough=thorough):
                     return False
             self._marks, self._watermark = source.marks(), source.watermark()
+            self._ended = source.ended_runs()
             return True
 
         while not source.in_one_moment(read):
@@ -396,6 +400,11 @@ class _Shipper:
         self._shipment.write_picture(path, content)
         self._report.pictures += 1
         return len(content)
+
+    def _tell_whole(self, source: Source) -> None:
+        """Say that all of the runs is there that were over when the round began."""
+        names = map(whole_name, sorted(self._ended - source.foreign))
+        self._outbox.add(None, {name: 1 for name in names if name not in self._progress})
 
     def _put(self, batch: Batch | None, told: Mapping[str, int]) -> None:
         """Send it with others, when they have come to a size."""

@@ -181,6 +181,10 @@ class Pool(Protocol):
         """How much of each table there is."""
         ...
 
+    def progress(self, recording_uuid: str) -> dict[str, int]:
+        """How far the recording was shipped, as `Shipment.progress` tells it."""
+        ...
+
     def rows(
         self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
     ) -> Iterator[Batch]:
@@ -194,6 +198,11 @@ class Pool(Protocol):
     def select(self, sql: str, limit: int) -> tuple[list[str], list[tuple[Any, ...]]]:
         """The columns and the first rows of one SELECT, which cannot write, before a deadline."""
         ...
+
+
+def whole_name(run_id: int) -> str:
+    """The number of the progress that is there once a run is over and all of it is shipped."""
+    return f"whole/{run_id}"
 
 
 def open_target(url: str) -> Target:

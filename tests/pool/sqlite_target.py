@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import fcntl
 import sqlite3
-from collections.abc import Callable, Collection, Generator, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
-from webots_mcp.pool.batch import Batch
+from webots_mcp.pool.batch import Batch, batches
 from webots_mcp.pool.tables import SQLValue, Table, tables
+from webots_mcp.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
 
 
 class SQLiteTarget:
@@ -151,3 +153,69 @@ def _write(table: Table) -> str:
         for name in table.columns
     )
     return f"{insert} ON CONFLICT ({key}) DO UPDATE SET {changes}"
+
+
+class SQLitePool:
+    """As `open_pool` gives one, for a file that `SQLiteTarget` writes."""
+
+    keeps_order = True
+
+    def __init__(self, file: Path) -> None:
+        self.address = f"sqlite:{file}"
+        self._connection = sqlite3.connect(file, isolation_level=None)
+
+    def __enter__(self) -> SQLitePool:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._connection.close()
+
+    def recordings(self) -> Iterator[PooledRecording]:
+        raise NotImplementedError
+
+    def runs(self, recording_uuid: str | None = None) -> Iterator[PooledRun]:
+        query = (
+            "SELECT r.recording_uuid, r.id, r.uuid, b.name, r.label, r.world, "
+            "r.started_wall_time_s, r.last_wall_time_s, r.started_sim_time_s, r.last_sim_time_s, "
+            "r.end_reason, r.rows FROM run r JOIN robot b ON b.id = r.robot_id "
+            "AND b.recording_uuid = r.recording_uuid WHERE ?1 IS NULL OR r.recording_uuid = ?1 "
+            "ORDER BY r.started_wall_time_s"
+        )
+        yield from (PooledRun(*row) for row in self._connection.execute(query, (recording_uuid,)))
+
+    def trial_sets(self) -> Iterator[PooledTrialSet]:
+        sets = "SELECT recording_uuid, id, uuid, created_wall_time_s FROM trial_set ORDER BY 4"
+        trials = "SELECT run_id FROM trial WHERE recording_uuid = ? AND trial_set_id = ?"
+        for recording, set_id, uuid, created_s in self._connection.execute(sets).fetchall():
+            runs = self._connection.execute(trials, (recording, set_id)).fetchall()
+            known = tuple((recording, run) for (run,) in runs if run is not None)
+            yield PooledTrialSet(recording, set_id, uuid, created_s, len(runs), known)
+
+    def sizes(self) -> Iterator[PooledSize]:
+        for each in tables():
+            (rows,) = self._connection.execute(f"SELECT count(*) FROM {each.name}").fetchone()
+            yield PooledSize(each.name, rows, None)
+
+    def progress(self, recording_uuid: str) -> dict[str, int]:
+        return SQLiteShipment(self._connection, recording_uuid).progress()
+
+    def rows(
+        self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]
+    ) -> Iterator[Batch]:
+        wanted = "".join(
+            f" AND {column} IN ({', '.join(map(str, values))})" for column, values in where.items()
+        )
+        query = (
+            f"SELECT {', '.join(table.columns)} FROM {table.name} WHERE recording_uuid = ?{wanted} "
+            f"ORDER BY {', '.join(table.key)}"
+        )
+        return batches(table, self._connection.execute(query, (recording_uuid,)))
+
+    def picture(self, recording_uuid: str, path: str) -> bytes | None:
+        query = "SELECT content FROM picture WHERE recording_uuid = ? AND path = ?"
+        row = self._connection.execute(query, (recording_uuid, path)).fetchone()
+        return row and row[0]
+
+    def select(self, sql: str, limit: int) -> tuple[list[str], list[tuple[Any, ...]]]:
+        cursor = self._connection.execute(sql)
+        return [name for name, *_ in cursor.description], cursor.fetchmany(limit)

@@ -12,9 +12,10 @@ from typing import Any
 import pytest
 
 from tests.recordings.answers import answers
+from tests.recordings.rounds import PART, ROWS, record_rounds
 from tests.recordings.rover import Recorder, rover_state, start_run
 from webots_mcp.connection import connect
-from webots_mcp.contract import DATABASE_NAME, new_uuid
+from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.schema import create_schema
 from webots_mcp.store.bundle import unpacked, write_bundle
@@ -23,38 +24,16 @@ from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.retention import Limit, Retention, prune
 from webots_mcp.store.rollup.rolling import roll
 
-ROWS = 5200  # 1040 s: two coarse buckets and some
 SIGNALS = (
     "SELECT name, kind, unit, path, reduce, rows, null_rows, min, max FROM signal WHERE robot_id = "
     "(SELECT id FROM robot WHERE name = 'rover') AND name NOT GLOB 'pose*' AND name <> 'mode'"
 )
-PART = (480.0, 720.0)
 
 
 @pytest.fixture(scope="module")
 def _whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of rounds of 120 s, rolled up, and a short one before it that lies between its ids."""
     file = tmp_path_factory.mktemp("whole") / DATABASE_NAME
-    with closing(connect(file, "writer", create=True)) as connection:
-        create_schema(connection)
-        recorder = start_run(connection)
-        other = Recorder(connection)
-        robot_id = other.robot("drone")
-        other.run(other.session(robot_id, "b" * 64), robot_id)
-        connection.execute("BEGIN")
-        for step in range(ROWS):
-            recorder.publish(step * 0.2, *rover_state(step * 0.2 % 120))
-            if step % 500 == 0:
-                other.publish(step * 0.2, {"height": step})
-        for each in (recorder, other):
-            each.end_run("finished")
-        connection.execute("UPDATE session SET ended_wall_time_s = 2e9, end_reason = 'finished'")
-        for table in ("session", "run"):
-            for key in (1, 2):
-                connection.execute(f"UPDATE {table} SET uuid = ? WHERE id = ?", (new_uuid(), key))
-        connection.execute("COMMIT")
-        assert roll(connection, 100_000).done
-        connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchall()
+    record_rounds(file)
     return file
 
 

@@ -71,11 +71,11 @@ def _print_fetched(found: Fetched, address: str) -> None:
         ids = id_ranges([found.runs[uuid] for uuid in found.summaries])
         print(f"of run {ids} only summaries were shipped, no rows ('webots-mcp ship --full' does)")
     for uuid in found.going_on:
-        print(f"not taken: run {uuid} goes on where it is recorded, or nobody has shipped its end")
-    for uuid, (left, of) in found.arriving.items():
+        print(f"not taken: run {uuid} goes on, or nobody has shipped its end")
+    for uuid in found.arriving:
         print(
-            f"not taken: of run {uuid} {left:,} of {of:,} rows are shipped so far; where it was "
-            "recorded, 'webots-mcp ship' goes on (with --follow until all is shipped)"
+            f"not taken: run {uuid} is not wholly shipped yet: where it was recorded, 'webots-mcp "
+            "ship' goes on (as before: with --full, where that was given); then fetch it again"
         )
     print_notes(found.notes)
 
@@ -210,8 +210,9 @@ def _print(found: dict[str, Any]) -> None:
     print(json.dumps(found, ensure_ascii=False, default=str))
 
 
-def _plain(cell: Any) -> Any:
-    """A value as a table shows it: of a type that JSON lacks its text."""
-    if cell is None:
-        return "NULL"
-    return cell if isinstance(cell, int | float | str | list | dict) else str(cell)
+def _plain(cell: Any) -> int | float | str:
+    """A value as a table shows it."""
+    if isinstance(cell, int | float | str):
+        return cell
+    is_json = isinstance(cell, list | dict)
+    return "NULL" if cell is None else json.dumps(cell) if is_json else str(cell)

@@ -27,7 +27,7 @@ from webots_mcp.pool.batch import Batch
 from webots_mcp.pool.catalogue import Choice, chosen_runs, chosen_trial_sets
 from webots_mcp.pool.key_order import Order, in_order, order_of
 from webots_mcp.pool.tables import SQLValue, table
-from webots_mcp.pool.target import Pool, PooledRun
+from webots_mcp.pool.target import Pool, PooledRun, whole_name
 from webots_mcp.store.bundle import small_recording
 from webots_mcp.store.images import PICTURES
 from webots_mcp.store.merging import merge
@@ -75,7 +75,7 @@ class Fetched:
         known: Of them, those that were here before.
         summaries: Of those that came now, the ones of which the pool has no rows.
         going_on: Those that are not over.
-        arriving: Those of which rows are still to be shipped, and how many are there of how many.
+        arriving: Those that are over, and not yet wholly shipped.
         notes: What else a person should know.
     """
 
@@ -83,7 +83,7 @@ class Fetched:
     known: list[str] = field(default_factory=list[str])
     summaries: list[str] = field(default_factory=list[str])
     going_on: list[str] = field(default_factory=list[str])
-    arriving: dict[str, tuple[int, int]] = field(default_factory=dict[str, tuple[int, int]])
+    arriving: list[str] = field(default_factory=list[str])
     notes: list[str] = field(default_factory=list[str])
 
     @property
@@ -125,6 +125,7 @@ def fetch(
     found.known = [run.uuid for run in runs if run.uuid in here]
     found.going_on = [run.uuid for run in runs if run.end_reason is None and run.uuid not in here]
     new = [run for run in runs if run.uuid not in here and run.end_reason is not None]
+    new, found.arriving = _shipped(pool, new)
     done = 0
     for part in _parts(new):
         progress(done, len(new))
@@ -134,6 +135,13 @@ def fetch(
     here = _here(connection)
     found.runs = {run.uuid: here[run.uuid] for run in runs if run.uuid in here}
     return found
+
+
+def _shipped(pool: Pool, runs: Sequence[PooledRun]) -> tuple[list[PooledRun], list[str]]:
+    """The runs that are wholly there, and the UUIDs of the others."""
+    told = {each: pool.progress(each) for each in {run.recording_uuid for run in runs}}
+    whole = [run for run in runs if whole_name(run.run_id) in told[run.recording_uuid]]
+    return whole, [run.uuid for run in runs if run not in whole]
 
 
 def _here(connection: sqlite3.Connection) -> dict[str, int]:
@@ -203,7 +211,7 @@ class _Fetcher:
                 small.execute(_DROP_STATES, {"run": run_id})
                 self._note_summaries(uuids[run_id], rows, rolled)
             elif left < rows - purged:
-                self.found.arriving[uuids[run_id]] = (left, rows - purged)
+                self.found.arriving.append(uuids[run_id])
                 small.execute(_DROP_RUN, {"run": run_id})
             small.execute(_PURGED, (gone, run_id))
         small.execute(_DROP_SESSIONS)

@@ -1,0 +1,350 @@
+"""What was shipped comes back as what it was: once, whole, and with the same answers."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.pool.sqlite_target import SQLitePool, SQLiteTarget
+from tests.recordings.answers import answers
+from tests.recordings.rounds import PART, record_rounds
+from tests.recordings.runs import Recorded
+from webots_mcp import MCPBridge
+from webots_mcp.connection import connect
+from webots_mcp.contract import DATABASE_NAME, new_uuid
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.pool.catalogue import Choice
+from webots_mcp.pool.fetching import Fetched, fetch
+from webots_mcp.pool.shipping import Order, Report, ship
+from webots_mcp.schema import create_schema
+from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.trials import (
+    Result,
+    create_trial_set,
+    find_trial_set,
+    finish_trial,
+    trials_of,
+)
+
+OF_RUN = ("kept_stretch", "kept_state", "log", "event", "image", "parameter_value", "state")
+LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id", "path",
+         "rolled_state_id", "coarse_end", "idempotency_key"}  # fmt: skip
+
+
+KEPT = "SELECT sim_time_s, data, odd FROM {} WHERE run_id = ? ORDER BY sim_time_s"
+
+
+class Lab:
+    """A pool, and a folder of a recording to fetch into."""
+
+    def __init__(self, folder: Path) -> None:
+        self.pool, self.here = folder / "pool.db", folder / "here"
+        self.here.mkdir()
+        with closing(connect(self.here / DATABASE_NAME, "writer", create=True)) as connection:
+            create_schema(connection)
+
+    def ship(self, database: Path, **options: Any) -> None:
+        recording = Recording(database, database.parent, read_only=True)
+        ship(Order(recording, lambda: SQLiteTarget(self.pool), **options), Report())
+
+    def fetch(self, **choice: Any) -> Fetched:
+        with self.opened() as connection, SQLitePool(self.pool) as pool:
+            return fetch(pool, connection, self.here, Choice(**choice))
+
+    def opened(self) -> closing[sqlite3.Connection]:
+        return closing(connect(self.here / DATABASE_NAME, "writer"))
+
+    def everything(self) -> list[Any]:
+        with self.opened() as connection:
+            query = "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name"
+            names = [name for (name,) in connection.execute(query).fetchall()]
+            return [connection.execute(f"SELECT * FROM {name}").fetchall() for name in names]
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Lab:
+    return Lab(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def _rounds(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("rounds") / DATABASE_NAME
+    record_rounds(file)
+    return file
+
+
+@pytest.fixture
+def rounds(_rounds: Path, tmp_path: Path) -> Path:
+    """The recording of a long run and a short one."""
+    (tmp_path / "there").mkdir()
+    return Path(shutil.copy(_rounds, tmp_path / "there"))
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Iterator[Recorded]:
+    """Three short runs of two robots, with pictures, labels and a trial set of two."""
+    folder = tmp_path / "there"
+    folder.mkdir()
+    with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as connection:
+        create_schema(connection)
+        recorded = Recorded(connection, folder)
+        for rows, robot in ((10, "rover"), (6, "rover"), (4, "drone")):
+            recorded.add_run(rows, robot_id=None if robot == "rover" else recorded.robot(robot))
+        for table in ("session", "run"):
+            for key in (1, 2, 3):
+                connection.execute(f"UPDATE {table} SET uuid = ? WHERE id = ?", (new_uuid(), key))
+        connection.execute("UPDATE run SET label = 'wall ' || id")
+        connection.execute("UPDATE parameter_value SET command_id = run_id")
+        set_id = create_trial_set(connection, "{}", [{"kp": 1.0}, {"kp": 2.0}, {"kp": 3.0}])
+        for trial, run_id in zip(trials_of(connection, set_id), (1, 2), strict=False):
+            finish_trial(connection, trial, Result(run_id, 1.5 * run_id, None))
+        yield recorded
+
+
+def uuid_of(database: Path, run_id: int) -> str:
+    with closing(connect(database, "reader")) as connection:
+        return connection.execute("SELECT uuid FROM run WHERE id = ?", (run_id,)).fetchone()[0]
+
+
+def everything(connection: sqlite3.Connection, folder: Path, run_id: int) -> dict[str, Any]:
+    """All of a run but what names it here; JSON by value; with the bytes of its pictures."""
+    found = {each: rows(connection, each, f"run_id = {run_id}") for each in OF_RUN}
+    found["run"] = rows(connection, "run", f"id = {run_id}")
+    session = f"(SELECT session_id FROM run WHERE id = {run_id})"
+    found["session"] = rows(connection, "session", f"id = {session}")
+    found["command"] = rows(connection, "command", f"session_id = {session}")
+    found["parameter"] = rows(connection, "parameter", f"session_id = {session}")
+    found["trial"] = rows(connection, "trial", f"run_id = {run_id}")
+    pictures = connection.execute(f"SELECT path FROM image WHERE run_id = {run_id} ORDER BY id")
+    found["pictures"] = [(folder / path).read_bytes() for (path,) in pictures]
+    return found
+
+
+def rows(connection: sqlite3.Connection, table: str, where: str) -> list[Any]:
+    names = [name for (_, name, *_) in connection.execute(f"PRAGMA table_info({table})")]
+    columns = ", ".join(name for name in names if name not in LOCAL)
+    query = f"SELECT {columns} FROM {table} WHERE {where} ORDER BY id"
+    return [tuple(map(value_of, row)) for row in connection.execute(query).fetchall()]
+
+
+def value_of(cell: Any) -> Any:
+    return json.loads(cell) if isinstance(cell, str) and cell[:1] in "{[" and cell else cell
+
+
+def test_a_run_of_full_rate_comes_back_with_the_same_answers_whatever_was_purged_since(
+    lab: Lab, rounds: Path
+) -> None:
+    lab.ship(rounds, full=True)
+    uuid = uuid_of(rounds, 1)
+    with closing(connect(rounds, "writer")) as there:
+        before = everything(there, rounds.parent, 1), answers(there, 1, PART)
+        prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
+    lab.ship(rounds, full=True)
+
+    found = lab.fetch(run=uuid[:13])
+
+    assert (list(found.runs), found.summaries, found.notes) == ([uuid], [], [])
+    with lab.opened() as here:
+        run = found.runs[uuid]
+        assert run_info(here, run).purged_rows == 0
+        assert (everything(here, lab.here, run), answers(here, run, PART)) == before
+
+
+def test_of_a_run_of_summaries_the_answers_are_those_after_all_its_rows_were_purged(
+    lab: Lab, rounds: Path
+) -> None:
+    lab.ship(rounds)
+    uuid = uuid_of(rounds, 1)
+
+    found = lab.fetch(run=uuid)
+
+    assert (found.summaries, found.notes) == ([uuid], [])
+    with closing(connect(rounds, "writer")) as there, lab.opened() as here:
+        prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
+        run = found.runs[uuid]
+        info = run_info(here, run)
+        assert info.purged_rows == info.rows == run_info(there, 1).purged_rows
+        assert answers(here, run, PART) == answers(there, 1, PART)
+
+
+def test_of_a_run_whose_first_rows_were_purged_before_they_were_shipped_the_others_come(
+    lab: Lab, rounds: Path
+) -> None:
+    with closing(connect(rounds, "writer")) as there:
+        there.execute("UPDATE run SET keep = 1 WHERE id = 2")
+        prune(there, rounds.parent, Retention(state=Limit(rows=1500), outlive=0), rest=False)
+    lab.ship(rounds, full=True)
+    uuid = uuid_of(rounds, 1)
+
+    found = lab.fetch(run=uuid)
+
+    assert found.summaries == []
+    with closing(connect(rounds, "reader")) as there, lab.opened() as here:
+        assert answers(here, found.runs[uuid], PART) == answers(there, 1, PART)
+        assert everything(here, lab.here, found.runs[uuid]) == everything(there, rounds.parent, 1)
+
+
+def test_kept_stretches_come_whole_though_only_summaries_were_shipped(
+    lab: Lab, tmp_path: Path
+) -> None:
+    database = tmp_path / "there" / DATABASE_NAME
+    robot = InProcessSupervisor("rover")
+    camera = robot.getDevice("camera")
+    camera.enable(16)
+    with MCPBridge(robot, database=database, keep_last_s=0.2) as bridge:
+        bridge.keep_camera(camera)
+        bridge.parameter("kp", 2.0)
+        bridge.breakpoint("n == 40", action="log")
+        for number in range(100):
+            robot.step(16)
+            bridge.publish({"n": number, "odd": float("nan")})
+        bridge.log("a line")
+        bridge.keep("a look")
+    lab.ship(database, pictures=True)
+    uuid = uuid_of(database, 1)
+
+    found = lab.fetch(run=uuid)
+
+    run = found.runs[uuid]
+    with closing(connect(database, "reader")) as there, lab.opened() as here:
+        before, after = everything(there, database.parent, 1), everything(here, lab.here, run)
+        kept = here.execute(KEPT.format("kept_state"), (run,)).fetchall()
+        in_both = "(SELECT * FROM every_state a WHERE EXISTS (SELECT 1 FROM kept_stretch k WHERE "
+        in_both += "a.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s))"
+        assert kept == there.execute(KEPT.format(in_both), (1,)).fetchall() != []
+    assert after["state"] == [] != before["state"]
+    for name in ("log", "event", "image", "parameter_value", "parameter", "session", "pictures"):
+        assert after[name] == before[name] != []
+    assert f"tell of 0 of its {len(before['state'])} rows" in found.notes[0]
+
+
+def test_a_label_a_set_a_robot_and_a_time_say_which_runs_come(lab: Lab, runs: Recorded) -> None:
+    database = runs.folder / DATABASE_NAME
+    lab.ship(database, full=True, pictures=True)
+    uuids = [uuid_of(database, run_id) for run_id in (1, 2, 3)]
+
+    assert list(lab.fetch(label="wall 2").runs) == [uuids[1]]
+    assert list(lab.fetch(robot="drone").runs) == [uuids[2]]
+    (begun_s,) = runs.connection.execute(
+        "SELECT started_wall_time_s FROM run WHERE id = 2"
+    ).fetchone()
+    found = lab.fetch(until=str(begun_s))
+    assert list(found.runs) == [uuids[0]]
+    again = lab.fetch(label="wall *")
+    assert (sorted(again.runs), sorted(again.known), again.come) == (
+        sorted(uuids),
+        sorted(uuids),
+        [],
+    )
+    with lab.opened() as here:
+        for run_id, uuid in enumerate(uuids, 1):
+            assert everything(here, lab.here, again.runs[uuid]) == everything(
+                runs.connection, runs.folder, run_id
+            )
+
+
+def test_a_trial_set_comes_with_its_runs_and_the_trials_that_wait(lab: Lab, runs: Recorded) -> None:
+    lab.ship(runs.folder / DATABASE_NAME)
+    (uuid,) = runs.connection.execute("SELECT uuid FROM trial_set").fetchone()
+
+    found = lab.fetch(trials=uuid[:8])
+
+    assert len(found.runs) == 2
+    with lab.opened() as here:
+        set_id = find_trial_set(here)
+        assert set_id is not None
+        told = [(trial.status, trial.score, trial.run_id) for trial in trials_of(here, set_id)]
+        one, two = found.runs.values()
+        assert told == [("done", 1.5, one), ("done", 3.0, two), ("waiting", None, None)]
+
+
+def test_fetching_again_changes_nothing(lab: Lab, runs: Recorded) -> None:
+    lab.ship(runs.folder / DATABASE_NAME, full=True, pictures=True)
+    first = lab.fetch(robot="rover")
+    before, files = lab.everything(), sorted(lab.here.rglob("*"))
+
+    again = lab.fetch(robot="rover")
+
+    assert (again.runs, again.come) == (first.runs, [])
+    assert lab.everything() == before
+    assert sorted(lab.here.rglob("*")) == files
+
+
+def test_pictures_that_were_not_shipped_are_rows_without_a_file(lab: Lab, runs: Recorded) -> None:
+    lab.ship(runs.folder / DATABASE_NAME)
+    lab.fetch(robot="rover")
+    with lab.opened() as here:
+        paths = [path for (path,) in here.execute("SELECT path FROM image").fetchall()]
+    assert len(paths) == 2
+    assert not [path for path in paths if (lab.here / path).exists()]
+
+
+def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
+    lab: Lab, runs: Recorded
+) -> None:
+    database = runs.folder / DATABASE_NAME
+    late = runs.add_run(5, end=None)
+    runs.connection.execute("UPDATE run SET uuid = ?, rows = 5 WHERE id = ?", (new_uuid(), late))
+    lab.ship(database, full=True)
+    uuid = uuid_of(database, late)
+    before = lab.everything()
+
+    found = lab.fetch(run=uuid)
+    assert (found.runs, found.going_on) == ({}, [uuid])
+
+    runs.connection.execute(
+        "UPDATE run SET ended_wall_time_s = last_wall_time_s, end_reason = 'finished'"
+    )
+    lab.ship(database, full=True)
+    with closing(sqlite3.connect(lab.pool)) as pool, pool:
+        pool.execute(
+            "CREATE TABLE later AS SELECT * FROM progress WHERE name = ?", (f"whole/{late}",)
+        )
+        pool.execute("DELETE FROM progress WHERE name = ?", (f"whole/{late}",))
+    found = lab.fetch(run=uuid)
+    assert (found.runs, found.arriving) == ({}, [uuid])
+
+    with closing(sqlite3.connect(lab.pool)) as pool, pool:
+        pool.execute("INSERT INTO progress SELECT * FROM later")
+        pool.execute("CREATE TABLE state_later AS SELECT * FROM state WHERE run_id = ?", (late,))
+        pool.execute("DELETE FROM state WHERE run_id = ? AND sim_time_s > 1", (late,))
+    found = lab.fetch(run=uuid)
+    assert (found.runs, found.arriving) == ({}, [uuid])
+    assert lab.everything() == before
+
+    with closing(sqlite3.connect(lab.pool)) as pool, pool:
+        pool.execute("INSERT OR IGNORE INTO state SELECT * FROM state_later")
+    assert list(lab.fetch(run=uuid).runs) == [uuid]
+
+
+def test_a_run_that_lacks_is_answered_with_the_nearest(lab: Lab, runs: Recorded) -> None:
+    lab.ship(runs.folder / DATABASE_NAME)
+    uuid = uuid_of(runs.folder / DATABASE_NAME, 1)
+    wrong = ("0" if uuid[0] != "0" else "1") + uuid[1:]
+    with pytest.raises(InvalidInputError, match=f"nearest are '{uuid}'"):
+        lab.fetch(run=wrong)
+    with pytest.raises(InvalidInputError, match="run whose UUID begins with ''"):
+        lab.fetch(run="")
+    with pytest.raises(InvalidInputError, match="the label 'wal 2'; nearest are 'wall 2'"):
+        lab.fetch(label="wal 2")
+    with pytest.raises(InvalidInputError, match="no robot called 'rovr'; nearest are 'rover'"):
+        lab.fetch(robot="rovr")
+    with pytest.raises(InvalidInputError, match="which runs"):
+        lab.fetch()
+
+
+def test_what_a_killed_fetch_left_is_removed_by_the_next(lab: Lab, runs: Recorded) -> None:
+    lab.ship(runs.folder / DATABASE_NAME)
+    (lab.here / ".fetch-999999999-x").mkdir()
+    lab.fetch(robot="rover")
+    assert not list(lab.here.glob(".fetch-*"))

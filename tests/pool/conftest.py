@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from tests.pool.lab import Lab, short_runs
 from tests.pool.sqlite_target import SQLiteTarget, pooled
 from tests.pool.sqlite_target import recorded as recorded_rows
 from tests.postgres import Server, running_server
@@ -78,3 +79,14 @@ def postgres() -> Iterator[Server]:
     """A server that all tests share; each makes a database of its own."""
     with running_server() as server:
         yield server
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Lab:
+    return Lab(tmp_path)
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> Iterator[Recorded]:
+    with short_runs(tmp_path / "there") as recorded:
+        yield recorded

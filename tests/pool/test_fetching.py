@@ -5,14 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
-from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.pool.sqlite_target import SQLitePool, SQLiteTarget
+from tests.pool.lab import Lab
 from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, record_rounds
 from tests.recordings.runs import Recorded
@@ -20,19 +19,11 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.pool.catalogue import Choice
-from webots_mcp.pool.fetching import Fetched, fetch
-from webots_mcp.pool.shipping import Order, Report, ship
-from webots_mcp.schema import create_schema
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.runs import run_info
-from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention import Limit, Retention, prune
 from webots_mcp.store.trials import (
-    Result,
-    create_trial_set,
     find_trial_set,
-    finish_trial,
     trials_of,
 )
 
@@ -42,38 +33,6 @@ LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id",
 
 
 KEPT = "SELECT sim_time_s, data, odd FROM {} WHERE run_id = ? ORDER BY sim_time_s"
-
-
-class Lab:
-    """A pool, and a folder of a recording to fetch into."""
-
-    def __init__(self, folder: Path) -> None:
-        self.pool, self.here = folder / "pool.db", folder / "here"
-        self.here.mkdir()
-        with closing(connect(self.here / DATABASE_NAME, "writer", create=True)) as connection:
-            create_schema(connection)
-
-    def ship(self, database: Path, **options: Any) -> None:
-        recording = Recording(database, database.parent, read_only=True)
-        ship(Order(recording, lambda: SQLiteTarget(self.pool), **options), Report())
-
-    def fetch(self, **choice: Any) -> Fetched:
-        with self.opened() as connection, SQLitePool(self.pool) as pool:
-            return fetch(pool, connection, self.here, Choice(**choice))
-
-    def opened(self) -> closing[sqlite3.Connection]:
-        return closing(connect(self.here / DATABASE_NAME, "writer"))
-
-    def everything(self) -> list[Any]:
-        with self.opened() as connection:
-            query = "SELECT name FROM sqlite_master WHERE type = 'table' ORDER BY name"
-            names = [name for (name,) in connection.execute(query).fetchall()]
-            return [connection.execute(f"SELECT * FROM {name}").fetchall() for name in names]
-
-
-@pytest.fixture
-def lab(tmp_path: Path) -> Lab:
-    return Lab(tmp_path)
 
 
 @pytest.fixture(scope="module")
@@ -88,27 +47,6 @@ def rounds(_rounds: Path, tmp_path: Path) -> Path:
     """The recording of a long run and a short one."""
     (tmp_path / "there").mkdir()
     return Path(shutil.copy(_rounds, tmp_path / "there"))
-
-
-@pytest.fixture
-def runs(tmp_path: Path) -> Iterator[Recorded]:
-    """Three short runs of two robots, with pictures, labels and a trial set of two."""
-    folder = tmp_path / "there"
-    folder.mkdir()
-    with closing(connect(folder / DATABASE_NAME, "writer", create=True)) as connection:
-        create_schema(connection)
-        recorded = Recorded(connection, folder)
-        for rows, robot in ((10, "rover"), (6, "rover"), (4, "drone")):
-            recorded.add_run(rows, robot_id=None if robot == "rover" else recorded.robot(robot))
-        for table in ("session", "run"):
-            for key in (1, 2, 3):
-                connection.execute(f"UPDATE {table} SET uuid = ? WHERE id = ?", (new_uuid(), key))
-        connection.execute("UPDATE run SET label = 'wall ' || id")
-        connection.execute("UPDATE parameter_value SET command_id = run_id")
-        set_id = create_trial_set(connection, "{}", [{"kp": 1.0}, {"kp": 2.0}, {"kp": 3.0}])
-        for trial, run_id in zip(trials_of(connection, set_id), (1, 2), strict=False):
-            finish_trial(connection, trial, Result(run_id, 1.5 * run_id, None))
-        yield recorded
 
 
 def uuid_of(database: Path, run_id: int) -> str:
@@ -151,9 +89,9 @@ def test_a_run_of_full_rate_comes_back_with_the_same_answers_whatever_was_purged
         prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
     lab.ship(rounds, full=True)
 
-    found = lab.fetch(run=uuid[:13])
+    found = lab.fetch(run_uuid=uuid[:13])
 
-    assert (list(found.runs), found.summaries, found.notes) == ([uuid], [], [])
+    assert (list(found.runs), found.summaries, found.unsummed) == ([uuid], [], {})
     with lab.opened() as here:
         run = found.runs[uuid]
         assert run_info(here, run).purged_rows == 0
@@ -166,9 +104,9 @@ def test_of_a_run_of_summaries_the_answers_are_those_after_all_its_rows_were_pur
     lab.ship(rounds)
     uuid = uuid_of(rounds, 1)
 
-    found = lab.fetch(run=uuid)
+    found = lab.fetch(run_uuid=uuid)
 
-    assert (found.summaries, found.notes) == ([uuid], [])
+    assert (found.summaries, found.unsummed) == ([uuid], {})
     with closing(connect(rounds, "writer")) as there, lab.opened() as here:
         prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
         run = found.runs[uuid]
@@ -186,7 +124,7 @@ def test_of_a_run_whose_first_rows_were_purged_before_they_were_shipped_the_othe
     lab.ship(rounds, full=True)
     uuid = uuid_of(rounds, 1)
 
-    found = lab.fetch(run=uuid)
+    found = lab.fetch(run_uuid=uuid)
 
     assert found.summaries == []
     with closing(connect(rounds, "reader")) as there, lab.opened() as here:
@@ -213,7 +151,7 @@ def test_kept_stretches_come_whole_though_only_summaries_were_shipped(
     lab.ship(database, pictures=True)
     uuid = uuid_of(database, 1)
 
-    found = lab.fetch(run=uuid)
+    found = lab.fetch(run_uuid=uuid)
 
     run = found.runs[uuid]
     with closing(connect(database, "reader")) as there, lab.opened() as here:
@@ -225,7 +163,7 @@ def test_kept_stretches_come_whole_though_only_summaries_were_shipped(
     assert after["state"] == [] != before["state"]
     for name in ("log", "event", "image", "parameter_value", "parameter", "session", "pictures"):
         assert after[name] == before[name] != []
-    assert f"tell of 0 of its {len(before['state'])} rows" in found.notes[0]
+    assert found.unsummed == {uuid: 0}
 
 
 def test_a_label_a_set_a_robot_and_a_time_say_which_runs_come(lab: Lab, runs: Recorded) -> None:
@@ -299,7 +237,7 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
     uuid = uuid_of(database, late)
     before = lab.everything()
 
-    found = lab.fetch(run=uuid)
+    found = lab.fetch(run_uuid=uuid)
     assert (found.runs, found.going_on) == ({}, [uuid])
 
     runs.connection.execute(
@@ -311,20 +249,20 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
             "CREATE TABLE later AS SELECT * FROM progress WHERE name = ?", (f"whole/{late}",)
         )
         pool.execute("DELETE FROM progress WHERE name = ?", (f"whole/{late}",))
-    found = lab.fetch(run=uuid)
+    found = lab.fetch(run_uuid=uuid)
     assert (found.runs, found.arriving) == ({}, [uuid])
 
     with closing(sqlite3.connect(lab.pool)) as pool, pool:
         pool.execute("INSERT INTO progress SELECT * FROM later")
         pool.execute("CREATE TABLE state_later AS SELECT * FROM state WHERE run_id = ?", (late,))
         pool.execute("DELETE FROM state WHERE run_id = ? AND sim_time_s > 1", (late,))
-    found = lab.fetch(run=uuid)
+    found = lab.fetch(run_uuid=uuid)
     assert (found.runs, found.arriving) == ({}, [uuid])
     assert lab.everything() == before
 
     with closing(sqlite3.connect(lab.pool)) as pool, pool:
         pool.execute("INSERT OR IGNORE INTO state SELECT * FROM state_later")
-    assert list(lab.fetch(run=uuid).runs) == [uuid]
+    assert list(lab.fetch(run_uuid=uuid).runs) == [uuid]
 
 
 def test_a_run_that_lacks_is_answered_with_the_nearest(lab: Lab, runs: Recorded) -> None:
@@ -332,9 +270,9 @@ def test_a_run_that_lacks_is_answered_with_the_nearest(lab: Lab, runs: Recorded)
     uuid = uuid_of(runs.folder / DATABASE_NAME, 1)
     wrong = ("0" if uuid[0] != "0" else "1") + uuid[1:]
     with pytest.raises(InvalidInputError, match=f"nearest are '{uuid}'"):
-        lab.fetch(run=wrong)
+        lab.fetch(run_uuid=wrong)
     with pytest.raises(InvalidInputError, match="run whose UUID begins with ''"):
-        lab.fetch(run="")
+        lab.fetch(run_uuid="")
     with pytest.raises(InvalidInputError, match="the label 'wal 2'; nearest are 'wall 2'"):
         lab.fetch(label="wal 2")
     with pytest.raises(InvalidInputError, match="no robot called 'rovr'; nearest are 'rover'"):

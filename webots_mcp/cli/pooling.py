@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, Final
 
@@ -26,9 +26,11 @@ if TYPE_CHECKING:
     from webots_mcp.pool.fetching import Fetched
     from webots_mcp.pool.target import Pool
 
+_MOST_NAMED: Final = 3
 _SHORT: Final = 8  # of a UUID: as much of it as tells one from the others
 _CHOICE: Final[tuple[Argument, ...]] = (
-    argument("--run", metavar="UUID", help="the run of that UUID, or that begins so"),
+    argument("--run", metavar="UUID", dest="run_uuid",
+             help="the run of that UUID, or that begins so"),
     argument("--label", metavar="TEXT", help="runs with that label, with '*'"),
     argument("--trials", metavar="UUID", help="the runs of that trial set, and its trials"),
     argument("--robot", metavar="NAME", help="runs of that robot"),
@@ -63,21 +65,34 @@ def fetch(arguments: argparse.Namespace) -> int:
 
 
 def _print_fetched(found: Fetched, address: str) -> None:
-    come, known = found.come, [found.runs[uuid] for uuid in found.known]
-    print(f"of {address} came: run {id_ranges(come) or 'none'}")
-    if known:
-        print(f"here already: run {id_ranges(known)}")
+    def listed(uuids: Iterable[str]) -> str | None:
+        return id_ranges([found.runs[uuid] for uuid in uuids])
+
+    print(f"of {address} came: run {id_ranges(found.come) or 'none'}")
+    if found.known:
+        print(f"here already: run {listed(found.known)}")
     if found.summaries:
-        ids = id_ranges([found.runs[uuid] for uuid in found.summaries])
-        print(f"of run {ids} only summaries were shipped, no rows ('webots-mcp ship --full' does)")
-    for uuid in found.going_on:
-        print(f"not taken: run {uuid} goes on, or nobody has shipped its end")
-    for uuid in found.arriving:
         print(
-            f"not taken: run {uuid} is not wholly shipped yet: where it was recorded, 'webots-mcp "
-            "ship' goes on (as before: with --full, where that was given); then fetch it again"
+            f"of run {listed(found.summaries)} only summaries were shipped, no rows "
+            "('webots-mcp ship --full' does)"
         )
-    print_notes(found.notes)
+    if found.unsummed:
+        print(
+            f"of run {listed(found.unsummed)} not even summaries of all rows: those were not made "
+            "where it was recorded, which a server does ('webots-mcp serve')"
+        )
+    if found.going_on:
+        print(f"not taken: {_named(found.going_on)} goes on, or nobody has shipped its end")
+    if found.arriving:
+        print(
+            f"not taken: {_named(found.arriving)} is not wholly shipped yet; where it was recorded "
+            "'webots-mcp ship' goes on, as it was given before; then fetch it again"
+        )
+
+
+def _named(uuids: Sequence[str]) -> str:
+    shown = ", ".join(uuids[:_MOST_NAMED])
+    return f"run {shown}" + (f" and {len(uuids) - _MOST_NAMED} more" * (len(uuids) > _MOST_NAMED))
 
 
 @command(

@@ -22,7 +22,7 @@ class Choice:
     """Which runs are meant: those of which all that is given is true.
 
     Attributes:
-        run: The UUID of one, or the first letters of it.
+        run_uuid: The UUID of one, or the first letters of it.
         label: Its label; `*` stands for any letters.
         trials: The UUID of a trial set, or the first letters of it: the runs of its trials.
         robot: Its robot.
@@ -30,7 +30,7 @@ class Choice:
         until: It began before this wall time.
     """
 
-    run: str | None = None
+    run_uuid: str | None = None
     label: str | None = None
     trials: str | None = None
     robot: str | None = None
@@ -65,8 +65,8 @@ def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
     if not runs:
         raise InvalidInputError(f"the pool {pool.address} holds no run yet")
     found = runs
-    if choice.run is not None:
-        found = [_one_of(runs, choice.run)]
+    if choice.run_uuid is not None:
+        found = [_one_of(runs, choice.run_uuid)]
     if choice.trials is not None:
         ids = set(_trial_set(pool, choice.trials).runs)
         found = [run for run in found if (run.recording_uuid, run.run_id) in ids]

@@ -76,7 +76,7 @@ class Fetched:
         summaries: Of those that came now, the ones of which the pool has no rows.
         going_on: Those that are not over.
         arriving: Those that are over, and not yet wholly shipped.
-        notes: What else a person should know.
+        unsummed: Of those in `summaries`, how many rows the summaries tell of, where not of all.
     """
 
     runs: dict[str, int] = field(default_factory=dict[str, int])
@@ -84,7 +84,7 @@ class Fetched:
     summaries: list[str] = field(default_factory=list[str])
     going_on: list[str] = field(default_factory=list[str])
     arriving: list[str] = field(default_factory=list[str])
-    notes: list[str] = field(default_factory=list[str])
+    unsummed: dict[str, int] = field(default_factory=dict[str, int])
 
     @property
     def come(self) -> list[int]:
@@ -209,22 +209,14 @@ class _Fetcher:
                 gone = rows
                 small.execute(_MOVE_KEPT, {"run": run_id})
                 small.execute(_DROP_STATES, {"run": run_id})
-                self._note_summaries(uuids[run_id], rows, rolled)
+                self.found.summaries.append(uuids[run_id])
+                self.found.unsummed |= {uuids[run_id]: rolled} if rolled < rows else {}
             elif left < rows - purged:
                 self.found.arriving.append(uuids[run_id])
                 small.execute(_DROP_RUN, {"run": run_id})
             small.execute(_PURGED, (gone, run_id))
         small.execute(_DROP_SESSIONS)
         small.execute(_END_SESSIONS)
-
-    def _note_summaries(self, uuid: str, rows: int, rolled: int) -> None:
-        self.found.summaries.append(uuid)
-        if rolled < rows:
-            self.found.notes.append(
-                f"the summaries of run {uuid} tell of {rolled:,} of its {rows:,} rows: the others "
-                "had not been summed up where it was recorded, which a server does, or were not "
-                "shipped yet"
-            )
 
 
 class _Copy:

@@ -197,7 +197,8 @@ class SQLitePool:
             yield PooledSize(each.name, rows, None)
 
     def progress(self, recording_uuid: str) -> dict[str, int]:
-        return SQLiteShipment(self._connection, recording_uuid).progress()
+        query = "SELECT name, value FROM progress WHERE recording_uuid = ?"
+        return dict(self._connection.execute(query, (recording_uuid,)).fetchall())
 
     def rows(
         self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]

@@ -245,10 +245,9 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
     )
     lab.ship(database, full=True)
     with closing(sqlite3.connect(lab.pool)) as pool, pool:
-        pool.execute(
-            "CREATE TABLE later AS SELECT * FROM progress WHERE name = ?", (f"whole/{late}",)
-        )
-        pool.execute("DELETE FROM progress WHERE name = ?", (f"whole/{late}",))
+        told = "FROM progress WHERE name = 'run.whole:0'"
+        pool.execute(f"CREATE TABLE later AS SELECT * {told}")
+        pool.execute(f"DELETE {told}")
     found = lab.fetch(run_uuid=uuid)
     assert (found.runs, found.arriving) == ({}, [uuid])
 

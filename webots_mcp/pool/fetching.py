@@ -27,7 +27,7 @@ from webots_mcp.pool.batch import Batch
 from webots_mcp.pool.catalogue import Choice, chosen_runs, chosen_trial_sets
 from webots_mcp.pool.key_order import Order, in_order, order_of
 from webots_mcp.pool.tables import SQLValue, table
-from webots_mcp.pool.target import Pool, PooledRun, whole_name
+from webots_mcp.pool.target import Pool, PooledRun, is_whole
 from webots_mcp.store.bundle import small_recording
 from webots_mcp.store.images import PICTURES
 from webots_mcp.store.merging import merge
@@ -140,7 +140,7 @@ def fetch(
 def _shipped(pool: Pool, runs: Sequence[PooledRun]) -> tuple[list[PooledRun], list[str]]:
     """The runs that are wholly there, and the UUIDs of the others."""
     told = {each: pool.progress(each) for each in {run.recording_uuid for run in runs}}
-    whole = [run for run in runs if whole_name(run.run_id) in told[run.recording_uuid]]
+    whole = [run for run in runs if is_whole(told[run.recording_uuid], run.run_id)]
     return whole, [run.uuid for run in runs if run not in whole]
 
 

@@ -33,7 +33,7 @@ from webots_mcp.pool.reading import (
 )
 from webots_mcp.pool.summaries import Summaries
 from webots_mcp.pool.tables import Table, table, tables
-from webots_mcp.pool.target import Shipment, Target, whole_name
+from webots_mcp.pool.target import Shipment, Target, whole_runs
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_shipped
@@ -403,8 +403,9 @@ class _Shipper:
 
     def _tell_whole(self, source: Source) -> None:
         """Say that all of the runs is there that were over when the round began."""
-        names = map(whole_name, sorted(self._ended - source.foreign))
-        self._outbox.add(None, {name: 1 for name in names if name not in self._progress})
+        told = whole_runs(self._ended - source.foreign).items()
+        told = {name: mask | self._progress.get(name, 0) for name, mask in told}
+        self._outbox.add(None, dict(told.items() - self._progress.items()))
 
     def _put(self, batch: Batch | None, told: Mapping[str, int]) -> None:
         """Send it with others, when they have come to a size."""

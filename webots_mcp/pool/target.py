@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import re
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, cast
@@ -24,6 +24,8 @@ _SECRET: Final = re.compile(
     re.IGNORECASE,
 )
 _NEARLY_A_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
+_WHOLE: Final = "run.whole:{}"  # a bit for each of so many runs
+_RUNS_TOLD: Final = 60
 _POSTGRES: Final = ("postgresql", "postgres")
 
 
@@ -200,9 +202,18 @@ class Pool(Protocol):
         ...
 
 
-def whole_name(run_id: int) -> str:
-    """The number of the progress that is there once a run is over and all of it is shipped."""
-    return f"whole/{run_id}"
+def whole_runs(run_ids: Iterable[int]) -> dict[str, int]:
+    """Numbers of the progress that say of these runs: they are over, and all of them is there."""
+    told: dict[str, int] = {}
+    for run_id in run_ids:
+        name = _WHOLE.format(run_id // _RUNS_TOLD)
+        told[name] = told.get(name, 0) | 1 << run_id % _RUNS_TOLD
+    return told
+
+
+def is_whole(progress: Mapping[str, int], run_id: int) -> bool:
+    """Whether the progress says so of a run."""
+    return bool(progress.get(_WHOLE.format(run_id // _RUNS_TOLD), 0) >> run_id % _RUNS_TOLD & 1)
 
 
 def open_target(url: str) -> Target:

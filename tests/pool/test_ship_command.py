@@ -5,6 +5,8 @@ from __future__ import annotations
 import pytest
 
 from tests.pool.conftest import Shipped
+from tests.pool.postgres.shipped import assert_equal
+from tests.postgres import Server
 from webots_mcp.cli import main
 
 
@@ -32,3 +34,37 @@ def test_a_pause_without_anything_to_wait_for_is_refused(
     asked = ["ship", "--data-dir", str(shipped.folder), "--to", "/srv/pool", "--every", "5"]
     assert main(asked) == 2
     assert "--every is for --follow" in capsys.readouterr().err
+
+
+def test_a_recording_is_shipped_to_postgresql_as_it_is(
+    shipped: Shipped, postgres: Server, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shipped.add_run(1200)
+    pool = postgres.new_database()
+    line = ["ship", "--data-dir", str(shipped.folder), "--to", postgres.url(pool), "--full"]
+    assert main(line) == 0
+    assert "state 1200" in capsys.readouterr().out
+    assert_equal(postgres, pool, shipped.connection)
+    assert main(line) == 0
+    assert "has everything already" in capsys.readouterr().out
+
+
+def test_a_server_that_is_not_there_is_said(
+    shipped: Shipped, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = ["ship", "--data-dir", str(shipped.folder), "--to", "postgresql://127.0.0.1:1/pool"]
+    assert main(line) == 2
+    assert "127.0.0.1:1/pool" in capsys.readouterr().err
+
+
+def test_a_server_that_only_reads_is_said_and_nothing_is_half_done(
+    shipped: Shipped, postgres: Server, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shipped.add_run()
+    pool = postgres.new_database()
+    postgres.execute("postgres", f"ALTER DATABASE {pool} SET default_transaction_read_only = on")
+    line = ["ship", "--data-dir", str(shipped.folder), "--to", postgres.url(pool)]
+    assert main(line) == 2
+    said = capsys.readouterr()
+    assert "read-only" in said.err
+    assert said.out == ""

@@ -63,24 +63,28 @@ def ship(arguments: argparse.Namespace) -> None:
     (url,) = arguments.urls
     connect = functools.partial(open_target, url)
     order = Order(open_recording(arguments), connect, arguments.full, arguments.pictures)
-    report = Report()
+    report, is_done = Report(), False
     try:
         if arguments.follow:
             follow(order, report, _say, arguments.pause_s or pause_of(url))
         else:
             ship_once(order, report)
+            is_done = True
     finally:
-        _print_report(redacted(url), report)
+        _print_report(redacted(url), report, is_done=is_done)
 
 
 def _say(text: str) -> None:
     print(f"webots-mcp: {text}", file=sys.stderr, flush=True)
 
 
-def _print_report(address: str, report: Report) -> None:
+def _print_report(address: str, report: Report, *, is_done: bool) -> None:
     sent = [f"{table} {rows}" for table, rows in sorted(report.rows.items()) if rows]
     sent += [f"pictures {report.pictures}"] if report.pictures else []
-    print(f"{address}: " + (f"rows sent: {', '.join(sent)}" if sent else "nothing new"))
+    if sent:
+        print(f"sent to {address}: {', '.join(sent)}")
+    elif is_done:
+        print(f"{address} has everything already")
     print_notes([*_notes(report), *report.notes])
 
 

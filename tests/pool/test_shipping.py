@@ -340,3 +340,15 @@ def test_rollups_of_an_older_version_that_marked_no_runs_are_shipped(shipped: Sh
     shipped.connection.execute("UPDATE run SET rolled_state_id = 0")
     shipped.ship()
     assert shipped.pooled()["rollup"] == shipped.rows()["rollup"] != []
+
+
+def test_while_a_pool_writes_the_log_of_the_database_can_be_cut_back(shipped: Shipped) -> None:
+    shipped.add_run(2500)
+    busy: list[int] = []
+
+    def cut_back() -> None:
+        answer = shipped.connection.execute("PRAGMA wal_checkpoint(TRUNCATE)").fetchone()
+        busy.append(answer[0])
+
+    shipped.ship(full=True, open_target=lambda: SQLiteTarget(shipped.pool, cut_back))
+    assert busy == [0] * len(busy) != []

@@ -11,6 +11,7 @@ from webots_mcp.pool.tables import SQLValue, Table
 BATCH_BYTES: Final = 4_000_000
 BATCH_ROWS: Final = 20_000
 _VALUE_BYTES: Final = 8
+_SIZED: Final = (str, bytes)
 
 Row = tuple[SQLValue, ...]
 
@@ -44,4 +45,5 @@ def batches(table: Table, rows: Iterable[Row]) -> Iterator[Batch]:
 
 def row_bytes(row: Row) -> int:
     """About how many bytes of memory a row's values take."""
-    return sum(len(value) if isinstance(value, str | bytes) else _VALUE_BYTES for value in row)
+    sized = sum([len(value) for value in row if isinstance(value, _SIZED)])
+    return sized + _VALUE_BYTES * len(row)

@@ -12,7 +12,7 @@ from hashlib import blake2b
 from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import DatabaseError
-from webots_mcp.pool.batch import BATCH_BYTES, BATCH_ROWS, Batch, Row, row_bytes
+from webots_mcp.pool.batch import BATCH_BYTES, BATCH_ROWS, Batch, Row, batches, row_bytes
 from webots_mcp.pool.tables import SQLValue, Table
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, bucket_of
 from webots_mcp.store.rollup.rolling import watermark
@@ -49,6 +49,10 @@ _IN_STRETCH: Final = (
 )
 _PICTURES: Final = (
     "SELECT id, run_id, path FROM image WHERE id > ? AND id <= ? ORDER BY id LIMIT 100"
+)
+_OF_RUN: Final = (
+    "SELECT {columns} FROM {table} WHERE run_id = ? AND (signal_id, {third}) > (?, ?) "
+    "ORDER BY signal_id, {third}"
 )
 _RECENT: Final = "SELECT {columns} FROM recent_rollup WHERE run_id = ? AND bucket > ?"
 
@@ -187,26 +191,33 @@ class Source:
 
     def rolled(self, table: Table, mark: Mark, after: int) -> Iterator[Batch]:
         """Rollups or change points of a run whose bucket or state row comes after that one."""
-        rows: list[Row] = []
         if table.name == "rollup":
             query = _RECENT.format(columns=", ".join(table.columns))
             rows = self._connection.execute(query, (mark.run_id, after)).fetchall()
-        query = _OF_SIGNAL.format(
-            columns=", ".join(table.columns), table=table.name, third=table.key[2]
-        )
-        signals = self._connection.execute(_SIGNALS, (mark.robot_id,)).fetchall()
-        third = table.columns.index(table.key[2])
-        for (signal_id,) in signals:
-            last, is_all = after, False
-            while not is_all:
-                some, is_all = self._some(query, (mark.run_id, signal_id, last))
-                last = int(str(some[-1][third])) if some else last
-                rows += some
-                if len(rows) >= BATCH_ROWS // 2:
-                    yield Batch(table, rows)
-                    rows = []
-        if rows:
-            yield Batch(table, rows)
+            yield from batches(table, rows)
+        yield from batches(table, self._rolled_rows(table, mark, after))
+
+    def _rolled_rows(self, table: Table, mark: Mark, after: int) -> Iterator[Row]:
+        """All of a run in the order of its key, or signal by signal the newest."""
+        columns, (_, _, third) = ", ".join(table.columns), table.key
+        if after == NOT_YET:
+            query = _OF_RUN.format(columns=columns, table=table.name, third=third)
+            yield from self._in_pieces(query, (mark.run_id,), (NOT_YET, NOT_YET), table)
+            return
+        query = _OF_SIGNAL.format(columns=columns, table=table.name, third=third)
+        for (signal_id,) in self._connection.execute(_SIGNALS, (mark.robot_id,)).fetchall():
+            yield from self._in_pieces(query, (mark.run_id, signal_id), (after,), table)
+
+    def _in_pieces(
+        self, query: str, owner: tuple[int, ...], after: tuple[Any, ...], table: Table
+    ) -> Iterator[Row]:
+        """Rows after a key, with no transaction open while they are used."""
+        places = [table.columns.index(name) for name in table.key[-len(after) :]]
+        is_all = False
+        while not is_all:
+            rows, is_all = self._some(query, (*owner, *after))
+            yield from rows
+            after = tuple(rows[-1][place] for place in places) if rows else after
 
     def stretches(self) -> list[Stretch]:
         """Kept stretches of the runs that are ours to ship."""

@@ -85,9 +85,14 @@ class Worker(Process):
         """Of the trial that it runs, once there is one."""
         return next(iter(self.folder.glob("**/trial-*/data/webots.db")), None)
 
+    @property
+    def children(self) -> list[psutil.Process]:
+        """What it has started, which is to end with it."""
+        return psutil.Process(self.process.pid).children(recursive=True)
+
     def kill(self) -> list[psutil.Process]:
-        """By SIGKILL; returns what it had started, which is to end by itself."""
-        children = psutil.Process(self.process.pid).children(recursive=True)
+        """By SIGKILL; returns what it had started."""
+        children = self.children
         self.process.kill()
         self.process.wait()
         return children

@@ -107,6 +107,94 @@ def test_who_handed_them_out_may_be_ended_and_gone_on_from(
     assert list((project / "data" / "trials").iterdir()) == []
 
 
+# Dies with the worker that runs it, at speed 2.
+DEADLY = """
+import os, signal
+import psutil
+from controller import Supervisor
+from webots_mcp import MCPBridge
+
+robot = Supervisor()
+bridge = MCPBridge(robot, throttle_interval=1)
+speed = bridge.parameter("speed", 1.0)
+if speed.value == 2.0:
+    for each in psutil.Process().parents():
+        if any(word.startswith("distributed.cli.dask_worker") for word in each.cmdline()):
+            each.kill()
+while robot.step(16) != -1:
+    bridge.publish({"x": speed.value})
+"""
+
+
+def test_a_trial_that_kills_its_workers_fails_with_that_reason(
+    project: Path, plan: Write, run: Run, dask_cluster: Cluster
+) -> None:
+    dask_cluster.start(3)
+    (project / "controllers" / "rover" / "rover.py").write_text(DEADLY)
+    plan('score = "last(x)"\nfor_s = 0.3\n[grid]\nspeed = [1.0, 2.0]')
+
+    answer = json.loads(run("--scheduler", dask_cluster.address, "--json").stdout)
+
+    assert [each["scores"] for each in answer["sets"]] == [[1.0, 1.0], []]
+    assert (
+        "2 workers died while they ran it, the last one tcp://" in answer["sets"][1]["failures"][0]
+    )
+    assert rows(project, "SELECT count(*) FROM run") == [(2,)]
+    assert len(dask_cluster.workers) == 1
+
+
+def test_a_search_prunes_there_as_here(
+    project: Path, plan: Write, run: Run, dask_cluster: Cluster
+) -> None:
+    dask_cluster.start(1)
+    plan(
+        'score = "last(x)"\nfor_s = 0.3\nprune = "x > 2"\nsets = 3\nseed = 1\n[ranges]\n'
+        "speed = { choices = [1.0, 9.0] }"
+    )
+    options = ("--scheduler", dask_cluster.address, "--search", "random", "--jobs", "1")
+
+    answer = json.loads(run(*options, "--json").stdout)
+
+    told = "SELECT status, ended_by, parameters FROM trial"
+    assert set(rows(project, told)) == {
+        ("done", "for_s", '{"speed": 1.0}'), ("pruned", "prune", '{"speed": 9.0}'),
+    }  # fmt: skip
+    assert sum(len(each["scores"]) + each["pruned"] for each in answer["sets"]) == 4
+
+
+def test_a_scheduler_without_simulators_is_told_at_once_and_one_that_is_lost_as_well(
+    project: Path,
+    plan: Write,
+    run: Run,
+    started: Callable[..., subprocess.Popen[str]],
+    tmp_path: Path,
+) -> None:
+    own = Cluster(tmp_path / "own")
+    try:
+        plan('score = "last(x)"\nuntil = "x > 1e6"\n[grid]\nspeed = [1.0]')
+        refused = run("--scheduler", own.address)
+        assert refused.returncode == 2
+        assert f"'dask worker {own.address} --resources simulator=1 --nth" in refused.stderr
+        assert not (project / "data").exists()
+
+        (worker,) = own.start(1)
+        process = started("--scheduler", own.address)
+        found(lambda: worker.recording)
+        children = worker.children
+        own.scheduler.end()
+        _, said = process.communicate(timeout=60)
+        found(lambda: not any(each.is_running() for each in children))
+    finally:
+        own.end()
+
+    assert process.returncode == 2
+    assert (
+        said == f"webots-mcp: the scheduler {own.address} was lost: what is left can be gone on "
+        "with once it is back\n"
+    )
+    assert rows(project, "SELECT DISTINCT status FROM trial") == [("waiting",)]
+
+
 @pytest.mark.parametrize(
     ("address", "said"),
     [

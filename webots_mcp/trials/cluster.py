@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import re
 import tempfile
 import time
@@ -277,6 +278,8 @@ def _connected(address: str) -> Generator[Any]:
             "trials on a cluster need Dask: pip install 'distributed>=2024.12' (the extra "
             "[cluster] of webots-mcp)"
         ) from error
+    # That a scheduler was lost is told by who misses it, in a sentence and not by a traceback.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     if not _ADDRESS.fullmatch(address):
         raise InvalidInputError(
             f"scheduler {address!r} is no address, such as tcp://HOST:8786 or tls://HOST:8786"

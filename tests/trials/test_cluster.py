@@ -11,14 +11,19 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from anyio import to_thread
+from mcp import Client
 
+from tests.server.conftest import anyio_backend, ask, fail  # fixtures
 from tests.trials.conftest import Run, command, rows
 from tests.trials.dask_cluster import Cluster, found
 from webots_mcp import __version__
+from webots_mcp.server import create_server
 from webots_mcp.trials import cluster
 from webots_mcp.trials.cluster import Needs, digest_of, what_lacks
 from webots_mcp.trials.simulators import stand_in
 
+__all__ = ["anyio_backend"]
 Write = Callable[[str], Path]
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="signals")
@@ -160,6 +165,44 @@ def test_a_search_prunes_there_as_here(
         ("done", "for_s", '{"speed": 1.0}'), ("pruned", "prune", '{"speed": 9.0}'),
     }  # fmt: skip
     assert sum(len(each["scores"]) + each["pruned"] for each in answer["sets"]) == 4
+
+
+@pytest.mark.anyio
+async def test_an_assistant_goes_on_with_a_set_and_cancels_one(
+    project: Path,
+    plan: Write,
+    started: Callable[..., subprocess.Popen[str]],
+    dask_cluster: Cluster,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (worker,) = dask_cluster.start(1)[:1]
+    address, data_dir = dask_cluster.address, project / "data"
+    plan('score = "last(x)"\nuntil = "x > 3"\n[grid]\nspeed = [1.0, 2.0]')
+    process = started("--scheduler", address)
+    found(lambda: worker.recording)
+    async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
+        assert (await ask(client, "webots_get_trials"))["state"] == "under way"
+        await ask(client, "webots_run_trials", trial_set=1, cancel=True, timeout_s=60)
+        _, said = await to_thread.run_sync(process.communicate)
+        assert said.endswith("webots-mcp: trial set 1 stopped: it was cancelled\n")
+        left = await ask(client, "webots_get_trials")
+        assert left["hint"].endswith(
+            "or webots_run_trials(trial_set=1, scheduler='tcp://...') on a cluster"
+        )
+
+        again: dict[str, Any] = {"trial_set": 1, "scheduler": address, "timeout_s": 60}
+        refused = await fail(client, "webots_run_trials", **again)
+        assert f"scheduler '{address}' is not allowed, none is" in refused
+        monkeypatch.setenv("DASK_SCHEDULER_ADDRESS", address)
+        done = await ask(client, "webots_run_trials", **again)
+        assert (done["state"], done["over"], done.get("failed")) == ("done", 3, None)
+
+        new: dict[str, Any] = {"parameters": {"speed": [5.0]}, "score": "last(x)", "for_s": 0.1}
+        refused = await fail(client, "webots_run_trials", **new, scheduler=address)
+        assert "there is no program 'webots'" in refused
+        unknown = {**new, "parameters": {"sped": [5.0]}, "scheduler": address}
+        assert "speed" in await fail(client, "webots_run_trials", **unknown)
+        assert rows(project, "SELECT count(*) FROM trial_set") == [(1,)]
 
 
 def test_a_scheduler_without_simulators_is_told_at_once_and_one_that_is_lost_as_well(

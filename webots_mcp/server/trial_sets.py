@@ -25,9 +25,10 @@ from webots_mcp.server.shortening import cut_text
 from webots_mcp.server.target import find_target
 from webots_mcp.server.tuning import settable
 from webots_mcp.store.analysis.ranking import Ranked, Ranking
+from webots_mcp.store.parameters import Declared, declared_for
 from webots_mcp.store.questions.score import require_kinds
 from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.recording import Recording, look
+from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.trials import (
     Trial,
@@ -42,7 +43,7 @@ from webots_mcp.store.trials import (
     stop_trial_set,
     trials_of,
 )
-from webots_mcp.trials.plan import Plan, combinations
+from webots_mcp.trials.plan import SCHEDULER, Plan, WorldPlan, combinations
 
 CANCELLED: Final = "it was cancelled"
 _TABLE_BUDGET: Final = 5_400
@@ -79,23 +80,63 @@ def begin_set(
     require_possible(recording, robot, asked.get("until"), asked.get("for_s"), reset=True)
     if asked.get("prune") is not None:
         require_possible(recording, robot, asked["prune"], None, reset=True)
-    checked = _checked(recording, robot, sets)
+    checked = _as_declared(settable(recording, robot), sets)
     with recording.reader() as connection:
         view = find_target(connection, robot, ACTION)
         plan = Plan(parameters=checked, robot=view.robot.name, **asked)
-        score = parse_score(plan.score)
-        require_kinds(connection, score, view.require_run().id)
-        if known := known_names(view):
-            score.require_known(known)
+        _require_scorable(connection, plan, view)
     with recording.writer() as connection:
         return create_trial_set(connection, plan.text, plan.trials, view.robot.id)
 
 
-def _checked(
-    recording: Recording, robot: str | None, sets: Sequence[Mapping[str, Any]]
+def planned_for_cluster(
+    recording: Recording,
+    parameters: Sequence[Mapping[str, Any]] | Mapping[str, Sequence[Any]],
+    robot: str | None,
+    **asked: Any,
+) -> WorldPlan:
+    """A plan in the world of a robot's newest run, which need not go on.
+
+    Args:
+        recording: Of the robot.
+        parameters: As in `begin_set`.
+        robot: None for the only one.
+        asked: As in `begin_set`.
+
+    Raises:
+        InvalidInputError: As in `begin_set`, or the world has no file.
+        NothingRecordedError: The robot has no run.
+    """
+    sets = combinations(dict(parameters)) if isinstance(parameters, Mapping) else parameters
+    with recording.reader() as connection:
+        view = look(connection, robot)
+        run = view.require_run()
+        if run.world is None:
+            raise InvalidInputError(f"run {run.id} does not tell of which world file it is")
+        checked = _as_declared(declared_for(connection, view.robot.id), sets)
+        plan = WorldPlan(world=run.world, parameters=checked, robot=view.robot.name, **asked)
+        _require_scorable(connection, plan, view)
+    return plan
+
+
+def enter_cluster_set(recording: Recording, plan: WorldPlan, scheduler: str) -> int:
+    """Enter the set of such a plan; returns its id."""
+    text = json.dumps({SCHEDULER: scheduler, **json.loads(plan.text)}, sort_keys=True)
+    with recording.writer() as connection:
+        return create_trial_set(connection, text, plan.trials)
+
+
+def _require_scorable(connection: sqlite3.Connection, plan: Plan, view: View) -> None:
+    score = parse_score(plan.score)
+    require_kinds(connection, score, view.require_run().id)
+    if known := known_names(view):
+        score.require_known(known)
+
+
+def _as_declared(
+    declared: Mapping[str, Declared], sets: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
     """The values as the parameters hold them."""
-    declared = settable(recording, robot)
     require_known(list({name: None for values in sets for name in values}), list(declared))
     return [
         {name: declared[name].declaration.checked(value) for name, value in values.items()}
@@ -103,8 +144,23 @@ def _checked(
     ]
 
 
+def plan_of(recording: Recording, set_id: int) -> str:
+    """The text of a set's plan.
+
+    Raises:
+        InvalidInputError: There is no such set.
+    """
+    with recording.reader() as connection:
+        return fetch_trial_set(connection, set_id).plan
+
+
+def names_world(plan: str) -> bool:
+    """Whether the trials of a plan each have a simulator of their own."""
+    return "world" in json.loads(plan)
+
+
 def require_ours(recording: Recording, set_id: int) -> None:
-    """Refuse a set whose trials run in simulators of their own.
+    """Refuse a set that nobody here can go on with.
 
     Raises:
         InvalidInputError: It is one, or there is no such set.
@@ -112,15 +168,18 @@ def require_ours(recording: Recording, set_id: int) -> None:
     with recording.reader() as connection:
         found = fetch_trial_set(connection, set_id)
         if found.robot_id is None:
-            why = f"was begun from a shell: {_GOES_ON}" if _is_of_shell(found) else _FROM_ELSEWHERE
+            why = f"has simulators of its own: {_goes_on(found)}"
             raise InvalidInputError(
-                f"trial set {set_id} {why}; webots_get_trials(trial_set={set_id}) tells of it"
+                f"trial set {set_id} {why if names_world(found.plan) else _FROM_ELSEWHERE}; "
+                f"webots_get_trials(trial_set={set_id}) tells of it"
             )
 
 
-def _is_of_shell(found: TrialSet) -> bool:
-    """Only a plan file names a world."""
-    return "world" in json.loads(found.plan)
+def _goes_on(found: TrialSet) -> str:
+    """How a set goes on whose trials have simulators of their own."""
+    scheduler = json.loads(found.plan).get(SCHEDULER)
+    again = f"webots_run_trials(trial_set={found.id}, scheduler={scheduler or 'tcp://...'!r})"
+    return f"{again} goes on with it" if scheduler else f"{_GOES_ON}, or {again} on a cluster"
 
 
 def go_on(recording: Recording, set_id: int) -> None:
@@ -207,7 +266,7 @@ def _state(found: TrialSet, left: int, *, at_work: bool) -> tuple[str, str | Non
     if not left:
         return "done", None
     if found.robot_id is None:
-        return "left", _GOES_ON if _is_of_shell(found) else _FROM_ELSEWHERE
+        return "left", _goes_on(found) if names_world(found.plan) else _FROM_ELSEWHERE
     return why, f"{again} goes on with the {left} that are left"
 
 

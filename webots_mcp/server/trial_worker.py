@@ -12,8 +12,8 @@ import logging
 import sqlite3
 import threading
 import time
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
 from webots_mcp.server.running import ACTION
@@ -39,7 +39,10 @@ from webots_mcp.store.trials import (
     take_up,
     trials_of,
 )
-from webots_mcp.trials.plan import Plan, stored_plan
+from webots_mcp.trials.plan import Plan, WorldPlan, stored_plan
+
+if TYPE_CHECKING:
+    from webots_mcp.server.cluster_worker import ClusterWorker
 
 _LOOK_EVERY_S: Final = 0.02
 # So long that a controller that knows a reset only by its time having gone back notices the next.
@@ -347,7 +350,7 @@ class TrialWorkers:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._workers: list[TrialWorker] = []
+        self._workers: list[TrialWorker | ClusterWorker] = []
 
     def begin(self, set_id: int) -> None:
         """Work on a set.
@@ -356,8 +359,37 @@ class TrialWorkers:
             CommandRefusedError: Another process does.
         """
         worker = TrialWorker(self._recording, set_id)
-        self._workers = [each for each in self._workers if each.is_alive()] + [worker]
         worker.start()
+        self._keep(worker)
+
+    def begin_on_cluster(
+        self,
+        scheduler: str,
+        plan: WorldPlan,
+        enter: Callable[[], int],
+        *,
+        is_stand_in: bool = False,
+    ) -> int:
+        """Work on a set whose trials have simulators of their own; returns its id.
+
+        Args:
+            scheduler: The address of Dask's.
+            plan: Of the trials.
+            enter: Gives the set's id, once it is sure that its trials can be run.
+            is_stand_in: They run on the stand-in.
+
+        Raises:
+            CommandRefusedError, InvalidInputError: As `ClusterWorker`.
+        """
+        from webots_mcp.server.cluster_worker import ClusterWorker
+
+        worker = ClusterWorker(self._recording, scheduler, plan, is_stand_in=is_stand_in)
+        set_id = worker.begin(enter)
+        self._keep(worker)
+        return set_id
+
+    def _keep(self, worker: TrialWorker | ClusterWorker) -> None:
+        self._workers = [each for each in self._workers if each.is_alive()] + [worker]
 
     def stop(self) -> None:
         """The server ends."""

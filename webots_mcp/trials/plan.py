@@ -20,6 +20,7 @@ from webots_mcp.trials.ranges import Range, as_plain, read_ranges, require_kinds
 Search = Literal["tpe", "random"]
 MOST_TRIALS: Final = 10_000
 _MOST_SEED: Final = 2**63
+SCHEDULER: Final = "scheduler"  # in the text of a plan that an assistant has begun on a cluster
 _GRID: Final = "grid"
 _REQUIRED: Final = ("world", "score")
 
@@ -156,6 +157,23 @@ def read_plan(file: Path, search: Search | None = None) -> WorldPlan:
 def stored_plan(text: str) -> Plan:
     """What the text of a plan says whose trials run in a robot's simulation."""
     return Plan(**json.loads(text))
+
+
+def stored_world_plan(text: str) -> tuple[WorldPlan, bool]:
+    """What the text of a plan says whose trials have simulators of their own.
+
+    Returns:
+        The plan, and whether the stand-in is meant.
+
+    Raises:
+        InvalidInputError: Its world file is not there any more.
+    """
+    found = cast("dict[str, Any]", json.loads(text))
+    is_stand_in = bool(found.pop("stand_in", False))
+    found = {name: value for name, value in found.items() if name != SCHEDULER}
+    if found["ranges"]:
+        found["ranges"] = read_ranges(found["ranges"])
+    return WorldPlan(**found), is_stand_in
 
 
 def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> WorldPlan:

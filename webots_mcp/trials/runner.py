@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import DATABASE_NAME, make_folder
-from webots_mcp.errors import CommandRefusedError
+from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.store.leases import Job
 from webots_mcp.store.merging import merge
 from webots_mcp.store.recording import Recording
@@ -98,20 +98,41 @@ def run_trials(workshop: Workshop, set_id: int, told: Told) -> None:
         InvalidInputError: No trial of the set can succeed; nothing else is tried.
         StoppedError: Somebody wanted them to stop; what ran waits to be run again.
     """
+    run_taken_up(taken_up(workshop, set_id), set_id, told)
+
+
+def taken_up(workshop: Workshop, set_id: int) -> Workshop:
+    """A workshop that works on a set: `run_taken_up` has to follow.
+
+    Raises:
+        CommandRefusedError: Another process works on it.
+    """
     with workshop.recording.writer() as connection:
-        lease = take_up(connection, set_id)
+        job = Job(workshop.recording, take_up(connection, set_id))
         stop_trial_set(connection, set_id, None)
-        trials = trials_of(connection, set_id)
-    job = Job(workshop.recording, lease)
+    return replace(workshop, job=job)
+
+
+def run_taken_up(workshop: Workshop, set_id: int, told: Told) -> None:
+    """The rest of `run_trials`; why a set does not go on is noted in it."""
+    job = workshop.job
+    assert job is not None
     try:
         with job.renewed():
-            _run_left(replace(workshop, job=job), set_id, trials, told)
+            _run_left(workshop, set_id, told)
+    except (CommandRefusedError, InvalidInputError) as error:
+        with job.writer() as connection:
+            if fetch_trial_set(connection, set_id).stop_reason is None:
+                stop_trial_set(connection, set_id, str(error))
+        raise
     finally:
         with job.writer() as connection:
-            lay_down(connection, set_id, lease)
+            lay_down(connection, set_id, job.lease)
 
 
-def _run_left(workshop: Workshop, set_id: int, trials: list[Trial], told: Told) -> None:
+def _run_left(workshop: Workshop, set_id: int, told: Told) -> None:
+    with workshop.recording.reader() as connection:
+        trials = trials_of(connection, set_id)
     for trial in trials:
         if trial.is_over:
             shutil.rmtree(workshop.folder(trial), ignore_errors=True)

@@ -19,7 +19,8 @@ from webots_mcp.server.parameters import RobotName, TimeoutS, TrialSetId
 from webots_mcp.server.trial_worker import TrialWorkers
 from webots_mcp.store.analysis.ranking import Best
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.trials import fetch_trial_set, is_at_work, progress_of
+from webots_mcp.store.trials import TrialSet, fetch_trial_set, is_at_work, progress_of
+from webots_mcp.trials.plan import stored_world_plan
 
 _WAIT_S: Final = 60.0
 _TRIAL_S: Final = 300.0
@@ -83,6 +84,9 @@ async def webots_run_trials(
     trial_timeout_s: Annotated[float, Field(gt=0, description="Wall seconds.")] = _TRIAL_S,
     trial_set: TrialSetId = None,
     cancel: Annotated[bool, Field(description="Stop it after this trial.")] = False,
+    scheduler: Annotated[
+        str | None, Field(description="tcp://HOST:8786: on a Dask cluster, a simulator each.")
+    ] = None,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> TrialsAnswer:
@@ -102,12 +106,11 @@ async def webots_run_trials(
         asked = {"score": score, "best": best, "for_s": for_s, "until": until, "repeats": repeats}
         asked |= {"timeout_s": trial_timeout_s, "prune": prune}
         number = await to_thread.run_sync(
-            lambda: trial_sets.begin_set(recording, parameters, robot, **asked)
+            lambda: _begin(recording, workers, parameters, robot, scheduler, asked)
         )
-        await to_thread.run_sync(workers.begin, number)
     else:
         number = trial_set
-        await to_thread.run_sync(lambda: _take_up(recording, workers, number, cancel=cancel))
+        await to_thread.run_sync(_take_up, recording, workers, number, scheduler, cancel)
     await _wait(recording, ctx, number, timeout_s)
     return TrialsAnswer(**await to_thread.run_sync(trial_sets.told_of_set, recording, number))
 
@@ -118,17 +121,64 @@ def webots_get_trials(recording: Recording, trial_set: TrialSetId = None) -> Tri
     return TrialsAnswer(**trial_sets.told_of_set(recording, trial_set))
 
 
-def _take_up(recording: Recording, workers: TrialWorkers, set_id: int, *, cancel: bool) -> None:
+def _begin(
+    recording: Recording,
+    workers: TrialWorkers,
+    parameters: list[dict[str, _Value]] | dict[str, list[_Value]],
+    robot: str | None,
+    scheduler: str | None,
+    asked: dict[str, Any],
+) -> int:
+    if scheduler is None:
+        number = trial_sets.begin_set(recording, parameters, robot, **asked)
+        workers.begin(number)
+        return number
+    plan = trial_sets.planned_for_cluster(recording, parameters, robot, **asked)
+    return workers.begin_on_cluster(
+        scheduler, plan, lambda: trial_sets.enter_cluster_set(recording, plan, scheduler)
+    )
+
+
+def _take_up(
+    recording: Recording, workers: TrialWorkers, set_id: int, scheduler: str | None, cancel: bool
+) -> None:
     """Go on with a set, or end it, unless somebody is at it already."""
-    trial_sets.require_ours(recording, set_id)
     with recording.reader() as connection:
-        at_work = is_at_work(connection, fetch_trial_set(connection, set_id))
+        found = fetch_trial_set(connection, set_id)
+        at_work = is_at_work(connection, found)
+    if trial_sets.names_world(found.plan):
+        _take_up_elsewhere(recording, workers, found, scheduler, at_work=at_work, cancel=cancel)
+        return
+    if scheduler is not None:
+        raise InvalidInputError(f"trial set {set_id} runs in a robot's simulation, on no cluster")
+    trial_sets.require_ours(recording, set_id)
     if cancel:
         trial_sets.cancel(recording, set_id)
     elif not at_work:
         trial_sets.go_on(recording, set_id)
     if not at_work:
         workers.begin(set_id)
+
+
+def _take_up_elsewhere(
+    recording: Recording,
+    workers: TrialWorkers,
+    found: TrialSet,
+    scheduler: str | None,
+    *,
+    at_work: bool,
+    cancel: bool,
+) -> None:
+    """The same with one whose trials have simulators of their own."""
+    if cancel:
+        trial_sets.cancel(recording, found.id)
+    elif at_work:
+        return
+    elif scheduler is None:
+        trial_sets.require_ours(recording, found.id)
+    else:
+        plan, is_stand_in = stored_world_plan(found.plan)
+        workers.begin_on_cluster(scheduler, plan, lambda: found.id, is_stand_in=is_stand_in)
 
 
 async def _wait(recording: Recording, ctx: Context[Any], set_id: int, timeout_s: float) -> None:

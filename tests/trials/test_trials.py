@@ -90,16 +90,33 @@ def test_a_value_that_was_not_taken_is_a_failure_and_not_a_score(plan: Plan, run
 
 def test_two_cannot_work_on_one_set(project: Path, plan: Plan, run: Run) -> None:
     plan('score = "last(x)"\nuntil = "x > 1e6"\n[grid]\nspeed = [1.0, 2.0]')
+    assert "no database" in run("--so-far").stderr
     process = subprocess.Popen(command(project, "--jobs", "2"), stderr=subprocess.DEVNULL)
     try:
         wait_for_trial(project, 2, process)
         refused = run()
+        so_far = run("--so-far")
     finally:
         process.send_signal(signal.SIGTERM)
         process.wait(30)
 
     assert refused.returncode == 2
     assert f"process {process.pid} on " in refused.stderr
+    assert (so_far.returncode, so_far.stderr) == (0, "")
+    assert "trial set 1, no run was recorded" in so_far.stdout
+
+
+def test_what_is_over_so_far_is_ranked_and_who_leads_is_told(
+    project: Path, plan: Plan, run: Run
+) -> None:
+    plan('score = "last(x)"\nfor_s = 0.2\n[grid]\nspeed = [1.0]')
+    whole = run()
+    assert "best so far: speed 1, median 0.19" in whole.stderr
+
+    assert run("--so-far").stdout == whole.stdout
+
+    plan('score = "last(x)"\nfor_s = 0.3\n[grid]\nspeed = [1.0]')
+    assert "no trials of " in run("--so-far").stderr
 
 
 def test_the_example_tries_five_speeds_three_times() -> None:

@@ -6,6 +6,7 @@ import argparse
 import json
 import sys
 import threading
+import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, redirect_stdout
 from dataclasses import replace
@@ -24,15 +25,17 @@ from webots_mcp.cli.command import (
 from webots_mcp.cli.ending import ending_by_event
 from webots_mcp.cli.history import write_picture
 from webots_mcp.cli.tables import print_notes, print_table, text_of
+from webots_mcp.errors import NothingRecordedError
 
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.ranking import Ranking
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.trials import Result, Trial
     from webots_mcp.trials.plan import WorldPlan
-    from webots_mcp.trials.running import Command, Simulators
+    from webots_mcp.trials.running import Simulators
 
 
+_RANK_EVERY_S: Final = 1.0
 _WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
 
 
@@ -49,6 +52,8 @@ _WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
     argument("--plot", metavar="FILE", help="a .png or .svg file: the scores over the parameters"),
     argument("--again", action="store_true",
              help="from the start, also where all trials of the plan are done"),
+    argument("--so-far", action="store_true",
+             help="only print what is over, also while another process works on it"),
 )  # fmt: skip
 def trials(arguments: argparse.Namespace) -> None:
     """Try sets of parameters in runs of their own, score each run, and rank the sets.
@@ -64,16 +69,27 @@ def trials(arguments: argparse.Namespace) -> None:
     Ended by Ctrl-C or killed, the same command goes on with what is left.
     """
     from webots_mcp.trials.plan import read_plan
-    from webots_mcp.trials.runner import Workshop, run_trials
-    from webots_mcp.trials.searching import next_parameters, require_optuna
-    from webots_mcp.trials.simulators import stand_in, webots
 
     plan = read_plan(Path(arguments.plan), arguments.search)
-    command_of = stand_in if arguments.stand_in else webots
     picture = _picture_of(arguments)
+    if arguments.so_far:
+        recording = open_recording(arguments)
+        set_id = _begun_set(recording, plan, arguments)
+    else:
+        recording, set_id = _run(plan, arguments)
+    _show(recording, set_id, plan, as_json=arguments.json)
+    if picture is not None:
+        picture(recording, set_id)
+
+
+def _run(plan: WorldPlan, arguments: argparse.Namespace) -> tuple[Recording, int]:
+    """Run what is left of the plan's set; returns where it is recorded, and its id."""
+    from webots_mcp.trials.runner import Workshop, run_trials
+    from webots_mcp.trials.searching import next_parameters, require_optuna
+
     if plan.search:
         require_optuna()
-    with _simulators(arguments, plan, command_of) as simulators:
+    with _simulators(arguments, plan) as simulators:
         recording = replace(open_recording(arguments), read_only=False)
         recording.create()
         set_id = _set_of(recording, plan, arguments)
@@ -81,17 +97,17 @@ def trials(arguments: argparse.Namespace) -> None:
         workshop = Workshop(recording, plan, simulators, threading.Event(), search)
         with ending_by_event(workshop.stopping):
             run_trials(workshop, set_id, _Progress(recording, set_id, plan).tell)
-    _show(recording, set_id, plan, as_json=arguments.json)
-    if picture is not None:
-        picture(recording, set_id)
+    return recording, set_id
 
 
 def _simulators(
-    arguments: argparse.Namespace, plan: WorldPlan, command_of: Command
+    arguments: argparse.Namespace, plan: WorldPlan
 ) -> AbstractContextManager[Simulators]:
     """Where the trials run; that there is such a program is seen before anything is written."""
     from webots_mcp.trials.running import LocalSimulators
+    from webots_mcp.trials.simulators import stand_in, webots
 
+    command_of = stand_in if arguments.stand_in else webots
     if arguments.scheduler is not None:
         from webots_mcp.trials.cluster import cluster
 
@@ -122,21 +138,44 @@ def _set_of(recording: Recording, plan: WorldPlan, arguments: argparse.Namespace
     """The set that was begun with this plan, or a new one."""
     from webots_mcp.store.trials import create_trial_set, find_trial_set
 
-    text = json.dumps({"stand_in": arguments.stand_in, **json.loads(plan.text)}, sort_keys=True)
+    text = _text_of(plan, arguments)
     with recording.writer() as connection:
         known = None if arguments.again else find_trial_set(connection, text)
         return known or create_trial_set(connection, text, plan.trials)
 
 
+def _begun_set(recording: Recording, plan: WorldPlan, arguments: argparse.Namespace) -> int:
+    """The set that was begun with this plan.
+
+    Raises:
+        NothingRecordedError: There is none.
+    """
+    from webots_mcp.store.trials import find_trial_set
+
+    with recording.reader() as connection:
+        known = find_trial_set(connection, _text_of(plan, arguments))
+    if known is None:
+        raise NothingRecordedError(f"no trials of {arguments.plan} were begun with these options")
+    return known
+
+
+def _text_of(plan: WorldPlan, arguments: argparse.Namespace) -> str:
+    """By which a set is found again."""
+    return json.dumps({"stand_in": arguments.stand_in, **json.loads(plan.text)}, sort_keys=True)
+
+
 class _Progress:
-    """A line on stderr for each trial that is over."""
+    """A line on stderr for each trial that is over, and for each set that takes the lead."""
 
     def __init__(self, recording: Recording, set_id: int, plan: WorldPlan) -> None:
         from webots_mcp.store.trials import trials_of
 
         with recording.reader() as connection:
             known = trials_of(connection, set_id)
+        self._recording, self._set_id, self._plan = recording, set_id, plan
         self._of, self._over = plan.trial_count, sum(each.is_over for each in known)
+        self._leader: dict[str, Any] | None = None
+        self._ranked_s = 0.0
         if self._over:
             print(f"trial set {set_id}: {self._over} of {self._of} trials were done before",
                   file=sys.stderr)  # fmt: skip
@@ -148,6 +187,19 @@ class _Progress:
         came = f"{_WORDS[result.status]} {came}"
         said = f"{self._over}/{self._of}  {text_of(trial.values)}: {came}"
         print(said, file=sys.stderr, flush=True)
+        if time.monotonic() >= self._ranked_s + _RANK_EVERY_S and self._over < self._of:
+            self._tell_leader()
+            self._ranked_s = time.monotonic()
+
+    def _tell_leader(self) -> None:
+        from webots_mcp.store.trials import ranking_of, trials_of
+
+        with self._recording.reader() as connection:
+            first = ranking_of(trials_of(connection, self._set_id), self._plan.best).sets[0]
+        if first.score is not None and first.parameters != self._leader:
+            self._leader = first.parameters
+            said = f"{text_of(first.parameters)}, median {text_of(first.score.median)}"
+            print(f"      best so far: {said}", file=sys.stderr, flush=True)
 
 
 def _show(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, groupby
 from typing import Any, Final
 
@@ -179,15 +179,19 @@ def _standstills(
     found: list[Incident] = []
     start_s = 0.0
     before: Phase | None = None
+    reached = 0
     for (stands, told), group in groupby(phases, lambda each: (not each.speed_m_s, each.told_m_s)):
         part = list(group)
+        reached += len(part)
         end_s = start_s + sum(each.duration_s for each in part)
         if stands and end_s - start_s >= SURELY_NONE_S:
             turning = any(each.turn_rad_s for each in part)
             optional = turning or end_s - start_s < LEAST_STANDSTILL_S
-            least_s = _least_error_s(before, interval_s, noise_m)
-            stop = Incident("standstill", start_s, end_s, begin_error_s=least_s, optional=optional)
-            found.append(stop)
+            after = phases[reached] if reached < len(phases) else None
+            errors_s = (_least_error_s(each, interval_s, noise_m) for each in (before, after))
+            begin_s, last_s = errors_s
+            stop = Incident("standstill", start_s, end_s, optional=optional)
+            found.append(replace(stop, begin_error_s=begin_s, end_error_s=last_s))
             come = not told and any(each.mode in driven_in for each in part)
             if told or come or not known:
                 unclear = optional or come or not known

@@ -21,7 +21,8 @@ class Incident:
     Attributes:
         name: The published signal that it is about; None where it is about the robot.
         amplitude: Half of the way from one extreme to the other.
-        begin_error_s: Standard deviation that no unbiased estimate of its begin falls below.
+        begin_error_s: Standard deviation that no unbiased estimate of its begin falls below;
+            `end_error_s` of its end.
         optional: It lies at the limit of what counts, so that an answer may tell it or not.
         split: It is cut in two by a recording gap, so that an answer may tell it twice.
     """
@@ -33,6 +34,7 @@ class Incident:
     period_s: float | None = None
     amplitude: float | None = None
     begin_error_s: float = 0.0
+    end_error_s: float = 0.0
     optional: bool = False
     split: bool = False
 
@@ -124,7 +126,11 @@ def _reversed(run: LabelledRun) -> LabelledRun:
         columns={name: list(values)[::-1] for name, values in run.columns.items()},
         incidents=tuple(
             replace(
-                each, start_s=ends_s - each.end_s, end_s=ends_s - each.start_s, begin_error_s=0.0
+                each,
+                start_s=ends_s - each.end_s,
+                end_s=ends_s - each.start_s,
+                begin_error_s=each.end_error_s,
+                end_error_s=each.begin_error_s,
             )
             if each.measure != "leap"
             else _shifted(each, ends_s + run.interval_s - 2 * each.start_s)
@@ -152,5 +158,6 @@ def _joined(incidents: Iterable[Incident], within_s: float) -> list[Incident]:
             found.append(incident)
         else:
             optional = found[index].optional and incident.optional
-            found[index] = replace(found[index], end_s=incident.end_s, optional=optional)
+            ends = {"end_s": incident.end_s, "end_error_s": incident.end_error_s}
+            found[index] = replace(found[index], **ends, optional=optional)
     return found

@@ -13,6 +13,7 @@ from webots_mcp.store.analysis.spread import (
     Verdict,
     chance_of,
     chance_of_counts,
+    may_differ,
     spread_of,
     verdicts_on,
 )
@@ -79,6 +80,12 @@ def test_counts_of_groups_of_unequal_size_are_expected_by_their_runs() -> None:
         2 * sum(math.comb(9, n) * 0.2**n * 0.8 ** (9 - n) for n in (0, 1))
     )
     assert chance_of_counts([2000] * 3, [4000] * 3) == pytest.approx(0, abs=1e-12)
+
+
+def test_counts_of_few_events_cannot_differ_by_chance_and_do_not_hide_what_does() -> None:
+    assert not may_differ([[0, 0, 0, 0], [2, 2, 2, 3]])  # 2 * 0.5**9 is above 0.002
+    assert may_differ([[0, 0, 0, 0], [2, 2, 3, 3]])  # 2 * 0.5**10 is not
+    assert not may_differ([[3], [0, 0, 0, 0]]) and may_differ([[5], [0, 0, 0, 0]])  # 2 * 0.2**5
 
 
 def test_a_few_counts_that_happen_to_agree_are_not_certain() -> None:

@@ -72,6 +72,18 @@ def test_a_slow_way_is_used_as_far_as_it_is_straight_to_tell_when_it_ended() -> 
     assert statistics.median(errors_s) < 1.5 * 0.6745 * least_s
 
 
+def test_a_creep_between_drives_tells_the_begin_of_rest_as_exactly_as_its_rows_allow() -> None:
+    phases = [(20.0, 0.2, 0.0), (70.0, 0.002, 0.0), (40.0, 0.0, 0.0), (20.0, 0.2, 0.0)]
+    errors_s: list[float] = []
+    for seed in range(20):
+        track, _ = noisy_track(phases, 0.1, 0.005, seed)
+        (found,) = find_standstills(track, RADIUS_M, LEAST_S)
+        errors_s.append(float(track.times[found.start]) - 90.0)
+    # Of a ramp of 700 rows and a rest of 400, both unknown.
+    least_s = 0.005 / 0.002 * (4 / 700 + 1 / 400) ** 0.5
+    assert statistics.fmean(error**2 for error in errors_s) ** 0.5 < 2 * least_s
+
+
 CREEPS = (60.0, 0.001, 0.0)
 RESTS = (40.0, 0.0, 0.0)
 

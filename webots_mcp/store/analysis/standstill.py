@@ -16,7 +16,7 @@ _NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or tw
 UNSEEN_SLOPE: Final = 3.0  # deviations: a speed that is less may be noise alone
 _LEAST_RAMP_ROWS: Final = 4
 _MOST_RAMP_ROWS: Final = 2**14
-_AGREEING: Final = 1.5  # standard deviations: ends of one ramp in more and more rows
+_AGREEING: Final = 2.5  # standard deviations: ends of one ramp in more and more rows
 _RAMP_SHARE: Final = 0.75  # of the smoothed rows: so far a ramp is looked for at first
 _CERTAIN_RAMP: Final = 50.0  # variances of the noise: a ramp that explains more is none of it
 
@@ -151,9 +151,7 @@ def _begin_of_rest(track: Track, first: int, last: int) -> int:
 
     A slow robot is near its place long before it rests: its ramp is looked for in ever more rows,
     until it stands out from the noise. From then on more rows make its end more exact, as long as
-    they are of the same ramp: as long as the ends that ever more rows tell agree within their
-    standard deviations (A. Goldenshluger, A. Nemirovski, On spatially adaptive estimation of
-    nonparametric regression, Mathematical Methods of Statistics 6, 1997).
+    they are of the same ramp: as long as the end that more rows tell lies where it should.
 
     Args:
         track: The positions as recorded count: smoothing blurs the bend.
@@ -161,31 +159,27 @@ def _begin_of_rest(track: Track, first: int, last: int) -> int:
         last: Index of a row in rest.
     """
     reach = max(_LEAST_RAMP_ROWS, int(_RAMP_SHARE * track.smoothed_rows))
-    latest, quarter = (first + last) // 2, (last - first) // 4
-    surely = slice(first + quarter, last + 1 - quarter)
-    earliest_s, latest_s, begin = -np.inf, np.inf, None
+    latest, rested = (first + last) // 2, last + 1 - (last - first) // 4
+    found: _Ramp | None = None
     while first > 0:
         rows = slice(max(0, first - reach), min(latest, first + reach))
         if rows.stop <= rows.start:
             break
-        ramp = _end_of_ramp(track, rows, surely)
+        ramp = _end_of_ramp(track, rows, rested)
         widest = rows.start == 0 or reach >= _MOST_RAMP_ROWS
         certain = ramp.explained_m2 > _CERTAIN_RAMP * track.noise_m**2
-        if begin is None and not certain and not widest:
+        if found is None and not certain and not widest:
             reach *= 2
-        elif begin is None and ramp.end == rows.stop - 1 and rows.stop < latest:
+        elif found is None and ramp.end == rows.stop - 1 and rows.stop < latest:
             first = ramp.end
+        elif found is not None and not _is_same_ramp(track, found, ramp):
+            break
         else:
-            end_s = float(track.times[ramp.end])
-            if not earliest_s <= end_s <= latest_s:
+            found = ramp
+            if widest:
                 break
-            begin = ramp.end
-            if widest or not ramp.error_s:
-                break
-            earliest_s = max(earliest_s, end_s - _AGREEING * ramp.error_s)
-            latest_s = min(latest_s, end_s + _AGREEING * ramp.error_s)
             reach *= 2
-    return first if begin is None else begin
+    return first if found is None else found.end
 
 
 class _Ramp(NamedTuple):
@@ -193,39 +187,53 @@ class _Ramp(NamedTuple):
 
     Attributes:
         end: The row in which it rests.
+        rows: How many it has before that one.
         explained_m2: How many squares it explains.
-        error_s: Standard deviation of when it ends.
     """
 
     end: int
+    rows: int
+    speed_m_s: float
     explained_m2: float
-    error_s: float
 
 
-def _end_of_ramp(track: Track, rows: slice, rest: slice) -> _Ramp:
-    """Of ramps that end in rest, each in another row, the best.
-
-    Of n rows at a speed, the end is known to twice the noise over the speed and the root of n: the
-    bound of Cramer and Rao, where neither speed nor end is known.
+def _end_of_ramp(track: Track, rows: slice, rested: int) -> _Ramp:
+    """Of ramps that end in rest, each in another row, the best, with the place of that rest.
 
     Args:
         track: Recorded positions.
         rows: Where one may end.
-        rest: Rows in which it certainly stands.
+        rested: Until that row it certainly stands.
     """
-    off = np.stack([each[rows] - mean(each[rest]) for each in (track.raw_x, track.raw_y)])
+    whole = slice(rows.start, max(rows.stop, rested))
+    off = np.stack([each[rows] - mean(each[whole]) for each in (track.raw_x, track.raw_y)])
     times = track.times[rows] - track.times[rows.start]
-    counts = np.arange(len(times))
-    squares = _sums_before(times**2) - 2 * times * _sums_before(times) + counts * times**2
-    heights = _sums_before(times * off) - times * _sums_before(off)
-    explained: Array = (heights**2).sum(axis=0)
+    ones = np.ones_like(times)
+    sums, of_times, along = (_along_ramps(times, each) for each in (ones, times, off))
+    squares = times * sums - of_times - sums**2 / (whole.stop - whole.start)
+    explained: Array = (along**2).sum(axis=0)
     gain = np.divide(explained, squares, out=np.zeros_like(squares), where=squares > 0)
     best = int(np.argmax(gain))
     speed_m_s = float(np.sqrt(explained[best])) / squares[best] if squares[best] else 0.0
-    error_s = 2 * track.noise_m / (speed_m_s * best**0.5) if speed_m_s else 0.0
-    return _Ramp(rows.start + best, float(gain[best]), error_s)
+    return _Ramp(rows.start + best, best, speed_m_s, float(gain[best]))
 
 
-def _sums_before(values: Array) -> Array:
-    """Of all values before each."""
-    return np.cumsum(values, axis=-1) - values
+def _along_ramps(times: Array, values: Array) -> Array:
+    """The sum of the values before each row, each times the time that is left until then."""
+    sums, moments = (np.cumsum(each, axis=-1) - each for each in (values, times * values))
+    return times * sums - moments
+
+
+def _is_same_ramp(track: Track, found: _Ramp, wider: _Ramp) -> bool:
+    """Whether a ramp in more rows ends where it does if all of them are of one motion.
+
+    The end of n rows at a speed is known to twice the noise over the speed and the root of n: the
+    bound of Cramer and Rao, where neither speed nor end is known. Where both estimates reach it,
+    the variance of their difference is the difference of their variances (J. A. Hausman,
+    Specification tests in econometrics, Econometrica 46, 1978).
+    """
+    if not wider.rows or not wider.speed_m_s:
+        return False
+    more = 1 / max(found.rows, 1) - 1 / wider.rows
+    apart_m = float(track.times[wider.end] - track.times[found.end]) * wider.speed_m_s
+    return apart_m**2 <= more * (_AGREEING * 2 * track.noise_m) ** 2

@@ -13,6 +13,7 @@ from webots_mcp.store.analysis.spread import (
     Spread,
     Verdict,
     chance_of_counts,
+    may_differ,
     spread_of,
     verdicts_on,
 )
@@ -100,7 +101,7 @@ def outcomes_of(
     runs = [run for group in found for run in group]
     names = dict.fromkeys(name for run in runs for name in run.figures)
     kinds: list[str] = list(dict.fromkeys(kind for run in runs for kind in run.events))
-    tests = _facts(runs, list(names), kinds)
+    tests = _facts(found, list(names), kinds)
     measures = [
         _measure(name, figures, verdicts_on(figures, tests))
         for name in names
@@ -110,16 +111,21 @@ def outcomes_of(
     return Outcomes(tuple(measures), _not_known(runs))
 
 
-def _facts(runs: Sequence[_Outcome], names: Sequence[str], kinds: Sequence[str]) -> int:
+def _facts(groups: Sequence[Sequence[_Outcome]], names: Sequence[str], kinds: Sequence[str]) -> int:
     """How many figures can differ by chance, each on its own.
 
-    Not those that are the same in all runs, which cannot (R. E. Tarone, A modified Bonferroni
-    method for discrete data, Biometrics 46, 1990); the distance and the mean speed over the same
-    time are one fact, and the last share of the time follows from the others.
+    Not those that are the same in all runs, nor counts of too few events (`may_differ`); the
+    distance and the mean speed over the same time are one fact, and the last share of the time
+    follows from the others.
     """
+    runs = [run for group in groups for run in group]
     vary = [name for name in names if _varies([run.figure(name) for run in runs])]
     shares = sum(name.startswith(_SHARE) for name in vary)
-    counted = sum(len({run.events_of(kind) for run in runs}) > 1 for kind in kinds)
+    counted = sum(
+        may_differ([[run.events_of(kind) or 0 for run in group] for group in groups])
+        for kind in kinds
+        if len({run.events_of(kind) for run in runs}) > 1
+    )
     alike = (_SPEED in vary) + (shares > 0)
     return max(1, len(vary) - alike + counted)
 

@@ -116,7 +116,10 @@ def _chance_of_split(first: int, other: int, share: float) -> float:
 
 
 def verdicts_on(
-    groups: Sequence[Sequence[float | None]], tests: int, chance: Chance = chance_of
+    groups: Sequence[Sequence[float | None]],
+    tests: int,
+    chance: Chance = chance_of,
+    tests_of_more: int = 0,
 ) -> list[Verdict]:
     """Of each group whether it differs from the first by more than like runs do.
 
@@ -126,22 +129,24 @@ def verdicts_on(
         groups: A figure of each run of each group.
         tests: How many such questions are asked at once: the more, the surer each has to be.
         chance: How often like runs lie as far apart.
+        tests_of_more: How many are asked once there are more runs, if not as many.
     """
     known = [[each for each in group if each is not None] for group in groups]
     if any(len(a) < len(b) for a, b in zip(known, groups, strict=True)):
         return [Verdict(None)] * len(groups)
-    limit = MOST_CHANCE / max(tests, 1)
-    others = (_verdict(known[0], other, limit, chance) for other in known[1:])
+    limits = [MOST_CHANCE / max(each, 1) for each in (tests, tests_of_more or tests)]
+    others = (_verdict(known[0], other, limits, chance) for other in known[1:])
     return [Verdict(False), *others]
 
 
 def _verdict(
-    first: Sequence[float], other: Sequence[float], limit: float, chance: Chance
+    first: Sequence[float], other: Sequence[float], limits: Sequence[float], chance: Chance
 ) -> Verdict:
+    limit, of_more = limits
     found = chance(first, other)
     if found is None or found < limit:
         return Verdict(None if found is None else True)
-    wanted = _runs_wanted(first, other, limit, chance)
+    wanted = _runs_wanted(first, other, of_more, chance)
     return Verdict(None if wanted else False, wanted)
 
 

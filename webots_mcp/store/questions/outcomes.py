@@ -101,18 +101,20 @@ def outcomes_of(
     runs = [run for group in found for run in group]
     names = dict.fromkeys(name for run in runs for name in run.figures)
     kinds: list[str] = list(dict.fromkeys(kind for run in runs for kind in run.events))
-    tests = _facts(found, list(names), kinds)
+    tests, of_more = _facts(found, list(names), kinds)
     measures = [
-        _measure(name, figures, verdicts_on(figures, tests))
+        _measure(name, figures, verdicts_on(figures, tests, tests_of_more=of_more))
         for name in names
         for figures in [[[run.figure(name) for run in group] for group in found]]
     ]
-    measures += [_counted(kind, found, tests) for kind in kinds]
+    measures += [_counted(kind, found, tests, of_more) for kind in kinds]
     return Outcomes(tuple(measures), _not_known(runs))
 
 
-def _facts(groups: Sequence[Sequence[_Outcome]], names: Sequence[str], kinds: Sequence[str]) -> int:
-    """How many figures can differ by chance, each on its own.
+def _facts(
+    groups: Sequence[Sequence[_Outcome]], names: Sequence[str], kinds: Sequence[str]
+) -> tuple[int, int]:
+    """How many figures can differ by chance, each on its own, and how many if runs are repeated.
 
     Not those that are the same in all runs, nor counts of too few events (`may_differ`); the
     distance and the mean speed over the same time are one fact, and the last share of the time
@@ -121,13 +123,11 @@ def _facts(groups: Sequence[Sequence[_Outcome]], names: Sequence[str], kinds: Se
     runs = [run for group in groups for run in group]
     vary = [name for name in names if _varies([run.figure(name) for run in runs])]
     shares = sum(name.startswith(_SHARE) for name in vary)
-    counted = sum(
-        may_differ([[run.events_of(kind) or 0 for run in group] for group in groups])
-        for kind in kinds
-        if len({run.events_of(kind) for run in runs}) > 1
-    )
     alike = (_SPEED in vary) + (shares > 0)
-    return max(1, len(vary) - alike + counted)
+    kinds = [kind for kind in kinds if len({run.events_of(kind) for run in runs}) > 1]
+    counts = [[[run.events_of(kind) or 0 for run in group] for group in groups] for kind in kinds]
+    figures, counted = len(vary) - alike, sum(map(may_differ, counts))
+    return max(1, figures + counted), max(1, figures + len(kinds))
 
 
 def _varies(figures: Sequence[float | None]) -> bool:
@@ -144,7 +144,7 @@ def _measure(
     return Measure(name, [spread_of(each) for each in groups], list(different), list(wanted))
 
 
-def _counted(kind: str, groups: Sequence[Sequence[_Outcome]], tests: int) -> Measure:
+def _counted(kind: str, groups: Sequence[Sequence[_Outcome]], tests: int, of_more: int) -> Measure:
     """Events per minute; whether they differ is asked of their counts."""
     counts = [[run.events_of(kind) for run in group] for group in groups]
     per_min = [
@@ -154,7 +154,9 @@ def _counted(kind: str, groups: Sequence[Sequence[_Outcome]], tests: int) -> Mea
         ]
         for each in groups
     ]
-    return _measure(f"{kind}{_RATE}", per_min, verdicts_on(counts, tests, chance_of_counts))
+    return _measure(
+        f"{kind}{_RATE}", per_min, verdicts_on(counts, tests, chance_of_counts, of_more)
+    )
 
 
 def _not_known(runs: Sequence[_Outcome]) -> dict[str, str]:

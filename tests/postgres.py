@@ -1,7 +1,7 @@
 """A real PostgreSQL for tests: a server of its own in a folder of its own, as fast as it can be.
 
-It is skipped where there is no PostgreSQL 14 or newer; `./run tests` installs Debian's where it
-may.
+Tests that need it are skipped where there is no PostgreSQL 14 or newer; `./run tests` installs
+Debian's where it may.
 """
 
 from __future__ import annotations
@@ -171,16 +171,18 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
+class NoServerError(Exception):
+    """There can be no PostgreSQL server here; the text says why."""
+
+
 @contextmanager
 def running_server() -> Generator[Server]:
-    """A server as long as the block runs; skips the test where there can be none."""
-    if sys.platform == "win32":
-        pytest.skip("the tests start PostgreSQL on a Unix socket")
-    programs = find_programs()
-    if programs is None:
-        pytest.skip(f"there is no PostgreSQL {OLDEST} or newer")
-    if os.geteuid() == 0 and not _is_user(OWNER):
-        pytest.skip(f"PostgreSQL does not run as root, and there is no user {OWNER!r}")
+    """A server as long as the block runs.
+
+    Raises:
+        NoServerError: There can be none.
+    """
+    programs = _usable_programs()
     # A socket's path is short, and the folders of pytest are closed to other users.
     folder = Path(tempfile.mkdtemp(prefix="pg-"))
     folder.chmod(0o755)
@@ -192,6 +194,17 @@ def running_server() -> Generator[Server]:
         if (server.data / "postmaster.pid").exists():
             server.stop()
         shutil.rmtree(folder)
+
+
+def _usable_programs() -> Path:
+    if sys.platform == "win32":
+        raise NoServerError("the tests start PostgreSQL on a Unix socket")
+    programs = find_programs()
+    if programs is None:
+        raise NoServerError(f"there is no PostgreSQL {OLDEST} or newer")
+    if os.geteuid() == 0 and not _is_user(OWNER):
+        raise NoServerError(f"PostgreSQL does not run as root, and there is no user {OWNER!r}")
+    return programs
 
 
 def _is_user(name: str) -> bool:

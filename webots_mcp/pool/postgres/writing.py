@@ -1,8 +1,8 @@
 """Shipping to PostgreSQL: rows by COPY, in one transaction with how far they go.
 
-Rows of appended tables go straight to their table. Where PostgreSQL refuses a batch (a value that
-it cannot hold, a row that is there already), it goes the way of all others: through a temporary
-table, where JSON is text still, and from there row by row.
+Rows that are new, as a rule, go straight to their table. Where PostgreSQL refuses a batch (a value
+that it cannot hold, a row that is there already), it goes the way of all others: through a
+temporary table, where JSON is text still, and from there row by row.
 """
 
 from __future__ import annotations
@@ -27,6 +27,7 @@ from webots_mcp.pool.target import redacted
 
 _T = TypeVar("_T")
 _SHIPPER: Final = 1_463_962_947  # the first half of the lock of who ships a recording
+_MANY: Final = 500  # rows of a table that changes: as a rule, so many at once are new
 _TYPES: Final = {int: "bigint", float: "double precision", str: "text"}
 _REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
 # Of values, where a batch has one that PostgreSQL cannot hold; and of rows that are there already.
@@ -159,7 +160,8 @@ class PostgresShipment:
     def _write_batch(self, batch: Batch) -> None:
         if batch.table.name == "run":
             self._own_runs(batch)
-        if not batch.table.is_appended or not self._tried(lambda: self._append(batch)):
+        is_new = batch.table.is_appended or len(batch.rows) >= _MANY
+        if not is_new or not self._tried(lambda: self._append(batch)):
             self._merge(batch)
 
     def _own_runs(self, batch: Batch) -> None:

@@ -1,0 +1,149 @@
+"""How fast a pool in PostgreSQL takes rows: ours beside a bare COPY of the same rows."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Iterable
+from typing import Any, Final, NamedTuple
+
+import psutil
+
+from tests.benchmarks.measuring import Samples, alternate, ratio
+from tests.benchmarks.registry import Bench, NotMeasurableError, benchmark
+from tests.benchmarks.states import make_states
+from tests.benchmarks.table import Line, Target
+from tests.postgres import NoServerError, Server, running_server
+from webots_mcp.contract import new_uuid
+from webots_mcp.pool.batch import Batch, batches
+from webots_mcp.pool.postgres.connecting import Connection, connect
+from webots_mcp.pool.postgres.schema import prepare
+from webots_mcp.pool.postgres.writing import PostgresShipment
+from webots_mcp.pool.tables import Table, table
+
+_ROWS: Final = 20_000
+_BLOCKS: Final = 5
+_WALL_S: Final = 1.7e9
+_RESOLUTION_S: Final = 0.01  # of a process's times
+_LEAST: Final = Target(0.5, least=True)
+
+
+class _Taken(NamedTuple):
+    """Seconds by the clock, and of processor time on both sides."""
+
+    wall_s: float
+    shipper_s: float
+    server_s: float
+
+
+@benchmark(
+    "pool",
+    "rows into PostgreSQL (fsync off, on this machine), beside a bare COPY of the same rows",
+)
+def measure_pool(bench: Bench) -> Iterable[Line]:
+    try:
+        with running_server() as server:
+            yield from _measure(bench, server)
+    except NoServerError as reason:
+        raise NotMeasurableError(str(reason)) from reason
+
+
+def _measure(bench: Bench, server: Server) -> Iterable[Line]:
+    pool = server.new_database()
+    url = server.url(pool)
+    prepare(url, "the pool")
+    server.execute(pool, "SELECT make_partition('state', 2023, 11)")
+    rows = bench.count(_ROWS, 50)
+    for name, made in (("state", _states(rows)), ("rollup", _rollups(rows))):
+        bench.say(name)
+        with connect(url, "the pool") as connection:
+            yield from _lines(name, rows, _compare(connection, list(batches(table(name), made))))
+
+
+def _states(rows: int) -> Iterable[tuple[Any, ...]]:
+    texts = [json.dumps(each, separators=(",", ":")) for each in make_states()]
+    for number in range(rows):
+        yield _row(table("state"), {
+            "id": number + 1, "run_id": 1, "sim_time_s": number * 0.016,
+            "wall_time_s": _WALL_S + number * 0.016, "data": texts[number % len(texts)],
+        })  # fmt: skip
+
+
+def _rollups(rows: int) -> Iterable[tuple[Any, ...]]:
+    figures = dict.fromkeys(("first", "last", "min", "max", "sum", "squares"), 1.25)
+    for number in range(rows):
+        key = {"run_id": 1, "signal_id": number % 39, "bucket": number // 39}
+        yield _row(table("rollup"), {"rows": 600, "present": 600, "changes": 9} | key | figures)
+
+
+def _row(of: Table, values: dict[str, Any]) -> tuple[Any, ...]:
+    return tuple(values.get(column) for column in of.columns)
+
+
+def _compare(connection: Connection, shipped: list[Batch]) -> dict[str, list[_Taken]]:
+    def ours() -> _Taken:
+        shipment = PostgresShipment(connection, "the pool", new_uuid())
+        return _timed(connection, lambda: _ship(shipment, shipped))
+
+    def bare() -> _Taken:
+        name, columns = shipped[0].table.name, ", ".join(f'"{c}"' for c in shipped[0].table.columns)
+        text = _as_text(connection, shipped)
+        copy = f"COPY {name} (recording_uuid, {columns}) FROM STDIN".encode()
+        return _timed(connection, lambda: _copy(connection, copy, text))
+
+    return alternate({"ours": ours, "bare": bare}, _BLOCKS)
+
+
+def _ship(shipment: PostgresShipment, shipped: list[Batch]) -> None:
+    for number, each in enumerate(shipped):
+        shipment.write([each], {each.table.name: number})
+
+
+def _copy(connection: Connection, statement: bytes, text: list[bytes]) -> None:
+    with connection.cursor() as cursor, cursor.copy(statement) as copy:
+        for part in text:
+            copy.write(part)
+
+
+def _as_text(connection: Connection, shipped: list[Batch]) -> list[bytes]:
+    """The rows of a new recording as COPY has them, made before anything is timed."""
+    uuid = new_uuid()
+    return [
+        "".join("\t".join(map(_field, (uuid, *row))) + "\n" for row in each.rows).encode()
+        for each in shipped
+    ]
+
+
+def _field(value: Any) -> str:
+    return r"\N" if value is None else str(value).replace("\\", r"\\")
+
+
+def _timed(connection: Connection, work: Callable[[], None]) -> _Taken:
+    backend = psutil.Process(connection.info.backend_pid)
+    before, shipper_s, started_s = backend.cpu_times(), time.process_time(), time.perf_counter()
+    work()
+    wall_s = time.perf_counter() - started_s
+    shipper_s, after = time.process_time() - shipper_s, backend.cpu_times()
+    server_s = after.user + after.system - before.user - before.system
+    return _Taken(wall_s, shipper_s, server_s)
+
+
+def _lines(name: str, rows: int, taken: dict[str, list[_Taken]]) -> Iterable[Line]:
+    for said, of, target in (("clock", _clock, None), ("processors", _processors, _LEAST)):
+        ours, bare = (Samples.of(map(of, taken[who])) for who in ("ours", "bare"))
+        per_s = [f"{rows / each.p50:,.0f} rows/s" for each in (ours, bare)]
+        what = f"{name}, by the {said}"
+        yield Line(what, per_s[0], f"bare {per_s[1]}", ratio(bare, ours), target=target)
+    for side in ("shipper_s", "server_s"):
+        spent_s = sum(getattr(each, side) for each in taken["ours"])
+        per_s = round(rows * len(taken["ours"]) / max(spent_s, _RESOLUTION_S))
+        what = f"{name}, per second of a core of the {side.removesuffix('_s')}"
+        yield Line(what, "", "", per_s, "rows/s")
+
+
+def _clock(taken: _Taken) -> float:
+    return taken.wall_s
+
+
+def _processors(taken: _Taken) -> float:
+    return max(taken.shipper_s + taken.server_s, _RESOLUTION_S)

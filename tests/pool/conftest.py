@@ -13,13 +13,14 @@ from typing import Any
 import pytest
 
 from tests.pool.lab import Lab, short_runs
-from tests.pool.sqlite_target import SQLiteTarget, pooled
+from tests.pool.sqlite_target import SQLitePool, SQLiteTarget, pooled
 from tests.pool.sqlite_target import recorded as recorded_rows
 from tests.postgres import NoServerError, Server, running_server
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.pool.shipping import Order, Report, ship
+from webots_mcp.pool.target import open_pool, open_target
 from webots_mcp.schema import create_schema
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.rollup.rolling import roll
@@ -86,8 +87,17 @@ def postgres() -> Iterator[Server]:
 
 
 @pytest.fixture
-def lab(tmp_path: Path) -> Lab:
-    return Lab(tmp_path)
+def lab(tmp_path: Path, request: pytest.FixtureRequest) -> Lab:
+    """With a pool in one file, or of the kind that the test asks for."""
+    kind = getattr(request, "param", "sqlite")
+    file = tmp_path / "pool"
+    if kind == "sqlite":
+        return Lab(tmp_path, lambda: SQLiteTarget(file), lambda: SQLitePool(file))
+    url = str(file)
+    if kind == "postgres":
+        server: Server = request.getfixturevalue("postgres")
+        url = server.url(server.new_database())
+    return Lab(tmp_path, lambda: open_target(url), lambda: open_pool(url))
 
 
 @pytest.fixture

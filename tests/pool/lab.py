@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-from tests.pool.sqlite_target import SQLitePool, SQLiteTarget
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.pool.catalogue import Choice
 from webots_mcp.pool.fetching import Fetched, fetch
 from webots_mcp.pool.shipping import Order, Report, ship
+from webots_mcp.pool.target import Pool, Target
 from webots_mcp.schema import create_schema
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of
@@ -23,18 +23,20 @@ from webots_mcp.store.trials import Result, create_trial_set, finish_trial, tria
 class Lab:
     """A pool, and a folder of a recording to fetch into."""
 
-    def __init__(self, folder: Path) -> None:
-        self.pool, self.here = folder / "pool.db", folder / "here"
+    def __init__(
+        self, folder: Path, target: Callable[[], Target], pool: Callable[[], Pool]
+    ) -> None:
+        self._target, self.pool, self.here = target, pool, folder / "here"
         self.here.mkdir()
         with closing(connect(self.here / DATABASE_NAME, "writer", create=True)) as connection:
             create_schema(connection)
 
     def ship(self, database: Path, **options: Any) -> None:
         recording = Recording(database, database.parent, read_only=True)
-        ship(Order(recording, lambda: SQLiteTarget(self.pool), **options), Report())
+        ship(Order(recording, self._target, **options), Report())
 
     def fetch(self, **choice: Any) -> Fetched:
-        with self.opened() as connection, SQLitePool(self.pool) as pool:
+        with self.opened() as connection, self.pool() as pool:
             return fetch(pool, connection, self.here, Choice(**choice))
 
     def opened(self) -> closing[sqlite3.Connection]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id",
          "rolled_state_id", "coarse_end", "idempotency_key"}  # fmt: skip
 
 
+IN_EACH_POOL = pytest.mark.parametrize("lab", ["parquet", "postgres"], indirect=True)
 KEPT = "SELECT sim_time_s, data, odd FROM {} WHERE run_id = ? ORDER BY sim_time_s"
 
 
@@ -72,20 +74,27 @@ def rows(connection: sqlite3.Connection, table: str, where: str) -> list[Any]:
     names = [name for (_, name, *_) in connection.execute(f"PRAGMA table_info({table})")]
     columns = ", ".join(name for name in names if name not in LOCAL)
     query = f"SELECT {columns} FROM {table} WHERE {where} ORDER BY id"
-    return [tuple(map(value_of, row)) for row in connection.execute(query).fetchall()]
+    return valued(connection.execute(query))
+
+
+def valued(rows: Iterable[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    return [tuple(map(value_of, row)) for row in rows]
 
 
 def value_of(cell: Any) -> Any:
     return json.loads(cell) if isinstance(cell, str) and cell[:1] in "{[" and cell else cell
 
 
+@IN_EACH_POOL
 def test_a_run_of_full_rate_comes_back_with_the_same_answers_whatever_was_purged_since(
-    lab: Lab, rounds: Path
+    lab: Lab, tmp_path: Path
 ) -> None:
+    rounds, part = tmp_path / "there" / DATABASE_NAME, (25.0, 115.0)
+    record_rounds(rounds, 1000)
     lab.ship(rounds, full=True)
     uuid = uuid_of(rounds, 1)
     with closing(connect(rounds, "writer")) as there:
-        before = everything(there, rounds.parent, 1), answers(there, 1, PART)
+        before = everything(there, rounds.parent, 1), answers(there, 1, part)
         prune(there, rounds.parent, Retention(state=Limit(rows=0), outlive=0), rest=False)
     lab.ship(rounds, full=True)
 
@@ -95,9 +104,10 @@ def test_a_run_of_full_rate_comes_back_with_the_same_answers_whatever_was_purged
     with lab.opened() as here:
         run = found.runs[uuid]
         assert run_info(here, run).purged_rows == 0
-        assert (everything(here, lab.here, run), answers(here, run, PART)) == before
+        assert (everything(here, lab.here, run), answers(here, run, part)) == before
 
 
+@IN_EACH_POOL
 def test_of_a_run_of_summaries_the_answers_are_those_after_all_its_rows_were_purged(
     lab: Lab, rounds: Path
 ) -> None:
@@ -132,6 +142,7 @@ def test_of_a_run_whose_first_rows_were_purged_before_they_were_shipped_the_othe
         assert everything(here, lab.here, found.runs[uuid]) == everything(there, rounds.parent, 1)
 
 
+@IN_EACH_POOL
 def test_kept_stretches_come_whole_though_only_summaries_were_shipped(
     lab: Lab, tmp_path: Path
 ) -> None:
@@ -156,16 +167,17 @@ def test_kept_stretches_come_whole_though_only_summaries_were_shipped(
     run = found.runs[uuid]
     with closing(connect(database, "reader")) as there, lab.opened() as here:
         before, after = everything(there, database.parent, 1), everything(here, lab.here, run)
-        kept = here.execute(KEPT.format("kept_state"), (run,)).fetchall()
+        kept = valued(here.execute(KEPT.format("kept_state"), (run,)))
         in_both = "(SELECT * FROM every_state a WHERE EXISTS (SELECT 1 FROM kept_stretch k WHERE "
         in_both += "a.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s))"
-        assert kept == there.execute(KEPT.format(in_both), (1,)).fetchall() != []
+        assert kept == valued(there.execute(KEPT.format(in_both), (1,))) != []
     assert after["state"] == [] != before["state"]
     for name in ("log", "event", "image", "parameter_value", "parameter", "session", "pictures"):
         assert after[name] == before[name] != []
     assert found.unsummed == {uuid: 0}
 
 
+@IN_EACH_POOL
 def test_a_label_a_set_a_robot_and_a_time_say_which_runs_come(lab: Lab, runs: Recorded) -> None:
     database = runs.folder / DATABASE_NAME
     lab.ship(database, full=True, pictures=True)
@@ -191,6 +203,7 @@ def test_a_label_a_set_a_robot_and_a_time_say_which_runs_come(lab: Lab, runs: Re
             )
 
 
+@IN_EACH_POOL
 def test_a_trial_set_comes_with_its_runs_and_the_trials_that_wait(lab: Lab, runs: Recorded) -> None:
     lab.ship(runs.folder / DATABASE_NAME)
     (uuid,) = runs.connection.execute("SELECT uuid FROM trial_set").fetchone()
@@ -228,7 +241,7 @@ def test_pictures_that_were_not_shipped_are_rows_without_a_file(lab: Lab, runs: 
 
 
 def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
-    lab: Lab, runs: Recorded
+    lab: Lab, runs: Recorded, tmp_path: Path
 ) -> None:
     database = runs.folder / DATABASE_NAME
     late = runs.add_run(5, end=None)
@@ -244,14 +257,14 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
         "UPDATE run SET ended_wall_time_s = last_wall_time_s, end_reason = 'finished'"
     )
     lab.ship(database, full=True)
-    with closing(sqlite3.connect(lab.pool)) as pool, pool:
+    with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
         told = "FROM progress WHERE name = 'run.whole:0'"
         pool.execute(f"CREATE TABLE later AS SELECT * {told}")
         pool.execute(f"DELETE {told}")
     found = lab.fetch(run_uuid=uuid)
     assert (found.runs, found.arriving) == ({}, [uuid])
 
-    with closing(sqlite3.connect(lab.pool)) as pool, pool:
+    with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
         pool.execute("INSERT INTO progress SELECT * FROM later")
         pool.execute("CREATE TABLE state_later AS SELECT * FROM state WHERE run_id = ?", (late,))
         pool.execute("DELETE FROM state WHERE run_id = ? AND sim_time_s > 1", (late,))
@@ -259,7 +272,7 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
     assert (found.runs, found.arriving) == ({}, [uuid])
     assert lab.everything() == before
 
-    with closing(sqlite3.connect(lab.pool)) as pool, pool:
+    with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
         pool.execute("INSERT OR IGNORE INTO state SELECT * FROM state_later")
     assert list(lab.fetch(run_uuid=uuid).runs) == [uuid]
 

@@ -9,28 +9,22 @@ from typing import Any
 import pytest
 
 from tests.pool.lab import Lab
-from tests.pool.sqlite_target import SQLitePool
 from tests.recordings.runs import Recorded
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
 
 Ask = Callable[..., Any]
+pytestmark = pytest.mark.parametrize("lab", ["parquet"], indirect=True)
 
 
 @pytest.fixture
-def ask(
-    lab: Lab, runs: Recorded, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Ask:
-    """Runs a command, and gives what it prints."""
+def ask(lab: Lab, runs: Recorded, capsys: pytest.CaptureFixture[str]) -> Ask:
+    """Runs a command on a pool of Parquet files, and gives what it prints."""
     lab.ship(runs.folder / DATABASE_NAME)
 
-    def opened(url: str) -> SQLitePool:
-        return SQLitePool(lab.pool)
-
-    monkeypatch.setattr("webots_mcp.pool.target.open_pool", opened)
-
     def run(*words: str, code: int = 0) -> str:
-        assert main(list(words)) == code
+        url = [lab.pool().address if word == "POOL" else word for word in words]
+        assert main(url) == code
         said = capsys.readouterr()
         return said.err if code == 2 else said.out
 
@@ -38,40 +32,40 @@ def ask(
 
 
 def test_robots_runs_trial_sets_and_sizes_are_listed(ask: Ask) -> None:
-    robots = [line.split()[:4] for line in ask("pool", "./pool").splitlines()]
+    robots = [line.split()[:4] for line in ask("pool", "POOL").splitlines()]
     assert robots[0] == ["robot", "recordings", "runs", "rows"]
     assert sorted(robots[1:]) == [["drone", "1", "1", "4"], ["rover", "1", "2", "16"]]
-    assert "wall 1" in ask("pool", "./pool", "runs", "--robot", "rover")
-    assert "wall 3" not in ask("pool", "./pool", "runs", "--robot", "rover")
-    assert "2 robots in all: -n shows more" in ask("pool", "./pool", "-n", "1")
-    assert ask("pool", "./pool", "trials").splitlines()[1].split()[3:5] == ["3", "2"]
-    assert "event" in ask("pool", "./pool", "sizes")
+    assert "wall 1" in ask("pool", "POOL", "runs", "--robot", "rover")
+    assert "wall 3" not in ask("pool", "POOL", "runs", "--robot", "rover")
+    assert "2 robots in all: -n shows more" in ask("pool", "POOL", "-n", "1")
+    assert ask("pool", "POOL", "trials").splitlines()[1].split()[3:5] == ["3", "2"]
+    assert "event" in ask("pool", "POOL", "sizes")
 
 
 def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
-    found = json.loads(ask("pool", "./pool", "runs", "--label", "wall 2", "--json"))
+    found = json.loads(ask("pool", "POOL", "runs", "--label", "wall 2", "--json"))
     (run,) = found["runs"]
     (uuid,) = runs.connection.execute("SELECT uuid FROM run WHERE id = 2").fetchone()
     assert (run["uuid"], run["rows"], found["total"]) == (uuid, 6, 1)
-    assert json.loads(ask("pool", "./pool", "trials", "--json"))["total"] == 1
-    assert json.loads(ask("pool", "./pool", "sizes", "--json"))["tables"]
+    assert json.loads(ask("pool", "POOL", "trials", "--json"))["total"] == 1
+    assert json.loads(ask("pool", "POOL", "sizes", "--json"))["tables"]
 
 
 def test_a_select_is_answered_with_its_first_rows(ask: Ask) -> None:
     query = ("--sql", "SELECT label, NULL AS empty FROM run ORDER BY label")
-    said = ask("pool", "./pool", *query, "-n", "2").splitlines()
+    said = ask("pool", "POOL", *query, "-n", "2").splitlines()
     assert [line.split() for line in said[:3]] == [
         ["label", "empty"], ["wall", "1", "NULL"], ["wall", "2", "NULL"],
     ]  # fmt: skip
     assert said[3] == "note: only the first 2 rows: -n shows more"
-    answer = json.loads(ask("pool", "./pool", *query, "--json"))
+    answer = json.loads(ask("pool", "POOL", *query, "--json"))
     assert (answer["columns"], len(answer["rows"])) == (["label", "empty"], 3)
 
 
 def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None:
-    words = ("fetch", "--from", "./pool", "--data-dir", str(lab.here), "--robot", "rover")
+    words = ("fetch", "--from", "POOL", "--data-dir", str(lab.here), "--robot", "rover")
     assert ask(*words).splitlines() == [
-        f"of sqlite:{lab.pool} came: run 1 to 2",
+        f"of {lab.pool().address} came: run 1 to 2",
         "of run 1 to 2 only summaries were shipped, no rows ('webots-mcp ship --full' does)",
         "of run 1 to 2 not even summaries of all rows: those were not made where it was recorded, "
         "which a server does ('webots-mcp serve')",
@@ -80,6 +74,6 @@ def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None
 
 
 def test_what_is_not_there_is_refused_with_what_is(ask: Ask) -> None:
-    words = ("fetch", "--from", "./pool")
+    words = ("fetch", "--from", "POOL")
     assert "nearest are 'rover'" in ask(*words, "--robot", "rovr", code=2)
     assert "which runs?" in ask(*words, code=2)

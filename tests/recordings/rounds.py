@@ -16,7 +16,7 @@ ROWS: Final = 5200  # 1040 s: two coarse buckets and some
 PART: Final = (480.0, 720.0)  # within it, over the border of coarse buckets
 
 
-def record_rounds(file: Path) -> None:
+def record_rounds(file: Path, rows: int = ROWS) -> None:
     """Write run 1, rolled up, and run 2 of another robot, whose rows lie between its ids."""
     with closing(connect(file, "writer", create=True)) as connection:
         create_schema(connection)
@@ -25,7 +25,7 @@ def record_rounds(file: Path) -> None:
         robot_id = other.robot("drone")
         other.run(other.session(robot_id, "b" * 64), robot_id)
         connection.execute("BEGIN")
-        for step in range(ROWS):
+        for step in range(rows):
             recorder.publish(step * 0.2, *rover_state(step * 0.2 % 120))
             if step % 500 == 0:
                 other.publish(step * 0.2, {"height": step})

@@ -31,6 +31,8 @@ class ParquetPool:
         address: Without secrets.
     """
 
+    keeps_order = True  # JSON is held as the text that it was
+
     def __init__(self, url: str) -> None:
         package("pyarrow")
         self._storage = Storage(url)
@@ -82,6 +84,10 @@ class ParquetPool:
             with ThreadPoolExecutor(_AT_ONCE) as workers:
                 rows = sum(workers.map(self._row_count, files))
             yield PooledSize(each.name, rows, sum(files.values()))
+
+    def progress(self, recording_uuid: str) -> dict[str, int]:
+        """How far the recording was shipped."""
+        return dict(read_progress(self._storage, recording_uuid).numbers)
 
     def rows(
         self, recording_uuid: str, table: Table, where: Mapping[str, Collection[int]]

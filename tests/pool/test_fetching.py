@@ -5,6 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import sqlite3
+import subprocess
+import sys
+import time
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
@@ -20,6 +23,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.pool.target import open_pool, open_target
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.retention import Limit, Retention, prune
@@ -33,6 +37,7 @@ LOCAL = {"id", "run_id", "session_id", "robot_id", "command_id", "trial_set_id",
          "rolled_state_id", "coarse_end", "idempotency_key"}  # fmt: skip
 
 
+STATES = ("state", "kept_state")
 IN_EACH_POOL = pytest.mark.parametrize("lab", ["parquet", "postgres"], indirect=True)
 KEPT = "SELECT sim_time_s, data, odd FROM {} WHERE run_id = ? ORDER BY sim_time_s"
 
@@ -74,7 +79,13 @@ def rows(connection: sqlite3.Connection, table: str, where: str) -> list[Any]:
     names = [name for (_, name, *_) in connection.execute(f"PRAGMA table_info({table})")]
     columns = ", ".join(name for name in names if name not in LOCAL)
     query = f"SELECT {columns} FROM {table} WHERE {where} ORDER BY id"
-    return valued(connection.execute(query))
+    found = valued(connection.execute(query))
+    return [*found, *map(keys_of, connection.execute(query))] if table in STATES else found
+
+
+def keys_of(row: tuple[Any, ...]) -> list[str]:
+    """The texts of JSON without its spaces: the order of the keys counts."""
+    return [json.dumps(json.loads(cell)) for cell in row if isinstance(cell, str)]
 
 
 def valued(rows: Iterable[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
@@ -291,6 +302,43 @@ def test_a_run_that_lacks_is_answered_with_the_nearest(lab: Lab, runs: Recorded)
         lab.fetch(robot="rovr")
     with pytest.raises(InvalidInputError, match="which runs"):
         lab.fetch()
+
+
+def test_a_fetch_that_is_killed_leaves_whole_runs_and_is_gone_on_with(
+    tmp_path: Path, runs: Recorded
+) -> None:
+    for _ in range(60):
+        run_id = runs.add_run(20)
+        for table in ("session", "run"):
+            update = f"UPDATE {table} SET uuid = ? WHERE id = ?"
+            runs.connection.execute(update, (new_uuid(), run_id))
+    url = str(tmp_path / "pool")
+    lab = Lab(tmp_path, lambda: open_target(url), lambda: open_pool(url))
+    lab.ship(runs.folder / DATABASE_NAME, full=True)
+    words = ("fetch", "--from", url, "--robot", "rover", "--data-dir", str(lab.here))
+    line = [sys.executable, "-m", "webots_mcp", *words]
+    with subprocess.Popen(line) as fetching, lab.opened() as here:
+        while not count(here, "run") and fetching.poll() is None:
+            time.sleep(0.001)
+        fetching.kill()
+        fetching.wait()
+        some = count(here, "run")
+        assert here.execute(
+            "SELECT count(*) FROM run WHERE rows <> (SELECT count(*) FROM state "
+            "WHERE run_id = run.id) OR NOT EXISTS (SELECT 1 FROM image WHERE run_id = run.id)"
+        ).fetchone() == (0,)
+
+    found = lab.fetch(robot="rover")
+
+    assert len(found.known) == some
+    assert len(found.runs) == 62
+    with lab.opened() as here:
+        assert count(here, "state") == 16 + 60 * 20
+    assert not list(lab.here.glob(".fetch-*"))
+
+
+def count(connection: sqlite3.Connection, table: str) -> int:
+    return connection.execute(f"SELECT count(*) FROM {table}").fetchone()[0]
 
 
 def test_what_a_killed_fetch_left_is_removed_by_the_next(lab: Lab, runs: Recorded) -> None:

@@ -51,6 +51,14 @@ class Shipped:
         self.roll()
         return run_id
 
+    def keep(self, run_id: int, start_s: float, end_s: float) -> None:
+        """A stretch at full rate."""
+        self.connection.execute(
+            "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, "
+            "wall_time_s, reason) VALUES (?, ?, ?, ?, 0, 'a bump')",
+            (run_id, new_uuid(), start_s, end_s),
+        )
+
     def roll(self) -> None:
         while not roll(self.connection).done:
             pass

@@ -28,6 +28,7 @@ from webots_mcp.pool.shipping import Report, follow
 from webots_mcp.schema import create_schema
 from webots_mcp.store.merging import merge
 from webots_mcp.store.migrate import downgrade
+from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention.shipped import read_shipped
 from webots_mcp.store.rollup.rolling import forget
 
@@ -62,11 +63,7 @@ def test_without_full_rate_no_states_are_sent_but_those_of_kept_stretches(
     shipped: Shipped,
 ) -> None:
     run_id = shipped.add_run(60)
-    shipped.connection.execute(
-        "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, wall_time_s, "
-        "reason) VALUES (?, ?, 2, 4, 0, 'a bump')",
-        (run_id, new_uuid()),
-    )
+    shipped.keep(run_id, 2, 4)
     shipped.ship()
     pooled, rows = shipped.pooled(), shipped.rows()
     sim_time_s = 2
@@ -82,11 +79,7 @@ def test_a_kept_state_that_retention_moved_is_in_the_pool_once(
     shipped: Shipped, full: bool
 ) -> None:
     run_id = shipped.add_run(60)
-    shipped.connection.execute(
-        "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, wall_time_s, "
-        "reason) VALUES (?, ?, 2, 4, 0, 'a bump')",
-        (run_id, new_uuid()),
-    )
+    shipped.keep(run_id, 2, 4)
     shipped.ship(full=full)
     before = shipped.pooled()["state"]
     shipped.recorded.prune(states(rows=10))
@@ -100,11 +93,7 @@ def test_kept_states_that_were_moved_before_anything_was_shipped_are_in_the_pool
     shipped: Shipped,
 ) -> None:
     run_id = shipped.add_run(60)
-    shipped.connection.execute(
-        "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, wall_time_s, "
-        "reason) VALUES (?, ?, 2, 4, 0, 'a bump')",
-        (run_id, new_uuid()),
-    )
+    shipped.keep(run_id, 2, 4)
     shipped.recorded.prune(states(rows=10))
     shipped.ship()
     assert shipped.pooled()["kept_state"] == shipped.rows()["kept_state"] != []
@@ -352,3 +341,54 @@ def test_while_a_pool_writes_the_log_of_the_database_can_be_cut_back(shipped: Sh
 
     shipped.ship(full=True, open_target=lambda: SQLiteTarget(shipped.pool, cut_back))
     assert busy == [0] * len(busy) != []
+
+
+@pytest.mark.parametrize("full", [False, True])
+def test_states_that_retention_moved_while_no_shipper_ran_are_in_the_pool_once(
+    shipped: Shipped, full: bool
+) -> None:
+    run_id = shipped.add_run(20, end=None)
+    shipped.keep(run_id, 2, 40)
+    shipped.ship(full=full)
+    for i in range(20, 60):
+        shipped.recorded.publish(i / 2, {"x": i, "mode": "c"})
+    shipped.roll()
+    shipped.recorded.prune(states(rows=5))
+    assert shipped.ship(full=full).lost.keys() <= {"state"}
+    pooled = shipped.pooled()
+    in_state = [row[2] for row in pooled["state"]]
+    in_kept = [row[3] for row in pooled["kept_state"]]
+    first = 0 if full else 4
+    assert sorted(in_state + in_kept) == [i / 2 for i in range(first, 60)]
+
+
+def test_a_recording_that_is_not_there_yet_is_waited_for_and_one_in_its_place_is_noticed(
+    shipped: Shipped, tmp_path: Path
+) -> None:
+    shipped.add_run()
+    shipped.connection.execute("VACUUM INTO ?", (str(tmp_path / "copy.db"),))
+    database, other = tmp_path / "late" / "webots.db", new_uuid()
+    said: list[str] = []
+
+    def hear(text: str) -> None:
+        said.append(text)
+        database.parent.mkdir(exist_ok=True)
+        shutil.copy(tmp_path / "copy.db", database)
+        if len(said) > 1:
+            raise KeyboardInterrupt
+
+    def replace_it() -> None:
+        with closing(connect(database, "writer")) as connection:
+            connection.execute("UPDATE recording SET uuid = ?", (other,))
+
+    order = replace(
+        shipped.order,
+        recording=Recording(database, database.parent, read_only=True),
+        open_target=lambda: SQLiteTarget(shipped.pool, replace_it),
+        full=True,
+    )
+    with pytest.raises(KeyboardInterrupt):
+        follow(order, Report(), hear, 0.0)
+    assert "It is shipped as soon as it is there" in said[0]
+    assert f"the recording {other} stands now where {shipped.uuid} was" in said[1]
+    assert pooled(shipped.pool, shipped.uuid) == shipped.rows()

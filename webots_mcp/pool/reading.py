@@ -75,14 +75,6 @@ class Stretch(NamedTuple):
     end_sim_time_s: float
     is_over: bool
 
-    def holds(self, run_id: SQLValue, sim_time_s: SQLValue) -> bool:
-        """Whether a moment of a run lies in it."""
-        return (
-            run_id == self.run_id
-            and isinstance(sim_time_s, int | float)
-            and self.start_sim_time_s <= sim_time_s <= self.end_sim_time_s
-        )
-
 
 class Source:
     """A connection to a recording, and which of its runs are another's to ship.

@@ -13,22 +13,24 @@ from collections.abc import Callable, Generator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Final
+from typing import Final, NoReturn
 
 from webots_mcp.connection import FrozenConnection
 from webots_mcp.errors import (
     InvalidInputError,
+    NoDatabaseError,
     NothingRecordedError,
     PoolBusyError,
     PoolError,
     PoolUnavailableError,
+    WebotsMCPError,
 )
-from webots_mcp.pool.batch import Batch, Row, row_bytes
+from webots_mcp.pool.batch import Batch, row_bytes
+from webots_mcp.pool.kept import Kept
 from webots_mcp.pool.reading import (
     ROLLED,
     Mark,
     Source,
-    Stretch,
     digest,
 )
 from webots_mcp.pool.summaries import Summaries
@@ -44,9 +46,7 @@ THOROUGH_S: Final = 30.0  # between two looks at all of what may change, and not
 _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 60.0
 _UNCHECKED: Final = -1
-# Names of the progress, beside those of tables.
-_STATE_TIME: Final = "state.wall_time_us"  # of the newest state that was shipped
-_PICTURE: Final = "picture"
+_PICTURE: Final = "picture"  # of the progress: the last one whose file was shipped
 
 Say = Callable[[str], None]
 
@@ -109,7 +109,8 @@ def ship(order: Order, report: Report) -> None:
 def follow(order: Order, report: Report, say: Say, pause_s: float) -> None:
     """Ship what is there and what comes, until a KeyboardInterrupt.
 
-    A pool that is away is tried again, each time after a longer wait.
+    A pool that is away is tried again, each time after a longer wait; a recording that is not there
+    yet is waited for.
 
     Args:
         order: What.
@@ -121,25 +122,59 @@ def follow(order: Order, report: Report, say: Say, pause_s: float) -> None:
         PoolError: The pool will not be better by itself.
         DatabaseError: The recording cannot be read.
     """
-    wait_s, was_there = 0.0, False
+    patience = _Patience(say, pause_s)
     while True:
-        try:
-            with _shipper(order, report) as shipper:
-                if wait_s:
-                    say(f"the pool {shipper.address} is there again")
-                was_there, wait_s = True, 0.0
-                _go_on(shipper, pause_s)
-        except PoolBusyError:
-            if not was_there:
-                raise
-            wait_s = _FIRST_WAIT_S  # a server finds out late that the connection of before is gone
-        except PoolUnavailableError as error:
-            wait_s = min(max(2 * wait_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
-            say(f"{error}; trying again in {wait_s:g} s, nothing is lost meanwhile")
-        time.sleep(wait_s)
+        time.sleep(_go_on_until_it_fails(order, report, say, pause_s, patience))
 
 
-def _go_on(shipper: _Shipper, pause_s: float) -> None:
+def _go_on_until_it_fails(
+    order: Order, report: Report, say: Say, pause_s: float, patience: _Patience
+) -> float:
+    """Ship as long as recording and pool are there; returns how long to wait then."""
+    try:
+        with _shipper(order, report) as shipper:
+            patience.connected(shipper.address)
+            _go_on(shipper, pause_s)
+    except _ReplacedError as error:
+        say(f"{error}: that one is shipped from here on")
+        return 0.0
+    except (NoDatabaseError, PoolBusyError, PoolUnavailableError) as error:
+        return patience.wait_after(error)
+
+
+class _Patience:
+    """How long to wait before the next attempt, and what is said of it."""
+
+    def __init__(self, say: Say, pause_s: float) -> None:
+        self._say = say
+        self._pause_s = pause_s
+        self._away_s = 0.0
+        self._was_there = False
+        self._has_told = False
+
+    def connected(self, address: str) -> None:
+        """The recording and the pool are there."""
+        if self._away_s:
+            self._say(f"the pool {address} is there again")
+        self._away_s, self._was_there, self._has_told = 0.0, True, False
+
+    def wait_after(self, error: WebotsMCPError) -> float:
+        """In seconds; what would not be better after it is raised again."""
+        if isinstance(error, NoDatabaseError):
+            if not self._has_told:
+                self._say(f"{error}. It is shipped as soon as it is there")
+            self._has_told = True
+            return self._pause_s
+        if isinstance(error, PoolBusyError):
+            if not self._was_there:
+                raise error
+            return _FIRST_WAIT_S  # a server finds out late that our last connection is gone
+        self._away_s = min(max(2 * self._away_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
+        self._say(f"{error}; trying again in {self._away_s:g} s, nothing is lost meanwhile")
+        return self._away_s
+
+
+def _go_on(shipper: _Shipper, pause_s: float) -> NoReturn:
     next_s = 0.0
     while True:
         is_thorough = time.monotonic() >= next_s
@@ -157,6 +192,10 @@ def _shipper(order: Order, report: Report) -> Generator[_Shipper]:
         target.prepare()
         with target.shipment(uuid) as shipment:
             yield _Shipper(order, report, uuid, target, shipment)
+
+
+class _ReplacedError(PoolError):
+    """Another recording stands where the one was that is shipped."""
 
 
 class _Outbox:
@@ -211,6 +250,7 @@ class _Shipper:
         self._marks: list[Mark] = []
         self._watermark = 0
         self._summaries = Summaries(self._progress, self._put)
+        self._kept = Kept(self._progress, self._put)
         self._ended = set[int]()
         self.address = target.address
 
@@ -229,18 +269,18 @@ class _Shipper:
             self._require_the_same(source)
             self._ship_changing(source, thorough=thorough)
             self._summaries.ship(source, self._marks, self._watermark)
-            all_of = [self._ship_appended(source, each) for each in self._appended()]
-            if not self._order.full:
-                self._ship_kept(source, thorough=thorough)
+            is_complete = self._ship_all_appended(source)
+            if is_complete and not self._order.full:
+                self._kept.ship(source, self._last_ids["state"], thorough=thorough)
             if self._order.pictures:
                 self._ship_pictures(source)
-            if all(all_of):
+            if is_complete:
                 self._tell_whole(source)
             self._outbox.send()
             is_frozen = isinstance(connection, FrozenConnection)
         if not is_frozen:
-            self._leave_word(started_s, is_complete=all(all_of))
-        return all(all_of)
+            self._leave_word(started_s, is_complete=is_complete)
+        return is_complete
 
     def _appended(self) -> list[Table]:
         """States last: others should not wait for the largest table."""
@@ -255,9 +295,7 @@ class _Shipper:
             PoolError: It is not.
         """
         if (uuid := source.uuid()) != self._uuid:
-            raise PoolError(
-                f"another recording ({uuid}) stands where {self._uuid} was: ship it anew"
-            )
+            raise _ReplacedError(f"the recording {uuid} stands now where {self._uuid} was")
         if self._is_checked:
             return
         for each in (table("run"), *self._appended()):
@@ -328,6 +366,15 @@ class _Shipper:
                 last = self._progress[each.name]
         return True
 
+    def _ship_all_appended(self, source: Source) -> bool:
+        """Ship the next rows of the appended tables; returns whether these were all.
+
+        States come after all others: where retention moves one, it is looked for among them.
+        """
+        *others, last = self._appended()
+        are_all = [self._ship_appended(source, each) for each in others]
+        return all(are_all) and self._ship_appended(source, last)
+
     def _ship_appended(self, source: Source, each: Table) -> bool:
         """Ship the next rows; returns whether these were all."""
         after, upto = self._progress.get(each.name, 0), self._last_ids[each.name]
@@ -335,44 +382,17 @@ class _Shipper:
             if after >= upto:
                 return True
             batch, last, found = source.appended(each, after, upto)
-            if lost := last - after - found:
+            told = _told_of(batch, last)
+            lost = last - after - found
+            if lost:
                 self._report.lost[each.name] += lost
-            self._put(self._not_moved(source, batch), _told_of(batch, last))
+            if each.name == "state":
+                told |= self._kept.told_of(batch.rows, lost, after)
+            elif each.name == "kept_state":
+                batch = self._kept.without_moved(source, batch)
+            self._put(batch, told)
             after = last
         return after >= upto
-
-    def _not_moved(self, source: Source, batch: Batch) -> Batch:
-        """Without those kept states that retention moved from `state` after they were shipped."""
-        if batch.table.name != "kept_state":
-            return batch
-        columns = batch.table.columns
-        call, run, sim, wall = map(columns.index, ("call", "run_id", "sim_time_s", "wall_time_s"))
-        shipped_us = self._progress.get(_STATE_TIME, -1)
-        known = [each for each in source.stretches() if _name_of(each) in self._progress]
-
-        def is_shipped(row: Row) -> bool:
-            wall_time_s = row[wall]
-            return row[call] is None and (
-                (isinstance(wall_time_s, int | float) and _microseconds(wall_time_s) <= shipped_us)
-                or any(each.holds(row[run], row[sim]) for each in known)
-            )
-
-        return Batch(batch.table, [row for row in batch.rows if not is_shipped(row)])
-
-    def _ship_kept(self, source: Source, *, thorough: bool) -> None:
-        """Ship the states of kept stretches: a stretch has both those and its kept states."""
-        states = table("state")
-        for stretch in source.stretches():
-            after, is_all = self._progress.get(_name_of(stretch)), False
-            if stretch.is_over and after is not None and not thorough:
-                continue
-            while not is_all:
-                upto = self._last_ids["state"]
-                batch, is_all = source.kept(states, stretch, after or 0, upto)
-                last = int(str(batch.rows[-1][0])) if batch.rows else after or 0
-                if after != last:
-                    self._put(batch, {_name_of(stretch): last})
-                after = last
 
     def _ship_pictures(self, source: Source) -> None:
         """Ship the files of the pictures whose rows are shipped."""
@@ -433,17 +453,4 @@ def _told_of(batch: Batch, last: int) -> dict[str, int]:
     """The progress that these rows make, with a digest of the last one."""
     name = batch.table.name
     newest = batch.rows[-1] if batch.rows and batch.rows[-1][0] == last else None
-    told = {name: last, f"{name}.check": digest([newest]) if newest else _UNCHECKED}
-    if name == "state" and batch.rows:
-        wall_time_s = batch.rows[-1][batch.table.columns.index("wall_time_s")]
-        if isinstance(wall_time_s, int | float):
-            told[_STATE_TIME] = _microseconds(wall_time_s)
-    return told
-
-
-def _name_of(stretch: Stretch) -> str:
-    return f"kept_stretch/{stretch.id}"
-
-
-def _microseconds(time_s: float) -> int:
-    return round(time_s * 1e6)
+    return {name: last, f"{name}.check": digest([newest]) if newest else _UNCHECKED}

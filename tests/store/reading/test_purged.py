@@ -16,7 +16,8 @@ from webots_mcp.store.questions.compare import Comparison, compare_code, compare
 from webots_mcp.store.questions.events import Events, find_events
 from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.reading.ranges import Scope, find_range
+from webots_mcp.store.reading.coverage import less_time
+from webots_mcp.store.reading.ranges import Scope, Segment, find_range
 from webots_mcp.store.retention import Limit, Retention, prune
 from webots_mcp.store.rollup.rolling import roll
 
@@ -46,6 +47,41 @@ def test_an_overview_is_the_same_after_a_purge(rover: sqlite3.Connection, tmp_pa
     assert after.numbers[0].max == before.numbers[0].max
     assert after.numbers[0].count == before.numbers[0].count
     assert after.changes == before.changes
+
+
+def test_gaps_of_purged_rows_are_told_or_said_to_be_hidden(tmp_path: Path) -> None:
+    with memory_connection() as connection:
+        recorder = start_run(connection)
+        for step in range(1000):
+            if not 330 < step < 380 and not 430 < step < 610:
+                recorder.publish(step / 10, {"x": 1.0})
+        recorder.end_run("finished")
+        roll(connection, 100_000)
+        for rows_left in (300, 0):
+            keep_rows(connection, tmp_path, rows_left)
+            found = gaps_of(connection)
+            (gap,) = found.events
+            assert (gap.start_s, gap.end_s) == (43.0, 61.0)
+            hidden = found.verdicts.not_searched["gap"]
+            assert hidden.startswith("rows are missing between 30 and 39.9 s: the rows about them")
+        assert gap.wall_time_s == pytest.approx(WALL_START_S + 0.5 * 43, abs=0.1)
+
+
+def gaps_of(connection: sqlite3.Connection) -> Events:
+    whole = find_range(connection, Scope(run_id=1))
+    return find_events(connection, whole, EventOptions(kinds=("gap",)), limit=10, around=())
+
+
+def test_only_what_has_rows_left_is_advised_to_be_asked_for(
+    rover: sqlite3.Connection, tmp_path: Path
+) -> None:
+    segment = Segment(1, 0.0, 120.0)
+    assert less_time(rover, segment) == "ask for less time"
+    keep_rows(rover, tmp_path, 1500)
+    assert less_time(rover, segment) == (
+        "ask for less time from 55 s on: the rows before were purged"
+    )
+    assert less_time(rover, Segment(1, 0.0, 50.0)) == "its rows were purged"
 
 
 def test_what_is_left_is_read_from_rows(rover: sqlite3.Connection, tmp_path: Path) -> None:

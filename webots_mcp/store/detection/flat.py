@@ -35,8 +35,7 @@ def flat_events(search: Search) -> Iterator[Event]:
     signals = search.required_quantities()
     search.note_too_large("flat")
     if (shortest_s := search.view.shortest_rest_s) and search.only is None:
-        advice = "" if search.is_purged else ": ask for less time"
-        why = f"not all of noisy signals for less than {shortest_s:g} s{advice}"
+        why = f"not all of noisy signals for less than {shortest_s:g} s: {search.less_time}"
         search.not_searched("flat", why)
     resting: dict[str, list[Span]] = {}
     sooner: list[tuple[Resting, Span]] = []

@@ -54,7 +54,8 @@ def _note_periods(search: Search) -> None:
     elif search.view.is_long and search.options.oscillation_period_s is None:
         search.not_searched(
             "oscillation",
-            f"not with a period of more than {longest_s:g} s in so long a range: ask for less time",
+            f"not with a period of more than {longest_s:g} s in so long a range: "
+            f"{search.less_time}",
         )
 
 

@@ -14,10 +14,11 @@ from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.kind import EventKind, NotSearchableError
 from webots_mcp.store.detection.motion import Motion, find_motion
 from webots_mcp.store.detection.verdict import Ledger
-from webots_mcp.store.reading.coverage import purged_until_s
+from webots_mcp.store.reading.coverage import less_time, purged_until_s
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.views import View, view_of
+from webots_mcp.store.reading.wall_time import UP_TO, RunClock
 from webots_mcp.store.rollup.buckets import EVER, totals
 from webots_mcp.store.signals.catalogue import resolve_signals
 from webots_mcp.store.signals.flatten import parse
@@ -37,11 +38,6 @@ _ENDS: Final = (
     "ORDER BY sim_time_s, id LIMIT 1), "
     "(SELECT id FROM state WHERE run_id = :run AND sim_time_s < :end "
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1))"
-)
-_RUN_START: Final = "SELECT started_wall_time_s FROM run WHERE id = ?"
-_WALL_AT: Final = (
-    "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
 
 
@@ -106,6 +102,11 @@ class Search:
         run_id, start_s = self.segment.run_id, self.segment.start_s
         until_s = purged_until_s(self.connection, run_id, start_s)
         return until_s is not None and until_s >= self.segment.end_s
+
+    @cached_property
+    def less_time(self) -> str:
+        """What shows more of the segment than its summaries do."""
+        return less_time(self.connection, self.segment)
 
     def require_rows(self) -> None:
         """For what shows in single rows only.
@@ -209,13 +210,13 @@ class Search:
         """An event of this run; what has a duration and reaches the newest row goes on."""
         run_id = self.segment.run_id
         ongoing = end_s >= self.ended_s > start_s
-        wall_s = self._wall_time_at(start_s)
+        wall_s = self.wall_time_at(start_s)
         return Event(kind, run_id, start_s, end_s, wall_s, name, details, ongoing)
 
     @cached_property
-    def _wall_time_at(self) -> Callable[[float], float]:
-        """Looked up once of events that begin together."""
-        return cache(partial(wall_time_at, self.connection, self.segment.run_id))
+    def wall_time_at(self) -> Callable[[float], float]:
+        """Of the last row at or before a time; looked up once of events that begin together."""
+        return cache(partial(RunClock(self.connection, self.segment.run_id).wall_s, UP_TO))
 
     def not_searched(self, kind: str, *reasons: str) -> None:
         """Note why a kind was not looked for, or where it was not."""
@@ -244,9 +245,3 @@ class Search:
         names = ", ".join(signal.name for signal in left[:3]) + (", ..." if left[3:] else "")
         self.not_searched(kind, f"the time was over before {len(left)} signals: ask for {names}")
         return True
-
-
-def wall_time_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> float:
-    """Wall time of the run's last row at or before a simulation time; else of the run's start."""
-    row = connection.execute(_WALL_AT, (run_id, sim_time_s)).fetchone()
-    return float(row[0] if row else connection.execute(_RUN_START, (run_id,)).fetchone()[0])

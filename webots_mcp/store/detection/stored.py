@@ -20,11 +20,11 @@ from webots_mcp.store.detection.kind import (
     but_for_numbers,
     only_if_named,
 )
-from webots_mcp.store.detection.search import Search, wall_time_at
+from webots_mcp.store.detection.search import Search
 from webots_mcp.store.detection.together import told_together
 from webots_mcp.store.reading.changes import MOST_VALUES, Point, change_points, value_ended_s
 from webots_mcp.store.reading.coverage import purged_until_s
-from webots_mcp.store.reading.gaps import rhythm_in, with_rows_around
+from webots_mcp.store.reading.gaps import hidden_gaps, rhythm_in, with_rows_around
 from webots_mcp.store.reading.ranges import Segment, just_after
 from webots_mcp.store.reading.rows import exceeds, read_columns
 from webots_mcp.store.signals.registry import Signal
@@ -98,10 +98,23 @@ def gap_events(search: Search) -> Iterator[Event]:
     else:
         rhythm = rhythm_of(read_columns(search.connection, around, (), search.deadline).times)
     details = {"usual_interval_s": rhythm.interval_s}
+    _note_hidden_gaps(search, segment, rhythm.interval_s)
     for gap in rhythm.gaps:
         if gap.end_s > segment.start_s and gap.start_s < segment.end_s:
-            wall_s = wall_time_at(search.connection, segment.run_id, gap.start_s)
+            wall_s = search.wall_time_at(gap.start_s)
             yield Event("gap", segment.run_id, gap.start_s, gap.end_s, wall_s, None, details)
+
+
+def _note_hidden_gaps(search: Search, segment: Segment, interval_s: float | None) -> None:
+    """Of purged rows only how many came in 10 s tells that some were missing."""
+    until_s = purged_until_s(search.connection, segment.run_id, segment.start_s)
+    if until_s is None or interval_s is None:
+        return
+    hidden = hidden_gaps(search.connection, segment, until_s, interval_s)
+    if hidden:
+        where = listed([f"{first_s:.6g} and {last_s:.6g} s" for first_s, last_s in hidden], 2)
+        why = f"rows are missing between {where}: the rows about them were purged, so that no call"
+        search.not_searched("gap", f"{why} tells from when to when")
 
 
 def change_events(search: Search) -> Iterator[Event]:
@@ -167,7 +180,7 @@ def _told(search: Search, name: str, changes: Sequence[_Change]) -> Iterator[Eve
 
 def _change(search: Search, name: str, change: _Change, details: dict[str, Any]) -> Event:
     run_id, start_s = search.segment.run_id, change.point.sim_time_s
-    wall_s = wall_time_at(search.connection, run_id, start_s)
+    wall_s = search.wall_time_at(start_s)
     place = (run_id, start_s, change.end_s, wall_s)
     return Event("change", *place, name, details, ongoing=change.ongoing)
 

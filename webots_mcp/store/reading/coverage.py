@@ -5,9 +5,12 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterator
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from webots_mcp.store.reading.moments import moment_of
+
+if TYPE_CHECKING:
+    from webots_mcp.store.reading.ranges import Segment
 
 _ROWS_LEFT: Final = (
     "SELECT (SELECT min(sim_time_s) FROM state WHERE run_id = run.id) FROM run "
@@ -74,6 +77,16 @@ def purged_until_s(connection: sqlite3.Connection, run_id: int, start_s: float) 
     if found is None or (found[0] is not None and start_s >= found[0]):
         return None
     return math.inf if found[0] is None else found[0]
+
+
+def less_time(connection: sqlite3.Connection, segment: Segment) -> str:
+    """What shows more of a segment than its summaries do, if anything."""
+    until_s = purged_until_s(connection, segment.run_id, segment.start_s)
+    if until_s is None:
+        return "ask for less time"
+    if until_s >= segment.end_s:
+        return "its rows were purged"
+    return f"ask for less time from {until_s:.6g} s on: the rows before were purged"
 
 
 def purge_notes(connection: sqlite3.Connection, run_id: int, start_s: float) -> Iterator[str]:

@@ -9,6 +9,7 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any, Final
 
+from webots_mcp.store.analysis.arrays import median, np
 from webots_mcp.store.analysis.rhythm import (
     GAP_INTERVALS,
     Gap,
@@ -17,6 +18,7 @@ from webots_mcp.store.analysis.rhythm import (
     interruptions,
     usual_interval_s,
 )
+from webots_mcp.store.reading.coverage import purged_until_s
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.buckets import BUCKET_S, FINE, Grain, bucket_of
 
@@ -63,11 +65,11 @@ def with_rows_around(connection: sqlite3.Connection, segment: Segment) -> Segmen
 def rhythm_in(connection: sqlite3.Connection, segment: Segment) -> Rhythm:
     """The rhythm of a long segment, from the rollups: rows are read only where some are missing.
 
-    The median is that of the first 2,000 rows. Where more than 300 buckets lack rows, recording
-    is irregular rather than interrupted, and within the others only whole missing buckets count.
+    The median is that of the first 2,000 rows, of purged ones that of their buckets. Where more
+    than 300 buckets lack rows, recording is irregular rather than interrupted, and within the
+    others only whole missing buckets count.
     """
-    sample = _times(connection, segment.run_id, segment.start_s, segment.end_s, _SAMPLE_ROWS)
-    interval_s = usual_interval_s(sample)
+    interval_s = _usual_interval_s(connection, segment)
     if interval_s is None:
         return Rhythm(None, ())
     irregular = _irregular(connection, segment, interval_s)
@@ -76,11 +78,49 @@ def rhythm_in(connection: sqlite3.Connection, segment: Segment) -> Rhythm:
     return Rhythm(interval_s, interruptions(tuple(dict.fromkeys(gaps))))
 
 
+def _usual_interval_s(connection: sqlite3.Connection, segment: Segment) -> float | None:
+    sample = _times(connection, segment.run_id, segment.start_s, segment.end_s, _SAMPLE_ROWS)
+    interval_s = usual_interval_s(sample)
+    is_purged = purged_until_s(connection, segment.run_id, segment.start_s) is not None
+    if interval_s is not None or not is_purged:
+        return interval_s
+    intervals = [
+        (last_s - first_s) / (rows - 1)
+        for _, rows, first_s, last_s in _counted(connection, segment.run_id, FINE, _span(segment))
+        if rows > 1 and first_s is not None
+    ]
+    return median(np.array(intervals)) if intervals else None
+
+
+def hidden_gaps(
+    connection: sqlite3.Connection, segment: Segment, until_s: float, interval_s: float
+) -> list[tuple[float, float]]:
+    """Between which times rows were missing in a bucket whose rows were purged since.
+
+    Args:
+        connection: Any.
+        segment: What is asked for.
+        until_s: The rows before that time were purged.
+        interval_s: At which rows usually came. Of n rows n - 2 such intervals and the gap fit.
+    """
+    purged = replace(segment, end_s=min(segment.end_s, until_s))
+    return [
+        (first_s, last_s)
+        for _, rows, first_s, last_s in _counted(connection, segment.run_id, FINE, _span(purged))
+        if first_s is not None and last_s - first_s > (rows - 2 + GAP_INTERVALS) * interval_s
+    ]
+
+
+def _span(segment: Segment) -> range:
+    """The buckets that the segment touches."""
+    return range(bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
+
+
 def _irregular(
     connection: sqlite3.Connection, segment: Segment, interval_s: float
 ) -> list[Segment]:
     """The parts in which a gap may be: around buckets that lack rows, or one at their border."""
-    run_id, span = segment.run_id, range(bucket_of(segment.start_s), bucket_of(segment.end_s) + 1)
+    run_id, span = segment.run_id, _span(segment)
     values = {
         **_bounds(run_id, span),
         "least": _least_rows(interval_s),
@@ -138,7 +178,11 @@ def _stretches(
         reached_s = end_s
         if complete and first_s is not None:
             yield (first_s, last_s), True
-        elif times := _times(connection, run_id, start_s, end_s):
+            continue
+        times = _times(connection, run_id, start_s, end_s)
+        if first_s is not None and (not times or first_s < times[0]):  # purged: `hidden_gaps`
+            yield (first_s, times[0] if times else last_s), True
+        if times:
             yield times, False
     if foot := _times(connection, run_id, reached_s, segment.end_s):
         yield foot, False

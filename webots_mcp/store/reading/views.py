@@ -18,6 +18,7 @@ from webots_mcp.store.analysis.jumps import least_jump
 from webots_mcp.store.analysis.rhythm import usual_interval_s
 from webots_mcp.store.analysis.summary import Summary, summarise_numbers
 from webots_mcp.store.analysis.swings import SLOW_HALF_SWINGS, Swing
+from webots_mcp.store.reading.coverage import less_time
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.gaps import rows_by_bucket
 from webots_mcp.store.reading.intervals import (
@@ -299,7 +300,8 @@ class LongView:
         every_s = max(stay_s / SAMPLES_PER_STAY, span_s / MOST_SAMPLES)
         self.sampled_s = every_s
         if every_s > stay_s / 2:
-            self.notes.append(f"not those of less than {2 * every_s:.3g} s: ask for less time")
+            advice = less_time(self._connection, self._segment)
+            self.notes.append(f"not those of less than {2 * every_s:.3g} s: {advice}")
         plain = [signal for signal in signals if signal.is_plain]
         found = Columns(self._segment.run_id, values={signal.name: [] for signal in plain})
         for part in parts:
@@ -422,7 +424,7 @@ class LongView:
         if len(taken) < len(places):
             self.notes.append(
                 f"of {signal.name} only in {len(taken)} of {len(places)} stretches of 10 s, those "
-                "with the largest steps: ask for less time to see the others"
+                f"with the largest steps: {less_time(self._connection, self._segment)}"
             )
         return list(_runs_of(sorted(steps.buckets[taken].tolist())))
 

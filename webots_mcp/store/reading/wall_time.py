@@ -17,7 +17,7 @@ _ENDS: Final = (
 _FIRST_ROW: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? ORDER BY sim_time_s, id LIMIT 1"
 )
-_UP_TO: Final = (  # of the last row at or before a simulation time
+UP_TO: Final = (  # of the last row at or before a simulation time
     "SELECT wall_time_s FROM state WHERE run_id = ? AND sim_time_s <= ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
 )
@@ -74,10 +74,10 @@ def simulation_times(
         recorded: Simulation times of its first and newest row, purged ones too.
         walls: Unix times.
     """
-    clock = _RunClock(connection, run_id)
+    clock = RunClock(connection, run_id)
 
     def begun(time_s: float) -> bool:
-        return clock.wall_s(_UP_TO, time_s) >= walls[0]
+        return clock.wall_s(UP_TO, time_s) >= walls[0]
 
     def over(time_s: float) -> bool:
         return clock.wall_s(_FROM, time_s) >= walls[1]
@@ -90,7 +90,7 @@ def simulation_times(
     return (start_s, last_s) if start_s <= last_s else None  # else between two rows
 
 
-class _RunClock:
+class RunClock:
     """The wall times of a run; of purged rows as if wall time had risen evenly."""
 
     def __init__(self, connection: sqlite3.Connection, run_id: int) -> None:
@@ -102,10 +102,12 @@ class _RunClock:
         self._rows_from_s, self._rows_from_wall_s = first_row or (last_s, last_wall_s)
 
     def wall_s(self, query: str, time_s: float) -> float:
-        """At a simulation time within the recording."""
+        """At a simulation time; before the recording that of its start."""
         if time_s >= self._rows_from_s:
             row = self._connection.execute(query, (self._run_id, time_s)).fetchone()
             return float(row[0]) if row else self._rows_from_wall_s
+        if time_s <= self._start_s:
+            return self._start_wall_s
         share = (time_s - self._start_s) / (self._rows_from_s - self._start_s)
         return self._start_wall_s + share * (self._rows_from_wall_s - self._start_wall_s)
 

@@ -11,7 +11,7 @@ from typing import Any
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.pool.catalogue import Choice
+from webots_mcp.pool.catalogue import Choice, meant
 from webots_mcp.pool.fetching import Fetched, fetch
 from webots_mcp.pool.shipping import Order, Report, ship
 from webots_mcp.pool.target import Pool, Target
@@ -37,7 +37,7 @@ class Lab:
 
     def fetch(self, **choice: Any) -> Fetched:
         with self.opened() as connection, self.pool() as pool:
-            return fetch(pool, connection, self.here, Choice(**choice))
+            return fetch(pool, connection, self.here, meant(pool, Choice(**choice)))
 
     def opened(self) -> closing[sqlite3.Connection]:
         return closing(connect(self.here / DATABASE_NAME, "writer"))

@@ -288,6 +288,18 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
     assert list(lab.fetch(run_uuid=uuid).runs) == [uuid]
 
 
+@IN_EACH_POOL
+def test_a_run_without_a_uuid_is_listed_and_not_taken(lab: Lab, runs: Recorded) -> None:
+    runs.connection.execute("UPDATE run SET uuid = NULL WHERE id = 1")
+    lab.ship(runs.folder / DATABASE_NAME, full=True)
+    with lab.pool() as pool:
+        assert [run.uuid for run in pool.runs() if run.run_id == 1] == [""]
+
+    found = lab.fetch(robot="rover")
+
+    assert (found.nameless, list(found.runs)) == (1, [uuid_of(runs.folder / DATABASE_NAME, 2)])
+
+
 def test_a_run_that_lacks_is_answered_with_the_nearest(lab: Lab, runs: Recorded) -> None:
     lab.ship(runs.folder / DATABASE_NAME)
     uuid = uuid_of(runs.folder / DATABASE_NAME, 1)

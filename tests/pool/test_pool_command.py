@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -73,7 +74,10 @@ def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None
     assert ask(*words).splitlines()[1] == "here already: run 1 to 2"
 
 
-def test_what_is_not_there_is_refused_with_what_is(ask: Ask) -> None:
-    words = ("fetch", "--from", "POOL")
+def test_what_is_not_there_is_refused_with_what_is_and_makes_no_recording(
+    ask: Ask, tmp_path: Path
+) -> None:
+    words = ("fetch", "--from", "POOL", "--data-dir", str(tmp_path / "new"))
     assert "nearest are 'rover'" in ask(*words, "--robot", "rovr", code=2)
     assert "which runs?" in ask(*words, code=2)
+    assert not (tmp_path / "new").exists()

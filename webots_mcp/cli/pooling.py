@@ -53,13 +53,17 @@ def fetch(arguments: argparse.Namespace) -> int:
     were shipped and no rows, the summaries come, and every answer says so. A run that goes on or is
     still being shipped is not taken: fetch it again when it is whole.
     """
+    from webots_mcp.pool.catalogue import meant
     from webots_mcp.pool.fetching import fetch as fetch_runs
     from webots_mcp.pool.target import open_pool
 
-    choice = _choice(arguments)
-    with open_pool(arguments.url) as pool, writing(arguments, create=True) as (here, connection):
-        with shown_progress("fetching") as progress:
-            found = fetch_runs(pool, connection, here.data_dir, choice, progress)
+    with open_pool(arguments.url) as pool:
+        wanted = meant(pool, _choice(arguments))  # first: no database is made for nothing
+        with (
+            writing(arguments, create=True) as (here, connection),
+            shown_progress("fetching") as progress,
+        ):
+            found = fetch_runs(pool, connection, here.data_dir, wanted, progress)
         _print_fetched(found, pool.address)
     return 0 if found.runs else 1
 
@@ -81,6 +85,8 @@ def _print_fetched(found: Fetched, address: str) -> None:
             f"of run {listed(found.unsummed)} not even summaries of all rows: those were not made "
             "where it was recorded, which a server does ('webots-mcp serve')"
         )
+    if found.nameless:
+        print(f"not taken: {found.nameless} runs without a UUID, which every bridge of today gives")
     if found.going_on:
         print(f"not taken: {_named(found.going_on)} goes on, or nobody has shipped its end")
     if found.arriving:

@@ -37,10 +37,18 @@ class Choice:
     since: str | None = None
     until: str | None = None
 
-    @property
-    def is_all(self) -> bool:
-        """Whether nothing is given."""
-        return self == Choice()
+
+@dataclass(frozen=True)
+class Meant:
+    """What a choice means in a pool.
+
+    Attributes:
+        runs: By when they began.
+        trial_sets: The set of which all trials are meant, as each recording has it.
+    """
+
+    runs: Sequence[PooledRun]
+    trial_sets: Sequence[PooledTrialSet]
 
 
 @dataclass(frozen=True)
@@ -68,7 +76,8 @@ def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
     if choice.run_uuid is not None:
         found = [_one_of(runs, choice.run_uuid)]
     if choice.trials is not None:
-        ids = set(_trial_set(pool, choice.trials).runs)
+        sets = chosen_trial_sets(pool, choice)
+        ids = {run for each in sets for run in each.runs}
         found = [run for run in found if (run.recording_uuid, run.run_id) in ids]
     if choice.robot is not None:
         _require_known("robot", choice.robot, [run.robot for run in runs])
@@ -81,9 +90,30 @@ def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
     return found
 
 
+def meant(pool: Pool, choice: Choice) -> Meant:
+    """What is to be fetched.
+
+    Raises:
+        InvalidInputError: That is nothing, or nothing is given that says what.
+    """
+    if choice == Choice():
+        raise InvalidInputError(
+            "which runs? Give --run, --label, --trials, --robot, --since or --until; "
+            f"'webots-mcp pool {pool.address} runs' lists them"
+        )
+    sets = chosen_trial_sets(pool, choice) if choice.trials is not None else []
+    return Meant(chosen_runs(pool, choice), sets)
+
+
 def chosen_trial_sets(pool: Pool, choice: Choice) -> list[PooledTrialSet]:
-    """The trial sets that are meant: the one of that UUID, or all."""
-    return list(pool.trial_sets()) if choice.trials is None else [_trial_set(pool, choice.trials)]
+    """The trial sets that are meant: all, or the one of that UUID, as each recording has it."""
+    sets = list(pool.trial_sets())
+    if choice.trials is None:
+        return sets
+    if not sets:
+        raise InvalidInputError(f"the pool {pool.address} holds no trial set")
+    uuid = _named("trial set", choice.trials, [each.uuid for each in sets])
+    return [each for each in sets if each.uuid == uuid]
 
 
 def robots(runs: Iterable[PooledRun]) -> list[PooledRobot]:
@@ -108,21 +138,6 @@ def robots(runs: Iterable[PooledRun]) -> list[PooledRobot]:
 def _one_of(runs: Sequence[PooledRun], asked: str) -> PooledRun:
     uuid = _named("run", asked, [run.uuid for run in runs])
     return next(run for run in runs if run.uuid == uuid)
-
-
-def _trial_set(pool: Pool, asked: str) -> PooledTrialSet:
-    """All that the recordings of a pool hold of one set."""
-    sets = list(pool.trial_sets())
-    if not sets:
-        raise InvalidInputError(f"the pool {pool.address} holds no trial set")
-    uuid = _named("trial set", asked, [each.uuid for each in sets])
-    same = [each for each in sets if each.uuid == uuid]
-    runs = tuple(dict.fromkeys(run for each in same for run in each.runs))
-    first = max(same, key=lambda each: each.trials)
-    return PooledTrialSet(
-        first.recording_uuid, first.trial_set_id, uuid, first.created_wall_time_s, first.trials,
-        runs,
-    )  # fmt: skip
 
 
 def _named(what: str, asked: str, uuids: Sequence[str]) -> str:

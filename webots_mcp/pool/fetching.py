@@ -12,6 +12,7 @@ import shutil
 import sqlite3
 import tempfile
 import time
+from collections import defaultdict
 from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,10 +22,9 @@ from typing import Final
 
 from webots_mcp.connection import transaction
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import process_alive
 from webots_mcp.pool.batch import Batch
-from webots_mcp.pool.catalogue import Choice, chosen_runs, chosen_trial_sets
+from webots_mcp.pool.catalogue import Meant
 from webots_mcp.pool.key_order import Order, in_order, order_of
 from webots_mcp.pool.tables import SQLValue, table
 from webots_mcp.pool.target import Pool, PooledRun, is_whole
@@ -76,6 +76,7 @@ class Fetched:
         summaries: Of those that came now, the ones of which the pool has no rows.
         going_on: Those that are not over.
         arriving: Those that are over, and not yet wholly shipped.
+        nameless: How many have no UUID, which no recording could tell from those that are there.
         unsummed: Of those in `summaries`, how many rows the summaries tell of, where not of all.
     """
 
@@ -84,6 +85,7 @@ class Fetched:
     summaries: list[str] = field(default_factory=list[str])
     going_on: list[str] = field(default_factory=list[str])
     arriving: list[str] = field(default_factory=list[str])
+    nameless: int = 0
     unsummed: dict[str, int] = field(default_factory=dict[str, int])
 
     @property
@@ -96,7 +98,7 @@ def fetch(
     pool: Pool,
     connection: sqlite3.Connection,
     data_dir: Path,
-    choice: Choice,
+    meant: Meant,
     progress: Progress = lambda done, of: None,
 ) -> Fetched:
     """Bring the runs that are meant, with their sessions, commands and trials.
@@ -105,35 +107,29 @@ def fetch(
         pool: Opened.
         connection: To the local recording, in the role "writer".
         data_dir: The folder of its pictures.
-        choice: Which runs.
+        meant: What is to come.
         progress: Called with how many runs are there of how many.
 
     Raises:
-        InvalidInputError: None is meant, or nothing is given that says which are.
         PoolError: The pool cannot be read.
     """
-    if choice.is_all:
-        raise InvalidInputError(
-            "which runs? Give --run, --label, --trials, --robot, --since or --until; "
-            f"'webots-mcp pool {pool.address} runs' lists them"
-        )
-    runs = chosen_runs(pool, choice)
     _sweep(data_dir)
     fetcher = _Fetcher(pool, connection, data_dir)
-    found = fetcher.found
-    here = _here(connection)
-    found.known = [run.uuid for run in runs if run.uuid in here]
-    found.going_on = [run.uuid for run in runs if run.end_reason is None and run.uuid not in here]
-    new = [run for run in runs if run.uuid not in here and run.end_reason is not None]
-    new, found.arriving = _shipped(pool, new)
+    found, here = fetcher.found, _here(connection)
+    found.known = [run.uuid for run in meant.runs if run.uuid in here]
+    new = [run for run in meant.runs if run.uuid not in here]
+    found.nameless = sum(not run.uuid for run in new)
+    found.going_on = [run.uuid for run in new if run.uuid and run.end_reason is None]
+    ended = [run for run in new if run.uuid and run.end_reason is not None]
+    whole, found.arriving = _shipped(pool, ended)
     done = 0
-    for part in _parts(new):
-        progress(done, len(new))
+    for part in _parts(whole):
+        progress(done, len(whole))
         fetcher.take(part)
         done += len(part)
-    fetcher.take_trials(runs, choice)
+    fetcher.take_trials(meant)
     here = _here(connection)
-    found.runs = {run.uuid: here[run.uuid] for run in runs if run.uuid in here}
+    found.runs = {run.uuid: here[run.uuid] for run in meant.runs if run.uuid in here}
     return found
 
 
@@ -181,17 +177,17 @@ class _Fetcher:
                 self._settle(small, {run.run_id: run.uuid for run in runs})
             merge(self._connection, self._data_dir, folder / DATABASE_NAME)
 
-    def take_trials(self, runs: Sequence[PooledRun], choice: Choice) -> None:
-        """Take in the trials of runs that are here by now, and others of a set that was meant."""
+    def take_trials(self, meant: Meant) -> None:
+        """Take in the trials of runs that are here by now, and others of a set that is meant."""
         here = _here(self._connection)
-        ids: dict[str, set[int]] = {}
-        for run in runs:
-            ids.setdefault(run.recording_uuid, set()).update([run.run_id] * (run.uuid in here))
-        sets: dict[str, set[int]] = {}
-        for each in chosen_trial_sets(self._pool, choice) if choice.trials else ():
-            sets.setdefault(each.recording_uuid, set()).add(each.trial_set_id)
-        for recording in ids | sets:
-            self._take_trials_of(recording, ids.get(recording, set()), sets.get(recording, set()))
+        ids, sets = defaultdict[str, set[int]](set), defaultdict[str, set[int]](set)
+        for run in meant.runs:
+            if run.uuid in here:
+                ids[run.recording_uuid].add(run.run_id)
+        for each in meant.trial_sets:
+            sets[each.recording_uuid].add(each.trial_set_id)
+        for recording in {**ids, **sets}:
+            self._take_trials_of(recording, ids[recording], sets[recording])
 
     def _take_trials_of(self, recording: str, ids: set[int], sets: set[int]) -> None:
         with _folder(self._data_dir) as folder:

@@ -114,7 +114,10 @@ class PooledRecording:
 
 @dataclass(frozen=True)
 class PooledRun:
-    """A run in a pool, with what is needed to choose it and to fetch it."""
+    """A run in a pool, with what is needed to choose it and to fetch it.
+
+    The UUID is empty where an old version recorded it.
+    """
 
     recording_uuid: str
     run_id: int

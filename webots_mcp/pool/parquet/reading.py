@@ -224,11 +224,12 @@ def _pooled_run(recording_uuid: str, run: Record, robots: Mapping[int, str]) -> 
     return PooledRun(
         recording_uuid=recording_uuid,
         run_id=run["id"],
+        uuid=run["uuid"] or "",
         robot=robots.get(run["robot_id"], ""),
         **{
             name: run[name]
             for name in (
-                "uuid", "label", "world", "started_wall_time_s", "last_wall_time_s",
+                "label", "world", "started_wall_time_s", "last_wall_time_s",
                 "started_sim_time_s", "last_sim_time_s", "end_reason", "rows",
             )
         },

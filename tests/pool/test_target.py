@@ -16,9 +16,12 @@ SECRET = "hunter2"
     [
         f"postgresql://robot:{SECRET}@db.lab/pool",
         f"postgresql://robot:{SECRET}/@x@db.lab/pool",
+        f"postgresql://robot:{SECRET}?x@db.lab/pool",
+        f"postgresql://robot:a?{SECRET}@db.lab/pool",
         f"postgresql://db.lab/pool?password={SECRET}",
         f"s3://key:{SECRET}@bucket/prefix",
         f"s3://bucket/prefix?secret_access_key={SECRET}",
+        f"https://store.lab/prefix?apikey={SECRET}",
     ],
 )
 def test_a_secret_in_a_url_is_refused_and_not_repeated(url: str) -> None:
@@ -35,9 +38,20 @@ def test_what_is_neither_a_url_nor_a_folder_is_refused_with_examples(url: str) -
 
 
 @pytest.mark.parametrize(
+    "text", [f"host=db.lab password={SECRET}", f"password = {SECRET}", "service=lab"]
+)
+def test_a_connection_string_makes_no_folder_of_its_password(text: str) -> None:
+    with pytest.raises(InvalidInputError, match="is no URL: write postgresql://") as raised:
+        open_target(text)
+    assert SECRET not in str(raised.value)
+
+
+@pytest.mark.parametrize(
     "url",
     [
         "postgresql:///?service=lab",
+        "postgresql:///?service=me@lab",
+        "./robots/day=2026-01-01",
         "postgresql://robot@db.lab:5433/pool?sslmode=require&passfile=/home/me/.pgpass",
         "/srv/pool",
         "s3://bucket/prefix",

@@ -20,8 +20,12 @@ from webots_mcp.pool.batch import Batch
 from webots_mcp.pool.tables import Table
 
 _SECRET: Final = re.compile(
-    "password|passwd|secret|token|credential|signature|access_?key|^(pass|key|sig|pwd)$",
+    "password|passwd|secret|token|credential|signature|authorization|(access|api|account)[_-]?key|"
+    "^(pass|key|sig|pwd)$",
     re.IGNORECASE,
+)
+_CONNECTION_STRING: Final = re.compile(
+    r"(^|\s)(host|hostaddr|dbname|user|password|passfile|service)\s*=", re.IGNORECASE
 )
 _NEARLY_A_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 _WHOLE: Final = "run.whole:{}"  # a bit for each of so many runs
@@ -254,13 +258,20 @@ def redacted(url: str) -> str:
     scheme, sign, rest = url.partition("://")
     if not sign:
         return url
-    place, question, query = rest.partition("?")
+    place, question, query = _place_and_query(rest)
     user, at, host = place.rpartition("@")
     shown = "&".join(
         f"{name}=***" if _SECRET.search(name) else f"{name}={value}"
         for name, value in parse_qsl(query, keep_blank_values=True)
     )
     return f"{scheme}://{user.partition(':')[0]}{at}{host}{question}{shown}"
+
+
+def _place_and_query(rest: str) -> tuple[str, str, str]:
+    """What comes before and after the question mark, which is not the one of a password."""
+    user, at, _ = rest.partition("@")
+    end = rest.find("?", len(user) if at and "/" not in user else 0)
+    return (rest, "", "") if end < 0 else (rest[:end], "?", rest[end + 1 :])
 
 
 def _is_postgres(url: str) -> bool:
@@ -275,6 +286,11 @@ def _is_postgres(url: str) -> bool:
     if sign:
         _require_no_secret(url, rest)
         return scheme.lower() in _POSTGRES
+    if _CONNECTION_STRING.search(url):
+        raise InvalidInputError(
+            "a connection string of PostgreSQL is no URL: write postgresql://USER@HOST/DATABASE, "
+            "and give the password in PGPASSWORD, ~/.pgpass or a service file"
+        )
     if _NEARLY_A_URL.match(url):
         raise InvalidInputError(
             f"{url!r} is neither a URL nor a folder: write postgresql://HOST/DATABASE, "
@@ -284,7 +300,7 @@ def _is_postgres(url: str) -> bool:
 
 
 def _require_no_secret(url: str, rest: str) -> None:
-    place, _, query = rest.partition("?")
+    place, _, query = _place_and_query(rest)
     user, _, _ = place.rpartition("@")
     named = [name for name, _ in parse_qsl(query) if _SECRET.search(name)]
     if ":" in user or named:

@@ -126,6 +126,7 @@ def test_what_is_there_is_listed(pool: PostgresPool, recording: sqlite3.Connecti
     sizes = {size.table: size for size in pool.sizes()}
     assert (sizes["state"].rows, sizes["trial"].rows, sizes["picture"].rows) == (2050, 3, 0)
     assert (sizes["state"].size_bytes or 0) > 2050 * 100
+    assert (sizes["rollup"].size_bytes or 0) > sizes["rollup"].rows * 50 > 0
     assert pool.progress(found.uuid) == {"shipped": 1}
     assert pool.picture(found.uuid, "camera/1.png") is None
 

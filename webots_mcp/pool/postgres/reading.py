@@ -48,10 +48,11 @@ SELECT s.{OWNER}::text, s.id, s.uuid, s.created_wall_time_s,
     AND t.run_id IS NOT NULL ORDER BY t.number)
 FROM trial_set s ORDER BY s.created_wall_time_s, s.{OWNER}, s.id"""
 _SIZE: Final = """
-SELECT coalesce(sum(pg_total_relation_size(p.relid)), 0)::bigint,
-  coalesce(sum(c.reltuples) FILTER (WHERE p.isleaf), 0)::bigint,
-  coalesce(bool_and(c.reltuples >= 0) FILTER (WHERE p.isleaf), false)
-FROM pg_partition_tree(%s) p JOIN pg_class c ON c.oid = p.relid"""
+SELECT sum(pg_total_relation_size(oid))::bigint,
+  sum(reltuples) FILTER (WHERE relkind = 'r')::bigint,
+  coalesce(bool_and(reltuples >= 0) FILTER (WHERE relkind = 'r'), false)
+FROM pg_class WHERE oid = %(name)s::regclass
+  OR oid IN (SELECT relid FROM pg_partition_tree(%(name)s))"""
 _ASKED_WRONG: Final = ("22", "25006", "42", "57014", "0A")  # SQLSTATEs that a question has
 
 
@@ -109,7 +110,7 @@ class PostgresPool:
     def sizes(self) -> Iterator[PooledSize]:
         """Bytes with those of indexes; rows of large tables as PostgreSQL last estimated them."""
         for each in (*(table.name for table in tables()), "picture"):
-            ((size_bytes, estimate, is_estimated),) = self._asked(_SIZE, (each,))
+            ((size_bytes, estimate, is_estimated),) = self._asked(_SIZE, {"name": each})
             rows = estimate
             if size_bytes < _COUNTED_BYTES or not is_estimated:
                 ((rows,),) = self._asked(f"SELECT count(*) FROM {each}")

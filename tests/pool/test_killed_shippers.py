@@ -3,50 +3,98 @@
 from __future__ import annotations
 
 import functools
+import json
 import multiprocessing
 import random
-from collections.abc import Iterator
-from contextlib import closing
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.pool.sqlite_target import SQLiteTarget, pooled, recorded
+from tests.pool.sqlite_target import recorded
+from tests.postgres import Server
 from tests.recordings.bridge import STEP_MS, Rover
 from webots_mcp.connection import connect
+from webots_mcp.pool.batch import Row
 from webots_mcp.pool.shipping import Order, Report, follow, ship
+from webots_mcp.pool.tables import Table, tables
+from webots_mcp.pool.target import open_pool, open_target
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.rollup.rolling import roll
 
-KILLS = 50
+KILLS = {"postgresql": 20, "parquet": 8}
 
 
-def order_of(folder: Path, pool: Path) -> Order:
+class Telling:
+    """A target, or its shipment, that tells before each transaction."""
+
+    def __init__(self, inner: Any, writing: Connection) -> None:
+        self._inner = inner
+        self._writing = writing
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._inner, name)
+
+    def __enter__(self) -> Telling:
+        self._inner.__enter__()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._inner.__exit__(*exception)
+
+    @contextmanager
+    def shipment(self, uuid: str) -> Generator[Any]:
+        with self._inner.shipment(uuid) as shipment:
+            yield Telling(shipment, self._writing)
+
+    def write(self, *arguments: Any) -> None:
+        self._writing.send("about to write")
+        self._inner.write(*arguments)
+
+
+def order_of(folder: Path, url: str) -> Order:
     recording = Recording(folder / "webots.db", folder, read_only=True)
-    return Order(recording, functools.partial(SQLiteTarget, pool), full=True, pictures=True)
+    return Order(recording, functools.partial(open_target, url), full=True, pictures=True)
 
 
-def ship_on_and_on(folder: Path, pool: Path, writing: Connection) -> None:
-    tell = functools.partial(writing.send, "about to write")
-    order = replace(order_of(folder, pool), open_target=lambda: SQLiteTarget(pool, tell))
-    follow(order, Report(), lambda _: None, 0.0)
+def ship_on_and_on(folder: Path, url: str, writing: Connection) -> None:
+    order = replace(order_of(folder, url), open_target=lambda: Telling(open_target(url), writing))
+    follow(order, Report(), lambda _: None, 0.01)
+
+
+def ship_again(folder: Path, url: str) -> Report:
+    report = Report()
+    ship(order_of(folder, url), report)
+    return report
 
 
 @pytest.fixture(scope="module")
 def processes() -> Iterator[ForkServerContext]:
     """Processes that have everything imported when they start."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([__name__, "webots_mcp.store.models"])
+    engines = ["webots_mcp.pool.postgres.writing", "webots_mcp.pool.parquet.writing"]
+    context.set_forkserver_preload([__name__, "webots_mcp.store.models", *engines])
     yield context
 
 
-def test_of_fifty_shippers_that_are_killed_while_a_bridge_records_no_row_is_lost_or_twice(
-    tmp_path: Path, processes: ForkServerContext
+@pytest.fixture(params=["postgresql", "parquet"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """A pool of each kind, with its tables."""
+    if request.param == "parquet":
+        return str(tmp_path / "pool")
+    server: Server = request.getfixturevalue("postgres")
+    return server.url(server.new_database())
+
+
+def test_of_shippers_that_are_killed_while_a_bridge_records_no_row_is_lost_or_twice(
+    tmp_path: Path, url: str, processes: ForkServerContext
 ) -> None:
-    folder, pool = tmp_path / "robot", tmp_path / "pool.db"
+    folder = tmp_path / "robot"
     rover, chance = Rover(folder / "webots.db"), random.Random(11)
     steps = 0
 
@@ -56,10 +104,11 @@ def test_of_fifty_shippers_that_are_killed_while_a_bridge_records_no_row_is_lost
         rover.drive(steps * STEP_MS / 1000, {}, (0.0, 0.0))
 
     with closing(connect(rover.database, "writer")) as connection:
-        for _ in range(KILLS):
+        ship_again(folder, url)
+        for _ in range(KILLS["postgresql" if "://" in url else "parquet"]):
             drive(10)
             writing, theirs = processes.Pipe()
-            shipper = processes.Process(target=ship_on_and_on, args=(folder, pool, theirs))
+            shipper = processes.Process(target=ship_on_and_on, args=(folder, url, theirs))
             shipper.start()
             writing.recv()
             drive(40)
@@ -72,16 +121,24 @@ def test_of_fifty_shippers_that_are_killed_while_a_bridge_records_no_row_is_lost
         rover.bridge.close()
         while not roll(connection).done:
             pass
-        last = ship_again(folder, pool)
+        last = ship_again(folder, url)
         (uuid,) = connection.execute("SELECT uuid FROM recording").fetchone()
         rows = recorded(connection)
-        assert pooled(pool, uuid) == rows
-        assert len(rows["state"]) > 400
-        assert last.rows["state"] < len(rows["state"]) / 2  # those that were killed did something
-    assert ship_again(folder, pool).rows.total() == 0
+    with open_pool(url) as pool:
+        for table in tables():
+            found = [row for batch in pool.rows(uuid, table, {}) for row in batch.rows]
+            assert parsed(table, found) == parsed(table, rows[table.name])
+    assert len(rows["state"]) > 80
+    assert last.rows["state"] < len(rows["state"]) / 2  # those that were killed did something
+    assert ship_again(folder, url).rows.total() == 0
 
 
-def ship_again(folder: Path, pool: Path) -> Report:
-    report = Report()
-    ship(order_of(folder, pool), report)
-    return report
+def parsed(table: Table, rows: Sequence[Row]) -> list[tuple[Any, ...]]:
+    """With JSON as what it means: PostgreSQL does not keep how it was written."""
+    return [
+        tuple(
+            json.loads(str(value)) if name in table.json_columns and value else value
+            for name, value in zip(table.columns, row, strict=True)
+        )
+        for row in rows
+    ]

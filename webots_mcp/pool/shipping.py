@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, NoReturn
@@ -45,6 +45,7 @@ MOST_BATCHES: Final = 8  # of a table in a round, before the others get their tu
 THOROUGH_S: Final = 30.0  # between two looks at all of what may change, and not only the newest
 _FIRST_WAIT_S: Final = 1.0
 _LONGEST_WAIT_S: Final = 60.0
+_HANDOVER_S: Final = (0.02, 0.1, 0.3, 0.6)
 _UNCHECKED: Final = -1
 _PICTURE: Final = "picture"  # of the progress: the last one whose file was shipped
 
@@ -161,17 +162,21 @@ class _Patience:
     def wait_after(self, error: WebotsMCPError) -> float:
         """In seconds; what would not be better after it is raised again."""
         if isinstance(error, NoDatabaseError):
-            if not self._has_told:
-                self._say(f"{error}. It is shipped as soon as it is there")
-            self._has_told = True
+            self._tell_once(f"{error}. It is shipped as soon as it is there")
             return self._pause_s
         if isinstance(error, PoolBusyError):
             if not self._was_there:
                 raise error
-            return _FIRST_WAIT_S  # a server finds out late that our last connection is gone
+            self._tell_once(f"{error}; waiting until it ends")
+            return _FIRST_WAIT_S  # it may be our last connection, of which a server learns late
         self._away_s = min(max(2 * self._away_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
         self._say(f"{error}; trying again in {self._away_s:g} s, nothing is lost meanwhile")
         return self._away_s
+
+    def _tell_once(self, text: str) -> None:
+        if not self._has_told:
+            self._say(text)
+        self._has_told = True
 
 
 def _go_on(shipper: _Shipper, pause_s: float) -> NoReturn:
@@ -188,10 +193,19 @@ def _go_on(shipper: _Shipper, pause_s: float) -> NoReturn:
 def _shipper(order: Order, report: Report) -> Generator[_Shipper]:
     with order.recording.reader() as connection:
         uuid = Source(connection).uuid()  # first: nothing is asked of the pool in vain
-    with order.open_target() as target:
+    with order.open_target() as target, ExitStack() as stack:
         target.prepare()
-        with target.shipment(uuid) as shipment:
-            yield _Shipper(order, report, uuid, target, shipment)
+        shipment = _enter(stack, target, uuid)
+        yield _Shipper(order, report, uuid, target, shipment)
+
+
+def _enter(stack: ExitStack, target: Target, uuid: str) -> Shipment:
+    """Wait a moment for a server that has not noticed yet that the shipper before was killed."""
+    for wait_s in _HANDOVER_S:
+        with suppress(PoolBusyError):
+            return stack.enter_context(target.shipment(uuid))
+        time.sleep(wait_s)
+    return stack.enter_context(target.shipment(uuid))
 
 
 class _ReplacedError(PoolError):

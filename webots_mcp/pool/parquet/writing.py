@@ -46,9 +46,12 @@ from webots_mcp.pool.parquet.rows import (
 from webots_mcp.pool.parquet.storage import Storage
 from webots_mcp.pool.tables import Table, tables
 
-# A part is over when its file is larger, or its rows in memory are.
+# A part is over when its file is so large, or its rows in memory are, or when what comes at a time
+# is so little beside it that it would be written again for almost nothing.
 PART_BYTES: Final = 8_000_000
 _PART_MEMORY_BYTES: Final = 64_000_000
+_SMALL_PART_BYTES: Final = 1_000_000
+_MOST_TIMES: Final = 16
 _AT_ONCE: Final = 16  # small objects: most of it is waiting
 _HALF_WRITTEN_S: Final = 3600.0
 
@@ -197,7 +200,7 @@ class ParquetShipment:
         whole = whole if held is None else joined(held, whole)
         content = encoded(table, whole)
         self._place(path, content)
-        return len(content) > PART_BYTES or whole.nbytes > _PART_MEMORY_BYTES
+        return _is_over(len(content), whole.nbytes, len(added) / whole.num_rows)
 
     def _replace(self, table: Table, rows: Iterable[Row]) -> None:
         for name, changed in by_block(table, rows).items():
@@ -258,6 +261,11 @@ class ParquetShipment:
 
     def _path(self, name: str) -> str:
         return f"{folder_of(self._uuid)}/{name}"
+
+
+def _is_over(file_bytes: int, memory_bytes: int, added_share: float) -> bool:
+    is_seldom_more = file_bytes > _SMALL_PART_BYTES and added_share * _MOST_TIMES < 1
+    return file_bytes > PART_BYTES or memory_bytes > _PART_MEMORY_BYTES or is_seldom_more
 
 
 def _by_table(batches: Sequence[Batch]) -> Iterable[tuple[Table, list[Row]]]:

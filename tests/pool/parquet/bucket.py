@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator
 from contextlib import contextmanager
 from importlib import import_module
+from pathlib import Path
 from typing import Any, ClassVar
 
 fsspec: Any = import_module("fsspec")  # it has no types
@@ -58,6 +59,14 @@ def empty() -> str:
     Bucket.pseudo_dirs[:] = [""]
     Bucket.puts, Bucket.puts_left = 0, None
     return "bucket://pool/robots"
+
+
+def copy_to(folder: Path) -> None:
+    """What is in the pool, as files."""
+    for path, content in Bucket.store.items():
+        file = folder / path.removeprefix("/pool/robots/")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_bytes(content.getvalue())
 
 
 @contextmanager

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping
-from contextlib import closing
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import closing, contextmanager
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
@@ -12,8 +12,8 @@ from typing import Any
 
 from webots_mcp.pool.batch import Batch, Row, batches
 from webots_mcp.pool.parquet.reading import ParquetPool
-from webots_mcp.pool.parquet.writing import ParquetTarget
-from webots_mcp.pool.tables import Table, table, tables
+from webots_mcp.pool.parquet.writing import ParquetShipment, ParquetTarget
+from webots_mcp.pool.tables import SQLValue, Table, table, tables
 
 parquet: Any = import_module("pyarrow.parquet")  # it has no types
 
@@ -59,18 +59,30 @@ def pooled(
         return [row for batch in found for row in batch.rows]
 
 
+@contextmanager
+def shipping(url: str | Path, uuid: str = UUID) -> Generator[ParquetShipment]:
+    with ParquetTarget(str(url)) as target:
+        target.prepare()
+        with target.shipment(uuid) as shipment:
+            yield shipment
+
+
+def batch(name: str, *rows: Mapping[str, SQLValue]) -> Batch:
+    each = table(name)
+    return Batch(each, [tuple(row.get(column) for column in each.columns) for row in rows])
+
+
 def logs(*ids: int, wall_time_s: float = 1_700_000_000.0, message: str = "driving") -> Batch:
     """Rows of `log` with these ids, a second apart."""
-    each = table("log")
-    rows: list[Row] = []
-    for row_id in ids:
-        values: dict[str, int | float | str | None] = {
+    rows: list[dict[str, SQLValue]] = [
+        {
             "id": row_id, "run_id": 1, "sim_time_s": float(row_id),
             "wall_time_s": wall_time_s + row_id, "level": "info", "source": "controller",
-            "message": f"{message} {row_id}", "logger": None,
-        }  # fmt: skip
-        rows.append(tuple(values[column] for column in each.columns))
-    return Batch(each, rows)
+            "message": f"{message} {row_id}",
+        }
+        for row_id in ids
+    ]  # fmt: skip
+    return batch("log", *rows)
 
 
 def globbed(folder: Path, name: str) -> list[dict[str, Any]]:

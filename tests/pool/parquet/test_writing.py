@@ -10,8 +10,7 @@ import subprocess
 import sys
 import threading
 from collections import Counter
-from collections.abc import Generator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from tests.pool.parquet.bucket import Bucket, KilledError
 from tests.pool.parquet.rows import (
     OTHER_UUID,
     UUID,
+    batch,
     globbed,
     logs,
     parquet,
@@ -31,12 +31,13 @@ from tests.pool.parquet.rows import (
     records,
     rows_of,
     ship,
+    shipping,
     uuid_of,
 )
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.pool.batch import Batch, Row
 from webots_mcp.pool.parquet.reading import ParquetPool
-from webots_mcp.pool.parquet.writing import PART_BYTES, ParquetShipment, ParquetTarget
+from webots_mcp.pool.parquet.writing import PART_BYTES, ParquetTarget
 from webots_mcp.pool.tables import SQLValue, table, tables
 
 DAY_S = 86_400.0
@@ -52,19 +53,6 @@ with ParquetTarget(sys.argv[1]) as target:
         sys.stdin.read()
         os._exit(9)
 """
-
-
-@contextmanager
-def shipping(url: str | Path, uuid: str = UUID) -> Generator[ParquetShipment]:
-    with ParquetTarget(str(url)) as target:
-        target.prepare()
-        with target.shipment(uuid) as shipment:
-            yield shipment
-
-
-def batch(name: str, *rows: Mapping[str, SQLValue]) -> Batch:
-    each = table(name)
-    return Batch(each, [tuple(row.get(column) for column in each.columns) for row in rows])
 
 
 def ids(rows: Sequence[Row]) -> list[SQLValue]:

@@ -77,10 +77,6 @@ class ParquetPool:
         ]
         yield from sorted(found, key=lambda each: (each.created_wall_time_s, each.uuid))
 
-    def progress(self, recording_uuid: str) -> dict[str, int]:
-        """How far the recording was shipped."""
-        return dict(read_progress(self._storage, recording_uuid).numbers)
-
     def sizes(self) -> Iterator[PooledSize]:
         """How much of each table there is; the end of each file is read for it."""
         for each in tables():

@@ -114,5 +114,6 @@ def _is_lost(error: psycopg.Error, state: str) -> bool:
 
 
 def one_line(text: str) -> str:
-    """A text without line breaks."""
-    return " ".join(text.split())
+    """A text without line breaks, and without the advice for beginners that libpq indents."""
+    lines = (line for line in text.splitlines() if not line.startswith("\t"))
+    return " ".join(" ".join(lines).split())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -144,3 +146,14 @@ def test_an_encoding_that_lacks_letters_is_refused(postgres: Server) -> None:
         "CREATE DATABASE latin ENCODING 'LATIN1' LC_COLLATE 'C' LC_CTYPE 'C' TEMPLATE template0",
     )
     assert "LATIN1" in refusal(postgres, "latin")
+
+
+def test_without_psycopg_the_extra_is_named() -> None:
+    without = (
+        "import sys; sys.modules['psycopg'] = None\n"
+        "from webots_mcp.cli import main; sys.exit(main(['pool', 'postgresql:///robots']))"
+    )
+    ended = subprocess.run([sys.executable, "-c", without], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout) == (2, "")
+    assert ended.stderr.startswith("webots-mcp: a pool in PostgreSQL needs psycopg: pip install")
+    assert ended.stderr.count("\n") == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -280,6 +281,27 @@ def test_two_that_write_the_same_rows_all_the_same_write_none_twice(
 def pieces(whole: Batch, rows: int) -> Iterator[Batch]:
     for start in range(0, len(whole.rows), rows):
         yield Batch(whole.table, whole.rows[start : start + rows])
+
+
+def test_a_recording_is_deleted_as_the_page_says_and_shipped_anew(
+    postgres: Server, pool: str, rover: sqlite3.Connection, target: PostgresTarget
+) -> None:
+    ship(postgres, pool, rover)
+    with target.shipment(OTHER) as shipment:
+        shipment.write([batch("log"), batch("run", uuid="its own")], {"a": 1})
+    page = (Path(__file__).parents[3] / "docs" / "pool.md").read_text("utf-8")
+    found = re.search(r"```sql\n(DO .*?)```", page, re.DOTALL)
+    assert found
+    named = re.compile("'6719d286-[-0-9]*'")
+    postgres.execute(pool, named.sub(f"'{uuid_of(rover)}'", found[1]))
+    for name in ("log", "run", "run_owner", "progress"):
+        assert owners_in(postgres, pool, name) == {OTHER}
+    ship(postgres, pool, rover)
+    assert_equal(postgres, pool, rover)
+
+
+def owners_in(server: Server, pool: str, name: str) -> set[str]:
+    return {uuid for (uuid,) in server.execute(pool, f"SELECT recording_uuid::text FROM {name}")}
 
 
 class Interrupted(list[Row]):

@@ -7,14 +7,9 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from typing import Any, Final, TypeAlias
 
-from webots_mcp.errors import PoolError, PoolUnavailableError
+import psycopg
 
-try:
-    import psycopg
-except ModuleNotFoundError as missing:
-    raise ModuleNotFoundError(
-        "PostgreSQL needs the extra postgres: pip install 'webots-mcp[postgres]'", name=missing.name
-    ) from None
+from webots_mcp.errors import PoolError, PoolUnavailableError
 
 Connection: TypeAlias = "psycopg.Connection[tuple[Any, ...]]"
 

@@ -119,6 +119,17 @@ def test_a_swing_is_found_over_turns_that_follow_each_other_as_fast_as_its_perio
     assert found.end_s == pytest.approx(START_S + 24.0, abs=5.0)
 
 
+def test_periods_of_almost_5_s_are_looked_for_over_turns_as_well() -> None:
+    times = np.arange(0, 120, 0.08)
+    swing = swinging(times, "constant", 4.7, 0.01)
+    ways = [zigzag(np.random.default_rng(seed), times) for seed in range(12)]
+    found = [each for way in ways for each in swings_of(times, way + swing)]
+    assert 10 <= len(found) <= 12  # some turns hide it
+    for each in found:
+        assert each.period_s == pytest.approx(4.7, rel=0.05)
+        assert each.amplitude == pytest.approx(HEIGHT, rel=0.1)
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_pieces_of_which_none_is_as_high_as_their_median_swing_without_a_warning() -> None:
     rng = np.random.default_rng(43)

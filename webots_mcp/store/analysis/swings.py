@@ -182,11 +182,12 @@ def _in_stretch(
             for crossings in _regular(moments, band, rows * interval_s, least_half_swings):
                 if not any(_is_same(crossings, each) for each in found):
                     found += _fitted(whole, crossings)
-        is_slow = rows * interval_s > SLOW_PERIOD_S  # bends of a way come as often as its turns
+        # Bends of a way come as often as the turns of a slow swing; a band reaches to both sides.
+        is_slow = rows * interval_s > SLOW_PERIOD_S * SCALE_RATIO**0.5
         if not is_slow and _bends(slow, round(rows / step), of_means):
             course = moments, means, of_means
             for swing in _on_bends(*course, rows / step, least_half_swings, found):
-                if _stands_out(whole, swing):
+                if swing.period_s <= SLOW_PERIOD_S and _stands_out(whole, swing):
                     found.append(swing)
         rows *= SCALE_RATIO
     lasting = [each for each in found if _lasts(each, longest_period_s)]

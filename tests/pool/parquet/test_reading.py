@@ -16,6 +16,7 @@ from tests.pool.parquet.conftest import RECORDINGS, Many
 from tests.pool.parquet.rows import batch, pooled, rows_of, ship, shipping, uuid_of
 from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolError
+from webots_mcp.pool.parquet import asking
 from webots_mcp.pool.parquet.reading import ParquetPool
 from webots_mcp.pool.tables import table
 from webots_mcp.store.detection.event import EventOptions
@@ -202,6 +203,14 @@ def test_what_is_no_question_to_the_pool_is_refused(
     with pytest.raises(InvalidInputError, match=text):
         pool.select(sql.format(pool=many.pool, outside=outside), 10)
     assert not (many.pool / "x.csv").exists()
+
+
+def test_a_question_that_takes_too_long_is_ended(
+    pool: ParquetPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(asking, "DEADLINE_S", 0.05)
+    with pytest.raises(InvalidInputError, match=r"no answer within 0.05 s: narrow it"):
+        pool.select("SELECT sum(a.range * b.range) FROM range(1000000) a, range(1000000) b", 1)
 
 
 def test_a_folder_without_a_pool_is_told(tmp_path: Path) -> None:

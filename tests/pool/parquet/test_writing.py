@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Sequence
 from importlib.util import find_spec
@@ -266,12 +267,28 @@ def test_a_second_shipper_is_refused_until_the_first_is_gone(tmp_path: Path) -> 
     assert first.stdout.readline() == "ships\n"
     with pytest.raises(PoolBusyError, match=f"process {first.pid} on .* ships this recording"):
         write_all(str(tmp_path), STEPS)
+    lease = tmp_path / f"recording={UUID}" / "_lease"
+    lease.write_text(json.dumps(json.loads(lease.read_text()) | {"until_wall_time_s": 1.0}))
+    with pytest.raises(PoolBusyError):  # it is slow, and lives
+        write_all(str(tmp_path), STEPS)
     with shipping(tmp_path, OTHER_UUID):  # of another recording it is free
         pass
     first.kill()
     first.communicate()
     write_all(str(tmp_path), STEPS)
     assert len(globbed(tmp_path, "log")) == 6
+
+
+def test_a_shipper_of_another_host_is_waited_for_until_its_lease_is_over(tmp_path: Path) -> None:
+    write_all(str(tmp_path), STEPS[:1])
+    lease = tmp_path / f"recording={UUID}" / "_lease"
+    other = {"host": "elsewhere", "pid": 1, "process": "x", "token": "x"}
+    lease.write_text(json.dumps(other | {"until_wall_time_s": time.time() + 30}))
+    with pytest.raises(PoolBusyError, match="process 1 on elsewhere ships this recording"):
+        write_all(str(tmp_path), STEPS)
+    lease.write_text(json.dumps(other | {"until_wall_time_s": time.time() - 1}))
+    write_all(str(tmp_path), STEPS)
+    assert not lease.exists()
 
 
 def test_who_lost_the_lease_writes_nothing_that_counts(tmp_path: Path) -> None:
@@ -337,6 +354,8 @@ def test_what_is_damaged_is_named_and_nothing_is_written_over_it(tmp_path: Path,
     with pytest.raises(PoolError, match=r"_progress .*cannot be read|is damaged"):
         write_all(str(tmp_path), STEPS)
     assert file.read_bytes() == b"PAR1 and no more"
+    with pytest.raises(PoolError, match=r"_progress .*cannot be read|is damaged"):
+        pooled(str(tmp_path), UUID, "log")
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from webots_mcp.contract import host_name
 from webots_mcp.errors import PoolBusyError
-from webots_mcp.liveness import process_alive, process_identity
+from webots_mcp.liveness import process_identity
 from webots_mcp.pool.parquet.storage import Storage
 
 LEASE_S: Final = 60.0
@@ -31,11 +31,13 @@ class _Holder:
         return json.dumps(asdict(self)).encode()
 
     def is_gone(self, now_s: float) -> bool:
-        """Whether another may take over: at once where this host knows that the process ended."""
-        if not now_s < self.until_wall_time_s <= now_s + LEASE_S:
-            return True
-        seen_s = self.until_wall_time_s - LEASE_S
-        return self.host == host_name() and not process_alive(self.pid, self.process, seen_s)
+        """Whether another may take over: this host knows that the process ended, or it is silent.
+
+        A shipper of this host that waits for long between two looks is not gone.
+        """
+        if self.host == host_name() and self.process is not None:
+            return process_identity(self.pid) != self.process
+        return not now_s < self.until_wall_time_s <= now_s + LEASE_S
 
 
 class Lease:

@@ -14,7 +14,7 @@ from webots_mcp.pool.parquet.asking import select
 from webots_mcp.pool.parquet.layout import files_of, folder_of, picture_file, uuid_in
 from webots_mcp.pool.parquet.packages import package
 from webots_mcp.pool.parquet.progress import read_progress, require_pool
-from webots_mcp.pool.parquet.rows import as_rows, decoded, span
+from webots_mcp.pool.parquet.rows import as_rows, decoded, footer_of, span
 from webots_mcp.pool.parquet.storage import Storage
 from webots_mcp.pool.tables import Table, table, tables
 from webots_mcp.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
@@ -156,7 +156,7 @@ class ParquetPool:
 
     def _footer(self, path: str) -> Any:
         with self._storage.opened(path) as file:
-            return package("pyarrow.parquet").read_metadata(file)
+            return footer_of(file, path)
 
 
 class _Piece(NamedTuple):

@@ -5,7 +5,8 @@ from __future__ import annotations
 import io
 import logging
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, Final
 
@@ -123,12 +124,26 @@ def decoded(table: Table, content: bytes, path: str) -> Any:
         PoolError: The file is none, or is damaged.
     """
     arrow, parquet = package("pyarrow"), package("pyarrow.parquet")
+    with _whole(path):
+        return conformed(table, parquet.read_table(arrow.BufferReader(content)))
 
+
+def footer_of(file: Any, path: str) -> Any:
+    """What the end of a file tells of its rows.
+
+    Raises:
+        PoolError: The file is none, or is damaged.
+    """
+    with _whole(path):
+        return package("pyarrow.parquet").read_metadata(file)
+
+
+@contextmanager
+def _whole(path: str) -> Generator[None]:
     try:
-        held = parquet.read_table(arrow.BufferReader(content))
-    except arrow.ArrowException as error:
+        yield
+    except package("pyarrow").ArrowException as error:
         raise PoolError(f"{path} is damaged ({error}): restore or remove it") from error
-    return conformed(table, held)
 
 
 def conformed(table: Table, held: Any) -> Any:

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 from uuid import uuid4
 
-from webots_mcp.errors import InvalidInputError, PoolError, PoolUnavailableError
+from webots_mcp.errors import InvalidInputError, PoolError, PoolUnavailableError, WebotsMCPError
 from webots_mcp.pool.parquet.packages import package
 from webots_mcp.pool.target import redacted
 
@@ -160,6 +160,8 @@ class Storage:
     def _answering(self, path: str) -> Generator[None]:
         try:
             yield
+        except WebotsMCPError:  # from inside the block
+            raise
         except OSError as error:
             raise self._explained(error, path) from error
         except Exception as error:  # each client of an object store has its own

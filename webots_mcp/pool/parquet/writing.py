@@ -39,6 +39,7 @@ from webots_mcp.pool.parquet.rows import (
     as_arrow,
     decoded,
     encoded,
+    footer_of,
     joined,
     replaced,
     span,
@@ -185,8 +186,7 @@ class ParquetShipment:
     def _span(self, path: str) -> tuple[int, int] | None:
         if path not in self._spans:
             with self._storage.opened(path) as file:
-                footer = package("pyarrow.parquet").read_metadata(file)
-            self._spans[path] = span(footer, "id")
+                self._spans[path] = span(footer_of(file, path), "id")
         return self._spans[path]
 
     def _ids(self, path: str) -> list[int]:

@@ -56,6 +56,19 @@ def test_a_drone_that_climbs_or_sinks_does_not_stand_still(
     assert (hovers.start_s, hovers.end_s) == pytest.approx((10.0, 20.0), abs=0.3)
 
 
+def test_a_drone_that_hovers_with_noise_and_a_little_drift_in_its_height_stands(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    noise = np.random.default_rng(1).normal(0, 0.01, 600)
+
+    def hovering(time_s: float) -> dict[str, Any]:
+        return {"gps": [0.0, 0.0, 1.0 + 0.04 * time_s / 60 + noise[round(10 * time_s)]]}
+
+    (hovers,) = ask(empty, hovering).events
+    assert (hovers.kind, hovers.start_s) == ("still", 0.0)
+    assert hovers.end_s == pytest.approx(60.0, abs=0.2)
+
+
 def test_who_only_climbs_is_said_to_have_climbed(empty: sqlite3.Connection) -> None:
     found = ask(empty, lambda time_s: {"gps": [0.0, 0.0, 0.5 * time_s]})
     assert found.verdicts.absent["still"].endswith("but climbed or sank")

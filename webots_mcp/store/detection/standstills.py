@@ -18,6 +18,7 @@ from webots_mcp.store.detection.motion import Motion, in_metres
 from webots_mcp.store.reading.rows import Columns
 
 NEARLY: Final = 0.95  # of the shortest duration: ends are known to a row or two
+NOISE_RANGE: Final = 6.0  # deviations of noise from the least of some hundred rows to the greatest
 SHORTEST_SHARE: Final = 4.0  # of the shortest standstill: shorter ones came nowhere near
 _SAME_SHARE: Final = 0.5  # of the shorter one that two have in common, if they are the same
 _ACROSS_S: Final = 20.0  # or of so long
@@ -123,14 +124,19 @@ def standings_in(
 def _at_one_height(
     columns: Columns, motion: Motion, radius_m: float, least_s: float
 ) -> Iterator[Columns]:
-    """The parts of a standstill in which it neither climbs nor sinks."""
+    """The parts of a standstill in which it neither climbs nor sinks.
+
+    Noise does neither: with it, heights reach farther than the robot does.
+    """
     height = motion.height
     times, heights = columns.numbers(height.name) if height else (np.empty(0), np.empty(0))
     heights = in_metres(height, heights) if height else heights
-    if not len(times) or np.ptp(heights) <= radius_m:
+    tracks = tracks_of(times, heights, np.zeros(len(times)), noise_of(heights))
+    reach_m = np.ptp(np.concatenate([track.x for track in tracks])) if tracks else 0.0
+    if reach_m <= radius_m + NOISE_RANGE * max((each.left_m for each in tracks), default=0.0):
         yield columns
         return
-    for track in tracks_of(times, heights, np.zeros(len(times)), noise_of(heights)):
+    for track in tracks:
         for each in find_standstills(track, radius_m, least_s):
             yield _rows(columns, float(track.times[each.start]), float(track.times[each.last]))
 

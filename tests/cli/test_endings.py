@@ -103,7 +103,7 @@ def test_serving_ends_at_sigterm_with_a_word(folder: Path) -> None:
         process.stdin.flush()
         assert "serverInfo" in process.stdout.readline()
         process.terminate()
-        assert process.wait(timeout=20) == 143
+        assert process.wait(timeout=60) == 143
         assert process.stderr is not None
         assert process.stderr.read() == "webots-mcp: ended by SIGTERM\n"
 
@@ -121,7 +121,7 @@ def test_serving_ends_without_a_word_when_its_client_is_gone(folder: Path) -> No
         process.stdout.close()
         process.stdin.write(f"{json.dumps(call)}\n")
         process.stdin.close()
-        assert (process.wait(timeout=20), process.stderr.read()) == (0, "")
+        assert (process.wait(timeout=60), process.stderr.read()) == (0, "")
 
 
 @pytest.mark.parametrize(
@@ -135,7 +135,7 @@ def test_a_job_that_is_ended_halfway_says_so(
         assert process.stdout is not None
         process.stdout.read(100)  # it has begun, and waits until more is read: the pipe is full
         process.send_signal(number)
-        _, err = process.communicate(timeout=20)
+        _, err = process.communicate(timeout=60)
     assert (process.returncode, err) == (code, f"webots-mcp: {word}\n")
 
 

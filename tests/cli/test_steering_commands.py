@@ -185,7 +185,7 @@ def test_ctrl_c_leaves_the_simulation_as_then_says(
     wanted = "SELECT count(*) FROM command WHERE action = 'run' AND status = ?"
     wait_for(lambda: recording.rows(wanted, "claimed") == [1] or process.poll() is not None)
     process.send_signal(number)
-    _, said = process.communicate(timeout=20)
+    _, said = process.communicate(timeout=60)
     assert process.returncode == 128 + number, said
     wait_for(lambda: recording.rows(wanted, "done") == [1])
     (result,) = recording.rows("SELECT result FROM command WHERE action = 'run'")

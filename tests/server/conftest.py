@@ -112,7 +112,7 @@ class Driver(threading.Thread):
 
     def stop(self) -> None:
         self.robot.simulation.quit()
-        self.join(timeout=10)
+        self.join(timeout=60)
         assert not self.is_alive()
         self.bridge.close()
 

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.anyio
 
 async def newest_state(client: Client) -> dict[str, Any]:
     """The answer about the robot's state, once there is one."""
-    with anyio.fail_after(20):
+    with anyio.fail_after(60):
         while "state" not in (answer := await ask(client, "webots_get_robot_state")):
             await anyio.sleep(0.02)
     return answer
@@ -31,7 +31,7 @@ async def test_a_breakpoint_pauses_at_the_step_and_is_listed_and_removed(
         answer = await ask(client, "webots_breakpoint", condition=f"steps == {at}")
         assert answer["armed"] is True
         assert "notes" not in answer and "hint" not in answer
-        with anyio.fail_after(20):
+        with anyio.fail_after(60):
             while (await ask(client, "webots_get_robot_state"))["status"] != "paused":
                 await anyio.sleep(0.02)
         state = await ask(client, "webots_get_robot_state")

@@ -123,7 +123,7 @@ async def test_an_interrupt_that_meets_the_waiting_itself_ends_the_run(
 
 async def _until_run_is(client: Client, outcome: str) -> dict[str, Any]:
     """The newest `run` command, once it is that far."""
-    with anyio.fail_after(20):
+    with anyio.fail_after(60):
         while True:
             answer = await ask(client, "webots_list_commands")
             for row in rows_of(answer.get("commands")):
@@ -179,7 +179,7 @@ async def test_what_cannot_end_is_refused_before_anything_is_sent(
     connect: Connect, driver: Driver
 ) -> None:
     async with connect() as client:
-        with anyio.fail_after(20):
+        with anyio.fail_after(60):
             while (await ask(client, "webots_get_robot_state"))["sim_time_s"] < 0.5:
                 await anyio.sleep(0.02)
         misspelt = await fail(client, "webots_run", until="step > 70")

@@ -56,7 +56,7 @@ class Crowd:
     def close(self) -> None:
         self.simulation.quit()
         for loop in self.loops:
-            loop.join(timeout=10)
+            loop.join(timeout=60)
             assert not loop.is_alive()
             loop.bridge.close()
 

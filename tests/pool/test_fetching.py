@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shutil
 import sqlite3
 import subprocess
@@ -19,6 +20,7 @@ from tests.pool.lab import Lab
 from tests.recordings.answers import answers
 from tests.recordings.rounds import PART, record_rounds
 from tests.recordings.runs import Recorded
+from tests.store.export.test_export import publish
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
@@ -27,6 +29,7 @@ from webots_mcp.pool.target import open_pool, open_target
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.retention import Limit, Retention, prune
+from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.trials import (
     find_trial_set,
     trials_of,
@@ -116,6 +119,38 @@ def test_a_run_of_full_rate_comes_back_with_the_same_answers_whatever_was_purged
         run = found.runs[uuid]
         assert run_info(here, run).purged_rows == 0
         assert (everything(here, lab.here, run), answers(here, run, part)) == before
+
+
+ODD_STATES: list[dict[str, Any]] = [
+    {"z": 1, "a": {"longer": 1, "b": [{"y": 1, "x": 2}]}, "long": list(range(20))},
+    {"": 1, "a b": 2, 'q"u': 3, "back\\slash": 4, "ünï": "ö\u2028", "zz": {}, "empty": []},
+    {"tiny": 5e-324, "huge": 1.7e308, "e22": 1e22, "third": 1 / 3, "-": -0.0},
+    {"int": 2**70 + 1, "round": 10**20, "more": 123456789012345678901234567890},
+    {"nul": "a\0b", "flag": True, "none": None, "text": '{"not": "parsed"}', "k": 1e3},
+    {"nan": math.nan, "inf": [math.inf, 1.0, -math.inf]},
+]
+
+
+@IN_EACH_POOL
+def test_each_value_of_a_state_comes_back(lab: Lab, runs: Recorded) -> None:
+    run_id = runs.add_run(0)
+    for number, state in enumerate(ODD_STATES):
+        publish(runs, float(number), state)
+    runs.connection.execute(
+        "UPDATE run SET uuid = ?, rows = ? WHERE id = ?", (new_uuid(), len(ODD_STATES), run_id)
+    )
+    while not roll(runs.connection).done:
+        pass
+    lab.ship(runs.folder / DATABASE_NAME, full=True)
+    uuid = uuid_of(runs.folder / DATABASE_NAME, run_id)
+
+    run = lab.fetch(run_uuid=uuid).runs[uuid]
+
+    query = "SELECT json_group_array(json(data)) FROM state WHERE run_id = ? ORDER BY id"
+    with lab.opened() as here:
+        (fetched,) = here.execute(query, (run,)).fetchone()
+    (recorded,) = runs.connection.execute(query, (run_id,)).fetchone()
+    assert fetched.replace("-0.0", "0.0") == recorded.replace("-0.0", "0.0")
 
 
 @IN_EACH_POOL

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from typing import Any, Final, cast
 
 _STEP: Final = re.compile(r'\.("(?:[^"\\]|\\.)*"|[^."\[\]]+)|\[(\d+)\]')
+_LONG: Final = re.compile(r"\d{19}")
 
 Order = dict[str, Any]
 
@@ -35,12 +36,20 @@ def _key(step: str) -> str:
 
 
 def in_order(text: str, order: Order) -> str:
-    """A state as JSON text with its keys in that order; what the order lacks comes last."""
+    """A state as JSON text with its keys in that order; what the order lacks comes last.
+
+    A whole number beyond those of SQLite was a float, which a pool without exponents spells out.
+    """
     try:
-        state = json.loads(text)
-    except (ValueError, RecursionError):
+        state = json.loads(text, parse_int=_number if _LONG.search(text) else None)
+    except (ValueError, OverflowError, RecursionError):
         return text
     return json.dumps(_sorted(state, order), ensure_ascii=False, separators=(",", ":"))
+
+
+def _number(digits: str) -> int | float:
+    number = int(digits)
+    return number if -(2**63) <= number < 2**63 else float(number)
 
 
 def _sorted(value: Any, order: Order) -> Any:

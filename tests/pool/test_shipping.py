@@ -265,7 +265,7 @@ def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
     assert not list(shipped.folder.glob("*shipped.json"))
 
 
-def test_rows_of_other_programs_that_are_no_text_and_no_json_are_shipped_as_what_is_near(
+def test_rows_of_other_programs_that_hold_no_text_and_no_times_are_shipped_as_what_is_near(
     shipped: Shipped,
 ) -> None:
     run_id = shipped.add_run()
@@ -275,7 +275,21 @@ def test_rows_of_other_programs_that_are_no_text_and_no_json_are_shipped_as_what
         (run_id,),
     )
     shipped.ship()
-    assert shipped.pooled()["log"][-1][3:] == ("soon", "info", "controller", "a\ufffdb", None)
+    for time_s in ("'soon'", "-9e999", "9e999"):
+        shipped.connection.execute(
+            "INSERT INTO state (run_id, sim_time_s, wall_time_s, data) "
+            f"VALUES (?, {time_s}, {time_s}, '{{}}')",
+            (run_id,),
+        )
+    shipped.keep(run_id, 0, 9e999)
+    shipped.recorded.publish(100.0, {"x": 1})
+    shipped.roll()
+    shipped.ship()
+    shipped.ship(full=True)
+    pooled = shipped.pooled()
+    assert pooled["log"].pop()[3:] == ("soon", "info", "controller", "a\ufffdb", None)
+    shipped.connection.execute("DELETE FROM log WHERE wall_time_s = 'soon'")
+    assert pooled == shipped.rows()
 
 
 def test_a_row_that_is_larger_than_a_batch_is_shipped(shipped: Shipped) -> None:

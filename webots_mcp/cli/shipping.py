@@ -66,6 +66,7 @@ def ship(arguments: argparse.Namespace) -> None:
     report, is_done = Report(), False
     try:
         if arguments.follow:
+            _say(f"shipping to {redacted(url)} until Ctrl-C")
             follow(order, report, _say, arguments.pause_s or pause_of(url))
         else:
             ship_once(order, report)

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 
 from webots_mcp.pool.batch import Batch, Row
-from webots_mcp.pool.reading import Source, Stretch
+from webots_mcp.pool.reading import Source, Stretch, is_finite
 from webots_mcp.pool.tables import SQLValue, Table, table
 
 _NEVER: Final = -1
@@ -115,4 +115,4 @@ class Kept:
 
 def _microseconds(time_s: SQLValue) -> int | None:
     """None of what is no time."""
-    return round(time_s * 1e6) if isinstance(time_s, int | float) else None
+    return round(time_s * 1e6) if is_finite(time_s) else None

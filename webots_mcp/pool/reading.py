@@ -6,10 +6,11 @@ meanwhile, and the robot's disk would fill up because a server is slow.
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from collections.abc import Callable, Iterator, Sequence
 from hashlib import blake2b
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeGuard
 
 from webots_mcp.errors import DatabaseError
 from webots_mcp.pool.batch import BATCH_BYTES, BATCH_ROWS, Batch, Row, batches, row_bytes
@@ -179,7 +180,7 @@ class Source:
             return None  # rolled up anew, or rows that would tell are deleted
         asked = (known, mark.state_id, mark.run_id)
         earliest = self._connection.execute(_EARLIEST, asked).fetchone()[0]
-        return None if earliest is None else bucket_of(earliest)
+        return bucket_of(earliest) if is_finite(earliest) else None
 
     def rolled(self, table: Table, mark: Mark, after: int) -> Iterator[Batch]:
         """Rollups or change points of a run whose bucket or state row comes after that one."""
@@ -256,6 +257,11 @@ class Source:
 
     def _first(self, query: str, *values: object) -> int:
         return int(self._connection.execute(query, values).fetchone()[0])
+
+
+def is_finite(value: SQLValue) -> TypeGuard[int | float]:
+    """Whether it is a number that can be reckoned with, as all that a bridge writes."""
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def coarse_after(known_end: int | None, since: int | None) -> int:

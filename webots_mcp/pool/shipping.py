@@ -288,12 +288,13 @@ class _Shipper:
                 self._kept.ship(source, self._last_ids["state"], thorough=thorough)
             if self._order.pictures:
                 self._ship_pictures(source)
-            if is_complete:
+            is_whole = is_complete and thorough  # else some of what may change was not looked at
+            if is_whole:
                 self._tell_whole(source)
             self._outbox.send()
             is_frozen = isinstance(connection, FrozenConnection)
         if not is_frozen:
-            self._leave_word(started_s, is_complete=is_complete)
+            self._leave_word(started_s, is_complete=is_whole)
         return is_complete
 
     def _appended(self) -> list[Table]:

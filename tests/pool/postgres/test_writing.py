@@ -187,6 +187,22 @@ def test_a_month_that_somebody_dropped_is_made_again(
     assert postgres.execute(pool, "SELECT id FROM log") == [(2,)]
 
 
+def test_several_that_need_the_same_months_at_once_all_get_them(
+    postgres: Server, pool: str
+) -> None:
+    months = [batch("event", id=n, wall_time_s=1.6e9 + n * 2_700_000.0) for n in range(12)]
+
+    def write_all(number: int) -> None:
+        uuid = f"00000000-0000-4000-8000-00000000000{number}"
+        with PostgresTarget(postgres.url(pool)) as target, target.shipment(uuid) as shipment:
+            shipment.write(months[::-1] if number % 2 else months, {"a": 1})
+
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(write_all, range(4)))
+    sql = "SELECT count(*), count(DISTINCT tableoid) FROM event"
+    assert postgres.execute(pool, sql) == [(48, 12)]
+
+
 def test_who_ships_need_not_own_the_tables(postgres: Server, pool: str) -> None:
     postgres.execute(pool, "CREATE ROLE shipper LOGIN")
     postgres.execute(pool, "GRANT SELECT, INSERT, UPDATE ON ALL TABLES IN SCHEMA public TO shipper")

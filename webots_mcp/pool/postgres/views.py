@@ -29,9 +29,7 @@ def _path(name: str) -> str:
 _USUAL_POSITIONS: Final = ",\n      ".join(
     f"({_path(x)}, {_path(y)}, {metres_in(x)})" for x, y in naming.USUAL_POSITIONS
 )
-_UNITS: Final = " ".join(
-    f"WHEN '{unit}' = ANY(way || words) THEN {METRES[unit]}" for unit in ("mm", "cm", "km")
-)
+_UNITS: Final = ", ".join(f"('{unit}', {metres})" for unit, metres in METRES.items())
 _YAWS: Final = ", ".join(
     f"nullif(state #> {_path(name)}, 'null')"
     for name in ("pose.yaw", "pose.theta", "pose.heading", "yaw", "theta", "heading")
@@ -43,7 +41,7 @@ _RANKED: Final = (*naming.MODES, *naming.STATES)
 _JULIAN_MS: Final = "210866760000000.0::double precision"
 
 # Functions are found by name when a view is asked: so they keep the search path they were made in.
-_FUNCTIONS: Final = f"""
+_FUNCTIONS: Final = rf"""
 CREATE OR REPLACE FUNCTION utc_text(wall_time_s double precision) RETURNS text
 LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
   SELECT CASE WHEN wall_time_s BETWEEN -62135596800 AND 253402300799
@@ -72,6 +70,16 @@ LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
 CREATE OR REPLACE FUNCTION words_of(part text) RETURNS text[]
 LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
   SELECT string_to_array(lower(regexp_replace(part, '{_HUMP}', '_', 'g')), '_') $$;
+
+-- What one of the unit in a name is in metres: the last counts, and a lone m only at an end.
+CREATE OR REPLACE FUNCTION metres_of(parts text[]) RETURNS double precision
+LANGUAGE sql IMMUTABLE PARALLEL SAFE SET search_path FROM CURRENT AS $$
+  SELECT coalesce((
+    SELECT u.metres FROM unnest(parts) WITH ORDINALITY p (part, place),
+      unnest(words_of(part)) WITH ORDINALITY w (word, at)
+    JOIN (VALUES {_UNITS}) u (unit, metres) ON u.unit = word
+    WHERE word <> 'm' OR lower(part) LIKE '%\_m'
+    ORDER BY place DESC, at DESC LIMIT 1), 1) $$;
 
 -- Numbers and texts of a state with their paths; of arrays only what can be a coordinate.
 CREATE OR REPLACE FUNCTION leaves_of(state jsonb) RETURNS TABLE (path text[], value jsonb)
@@ -129,7 +137,7 @@ BEGIN
         AND cardinality(branch || rest) > 0 END
   )
   SELECT ARRAY[number_of(x.value) * x.metres, number_of(y.value) * x.metres] INTO found
-  FROM (SELECT *, CASE {_UNITS} ELSE 1 END AS metres FROM own WHERE axis = 'x') x
+  FROM (SELECT *, metres_of(branch || last) AS metres FROM own WHERE axis = 'x') x
   JOIN own y ON y.axis = 'y' AND y.branch = x.branch AND y.rest = x.rest
   ORDER BY NOT (coalesce(x.beside, '{{}}') || x.words) && {_array(naming.BRANCHES)},
     x.name COLLATE "C", y.name COLLATE "C" LIMIT 1;
@@ -185,8 +193,9 @@ def _robot_of(alias: str) -> str:
 
 
 _POSE: Final = """
-  (position_of(s.data))[1] AS x_m, (position_of(s.data))[2] AS y_m, yaw_of(s.data) AS yaw_rad,
-  mode_of(s.data) AS mode"""
+  p.xy[1] AS x_m, p.xy[2] AS y_m, yaw_of(s.data) AS yaw_rad, mode_of(s.data) AS mode"""
+# With an OFFSET it is found once for both coordinates, and not at all where none is asked for.
+_POSITION: Final = "CROSS JOIN LATERAL (SELECT position_of(s.data) AS xy OFFSET 0) p"
 
 # In the order in which they are made: what a view asks comes before it.
 VIEWS: Final = {
@@ -209,14 +218,15 @@ FROM robot r
 LEFT JOIN LATERAL (SELECT id, end_reason FROM run
   WHERE {_KEY} = r.{_KEY} AND robot_id = r.id ORDER BY id DESC LIMIT 1) u ON true
 LEFT JOIN LATERAL (SELECT sim_time_s, wall_time_s, data, odd FROM state
-  WHERE {_KEY} = r.{_KEY} AND run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1) s ON true""",
+  WHERE {_KEY} = r.{_KEY} AND run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1) s ON true
+{_POSITION}""",
     ),
     "robot_trajectory": (
         "Where each robot was and in which mode, row by row: ask with recording_uuid = ..., "
         "run_id = ... and a time.",
         f"""SELECT s.{_KEY}, {_robot_of("s")},
   s.run_id, s.id AS state_id, s.sim_time_s, utc_text(s.wall_time_s) AS utc,{_POSE}, s.odd
-FROM state s""",
+FROM state s {_POSITION}""",
     ),
     "robot_run": (
         "Runs: how long in simulation and in wall time, how fast, what is left of the rows.",

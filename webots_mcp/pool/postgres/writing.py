@@ -26,7 +26,7 @@ from webots_mcp.pool.tables import SQLValue, Table
 from webots_mcp.pool.target import redacted
 
 _T = TypeVar("_T")
-_SHIPPER: Final = 1_463_962_947  # the first half of the lock of who ships a recording
+_SHIPPER: Final = 1_463_962_947  # the seed of the lock of who ships a recording
 _MANY: Final = 500  # rows of a table that changes: as a rule, so many at once are new
 _TYPES: Final = {int: "bigint", float: "double precision", str: "text"}
 _REPLACEMENT: Final = "\N{REPLACEMENT CHARACTER}"
@@ -61,10 +61,10 @@ class PostgresTarget:
     def shipment(self, recording_uuid: str) -> Generator[PostgresShipment]:
         """Be the one who ships this recording, as long as the connection lasts."""
         connection = self._connected()
-        lock = "SELECT pg_try_advisory_lock(%s, hashtext(%s))"
+        lock = "SELECT pg_try_advisory_lock(hashtextextended(%s, %s))"
         with clear_errors(self.address):
             require_current(connection, self.address)
-            got = connection.execute(lock, (_SHIPPER, recording_uuid)).fetchone()
+            got = connection.execute(lock, (recording_uuid, _SHIPPER)).fetchone()
         if got is None or not got[0]:
             raise PoolBusyError(
                 f"another process ships the recording {recording_uuid} to {self.address}"
@@ -72,9 +72,9 @@ class PostgresTarget:
         try:
             yield PostgresShipment(connection, self.address, recording_uuid)
         finally:
-            unlock = "SELECT pg_advisory_unlock(%s, hashtext(%s))"
+            unlock = "SELECT pg_advisory_unlock(hashtextextended(%s, %s))"
             with contextlib.suppress(psycopg.Error):  # it is lost, and the lock with it
-                connection.execute(unlock, (_SHIPPER, recording_uuid))
+                connection.execute(unlock, (recording_uuid, _SHIPPER))
 
     def _connected(self) -> Connection:
         """The connection; a new one in the place of one that was lost."""

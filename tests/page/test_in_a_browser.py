@@ -18,7 +18,7 @@ from webots_mcp.contract import DATABASE_NAME
 pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
 from playwright.sync_api import Page, expect
 
-PATIENCE_MS = 20_000
+PATIENCE_MS = 120_000
 # Models that are shown no more are forgotten a little later: the last one of a name is meant.
 NAMED = "name => [...Bokeh.documents[0]._all_models.values()].filter(m => m.name == name).at(-1)"
 SOURCE = f"""name => {{

@@ -34,11 +34,17 @@ def refused(checkout: Path, python: str) -> str:
 
 def write_python(file: Path, version: str) -> str:
     """A program that says that it is that Python."""
-    file.parent.mkdir(parents=True, exist_ok=True)
     too_old = int(version < "3.10")
-    file.write_text(f"#!/bin/sh\ncase $2 in *ensurepip*) exit {too_old};; esac\necho {version}\n")
-    file.chmod(0o755)
+    write_program(file, f"case $2 in *ensurepip*) exit {too_old};; esac\necho {version}")
     return str(file)
+
+
+def write_program(file: Path, lines: str) -> Path:
+    """A program of the shell."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(f"#!/bin/sh\n{lines}\n")
+    file.chmod(0o755)
+    return file
 
 
 def test_a_python_that_is_not_there_is_named(checkout: Path) -> None:
@@ -72,3 +78,22 @@ def test_what_another_job_installed_is_not_installed_again(checkout: Path) -> No
     assert [bool(said(job)) for job in ("shell", "docs", "docs", "shell")] == [
         True, True, False, False
     ]  # fmt: skip
+
+
+def test_the_tests_run_side_by_side_unless_pytest_is_told_what_to_do(
+    checkout: Path, tmp_path: Path
+) -> None:
+    python = checkout / ".venv" / "bin" / "python"
+    write_program(python, '[ "$2" != pytest ] || echo "$@"')
+    (checkout / "pyproject.toml").touch()
+    for there in ("chromium", "initdb"):  # else they would be installed
+        write_program(tmp_path / "bin" / there, "")
+    path = f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    environment = {**os.environ, "PYTHON": str(python), "PATH": path}
+
+    def asked(*options: str) -> str:
+        line = [checkout / "run", "tests", *options]
+        return subprocess.run(line, env=environment, capture_output=True, text=True).stdout
+
+    assert asked().split()[:3] == ["-m", "pytest", "-n"]
+    assert asked("--pdb", "tests/test_units.py") == "-m pytest --pdb tests/test_units.py\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 from collections.abc import Callable, Iterator
@@ -19,8 +20,9 @@ from tests.trials.conftest import Run, command, rows
 from tests.trials.dask_cluster import Cluster, found
 from webots_mcp import __version__
 from webots_mcp.server import create_server
+from webots_mcp.store.trials import Result
 from webots_mcp.trials import cluster
-from webots_mcp.trials.cluster import Needs, digest_of, what_lacks
+from webots_mcp.trials.cluster import Needs, digest_of, packed, what_lacks
 from webots_mcp.trials.simulators import stand_in
 
 __all__ = ["anyio_backend"]
@@ -55,6 +57,11 @@ def started(project: Path) -> Iterator[Callable[..., subprocess.Popen[str]]]:
         process.communicate()
 
 
+def answer_of(ended: subprocess.CompletedProcess[str]) -> dict[str, Any]:
+    assert ended.returncode == 0, ended.stderr
+    return json.loads(ended.stdout)
+
+
 def scores(answer: dict[str, Any]) -> dict[float, set[float]]:
     """By the speed."""
     return {each["parameters"]["speed"]: set(each["scores"]) for each in answer["sets"]}
@@ -83,7 +90,7 @@ def test_a_worker_that_is_killed_costs_nothing_and_the_scores_are_those_of_this_
     assert [each.trials for each in dask_cluster.workers] == [[], [], []]
     found(lambda: not any(each.is_running() for each in simulator))
     plan(GRID.format(1))
-    assert scores(json.loads(run("--json").stdout)) == scores(answer)
+    assert scores(answer_of(run("--json"))) == scores(answer)
 
 
 def test_who_handed_them_out_may_be_ended_and_gone_on_from(
@@ -104,7 +111,7 @@ def test_who_handed_them_out_may_be_ended_and_gone_on_from(
         assert process.returncode == code
         assert "Traceback" not in said
         found(lambda: not any(each.trials for each in workers))
-    answer = json.loads(run("--scheduler", dask_cluster.address, "--json").stdout)
+    answer = answer_of(run("--scheduler", dask_cluster.address, "--json"))
 
     assert answer["trial_set_id"] == 1
     assert sorted(len(each["scores"]) for each in answer["sets"]) == [1, 2]
@@ -138,7 +145,7 @@ def test_a_trial_that_kills_its_workers_fails_with_that_reason(
     (project / "controllers" / "rover" / "rover.py").write_text(DEADLY)
     plan('score = "last(x)"\nfor_s = 0.3\n[grid]\nspeed = [1.0, 2.0]')
 
-    answer = json.loads(run("--scheduler", dask_cluster.address, "--json").stdout)
+    answer = answer_of(run("--scheduler", dask_cluster.address, "--json"))
 
     assert [each["scores"] for each in answer["sets"]] == [[1.0, 1.0], []]
     assert (
@@ -158,13 +165,38 @@ def test_a_search_prunes_there_as_here(
     )
     options = ("--scheduler", dask_cluster.address, "--search", "random", "--jobs", "1")
 
-    answer = json.loads(run(*options, "--json").stdout)
+    answer = answer_of(run(*options, "--json"))
 
     told = "SELECT status, ended_by, parameters FROM trial"
     assert set(rows(project, told)) == {
         ("done", "for_s", '{"speed": 1.0}'), ("pruned", "prune", '{"speed": 9.0}'),
     }  # fmt: skip
     assert sum(len(each["scores"]) + each["pruned"] for each in answer["sets"]) == 4
+
+
+def test_recordings_that_are_too_large_to_return_come_through_a_pool(
+    project: Path, plan: Write, run: Run, dask_cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dask_cluster.start(1)
+    plan('score = "last(x)"\nfor_s = 0.3\n[grid]\nspeed = [1.0]')
+    pool = project / "pool"
+    options = ("--scheduler", dask_cluster.address, "--ship-to", str(pool), "--json")
+
+    answer = answer_of(run(*options))
+
+    assert [len(each["scores"]) for each in answer["sets"]] == [2]
+    rows_of_run = "SELECT count(*) FROM trial t JOIN state s ON s.run_id = t.run_id GROUP BY t.id"
+    assert rows(project, rows_of_run) == [(20,), (20,)]
+    assert len(list(pool.glob("recording=*"))) == 2
+
+    trial = project / "trial"
+    shutil.copytree(project / "data", trial / "data")
+    monkeypatch.setattr(cluster, "MOST_BYTES", 10)
+    returned = packed(Result(1, 1.0, None), trial / "data")
+    assert (returned.recording, returned.result.run_id, returned.result.status) == (
+        None, None, "failed",
+    )  # fmt: skip
+    assert "--ship-to has it come through a pool" in (returned.result.error or "")
 
 
 @pytest.mark.anyio

@@ -25,7 +25,7 @@ from webots_mcp.cli.command import (
 from webots_mcp.cli.ending import ending_by_event
 from webots_mcp.cli.history import write_picture
 from webots_mcp.cli.tables import print_notes, print_table, text_of
-from webots_mcp.errors import NothingRecordedError
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
 
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.ranking import Ranking
@@ -46,6 +46,8 @@ _WORDS: Final = {"done": "score", "failed": "failed:", "pruned": "pruned:"}
           "--scheduler as many as its workers can run)", default=None, dest="jobs"),
     argument("--scheduler", metavar="ADDRESS",
              help="on the workers of a Dask cluster, such as tcp://HOST:8786"),
+    argument("--ship-to", metavar="URL",
+             help="with --scheduler: large recordings come through this pool, and stay in it"),
     argument("--search", metavar="SAMPLER",
              help="search the plan's [ranges]: tpe or random, by Optuna (pip install optuna)"),
     argument("--stand-in", action="store_true", help="on the stand-in instead of Webots"),
@@ -111,7 +113,9 @@ def _simulators(
     if arguments.scheduler is not None:
         from webots_mcp.trials.cluster import cluster
 
-        return cluster(arguments.scheduler, plan, command_of, arguments.jobs)
+        return cluster(arguments.scheduler, plan, command_of, arguments.jobs, arguments.ship_to)
+    if arguments.ship_to is not None:
+        raise InvalidInputError("--ship-to is for --scheduler: what runs here is merged as it is")
     command_of(plan.world)
     return nullcontext(LocalSimulators(command_of, arguments.jobs or 1))
 

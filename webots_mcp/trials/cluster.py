@@ -17,14 +17,17 @@ from collections.abc import Generator, Iterator
 from concurrent.futures import CancelledError, Executor, Future, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from webots_mcp import __version__
-from webots_mcp.contract import host_name
+from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+from webots_mcp.pool.target import open_pool, open_target
 from webots_mcp.store.bundle import pack, unpack
+from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result
 from webots_mcp.trials.plan import WorldPlan
 from webots_mcp.trials.running import Attempt, Command, StoppedError, run_attempt
@@ -54,19 +57,28 @@ class Needs:
         world: The path of the world file.
         digest: Of that file and the sources of the project's controllers.
         command: Of the simulator.
+        ship_to: The URL of a pool that takes the recordings; None where they are returned.
     """
 
     version: str
     world: str
     digest: str
     command: Command
+    ship_to: str | None = None
 
 
 class Returned(NamedTuple):
-    """What a worker returns: what became of a trial, and its recording, packed."""
+    """What a worker returns: what became of a trial, and what it recorded.
+
+    Attributes:
+        result: With the id of its run in that recording.
+        recording: Packed; None where there is none, or it was shipped.
+        shipped: By their ids the UUIDs of the runs that were shipped; None where none were.
+    """
 
     result: Result
-    recording: bytes | None
+    recording: bytes | None = None
+    shipped: dict[int, str] | None = None
 
 
 def what_lacks(needs: Needs) -> str | None:
@@ -79,9 +91,23 @@ def what_lacks(needs: Needs) -> str | None:
         return f"{needs.world}, or its controllers, are not the same there: {_SHARED}"
     try:
         needs.command(needs.world)
-    except CommandRefusedError as error:
+        if needs.ship_to is not None:
+            _require_pool(needs.ship_to)
+    except WebotsMCPError as error:
         return str(error)
     return None
+
+
+def _require_pool(url: str) -> None:
+    """See that it can be the address of a pool, without connecting.
+
+    Raises:
+        InvalidInputError: It cannot, or the packages for it are missing.
+    """
+    try:
+        open_target(url)
+    except ModuleNotFoundError as error:
+        raise InvalidInputError(str(error)) from error
 
 
 def digest_of(world: str) -> str:
@@ -115,7 +141,14 @@ def run_here(needs: Needs, plan_text: str) -> Returned:
             folder = Path(name) / "data"
             folder.mkdir()
             attempt = Attempt(plan, plan.parameters[0], folder, unwanted, _note_nothing)
-            return _returned(run_attempt(attempt, needs.command), folder)
+            result = run_attempt(attempt, needs.command)
+            if result.run_id is None:
+                return Returned(result)
+            return (
+                packed(result, folder)
+                if needs.ship_to is None
+                else Returned(result, shipped=_shipped(folder, needs.ship_to))
+            )
     except StoppedError:
         raise unwanted.as_dask_says() from None
     except OSError as error:
@@ -126,19 +159,27 @@ def _note_nothing(pid: int | None) -> None:
     """Whoever handed the trial out cannot end a process of this machine; its keeper does."""
 
 
-def _returned(result: Result, folder: Path) -> Returned:
-    if result.run_id is None:
-        return Returned(result, None)
+def packed(result: Result, folder: Path) -> Returned:
+    """A result with its recording, unless that is too large."""
     bundle = folder.parent / _BUNDLE
     pack(folder, bundle)
     size = bundle.stat().st_size
     if size > MOST_BYTES:
         why = (
             f"its recording has {size:,} bytes packed, and a worker returns at most "
-            f"{MOST_BYTES:,}: have the controller publish less, or less often"
+            f"{MOST_BYTES:,}: --ship-to has it come through a pool instead"
         )
-        return Returned(replace(result, run_id=None, score=None, error=why, pruned=False), None)
+        return Returned(replace(result, run_id=None, score=None, error=why, pruned=False))
     return Returned(result, bundle.read_bytes())
+
+
+def _shipped(folder: Path, url: str) -> dict[int, str]:
+    from webots_mcp.pool.shipping import Order, Report, ship
+
+    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    ship(Order(recording, partial(open_target, url), full=True, pictures=True), Report())
+    with recording.reader() as connection:
+        return dict(connection.execute("SELECT id, uuid FROM run").fetchall())
 
 
 class _Unwanted:
@@ -218,12 +259,28 @@ class ClusterSimulators:
                 future.cancel()
                 raise StoppedError
         returned = self._returned(future)
+        if returned.shipped is not None:
+            return self._fetched(returned.result, returned.shipped, attempt.folder)
         if returned.recording is not None:
             bundle = attempt.folder / _BUNDLE
             bundle.write_bytes(returned.recording)
             unpack(bundle, attempt.folder)
             bundle.unlink()
         return returned.result
+
+    def _fetched(self, result: Result, shipped: dict[int, str], folder: Path) -> Result:
+        """The result, with its runs in a recording in the folder, as if it had been returned."""
+        from webots_mcp.pool.catalogue import Choice
+        from webots_mcp.pool.fetching import fetch
+
+        assert self._needs.ship_to is not None and result.run_id is not None
+        recording = Recording(folder / DATABASE_NAME, folder)
+        recording.create()
+        ids: dict[str, int] = {}
+        with open_pool(self._needs.ship_to) as pool, recording.writer() as connection:
+            for uuid in shipped.values():
+                ids |= fetch(pool, connection, folder, Choice(run_uuid=uuid)).runs
+        return replace(result, run_id=ids[shipped[result.run_id]])
 
     def _returned(self, future: Future[Returned]) -> Returned:
         from distributed import KilledWorker
@@ -235,7 +292,7 @@ class ClusterSimulators:
                 f"{error.allowed_failures + 1} workers died while they ran it, the last one "
                 f"{error.last_worker.address}: see their logs"
             )
-            return Returned(Result(None, None, why), None)
+            return Returned(Result(None, None, why))
         except CancelledError as error:
             raise CommandRefusedError(_LOST.format(self._address)) from error
         except WebotsMCPError:
@@ -248,7 +305,11 @@ class ClusterSimulators:
 
 @contextmanager
 def cluster(
-    address: str, plan: WorldPlan, command: Command, most: int | None
+    address: str,
+    plan: WorldPlan,
+    command: Command,
+    most: int | None,
+    ship_to: str | None = None,
 ) -> Generator[ClusterSimulators]:
     """The simulators of a cluster, as long as the block goes on.
 
@@ -257,14 +318,18 @@ def cluster(
         plan: Of the trials.
         command: Of a world's simulator, where it runs.
         most: How many trials run at once at most; None for as many as there are workers.
+        ship_to: The URL of a pool through which the recordings come; None for the scheduler.
 
     Raises:
         CommandRefusedError: Nobody answers there, no worker has a simulator, or one lacks
             something.
         InvalidInputError: It is no address, or Dask is not installed.
     """
+    if ship_to is not None:
+        _require_pool(ship_to)
+        ship_to = ship_to if "://" in ship_to else str(Path(ship_to).absolute())
     with _connected(address) as client:
-        needs = Needs(__version__, plan.world, digest_of(plan.world), command)
+        needs = Needs(__version__, plan.world, digest_of(plan.world), command, ship_to)
         _require_fit(client, address, needs)
         yield ClusterSimulators(client, address, needs, most)
 

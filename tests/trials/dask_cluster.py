@@ -78,12 +78,18 @@ class Worker(Process):
     @property
     def trials(self) -> list[Path]:
         """The scratch folders of the trials that it runs."""
-        return list(self.folder.glob("**/trial-*"))
+        scratch = self.folder / "dask-scratch-space"
+        found: list[Path] = []
+        for worker in scratch.glob("worker-*/"):
+            with contextlib.suppress(FileNotFoundError):  # it ends just now
+                found += [each for each in worker.iterdir() if each.name.startswith("trial-")]
+        return found
 
     @property
     def recording(self) -> Path | None:
         """Of the trial that it runs, once there is one."""
-        return next(iter(self.folder.glob("**/trial-*/data/webots.db")), None)
+        files = (each / "data" / "webots.db" for each in self.trials)
+        return next((each for each in files if each.exists()), None)
 
     @property
     def children(self) -> list[psutil.Process]:

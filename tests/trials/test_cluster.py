@@ -155,47 +155,37 @@ def test_a_trial_that_kills_its_workers_fails_with_that_reason(
     assert len(dask_cluster.workers) == 1
 
 
-def test_a_search_prunes_there_as_here(
+def test_a_search_prunes_there_as_here_and_its_recordings_may_come_through_a_pool(
     project: Path, plan: Write, run: Run, dask_cluster: Cluster
 ) -> None:
     dask_cluster.start(1)
     plan(
-        'score = "last(x)"\nfor_s = 0.3\nprune = "x > 2"\nsets = 3\nseed = 1\n[ranges]\n'
+        'score = "last(x)"\nfor_s = 0.3\nprune = "x > 2"\nsets = 2\nseed = 1\n[ranges]\n'
         "speed = { choices = [1.0, 9.0] }"
     )
     options = ("--scheduler", dask_cluster.address, "--search", "random", "--jobs", "1")
 
-    answer = answer_of(run(*options, "--json"))
+    answer_of(run(*options, "--ship-to", str(project / "pool"), "--json"))
 
     told = "SELECT status, ended_by, parameters FROM trial"
     assert set(rows(project, told)) == {
         ("done", "for_s", '{"speed": 1.0}'), ("pruned", "prune", '{"speed": 9.0}'),
     }  # fmt: skip
-    assert sum(len(each["scores"]) + each["pruned"] for each in answer["sets"]) == 4
+    counted = "SELECT count(*) > 14 FROM trial t JOIN state s USING (run_id) GROUP BY t.id"
+    assert rows(project, counted) == [(1,)] * 3
+    assert len(list((project / "pool").glob("recording=*"))) == 3
 
 
-def test_recordings_that_are_too_large_to_return_come_through_a_pool(
-    project: Path, plan: Write, run: Run, dask_cluster: Cluster, monkeypatch: pytest.MonkeyPatch
+def test_a_recording_that_is_too_large_to_return_fails_its_trial_and_says_what_to_do(
+    bridge_recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    dask_cluster.start(1)
-    plan('score = "last(x)"\nfor_s = 0.3\n[grid]\nspeed = [1.0]')
-    pool = project / "pool"
-    options = ("--scheduler", dask_cluster.address, "--ship-to", str(pool), "--json")
-
-    answer = answer_of(run(*options))
-
-    assert [len(each["scores"]) for each in answer["sets"]] == [2]
-    counted = "SELECT count(*) > 18 FROM trial t JOIN state s USING (run_id) GROUP BY t.id"
-    assert rows(project, counted) == [(1,), (1,)]
-    assert len(list(pool.glob("recording=*"))) == 2
-
-    trial = project / "trial"
-    shutil.copytree(project / "data", trial / "data")
+    shutil.copytree(bridge_recording.parent, tmp_path / "trial")
     monkeypatch.setattr(cluster, "MOST_BYTES", 10)
-    returned = packed(Result(1, 1.0, None), trial / "data")
-    assert (returned.recording, returned.result.run_id, returned.result.status) == (
-        None, None, "failed",
-    )  # fmt: skip
+
+    returned = packed(Result(1, 1.0, None), tmp_path / "trial")
+
+    assert (returned.recording, returned.result.run_id) == (None, None)
+    assert returned.result.status == "failed"
     assert "--ship-to has it come through a pool" in (returned.result.error or "")
 
 

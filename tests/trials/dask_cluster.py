@@ -17,6 +17,15 @@ import psutil
 
 T = TypeVar("T")
 
+# Only workers need this package: the scheduler of a cluster lacks it.
+_RUN = """
+import sys
+if "{0}" == "scheduler":
+    sys.modules["webots_mcp"] = None
+from distributed.cli.dask_{0} import main
+main()
+"""
+
 _PATIENCE_S = 120.0
 _ADDRESS = re.compile(r"Scheduler at:\s+(tcp://\S+)")
 
@@ -37,7 +46,7 @@ class Process:
         folder.mkdir(parents=True)
         self.folder = folder
         self._log = folder / "log.txt"
-        line = [sys.executable, "-m", f"distributed.cli.dask_{program}", "--no-dashboard", *words]
+        line = [sys.executable, "-c", _RUN.format(program), "--no-dashboard", *words]
         # One death of a worker is an accident, two are the trial's fault.
         environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1"}
         with self._log.open("wb") as log:

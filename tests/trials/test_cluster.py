@@ -23,7 +23,6 @@ from webots_mcp.server import create_server
 from webots_mcp.store.trials import Result
 from webots_mcp.trials import cluster
 from webots_mcp.trials.cluster import Needs, digest_of, packed, what_lacks
-from webots_mcp.trials.simulators import stand_in
 
 __all__ = ["anyio_backend"]
 Write = Callable[[str], Path]
@@ -131,7 +130,7 @@ bridge = MCPBridge(robot, throttle_interval=1)
 speed = bridge.parameter("speed", 1.0)
 if speed.value == 2.0:
     for each in psutil.Process().parents():
-        if any(word.startswith("distributed.cli.dask_worker") for word in each.cmdline()):
+        if any("distributed.cli.dask_" in word for word in each.cmdline()):
             each.kill()
 while robot.step(16) != -1:
     bridge.publish({"x": speed.value})
@@ -285,7 +284,7 @@ def test_what_is_no_scheduler_is_refused_before_anything_is_written(
 def needs(world: Path, **other: Any) -> Needs:
     """What a worker has to have, as its client says."""
     said: dict[str, Any] = {"version": __version__, "digest": digest_of(str(world))}
-    return Needs(world=str(world), command=stand_in, **(said | other))
+    return Needs(world=str(world), is_stand_in=True, **(said | other))
 
 
 def test_a_worker_says_what_it_lacks(project: Path) -> None:

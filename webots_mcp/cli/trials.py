@@ -7,8 +7,8 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext, redirect_stdout
+from collections.abc import Callable, Generator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -109,15 +109,29 @@ def _simulators(
     from webots_mcp.trials.running import LocalSimulators
     from webots_mcp.trials.simulators import stand_in, webots
 
-    command_of = stand_in if arguments.stand_in else webots
     if arguments.scheduler is not None:
-        from webots_mcp.trials.cluster import cluster
-
-        return cluster(arguments.scheduler, plan, command_of, arguments.jobs, arguments.ship_to)
+        return _cluster(arguments, plan)
     if arguments.ship_to is not None:
         raise InvalidInputError("--ship-to is for --scheduler: what runs here is merged as it is")
+    command_of = stand_in if arguments.stand_in else webots
     command_of(plan.world)
     return nullcontext(LocalSimulators(command_of, arguments.jobs or 1))
+
+
+@contextmanager
+def _cluster(arguments: argparse.Namespace, plan: WorldPlan) -> Generator[Simulators]:
+    from webots_mcp.trials.cluster import cluster
+
+    with cluster(
+        arguments.scheduler,
+        plan,
+        is_stand_in=arguments.stand_in,
+        most=arguments.jobs,
+        ship_to=arguments.ship_to,
+    ) as simulators:
+        for note in simulators.notes:
+            print(f"webots-mcp: {note}", file=sys.stderr)
+        yield simulators
 
 
 def _picture_of(arguments: argparse.Namespace) -> Callable[[Recording, int], None] | None:

@@ -17,7 +17,6 @@ from webots_mcp.trials.plan import WorldPlan
 from webots_mcp.trials.runner import Workshop, run_taken_up, taken_up
 from webots_mcp.trials.running import StoppedError
 from webots_mcp.trials.searching import next_parameters
-from webots_mcp.trials.simulators import stand_in, webots
 
 ALLOWED_VARIABLE: Final = "DASK_SCHEDULER_ADDRESS"  # Dask's own name for the one to use
 _END_PATIENCE_S: Final = 5.0
@@ -47,8 +46,7 @@ class ClusterWorker(threading.Thread):
         self._stopping = threading.Event()
         self._set_id = 0
         self._open = ExitStack()
-        command = stand_in if is_stand_in else webots
-        simulators = self._open.enter_context(cluster(scheduler, plan, command, None))
+        simulators = self._open.enter_context(cluster(scheduler, plan, is_stand_in=is_stand_in))
         search = next_parameters if plan.search else None
         self._workshop = Workshop(recording, plan, simulators, self._stopping, search)
 

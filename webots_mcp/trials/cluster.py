@@ -13,13 +13,16 @@ import logging
 import re
 import tempfile
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import CancelledError, Executor, Future, wait
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from importlib import import_module
+from operator import methodcaller
 from pathlib import Path
+from pkgutil import resolve_name
+from platform import python_version
 from typing import Any, Final, NamedTuple
 
 from webots_mcp import __version__
@@ -31,6 +34,7 @@ from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result
 from webots_mcp.trials.plan import WorldPlan
 from webots_mcp.trials.running import Attempt, Command, StoppedError, run_attempt
+from webots_mcp.trials.simulators import stand_in, webots
 
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler
@@ -40,6 +44,7 @@ _COUNT_EVERY_S: Final = 2.0
 _WITHOUT_WORKERS_S: Final = 60.0
 _SOURCES: Final = (".py", ".c", ".cc", ".cpp", ".h", ".hpp", ".java", ".m")
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss)://[^\s/]+:[0-9]{1,5}")
+_TASK: Final = "webots_mcp.trials.cluster:run_here"
 _BUNDLE: Final = "recording.zip"
 _LOST: Final = "the scheduler {} was lost: what is left can be gone on with once it is back"
 _SHARED: Final = "all workers need the project under the same path, such as in a shared folder"
@@ -56,15 +61,20 @@ class Needs:
         version: Of webots-mcp.
         world: The path of the world file.
         digest: Of that file and the sources of the project's controllers.
-        command: Of the simulator.
+        is_stand_in: Whether the stand-in runs it, and not Webots.
         ship_to: The URL of a pool that takes the recordings; None where they are returned.
     """
 
     version: str
     world: str
     digest: str
-    command: Command
+    is_stand_in: bool
     ship_to: str | None = None
+
+    @property
+    def command(self) -> Command:
+        """Of the simulator."""
+        return stand_in if self.is_stand_in else webots
 
 
 class Returned(NamedTuple):
@@ -121,8 +131,12 @@ def digest_of(world: str) -> str:
     return digest.hexdigest()
 
 
-def run_here(needs: Needs, plan_text: str) -> Returned:
+def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
     """Run the only trial of a plan on this worker, in a scratch folder of its own.
+
+    Args:
+        asked: The fields of its `Needs`.
+        plan_text: The plan.
 
     Raises:
         CommandRefusedError: This machine cannot run it.
@@ -130,6 +144,7 @@ def run_here(needs: Needs, plan_text: str) -> Returned:
     """
     from distributed import get_worker
 
+    needs = Needs(**asked)
     worker: Any = get_worker()
     unwanted = _Unwanted(worker)
     where = f"worker {worker.address} on {host_name()}"
@@ -144,11 +159,9 @@ def run_here(needs: Needs, plan_text: str) -> Returned:
             result = run_attempt(attempt, needs.command)
             if result.run_id is None:
                 return Returned(result)
-            return (
-                packed(result, folder)
-                if needs.ship_to is None
-                else Returned(result, shipped=_shipped(folder, needs.ship_to))
-            )
+            if needs.ship_to is None:
+                return packed(result, folder)
+            return Returned(result, shipped=_shipped(folder, needs.ship_to))
     except StoppedError:
         raise unwanted.as_dask_says() from None
     except OSError as error:
@@ -220,9 +233,11 @@ class ClusterSimulators:
         address: Of the scheduler.
         needs: What each worker has to have.
         most: How many trials run at once at most; None for as many as there are workers.
+        notes: What its owner should know.
     """
 
     def __init__(self, client: Any, address: str, needs: Needs, most: int | None) -> None:
+        self.notes = _other_pythons(client)
         self._client = client
         self._address = address
         self._needs = needs
@@ -253,7 +268,7 @@ class ClusterSimulators:
         """As `Simulators.run`."""
         attempt.begun(None)
         text = _alone(attempt.plan, attempt.values).text
-        future = self._executor.submit(run_here, self._needs, text)
+        future: Future[Returned] = self._executor.submit(_call(asdict(self._needs), text), _TASK)
         while not wait([future], _PATIENCE_S).done:
             if attempt.stopping.wait(0):
                 future.cancel()
@@ -307,8 +322,9 @@ class ClusterSimulators:
 def cluster(
     address: str,
     plan: WorldPlan,
-    command: Command,
-    most: int | None,
+    *,
+    is_stand_in: bool,
+    most: int | None = None,
     ship_to: str | None = None,
 ) -> Generator[ClusterSimulators]:
     """The simulators of a cluster, as long as the block goes on.
@@ -316,7 +332,7 @@ def cluster(
     Args:
         address: Of the scheduler.
         plan: Of the trials.
-        command: Of a world's simulator, where it runs.
+        is_stand_in: Whether the stand-in runs them, and not Webots.
         most: How many trials run at once at most; None for as many as there are workers.
         ship_to: The URL of a pool through which the recordings come; None for the scheduler.
 
@@ -329,7 +345,7 @@ def cluster(
         _require_pool(ship_to)
         ship_to = ship_to if "://" in ship_to else str(Path(ship_to).absolute())
     with _connected(address) as client:
-        needs = Needs(__version__, plan.world, digest_of(plan.world), command, ship_to)
+        needs = Needs(__version__, plan.world, digest_of(plan.world), is_stand_in, ship_to)
         _require_fit(client, address, needs)
         yield ClusterSimulators(client, address, needs, most)
 
@@ -388,6 +404,18 @@ def _other_versions(client: Any, workers: list[str]) -> Iterator[str]:
             yield f"worker {each} (Python {python}) has {has}: here is {__version__}"
 
 
+def _other_pythons(client: Any) -> list[str]:
+    """Notes on workers whose Python is of another minor version: scores may hang on it."""
+    here, workers = python_version(), client.get_versions()["workers"]
+    minor = here.split(".")[:2]
+    pythons = {each: str(told["host"]["python"]) for each, told in workers.items()}
+    others = {each: said for each, said in pythons.items() if said.split(".")[:2] != minor}
+    if not others:
+        return []
+    some, said = next(iter(others.items()))
+    return [f"{len(others)} workers, such as {some}, have Python {said}: here is {here}"]
+
+
 def _simulators_of(client: Any, address: str) -> dict[str, int]:
     """How many simulators each worker runs at once, by its address."""
     try:
@@ -406,6 +434,16 @@ def _no_workers(address: str, when: str) -> str:
         f"the scheduler {address} has no worker with the resource {RESOURCE!r} {when}: start some "
         f"with 'dask worker {address} --resources {RESOURCE}=1 --nthreads 1'"
     )
+
+
+def _call(*arguments: Any) -> Callable[[str], Any]:
+    """What calls a function of that name with these arguments.
+
+    The scheduler unpacks what it passes on, and need not have this package: only a worker looks
+    the name up.
+    """
+    toolz: Any = import_module("toolz")  # a part of Dask
+    return toolz.compose(methodcaller("__call__", *arguments), resolve_name)
 
 
 def _alone(plan: WorldPlan, values: dict[str, Any]) -> WorldPlan:

@@ -48,7 +48,11 @@ class Process:
         self._log = folder / "log.txt"
         line = [sys.executable, "-c", _RUN.format(program), "--no-dashboard", *words]
         # One death of a worker is an accident, two are the trial's fault.
-        environment = {**os.environ, "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1"}
+        environment = {
+            **os.environ,
+            "DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "1",
+            "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
+        }
         with self._log.open("wb") as log:
             self.process = subprocess.Popen(
                 line, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT,

@@ -83,12 +83,12 @@ class Returned(NamedTuple):
     Attributes:
         result: With the id of its run in that recording.
         recording: Packed; None where there is none, or it was shipped.
-        shipped: By their ids the UUIDs of the runs that were shipped; None where none were.
+        shipped: The UUID of the recording, where it was shipped.
     """
 
     result: Result
     recording: bytes | None = None
-    shipped: dict[int, str] | None = None
+    shipped: str | None = None
 
 
 def what_lacks(needs: Needs) -> str | None:
@@ -186,13 +186,15 @@ def packed(result: Result, folder: Path) -> Returned:
     return Returned(result, bundle.read_bytes())
 
 
-def _shipped(folder: Path, url: str) -> dict[int, str]:
+def _shipped(folder: Path, url: str) -> str:
+    """The UUID of the recording, which is in the pool then."""
+    from webots_mcp.pool.reading import Source
     from webots_mcp.pool.shipping import Order, Report, ship
 
     recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
     ship(Order(recording, partial(open_target, url), full=True, pictures=True), Report())
     with recording.reader() as connection:
-        return dict(connection.execute("SELECT id, uuid FROM run").fetchall())
+        return Source(connection).uuid()
 
 
 class _Unwanted:
@@ -283,19 +285,19 @@ class ClusterSimulators:
             bundle.unlink()
         return returned.result
 
-    def _fetched(self, result: Result, shipped: dict[int, str], folder: Path) -> Result:
+    def _fetched(self, result: Result, recording_uuid: str, folder: Path) -> Result:
         """The result, with its runs in a recording in the folder, as if it had been returned."""
-        from webots_mcp.pool.catalogue import Choice
+        from webots_mcp.pool.catalogue import Meant
         from webots_mcp.pool.fetching import fetch
 
-        assert self._needs.ship_to is not None and result.run_id is not None
+        assert self._needs.ship_to is not None
         recording = Recording(folder / DATABASE_NAME, folder)
         recording.create()
-        ids: dict[str, int] = {}
         with open_pool(self._needs.ship_to) as pool, recording.writer() as connection:
-            for uuid in shipped.values():
-                ids |= fetch(pool, connection, folder, Choice(run_uuid=uuid)).runs
-        return replace(result, run_id=ids[shipped[result.run_id]])
+            runs = list(pool.runs(recording_uuid))
+            ids = fetch(pool, connection, folder, Meant(runs, ())).runs
+        (own,) = (ids[each.uuid] for each in runs if each.run_id == result.run_id)
+        return replace(result, run_id=own)
 
     def _returned(self, future: Future[Returned]) -> Returned:
         from distributed import KilledWorker

@@ -73,13 +73,15 @@ LANGUAGE sql IMMUTABLE PARALLEL SAFE AS $$
 
 -- What one of the unit in a name is in metres: the last counts, and a lone m only at an end.
 CREATE OR REPLACE FUNCTION metres_of(parts text[]) RETURNS double precision
-LANGUAGE sql IMMUTABLE PARALLEL SAFE SET search_path FROM CURRENT AS $$
-  SELECT coalesce((
+LANGUAGE plpgsql IMMUTABLE PARALLEL SAFE SET search_path FROM CURRENT AS $$
+BEGIN
+  RETURN coalesce((
     SELECT u.metres FROM unnest(parts) WITH ORDINALITY p (part, place),
       unnest(words_of(part)) WITH ORDINALITY w (word, at)
     JOIN (VALUES {_UNITS}) u (unit, metres) ON u.unit = word
     WHERE word <> 'm' OR lower(part) LIKE '%\_m'
-    ORDER BY place DESC, at DESC LIMIT 1), 1) $$;
+    ORDER BY place DESC, at DESC LIMIT 1), 1);
+END $$;
 
 -- Numbers and texts of a state with their paths; of arrays only what can be a coordinate.
 CREATE OR REPLACE FUNCTION leaves_of(state jsonb) RETURNS TABLE (path text[], value jsonb)
@@ -119,7 +121,9 @@ BEGIN
     SELECT path[:cardinality(path) - 1] AS branch, path[cardinality(path)] AS last, value,
       array_to_string(path, '.') AS name
     FROM leaves_of(state)
-    WHERE jsonb_typeof(value) = 'number' AND path[cardinality(path)] ~ '[xXyY]|^[01]$'
+    WHERE jsonb_typeof(value) = 'number' AND (path[cardinality(path)] ~ '[xXyY]'
+      OR path[cardinality(path)] IN ('0', '1')
+        AND path[cardinality(path) - 1] ~* '{"|".join(naming.BRANCHES)}')
   ), worded AS (
     SELECT *, words_of(last) AS words, words_of(branch[cardinality(branch)]) AS beside,
       ARRAY(SELECT w FROM unnest(branch) part, unnest(words_of(part)) w) AS way

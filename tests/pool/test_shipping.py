@@ -25,6 +25,7 @@ from webots_mcp.errors import (
 )
 from webots_mcp.pool.batch import BATCH_BYTES
 from webots_mcp.pool.shipping import Report, follow
+from webots_mcp.pool.tables import table
 from webots_mcp.schema import create_schema
 from webots_mcp.store.merging import merge
 from webots_mcp.store.migrate import downgrade
@@ -406,3 +407,29 @@ def test_a_recording_that_is_not_there_yet_is_waited_for_and_one_in_its_place_is
     assert "It is shipped as soon as it is there" in said[0]
     assert f"the recording {other} stands now where {shipped.uuid} was" in said[1]
     assert pooled(shipped.pool, shipped.uuid) == shipped.rows()
+
+
+def test_what_comes_while_a_shipper_follows_is_shipped_with_all_that_it_refers_to(
+    shipped: Shipped,
+) -> None:
+    for _ in range(40):
+        shipped.add_run(2)
+    looks = iter(range(8))
+
+    def record_more() -> None:
+        if next(looks, None) is None:
+            raise KeyboardInterrupt
+        shipped.add_run(4, end=None)
+
+    order = replace(
+        shipped.order, open_target=lambda: SQLiteTarget(shipped.pool, record_more), full=True
+    )
+    with pytest.raises(KeyboardInterrupt):
+        follow(order, Report(), lambda _: None, 0.0)
+    pooled = shipped.pooled()
+    runs = {row[0] for row in pooled["run"]}
+    assert len(runs) == 47
+    assert {row[1] for row in pooled["state"]} == runs
+    assert {row[1] for row in pooled["run"]} <= {row[0] for row in pooled["session"]}
+    run_id = table("rollup").columns.index("run_id")
+    assert {row[run_id] for row in pooled["rollup"]} == runs

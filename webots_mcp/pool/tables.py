@@ -33,7 +33,7 @@ class Table:
             does not replace the value that the pool has.
         is_appended: Rows come with rising ids and never change; otherwise a row replaces the one
             of the same key.
-        full_rate_only: Shipped only at full rate.
+        full_rate_only: Shipped only at full rate, but for the rows of kept stretches.
         time_column: The wall time by which a pool may cut it into parts, of appended tables.
         run_column: The column that names the row's run, where it belongs to one.
     """

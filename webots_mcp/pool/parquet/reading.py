@@ -49,12 +49,11 @@ class ParquetPool:
         """All recordings."""
         made = self._records("recording")
         robots, runs = self._records("robot"), self._records("run")
-        full_rate = {uuid_in(path) for path in self._storage.find("recording=*/table=state")}
         for uuid, (own, *_) in sorted(made.items()):
             names = tuple(str(robot["name"]) for robot in robots.get(uuid, ()))
             created_s = own["created_wall_time_s"]
             yield PooledRecording(
-                uuid, created_s, names, len(runs.get(uuid, ())), uuid in full_rate
+                uuid, created_s, names, len(runs.get(uuid, ())), "state" in self.progress(uuid)
             )
 
     def runs(self, recording_uuid: str | None = None) -> Iterator[PooledRun]:

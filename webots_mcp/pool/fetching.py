@@ -37,7 +37,7 @@ _MOST_RUNS: Final = 100  # that are written into one small recording,
 _MOST_ROWS: Final = 200_000  # unless one of them has more rows by itself
 _OF_RUN: Final = (
     "rollup", "coarse_rollup", "change", "kept_stretch", "kept_state", "log", "event",
-    "parameter_value", "state", "image",
+    "parameter_value", "image",
 )  # fmt: skip
 _STATES: Final = ("state", "kept_state")
 _HERE: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
@@ -51,6 +51,12 @@ _COUNTED: Final = (
     "WHERE k.run_id = s.run_id AND s.sim_time_s BETWEEN k.start_sim_time_s AND k.end_sim_time_s)), "
     "coalesce((SELECT max(held) FROM (SELECT sum(u.rows) AS held FROM rollup u "
     "WHERE u.run_id = run.id GROUP BY u.signal_id)), 0) FROM run ORDER BY id"
+)
+# An older version told only for all runs up to which row rollups are: those of this one are whole.
+_MARK: Final = (
+    "UPDATE run SET rolled_state_id = coalesce((SELECT max(id) FROM state "
+    "WHERE run_id = run.id), 0) WHERE rolled_state_id = 0 "
+    "AND EXISTS (SELECT 1 FROM rollup WHERE run_id = run.id)"
 )
 _PURGED: Final = "UPDATE run SET purged_rows = ? WHERE id = ?"
 _MOVE_KEPT: Final = (
@@ -108,7 +114,7 @@ def fetch(
         connection: To the local recording, in the role "writer".
         data_dir: The folder of its pictures.
         meant: What is to come.
-        progress: Called with how many runs are there of how many.
+        progress: Called with how many states came of how many that the runs had.
 
     Raises:
         PoolError: The pool cannot be read.
@@ -122,11 +128,11 @@ def fetch(
     found.going_on = [run.uuid for run in new if run.uuid and run.end_reason is None]
     ended = [run for run in new if run.uuid and run.end_reason is not None]
     whole, found.arriving = _shipped(pool, ended)
-    done = 0
+    done, of = 0, sum(run.rows for run in whole)
     for part in _parts(whole):
-        progress(done, len(whole))
-        fetcher.take(part)
-        done += len(part)
+        fetcher.take(part, lambda rows, before=done: progress(before + rows, of))
+        done += sum(run.rows for run in part)
+        progress(done, of)
     fetcher.take_trials(meant)
     here = _here(connection)
     found.runs = {run.uuid: here[run.uuid] for run in meant.runs if run.uuid in here}
@@ -164,8 +170,13 @@ class _Fetcher:
         self.found = Fetched()
         self._pool, self._connection, self._data_dir = pool, connection, data_dir
 
-    def take(self, runs: Sequence[PooledRun]) -> None:
-        """Take in runs of one recording that are over, but for those that are still shipped."""
+    def take(self, runs: Sequence[PooledRun], told: Callable[[int], None]) -> None:
+        """Take in runs of one recording that are over, but for those that are still shipped.
+
+        Args:
+            runs: Which.
+            told: Called with how many of their states are copied.
+        """
         ids = [run.run_id for run in runs]
         with _folder(self._data_dir) as folder:
             with small_recording(folder) as small:
@@ -173,6 +184,7 @@ class _Fetcher:
                 copy.context(ids)
                 for name in _OF_RUN:
                     copy.rows(name, "run_id", ids)
+                copy.rows("state", "run_id", ids, told)
                 copy.pictures(folder)
                 self._settle(small, {run.run_id: run.uuid for run in runs})
             merge(self._connection, self._data_dir, folder / DATABASE_NAME)
@@ -199,6 +211,7 @@ class _Fetcher:
 
     def _settle(self, small: sqlite3.Connection, uuids: Mapping[int, str]) -> None:
         """Say of each run how many of its rows are gone; a run whose rows still come is dropped."""
+        small.execute(_MARK)
         for run_id, rows, purged, left, kept, rolled in small.execute(_COUNTED).fetchall():
             gone = max(0, rows - left)
             if gone and left == kept:
@@ -248,10 +261,19 @@ class _Copy:
         self.rows("robot", "id", self._ids("robot_id", "run"))
         return bool(self._ids("id", "trial"))
 
-    def rows(self, name: str, column: str, values: Collection[int]) -> None:
-        """Copy the rows whose column has one of these values."""
+    def rows(
+        self,
+        name: str,
+        column: str,
+        values: Collection[int],
+        told: Callable[[int], None] = lambda copied: None,
+    ) -> None:
+        """Copy the rows whose column has one of these values; tell how many are copied so far."""
+        copied = 0
         for batch in self._rows(name, column, values):
             self._write(self._in_order(batch))
+            copied += len(batch.rows)
+            told(copied)
 
     def pictures(self, folder: Path) -> None:
         """The files that the rows of pictures name, where they were shipped."""

@@ -7,12 +7,12 @@ knows the one from before: names are entered as they first come.
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterable
 from typing import Any, Final, cast
 
 _STEP: Final = re.compile(r'\.("(?:[^"\\]|\\.)*"|[^."\[\]]+)|\[(\d+)\]')
+_ENCODED: Final = json.JSONEncoder(ensure_ascii=False, separators=(",", ":")).encode
 _LONG: Final = re.compile(r"\d{19}")
 
 Order = dict[str, Any]
@@ -44,7 +44,7 @@ def in_order(text: str, order: Order) -> str:
         state = json.loads(text, parse_int=_number if _LONG.search(text) else None)
     except (ValueError, OverflowError, RecursionError):
         return text
-    return json.dumps(_sorted(state, order), ensure_ascii=False, separators=(",", ":"))
+    return _ENCODED(_sorted(state, order))
 
 
 def _number(digits: str) -> int | float:
@@ -54,11 +54,10 @@ def _number(digits: str) -> int | float:
 
 def _sorted(value: Any, order: Order) -> Any:
     if isinstance(value, dict):
-        places = {key: place for place, key in enumerate(order)}
         members = cast("dict[str, Any]", value)
-        keys = sorted(members, key=lambda key: places.get(key, math.inf))
-        return {key: _sorted(members[key], order.get(key, {})) for key in keys}
-    if isinstance(value, list):
+        known = {key: _sorted(members[key], order[key]) for key in order if key in members}
+        return known if len(known) == len(members) else known | members | known
+    if isinstance(value, list) and any(order.values()):
         items = cast("list[Any]", value)
         return [_sorted(item, order.get(str(at), {})) for at, item in enumerate(items)]
-    return value
+    return cast("Any", value)

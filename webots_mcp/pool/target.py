@@ -7,12 +7,11 @@ Passwords come from PGPASSWORD, ~/.pgpass or a service file: in a URL, every pro
 
 from __future__ import annotations
 
-import importlib
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Final, Protocol, cast
+from typing import Any, Final, Protocol
 from urllib.parse import parse_qsl
 
 from webots_mcp.errors import InvalidInputError
@@ -224,28 +223,30 @@ def is_whole(progress: Mapping[str, int], run_id: int) -> bool:
 
 
 def open_target(url: str) -> Target:
-    """The pool of a URL, to ship to: not yet connected.
+    """The pool of a URL, to ship to: not yet connected. What it needs is imported only here.
 
     Raises:
         InvalidInputError: The URL names no pool, or holds a secret.
-        ModuleNotFoundError: The packages of an extra are missing.
+        PoolError: The packages of an extra are missing.
     """
-    kind = (
-        "postgres.writing:PostgresTarget" if _is_postgres(url) else "parquet.writing:ParquetTarget"
-    )
-    return cast("Target", _class(kind)(url))
+    if _is_postgres(url):
+        from webots_mcp.pool.postgres.writing import PostgresTarget
+
+        return PostgresTarget(url)
+    from webots_mcp.pool.parquet.writing import ParquetTarget
+
+    return ParquetTarget(url)
 
 
 def open_pool(url: str) -> Pool:
     """The pool of a URL, to read from; as `open_target`."""
-    kind = "postgres.reading:PostgresPool" if _is_postgres(url) else "parquet.reading:ParquetPool"
-    return cast("Pool", _class(kind)(url))
+    if _is_postgres(url):
+        from webots_mcp.pool.postgres.reading import PostgresPool
 
+        return PostgresPool(url)
+    from webots_mcp.pool.parquet.reading import ParquetPool
 
-def _class(kind: str) -> Callable[[str], Any]:
-    """Imported only when it is needed: an engine's packages are an extra, and cost."""
-    module, _, name = kind.partition(":")
-    return getattr(importlib.import_module(f"webots_mcp.pool.{module}"), name)
+    return ParquetPool(url)
 
 
 def pause_of(url: str) -> float:

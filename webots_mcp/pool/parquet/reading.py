@@ -14,7 +14,7 @@ from webots_mcp.pool.parquet.asking import select
 from webots_mcp.pool.parquet.layout import files_of, folder_of, picture_file, uuid_in
 from webots_mcp.pool.parquet.packages import package
 from webots_mcp.pool.parquet.progress import read_progress, require_pool
-from webots_mcp.pool.parquet.rows import as_rows, decoded, footer_of, span
+from webots_mcp.pool.parquet.rows import as_rows, decoded, footer_of, pieces_of, span
 from webots_mcp.pool.parquet.storage import Storage
 from webots_mcp.pool.tables import Table, table, tables
 from webots_mcp.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
@@ -132,12 +132,17 @@ class ParquetPool:
     def _rows_of(
         self, table: Table, piece: _Piece, where: Mapping[str, Collection[int]]
     ) -> Iterator[Row]:
-        content = self._storage.read(piece.path)
+        """Rows of a file in the order of the key, a few at a time."""
+        content = self._storage.read(piece.path)  # whole: it may be replaced by a larger one
         if content is None:
             raise PoolUnavailableError(f"{piece.path} is gone from {self.address}: ask again")
-        held = decoded(table, content, piece.path).slice(0, piece.counted)
-        chosen = held.filter(_filter(where)) if where else held
-        yield from as_rows(table, chosen.sort_by([(name, "ascending") for name in table.key]))
+        if table.is_appended:  # those of a kept stretch may stand before older ones
+            held = decoded(table, content, piece.path).slice(0, piece.counted)
+            found = iter([held.sort_by("id")])
+        else:
+            found = pieces_of(table, content, piece.path)
+        for some in found:
+            yield from as_rows(table, some.filter(_filter(where)) if where else some)
 
     def _records(self, name: str, recording_uuid: str | None = None) -> Mapping[str, list[Record]]:
         """The rows of a table that changes, by recording."""

@@ -17,7 +17,9 @@ from webots_mcp.pool.parquet.packages import package
 from webots_mcp.pool.tables import SQLValue, Table
 from webots_mcp.units import unit_in
 
-GROUP_ROWS: Final = 20_000
+_APPENDED_GROUP_ROWS: Final = 20_000
+_CHANGING_GROUP_ROWS: Final = 4_000  # those of many files are read side by side
+_ROWS_AT_ONCE: Final = 1000
 _FINE: Final[dict[type, frozenset[type]]] = {
     int: frozenset({int, type(None)}),
     float: frozenset({int, float, type(None)}),
@@ -111,8 +113,9 @@ def encoded(table: Table, arrow_table: Any) -> bytes:
 
     sink = io.BytesIO()
     alike = [name for name in table.columns if name not in table.json_columns]
+    group_rows = _APPENDED_GROUP_ROWS if table.is_appended else _CHANGING_GROUP_ROWS
     parquet.write_table(
-        arrow_table, sink, compression="zstd", use_dictionary=alike, row_group_size=GROUP_ROWS
+        arrow_table, sink, compression="zstd", use_dictionary=alike, row_group_size=group_rows
     )
     return sink.getvalue()
 
@@ -212,6 +215,21 @@ def span(footer: Any, name: str) -> tuple[int, int] | None:
     return min(each.min for each in told), max(each.max for each in told)
 
 
+def pieces_of(table: Table, content: bytes, path: str) -> Iterator[Any]:
+    """The rows of a file, so many at a time: the others stay compressed.
+
+    Raises:
+        PoolError: As `decoded`.
+    """
+    arrow, parquet = package("pyarrow"), package("pyarrow.parquet")
+    with _whole(path):
+        file = parquet.ParquetFile(arrow.BufferReader(content))
+        for piece in file.iter_batches(batch_size=_ROWS_AT_ONCE):
+            yield conformed(table, arrow.Table.from_batches([piece]))
+
+
 def as_rows(table: Table, held: Any) -> Iterator[Row]:
     """Rows with the values that SQLite holds."""
-    yield from zip(*(held.column(name).to_pylist() for name in table.columns), strict=True)
+    for first in range(0, held.num_rows, _ROWS_AT_ONCE):
+        some = held.slice(first, _ROWS_AT_ONCE)
+        yield from zip(*(some.column(name).to_pylist() for name in table.columns), strict=True)

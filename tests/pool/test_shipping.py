@@ -12,10 +12,10 @@ import pytest
 
 from tests import unprivileged
 from tests.pool.conftest import Shipped
-from tests.pool.sqlite_target import SQLiteTarget, pooled
+from tests.pool.sqlite_target import SQLitePool, SQLiteTarget, pooled
 from tests.recordings.runs import states
 from webots_mcp.connection import connect
-from webots_mcp.contract import new_uuid
+from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.errors import (
     DatabaseError,
     PoolBusyError,
@@ -26,6 +26,7 @@ from webots_mcp.errors import (
 from webots_mcp.pool.batch import BATCH_BYTES
 from webots_mcp.pool.shipping import Report, follow
 from webots_mcp.pool.tables import table
+from webots_mcp.pool.target import is_whole
 from webots_mcp.schema import create_schema
 from webots_mcp.store.merging import merge
 from webots_mcp.store.migrate import downgrade
@@ -41,6 +42,21 @@ def test_a_pool_at_full_rate_holds_every_row_as_the_recording_does(shipped: Ship
     rows = shipped.rows()
     assert shipped.pooled() == rows
     assert all(rows[table] for table in ("state", "rollup", "coarse_rollup", "change", "signal"))
+
+
+def test_a_run_whose_process_was_killed_is_over_in_the_pool(shipped: Shipped) -> None:
+    shipped.add_run(end=None)
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    shipped.connection.execute(
+        "UPDATE session SET pid = ?, host = ?, ended_wall_time_s = NULL, end_reason = NULL",
+        (gone.pid, host_name()),
+    )
+    shipped.ship()
+    with SQLitePool(shipped.pool) as pool:
+        (run,) = pool.runs()
+        assert run.end_reason == "crashed"
+        assert is_whole(pool.progress(shipped.uuid), run.run_id)
 
 
 def test_what_is_shipped_is_not_sent_again(shipped: Shipped) -> None:

@@ -42,8 +42,9 @@ def ship(arguments: argparse.Namespace) -> None:
     """Ship a recording to a pool, where the recordings of many machines are.
 
     The pool is a PostgreSQL database, or a dataset of Parquet files in a folder or an object store.
-    The recording is only read. What the pool has is not sent again, so that this may be killed and
-    started again at any time; a run that another recording has shipped stays that one's.
+    The recording is only read, but that runs whose process was killed are ended. What the pool has
+    is not sent again, so that this may be killed and started again at any time; a run that another
+    recording has shipped stays that one's.
 
     Runs, commands, events, log lines, parameters, trials, rollups and kept stretches are shipped,
     with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never

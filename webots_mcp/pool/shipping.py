@@ -7,6 +7,7 @@ What changes is compared by digests, and sent again only where they differ.
 
 from __future__ import annotations
 
+import sqlite3
 import time
 from collections import Counter
 from collections.abc import Callable, Generator, Mapping
@@ -17,6 +18,7 @@ from typing import Final, NoReturn
 
 from webots_mcp.connection import FrozenConnection
 from webots_mcp.errors import (
+    DatabaseError,
     InvalidInputError,
     NoDatabaseError,
     NothingRecordedError,
@@ -36,7 +38,9 @@ from webots_mcp.pool.reading import (
 from webots_mcp.pool.summaries import Summaries
 from webots_mcp.pool.tables import Table, table, tables
 from webots_mcp.pool.target import Shipment, Target, whole_runs
+from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
+from webots_mcp.store.merging import settled
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_shipped
 
@@ -281,6 +285,8 @@ class _Shipper:
         with self._order.recording.reader() as connection:
             source = Source(connection)
             self._require_the_same(source)
+            if thorough:
+                self._end_what_was_killed(connection)
             self._ship_changing(source, thorough=thorough)
             self._summaries.ship(source, self._marks, self._watermark)
             is_complete = self._ship_all_appended(source)
@@ -296,6 +302,16 @@ class _Shipper:
         if not is_frozen:
             self._leave_word(started_s, is_complete=is_whole)
         return is_complete
+
+    def _end_what_was_killed(self, connection: sqlite3.Connection) -> None:
+        """End runs whose process is gone, at the edge: nobody at the pool could judge that."""
+        database = self._order.recording.database
+        if not isinstance(database, Path) or not gone_sessions(connection):
+            return
+        try:
+            settled(database)
+        except DatabaseError as error:
+            self._report.note(f"runs whose process was killed stay open in the pool: {error}")
 
     def _appended(self) -> list[Table]:
         """States last: others should not wait for the largest table."""

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from uuid import UUID
 
+import psycopg
 import pytest
 from psycopg.conninfo import conninfo_to_dict
 
@@ -215,6 +216,19 @@ def test_who_ships_need_not_own_the_tables(postgres: Server, pool: str) -> None:
             postgres.execute(pool, "GRANT EXECUTE ON ALL FUNCTIONS IN SCHEMA public TO shipper")
             shipment.write([log], {})
     assert postgres.execute(pool, "SELECT id FROM log") == [(1,)]
+
+
+def test_who_makes_a_month_cannot_slip_a_table_of_his_own_under_it(
+    postgres: Server, pool: str
+) -> None:
+    postgres.execute(pool, "CREATE ROLE sly LOGIN; GRANT SELECT ON event TO sly")
+    postgres.execute(pool, "GRANT EXECUTE ON ALL FUNCTIONS IN SCHEMA public TO sly")
+    with psycopg.connect(postgres.url(pool, user="sly")) as connection:
+        own = "CREATE TEMPORARY TABLE event (LIKE public.event) PARTITION BY RANGE (wall_time_s)"
+        connection.execute(own.encode())
+        connection.execute("SELECT make_partition('event', 2023, 11)")
+    sql = "SELECT inhparent::regclass::text FROM pg_inherits WHERE inhrelid = %s::regclass"
+    assert postgres.execute(pool, sql, "public.event_2023_11") == [("event",)]
 
 
 def test_a_picture_is_kept_by_its_path(postgres: Server, pool: str, target: PostgresTarget) -> None:

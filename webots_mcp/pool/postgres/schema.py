@@ -79,7 +79,7 @@ EXCEPTION WHEN OTHERS THEN
 END $$;
 
 CREATE FUNCTION make_partition(parent text, year integer, month integer) RETURNS void
-LANGUAGE plpgsql SECURITY DEFINER SET search_path FROM CURRENT AS $$
+LANGUAGE plpgsql SECURITY DEFINER AS $$
 DECLARE
   part text := format('%s_%s_%s', parent, year, lpad(month::text, 2, '0'));
   start timestamptz := make_timestamptz(year, month, 1, 0, 0, 0, 'UTC');
@@ -97,6 +97,10 @@ BEGIN
       extract(epoch FROM start), extract(epoch FROM (start AT TIME ZONE 'UTC' + interval '1 month')
         AT TIME ZONE 'UTC'));
   END IF;
+END $$;
+DO $$
+BEGIN  -- as the owner it must not meet what the caller made under these names
+  EXECUTE format('ALTER FUNCTION make_partition SET search_path = %I, pg_temp', current_schema());
 END $$;
 REVOKE ALL ON FUNCTION make_partition FROM PUBLIC;
 """

@@ -266,6 +266,7 @@ def test_a_scheduler_without_simulators_is_told_at_once_and_one_that_is_lost_as_
     ("address", "said"),
     [
         ("HOST:8786", "'HOST:8786' is no address, such as tcp://HOST:8786"),
+        ("tls://127.0.0.1:1", "needs certificates, of which Dask's configuration tells"),
         ("tcp://127.0.0.1:1", "no Dask scheduler answers at tcp://127.0.0.1:1"),
     ],
 )

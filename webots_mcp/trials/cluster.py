@@ -44,6 +44,7 @@ _COUNT_EVERY_S: Final = 2.0
 _WITHOUT_WORKERS_S: Final = 60.0
 _SOURCES: Final = (".py", ".c", ".cc", ".cpp", ".h", ".hpp", ".java", ".m")
 _ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss)://[^\s/]+:[0-9]{1,5}")
+_WITH_TLS: Final = ("tls://", "wss://")
 _TASK: Final = "webots_mcp.trials.cluster:run_here"
 _BUNDLE: Final = "recording.zip"
 _LOST: Final = "the scheduler {} was lost: what is left can be gone on with once it is back"
@@ -366,6 +367,11 @@ def _connected(address: str) -> Generator[Any]:
     if not _ADDRESS.fullmatch(address):
         raise InvalidInputError(
             f"scheduler {address!r} is no address, such as tcp://HOST:8786 or tls://HOST:8786"
+        )
+    if address.startswith(_WITH_TLS) and distributed.Security().tls_ca_file is None:
+        raise InvalidInputError(
+            f"{address} needs certificates, of which Dask's configuration tells: "
+            "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ..._TLS__CLIENT__CERT and ..._TLS__CLIENT__KEY"
         )
     try:
         client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)

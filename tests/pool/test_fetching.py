@@ -25,6 +25,7 @@ from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.pool.key_order import in_order
 from webots_mcp.pool.target import open_pool, open_target
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.runs import run_info
@@ -57,6 +58,12 @@ def rounds(_rounds: Path, tmp_path: Path) -> Path:
     """The recording of a long run and a short one."""
     (tmp_path / "there").mkdir()
     return Path(shutil.copy(_rounds, tmp_path / "there"))
+
+
+def test_a_state_with_half_of_a_character_comes_back_as_the_text_that_it_was() -> None:
+    text = '{"b": "\\ud800", "a": 1}'
+    assert in_order(text, {"a": {}}) == text
+    assert in_order('{"b": 2, "a": 1}', {"a": {}}) == '{"a":1,"b":2}'
 
 
 def uuid_of(database: Path, run_id: int) -> str:

@@ -99,7 +99,6 @@ def _notes(report: Report) -> list[str]:
     for recording in sorted(set(report.foreign.values())):
         runs = [uuid for uuid, owner in report.foreign.items() if owner == recording]
         notes.append(
-            f"{len(runs)} runs are in the pool already, shipped from the recording {recording}: "
-            "they are left to it"
+            f"{len(runs)} runs are left to the recording {recording}, which shipped them before"
         )
     return notes

@@ -42,9 +42,11 @@ def in_order(text: str, order: Order) -> str:
     """
     try:
         state = json.loads(text, parse_int=_number if _LONG.search(text) else None)
+        ordered = _ENCODED(_sorted(state, order))
+        ordered.encode()
     except (ValueError, OverflowError, RecursionError):
-        return text
-    return _ENCODED(_sorted(state, order))
+        return text  # no JSON, or halves of characters: a pool holds it as the text that it was
+    return ordered
 
 
 def _number(digits: str) -> int | float:

@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import closing
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -173,6 +174,13 @@ def test_a_table_without_rows_can_be_asked(pool: ParquetPool) -> None:
 
 def test_only_so_many_rows_come(pool: ParquetPool) -> None:
     assert len(pool.select("SELECT * FROM state", 7)[1]) == 7
+
+
+def test_a_wall_time_can_be_asked_as_a_time(pool: ParquetPool) -> None:
+    sql = "SELECT to_timestamp(1.5) AS moment, id, id FROM run ORDER BY id"
+    columns, rows = pool.select(sql, 1)
+    assert columns[:2] == ["moment", "id"]
+    assert rows == [(datetime(1970, 1, 1, 0, 0, 1, 500_000), 1, 1)]
 
 
 def test_a_day_is_a_date(pool: ParquetPool) -> None:

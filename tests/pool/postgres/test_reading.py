@@ -160,6 +160,11 @@ def test_anything_else_than_a_select_is_refused(pool: PostgresPool, sql: str, sa
     assert pool.select("SELECT count(*) FROM run", 1)[1] == [(3,)]
 
 
+def test_nothing_that_a_select_makes_stays(pool: PostgresPool) -> None:
+    pool.select("SELECT lo_from_bytea(0, 'made')", 1)
+    assert pool.select("SELECT count(*) FROM pg_largeobject_metadata", 1)[1] == [(0,)]
+
+
 def test_a_select_that_takes_too_long_is_ended(
     pool: PostgresPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:

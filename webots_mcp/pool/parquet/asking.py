@@ -21,6 +21,7 @@ from webots_mcp.pool.tables import Table, tables
 
 DEADLINE_S: Final = 60.0
 _MEMORY: Final = "2GB"
+_WITH_ZONE: Final = "TIMESTAMP WITH TIME ZONE"
 _TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
 
 
@@ -37,9 +38,9 @@ def select(storage: Storage, sql: str, limit: int) -> tuple[list[str], list[tupl
         try:
             _require_select(duckdb, connection, sql)
             with _deadline(connection):
-                cursor = connection.execute(sql)
-                columns = [str(column[0]) for column in cursor.description]
-                return columns, list(cursor.fetchmany(limit))
+                answer = connection.sql(sql)
+                rows = _without_zones(answer).limit(limit).fetchall()
+                return list(map(str, answer.columns)), list(rows)
         except duckdb.InterruptException as error:
             raise InvalidInputError(
                 f"no answer within {DEADLINE_S:g} s: narrow it by recording_uuid and by day"
@@ -61,6 +62,16 @@ def _prepare(connection: Any, storage: Storage, sql: str) -> None:
     connection.execute(f"SET allowed_directories = [{_quoted(storage.url_of('') + '/')}]")
     connection.execute("SET enable_external_access = false")
     connection.execute("SET lock_configuration = true")
+
+
+def _without_zones(answer: Any) -> Any:
+    """Times with a zone, for which DuckDB's Python needs another package, as those of UTC."""
+    columns = (
+        f"CAST(#{at} AS TIMESTAMP)" if str(kind) == _WITH_ZONE else f"#{at}"
+        for at, kind in enumerate(answer.types, 1)
+    )
+    named = (f"{each} AS column_{at}" for at, each in enumerate(columns))
+    return answer.project(", ".join(named)) if _WITH_ZONE in map(str, answer.types) else answer
 
 
 def _view(table: Table, paths: list[str]) -> str:

@@ -146,7 +146,9 @@ class PostgresPool:
         Raises:
             InvalidInputError: It is no SELECT, is wrong, or takes longer than a minute.
         """
-        with clear_errors(self.address), _clear_question(), self._connection.transaction():
+        # Large objects may be made in a transaction that only reads: none of it stays.
+        undone = self._connection.transaction(force_rollback=True)
+        with clear_errors(self.address), _clear_question(), undone:
             self._connection.execute(f"SET LOCAL statement_timeout = '{SELECT_S}s'".encode())
             # With values, even none, PostgreSQL takes no more than one statement.
             with self._connection.cursor(next(self._names)) as cursor:

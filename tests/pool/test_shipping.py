@@ -59,6 +59,14 @@ def test_a_run_whose_process_was_killed_is_over_in_the_pool(shipped: Shipped) ->
         assert is_whole(pool.progress(shipped.uuid), run.run_id)
 
 
+def test_states_that_are_neither_shipped_nor_in_rollups_are_said(shipped: Shipped) -> None:
+    shipped.add_run()
+    assert not shipped.ship().notes
+    shipped.recorded.add_run(20)
+    assert shipped.ship().notes[0].startswith("the newest 20 states are in no rollups yet")
+    assert not shipped.ship(full=True).notes
+
+
 def test_what_is_shipped_is_not_sent_again(shipped: Shipped) -> None:
     shipped.add_run()
     shipped.ship(full=True)

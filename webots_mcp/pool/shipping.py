@@ -109,6 +109,7 @@ def ship(order: Order, report: Report) -> None:
     with _shipper(order, report) as shipper:
         while not shipper.round(thorough=True):
             pass
+        shipper.note_unsummed()
 
 
 def follow(order: Order, report: Report, say: Say, pause_s: float) -> None:
@@ -166,7 +167,7 @@ class _Patience:
     def wait_after(self, error: WebotsMCPError) -> float:
         """In seconds; what would not be better after it is raised again."""
         if isinstance(error, NoDatabaseError):
-            self._tell_once(f"{error}. It is shipped as soon as it is there")
+            self._tell_once(f"{f'{error}'.rstrip('.')}. It is shipped as soon as it is there")
             return self._pause_s
         if isinstance(error, PoolBusyError):
             if not self._was_there:
@@ -302,6 +303,15 @@ class _Shipper:
         if not is_frozen:
             self._leave_word(started_s, is_complete=is_whole)
         return is_complete
+
+    def note_unsummed(self) -> None:
+        """Say that states are neither shipped nor in rollups, which only a server makes."""
+        behind = self._last_ids["state"] - self._watermark
+        if not self._order.full and behind > 0:
+            self._report.note(
+                f"the newest {behind} states are in no rollups yet, which 'webots-mcp serve' makes "
+                "at the edge: ship with --full"
+            )
 
     def _end_what_was_killed(self, connection: sqlite3.Connection) -> None:
         """End runs whose process is gone, at the edge: nobody at the pool could judge that."""

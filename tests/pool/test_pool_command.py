@@ -66,7 +66,7 @@ def test_a_select_is_answered_with_its_first_rows(ask: Ask) -> None:
 def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None:
     words = ("fetch", "--from", "POOL", "--data-dir", str(lab.here), "--robot", "rover")
     assert ask(*words).splitlines() == [
-        f"of {lab.pool().address} came: run 1 to 2",
+        f"fetched from {lab.pool().address}: run 1 to 2",
         "of run 1 to 2 only summaries were shipped, no rows ('webots-mcp ship --full' does)",
         "of run 1 to 2 not even summaries of all rows: those were not made where it was recorded, "
         "which a server does ('webots-mcp serve')",

@@ -72,7 +72,7 @@ def _print_fetched(found: Fetched, address: str) -> None:
     def listed(uuids: Iterable[str]) -> str | None:
         return id_ranges([found.runs[uuid] for uuid in uuids])
 
-    print(f"of {address} came: run {id_ranges(found.come) or 'none'}")
+    print(f"fetched from {address}: run {id_ranges(found.come) or 'none'}")
     if found.known:
         print(f"here already: run {listed(found.known)}")
     if found.summaries:

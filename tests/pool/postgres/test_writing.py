@@ -320,7 +320,7 @@ def test_a_recording_is_deleted_as_the_page_says_and_shipped_anew(
     with target.shipment(OTHER) as shipment:
         shipment.write([batch("log"), batch("run", uuid="its own")], {"a": 1})
     page = (Path(__file__).parents[3] / "docs" / "pool.md").read_text("utf-8")
-    found = re.search(r"```sql\n(DO .*?)```", page, re.DOTALL)
+    found = re.search(r"```postgresql\n(DO .*?)```", page, re.DOTALL)
     assert found
     named = re.compile("'6719d286-[-0-9]*'")
     postgres.execute(pool, named.sub(f"'{uuid_of(rover)}'", found[1]))

@@ -93,7 +93,7 @@ class Worker(Process):
         """The scratch folders of the trials that it runs."""
         scratch = self.folder / "dask-scratch-space"
         found: list[Path] = []
-        for worker in scratch.glob("worker-*/"):
+        for worker in filter(Path.is_dir, scratch.glob("worker-*")):
             with contextlib.suppress(FileNotFoundError):  # it ends just now
                 found += [each for each in worker.iterdir() if each.name.startswith("trial-")]
         return found

@@ -80,7 +80,7 @@ class SQLiteShipment:
     def write_picture(self, path: str, content: bytes) -> None:
         self._pictures.append((self._recording, path, content))
 
-    def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
+    def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> dict[str, int]:
         self._before_write()
         with _transaction(self._connection):
             for batch in batches:
@@ -92,6 +92,7 @@ class SQLiteShipment:
             self._connection.executemany(
                 "INSERT OR REPLACE INTO picture VALUES (?, ?, ?)", pictures
             )
+        return {}
 
 
 def pooled(file: Path, recording: str) -> dict[str, list[tuple[SQLValue, ...]]]:

@@ -52,9 +52,9 @@ class Telling:
         with self._inner.shipment(uuid) as shipment:
             yield Telling(shipment, self._writing)
 
-    def write(self, *arguments: Any) -> None:
+    def write(self, *arguments: Any) -> Any:
         self._writing.send("about to write")
-        self._inner.write(*arguments)
+        return self._inner.write(*arguments)
 
 
 def order_of(folder: Path, url: str) -> Order:

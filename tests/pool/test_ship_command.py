@@ -68,3 +68,25 @@ def test_a_server_that_only_reads_is_said_and_nothing_is_half_done(
     said = capsys.readouterr()
     assert "read-only" in said.err
     assert said.out == ""
+
+
+@pytest.mark.parametrize("kind", ["postgres", "parquet"])
+def test_values_that_a_pool_cannot_hold_are_said(
+    shipped: Shipped,
+    kind: str,
+    request: pytest.FixtureRequest,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    run_id = shipped.add_run()
+    shipped.connection.execute(
+        "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
+        "VALUES (?, 1, 1.7e9, 'info', 'controller', x'ff'), (?, 1, 1.7e9, x'ff', 'controller', '')",
+        (run_id, run_id),
+    )
+    url = str(shipped.folder.parent / "files")
+    if kind == "postgres":
+        server: Server = request.getfixturevalue("postgres")
+        url = server.url(server.new_database())
+    assert main(["ship", "--data-dir", str(shipped.folder), "--to", url]) == 0
+    said = "in whose place is what comes nearest: log.level 1, log.message 1"
+    assert said in capsys.readouterr().out

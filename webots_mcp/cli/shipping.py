@@ -94,6 +94,12 @@ def _notes(report: Report) -> list[str]:
     notes: list[str] = []
     if lost := [f"{table} {rows}" for table, rows in sorted(report.lost.items()) if rows]:
         notes.append(f"rows deleted before they could be shipped: {', '.join(lost)}")
+    if report.replaced:
+        altered = [f"{column} {values}" for column, values in sorted(report.replaced.items())]
+        notes.append(
+            "values that the pool cannot hold, in whose place is what comes nearest: "
+            + ", ".join(altered)
+        )
     if report.lost_pictures:
         notes.append(f"pictures that are not there any more: {report.lost_pictures}")
     for recording in sorted(set(report.foreign.values())):

@@ -81,6 +81,7 @@ class Report:
         rows: By table; a row that changed counts each time that it was sent.
         pictures: Files.
         lost: By table, rows that retention had deleted before they could be shipped.
+        replaced: By column, values that the pool cannot hold, for which it has what comes nearest.
         lost_pictures: Files that were not there any more, or are no pictures of ours.
         foreign: By their UUIDs, runs that another recording had shipped before, with its UUID.
         notes: What else a person should know.
@@ -89,6 +90,7 @@ class Report:
     rows: Counter[str] = field(default_factory=Counter[str])
     pictures: int = 0
     lost: Counter[str] = field(default_factory=Counter[str])
+    replaced: Counter[str] = field(default_factory=Counter[str])
     lost_pictures: int = 0
     foreign: dict[str, str] = field(default_factory=dict[str, str])
     notes: list[str] = field(default_factory=list[str])
@@ -245,7 +247,7 @@ class _Outbox:
         """Write it all, in one transaction of the pool's."""
         if not self._batches and not self._told:
             return
-        self._shipment.write(self._batches, self._told)
+        self._report.replaced.update(self._shipment.write(self._batches, self._told))
         for batch in self._batches:
             self._report.rows[batch.table.name] += len(batch.rows)
         self._batches, self._told, self._size = [], {}, 0

@@ -50,13 +50,17 @@ class Shipment(Protocol):
         """
         ...
 
-    def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
+    def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> Mapping[str, int]:
         """Write rows, and change these numbers of the progress: all of it or nothing.
 
         Rows of appended tables that are there already are left alone. A row of the others replaces
         the one of its key, but where a column of `Table.lasting` is null, the value stays; rows
         that are not in the batch stay too, since retention at the edge deletes what a pool keeps.
         Batches may name a table twice; what a row refers to comes before it.
+
+        Returns:
+            By column (`log.message`), how many values the pool cannot hold as they are: it has what
+            comes nearest, or null.
 
         Raises:
             PoolUnavailableError: Worth trying again; nothing was written.

@@ -230,21 +230,22 @@ def test_short_runs_share_files_and_long_runs_have_some_of_their_own(tmp_path: P
     assert len(globbed(tmp_path, "rollup")) == 58 * 5 + 1000
 
 
-def test_what_a_column_cannot_hold_becomes_what_comes_nearest(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_what_a_column_cannot_hold_becomes_what_comes_nearest_and_is_counted(
+    tmp_path: Path,
 ) -> None:
     odd = {
         "id": 1, "run_id": "one", "sim_time_s": "soon", "wall_time_s": 2**60 + 1, "level": 5,
         "source": b"\xff", "message": "lone \ud800", "logger": None,
     }  # fmt: skip
     with shipping(tmp_path) as shipment:
-        shipment.write([batch("log", odd)], {})
+        altered = shipment.write([batch("log", odd)], {})
     (row,) = globbed(tmp_path, "log")
     assert row == {
         "id": 1, "run_id": None, "sim_time_s": None, "wall_time_s": float(2**60), "level": "5",
         "source": "\ufffd", "message": "lone ?", "logger": None,
     }  # fmt: skip
-    assert "1 values of log.run_id became what comes nearest" in caplog.text
+    odd_columns = ("run_id", "sim_time_s", "wall_time_s", "level", "source", "message")
+    assert altered == {f"log.{column}": 1 for column in odd_columns}
     assert [file.parent.name for file in tmp_path.rglob("table=log/*/*.parquet")] == [
         "day=__HIVE_DEFAULT_PARTITION__"
     ]

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import io
-import logging
 import math
+from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
@@ -25,8 +25,6 @@ _FINE: Final[dict[type, frozenset[type]]] = {
     float: frozenset({int, float, type(None)}),
     str: frozenset({str, type(None)}),
 }
-
-_log = logging.getLogger(__name__)
 
 
 @cache
@@ -63,18 +61,26 @@ def _told(table: Table, name: str, comments: Mapping[str, str]) -> dict[str, str
     return {key: value for key, value in told.items() if value is not None}
 
 
-def as_arrow(table: Table, rows: Sequence[Row]) -> Any:
-    """Rows as an Arrow table. What its column cannot hold becomes what comes nearest, or null."""
+def as_arrow(table: Table, rows: Sequence[Row], altered: Counter[str]) -> Any:
+    """Rows as an Arrow table. What its column cannot hold becomes what comes nearest, or null.
+
+    Args:
+        table: Of the rows.
+        rows: With whatever SQLite holds.
+        altered: Counts the values of which that is so, by column (`log.message`).
+    """
     arrow = package("pyarrow")
 
     schema = schema_of(table)
     columns = [*zip(*rows, strict=True)] or [()] * len(table.columns)
     kinds = zip(columns, table.types, schema, strict=True)
-    arrays = [_array(table, values, kind, field) for values, kind, field in kinds]
+    arrays = [_array(table, values, kind, field, altered) for values, kind, field in kinds]
     return arrow.table(arrays, schema=schema)
 
 
-def _array(table: Table, values: Sequence[SQLValue], kind: type, field: Any) -> Any:
+def _array(
+    table: Table, values: Sequence[SQLValue], kind: type, field: Any, altered: Counter[str]
+) -> Any:
     arrow = package("pyarrow")
 
     if set(map(type, values)) <= _FINE[kind]:
@@ -83,8 +89,10 @@ def _array(table: Table, values: Sequence[SQLValue], kind: type, field: Any) -> 
         except (ValueError, OverflowError):  # a lone surrogate; an integer no double has
             pass
     nearest = [_nearest(value, kind) for value in values]
-    altered = sum(new is not old for new, old in zip(nearest, values, strict=True))
-    _log.warning("%d values of %s.%s became what comes nearest", altered, table.name, field.name)
+    pairs = zip(nearest, values, strict=True)
+    altered[f"{table.name}.{field.name}"] += sum(
+        new is not old and new != old for new, old in pairs
+    )
     return arrow.array(nearest, type=field.type)
 
 
@@ -170,13 +178,14 @@ def joined(first: Any, second: Any) -> Any:
     return arrow.concat_tables([first, second]).combine_chunks()
 
 
-def replaced(table: Table, held: Any | None, rows: Iterable[Row]) -> Any:
+def replaced(table: Table, held: Any | None, rows: Iterable[Row], altered: Counter[str]) -> Any:
     """What a table that changes holds when these rows have come, in the order of its key.
 
     A row replaces the one of its key, but a null of `Table.lasting` does not replace a value.
+    `altered` is that of `as_arrow`.
     """
     new = _newest(table, held, rows)
-    added = as_arrow(table, new)
+    added = as_arrow(table, new, altered)
     if held is not None:
         keys = added.select(list(table.key))
         kept = held.join(keys, keys=list(table.key), join_type="left anti")

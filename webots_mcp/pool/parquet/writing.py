@@ -8,6 +8,7 @@ before it writes any, and those that change are replaced by themselves.
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Collection, Generator, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -111,6 +112,7 @@ class ParquetShipment:
         self._progress = read_progress(storage, recording_uuid)
         self._is_settled = False
         self._own_runs: set[str] = set()
+        self._altered = Counter[str]()  # in one `write`, by column
         self._spans: dict[str, tuple[int, int] | None] = {}
 
     def progress(self) -> dict[str, int]:
@@ -130,14 +132,15 @@ class ParquetShipment:
         self._lease.renew()
         self._storage.place(self._path(picture_file(path)), content)
 
-    def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
-        """Write rows, and then these numbers of the progress.
+    def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> Counter[str]:
+        """Write rows, and then these numbers of the progress; returns what was altered, by column.
 
         Raises:
             PoolUnavailableError: Worth trying again; rows that were placed do not count.
             PoolError: It will not be better by itself.
         """
         self._lease.renew()
+        self._altered = Counter[str]()
         if not self._is_settled:
             self._settle()
         self._is_settled = False
@@ -154,6 +157,7 @@ class ParquetShipment:
             place_progress(self._storage, self._uuid, told)
         self._progress = told
         self._is_settled = True
+        return +self._altered
 
     def _append(self, table: Table, rows: Iterable[Row]) -> Part:
         """Add the rows that are not there yet to the open part; what it is then."""
@@ -196,7 +200,7 @@ class ParquetShipment:
 
     def _place_part(self, table: Table, path: str, held: Any | None, added: list[Row]) -> bool:
         """Put a file in its own place with these rows behind its own; whether it is large."""
-        whole = as_arrow(table, added)
+        whole = as_arrow(table, added, self._altered)
         whole = whole if held is None else joined(held, whole)
         content = encoded(table, whole)
         self._place(path, content)
@@ -206,7 +210,7 @@ class ParquetShipment:
         for name, changed in by_block(table, rows).items():
             path = self._path(name)
             held = self._held(table, path)
-            whole = replaced(table, held, changed)
+            whole = replaced(table, held, changed, self._altered)
             if held is None or not whole.equals(held):
                 self._place(path, encoded(table, whole))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
+from collections import Counter
 from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import datetime, timezone
@@ -90,7 +91,7 @@ class PostgresShipment:
         self._connection, self._address, self._uuid = connection, address, recording_uuid
         self._parts: set[tuple[str, int, int]] = set()  # partitions that are there
         self._staged: set[str] = set()  # tables that have a temporary one
-        self._replaced = 0
+        self._replaced = Counter[str]()  # of one `write`, by column
 
     def progress(self) -> dict[str, int]:
         """What the last `write` left."""
@@ -112,14 +113,15 @@ class PostgresShipment:
                 (self._uuid, _text(path), content),
             )
 
-    def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
-        """Write rows and how far they go, or nothing."""
+    def write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> Counter[str]:
+        """Write rows and how far they go, or nothing; returns what was replaced, by column."""
         with clear_errors(self._address):
             try:
                 self._write_all(batches, progress)
             except psycopg.errors.CheckViolation:  # somebody dropped the months that are over
                 self._parts.clear()
                 self._write_all(batches, progress)
+        return self._replaced
 
     def _write_all(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
         self._make_partitions(batches)
@@ -132,7 +134,7 @@ class PostgresShipment:
             raise
 
     def _write(self, batches: Sequence[Batch], progress: Mapping[str, int]) -> None:
-        self._replaced = 0
+        self._replaced = Counter[str]()
         self._lock()
         for batch in batches:
             if batch.rows:
@@ -146,7 +148,7 @@ class PostgresShipment:
         self._connection.execute(
             "UPDATE shipment SET replaced_values = replaced_values + %s, shipped_wall_time_s = %s "
             f"WHERE {OWNER} = %s".encode(),
-            (self._replaced, time.time(), self._uuid),
+            (self._replaced.total(), time.time(), self._uuid),
         )
 
     def _lock(self) -> None:
@@ -235,8 +237,10 @@ class PostgresShipment:
             _nearest(value, kind, column in table.nullable)
             for value, kind, column in zip(row, table.types, table.columns, strict=True)
         )
-        self._replaced += sum(
-            new is not old and new != old for new, old in zip(held, row, strict=True)
+        self._replaced.update(
+            f"{table.name}.{column}"
+            for column, new, old in zip(table.columns, held, row, strict=True)
+            if new is not old and new != old
         )
         return held
 

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -245,6 +246,8 @@ def test_a_scheduler_without_simulators_is_told_at_once_and_one_that_is_lost_as_
         assert not (project / "data").exists()
 
         (worker,) = own.start(1)
+        its_address = worker.said(r"Start worker at:\s+(tcp://\S+)")[1]
+        assert f"answers at {its_address}, but a worker" in refused("--scheduler", its_address)
         process = started("--scheduler", own.address)
         found(lambda: worker.recording)
         children = worker.children
@@ -283,6 +286,19 @@ def test_what_is_no_scheduler_is_refused_before_anything_is_written(
 
     assert said in refused("--scheduler", address)
     assert not (project / "data").exists()
+
+
+def test_a_server_that_is_no_scheduler_is_not_waited_for(
+    plan: Write, refused: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "_CONNECT_S", 0.5)
+    plan(GRID.format(1))
+
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"tcp://127.0.0.1:{silent.getsockname()[1]}"
+        said = refused("--scheduler", address)
+
+    assert said.endswith(f"answers at {address}: what listens there is something else\n")
 
 
 def needs(world: Path, **other: Any) -> Needs:

@@ -7,6 +7,7 @@ that happened too often. Needs the extra `cluster`.
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import logging
@@ -373,14 +374,26 @@ def _connected(address: str) -> Generator[Any]:
             f"{address} needs certificates, of which Dask's configuration tells: "
             "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ..._TLS__CLIENT__CERT and ..._TLS__CLIENT__KEY"
         )
+    nobody = f"no Dask scheduler answers at {address}"
     try:
-        client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
-    except OSError as error:
-        raise CommandRefusedError(f"no Dask scheduler answers at {address}: {error}") from error
+        kind = asyncio.run(asyncio.wait_for(_kind_of_server(distributed, address), 2 * _CONNECT_S))
+    except Exception as error:
+        why = str(error) or "what listens there is something else"
+        raise CommandRefusedError(f"{nobody}: {why}") from error
+    if kind != "Scheduler":
+        raise CommandRefusedError(f"{nobody}, but a {kind.lower()}")
+    client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
     try:
         yield client
     finally:
         client.close(timeout=_PATIENCE_S)
+
+
+async def _kind_of_server(distributed: Any, address: str) -> str:
+    """`Scheduler` or `Worker`. A `Client` waits without end for the answer of what is neither."""
+    security = distributed.Security().get_connection_args("client")
+    async with distributed.rpc(address, timeout=_CONNECT_S, connection_args=security) as server:
+        return (await server.identity())["type"]
 
 
 def _require_fit(client: Any, address: str, needs: Needs) -> None:

@@ -7,12 +7,12 @@ import sqlite3
 from collections.abc import Callable, Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.pool.batch import Batch, batches
 from webots_mcp.pool.tables import SQLValue, Table, tables
 from webots_mcp.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
+from webots_mcp.store.questions.sql import Result, query_sql
 
 
 class SQLiteTarget:
@@ -218,6 +218,5 @@ class SQLitePool:
         row = self._connection.execute(query, (recording_uuid, path)).fetchone()
         return row and row[0]
 
-    def select(self, sql: str, limit: int) -> tuple[list[str], list[tuple[Any, ...]]]:
-        cursor = self._connection.execute(sql)
-        return [name for name, *_ in cursor.description], cursor.fetchmany(limit)
+    def select(self, sql: str, max_rows: int) -> Result:
+        return query_sql(self._connection, sql, max_rows=max_rows)

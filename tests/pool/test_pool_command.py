@@ -15,7 +15,7 @@ from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
 
 Ask = Callable[..., Any]
-pytestmark = pytest.mark.parametrize("lab", ["parquet"], indirect=True)
+files = pytest.mark.parametrize("lab", ["parquet"], indirect=True)
 
 
 @pytest.fixture
@@ -32,6 +32,7 @@ def ask(lab: Lab, runs: Recorded, capsys: pytest.CaptureFixture[str]) -> Ask:
     return run
 
 
+@files
 def test_robots_runs_trial_sets_and_sizes_are_listed(ask: Ask) -> None:
     robots = [line.split()[:4] for line in ask("pool", "POOL").splitlines()]
     assert robots[0] == ["robot", "recordings", "runs", "rows"]
@@ -43,6 +44,7 @@ def test_robots_runs_trial_sets_and_sizes_are_listed(ask: Ask) -> None:
     assert "event" in ask("pool", "POOL", "sizes")
 
 
+@files
 def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
     found = json.loads(ask("pool", "POOL", "runs", "--label", "wall 2", "--json"))
     (run,) = found["runs"]
@@ -52,17 +54,42 @@ def test_programs_read_json(ask: Ask, runs: Recorded) -> None:
     assert json.loads(ask("pool", "POOL", "sizes", "--json"))["tables"]
 
 
+@files
 def test_a_select_is_answered_with_its_first_rows(ask: Ask) -> None:
     query = ("--sql", "SELECT label, NULL AS empty FROM run ORDER BY label")
     said = ask("pool", "POOL", *query, "-n", "2").splitlines()
     assert [line.split() for line in said[:3]] == [
         ["label", "empty"], ["wall", "1", "NULL"], ["wall", "2", "NULL"],
     ]  # fmt: skip
-    assert said[3] == "note: only the first 2 rows: -n shows more"
+    assert said[3].startswith("note: only the first 2 rows; narrow the question")
     answer = json.loads(ask("pool", "POOL", *query, "--json"))
     assert (answer["columns"], len(answer["rows"])) == (["label", "empty"], 3)
 
 
+@pytest.mark.parametrize("lab", ["parquet", "postgres"], indirect=True)
+def test_an_answer_has_the_limits_of_sql_and_is_json_for_strict_readers(ask: Ask) -> None:
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    floats = ", ".join(f"CAST('{each}' AS FLOAT8)" for each in ("NaN", "Infinity", "-Infinity"))
+    query = f"SELECT repeat('x', 1000000), {floats}, 2.50, CAST('x' AS BYTEA), true, NULL"
+    said = ask("pool", "POOL", "--json", "--sql", query)
+    answer = json.loads(said, parse_constant=refuse)
+    assert answer["rows"] == [
+        ["x" * 200 + "... (1000000 characters)", "nan", "inf", "-inf", 2.5, "<blob of 1 bytes>",
+         True, None]
+    ]  # fmt: skip
+    assert answer["shortened"] == 1
+    texts = "SELECT repeat('x', 190) FROM generate_series(1, 900) AS many"
+    shown = ask("pool", "POOL", "-n", "1000", "--sql", texts)
+    assert len(shown) < 30_000
+    assert "their values are too long" in shown
+    assert "must be from 1 to 1000" in ask("pool", "POOL", "-n", "1001", "--sql", texts, code=2)
+    columns = ", ".join(f"{number} AS c{number}" for number in range(101))
+    assert "name at most 100" in ask("pool", "POOL", "--sql", f"SELECT {columns}", code=2)
+
+
+@files
 def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None:
     words = ("fetch", "--from", "POOL", "--data-dir", str(lab.here), "--robot", "rover")
     assert ask(*words).splitlines() == [
@@ -74,6 +101,7 @@ def test_what_came_is_said_and_what_is_missing_of_it(ask: Ask, lab: Lab) -> None
     assert ask(*words).splitlines()[1] == "here already: run 1 to 2"
 
 
+@files
 def test_what_is_not_there_is_refused_with_what_is_and_makes_no_recording(
     ask: Ask, tmp_path: Path
 ) -> None:

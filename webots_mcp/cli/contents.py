@@ -22,7 +22,7 @@ from webots_mcp.cli.command import (
 )
 from webots_mcp.cli.looking import wait
 from webots_mcp.cli.ranges import RUN, SIMULATION_TIMES
-from webots_mcp.cli.tables import print_json, print_notes, print_table
+from webots_mcp.cli.tables import print_json, print_notes, print_result, print_table
 from webots_mcp.contract import LOG_LEVELS, LOG_SOURCES
 
 if TYPE_CHECKING:
@@ -198,9 +198,4 @@ def sql(arguments: argparse.Namespace) -> None:
             LINE, input=asked.encoded(), stdout=subprocess.PIPE, cwd=FOLDER, check=False
         )
         found = decode(ended.stdout, ended.returncode, asked)
-    if arguments.json:
-        return print_json(found)
-    rows = [["NULL" if cell is None else cell for cell in row] for row in found.rows]
-    print_table(found.columns, rows)
-    cut = f"{found.shortened} long values are cut" if found.shortened else None
-    print_notes([note for note in (found.truncated, cut, None if rows else "no row") if note])
+    print_result(found, as_json=arguments.json)

@@ -19,7 +19,7 @@ from webots_mcp.cli.command import (
     writing,
 )
 from webots_mcp.cli.progress import shown_progress
-from webots_mcp.cli.tables import clock_text, id_ranges, print_notes, print_table
+from webots_mcp.cli.tables import clock_text, id_ranges, print_notes, print_result, print_table
 
 if TYPE_CHECKING:
     from webots_mcp.pool.catalogue import Choice
@@ -107,10 +107,12 @@ def _named(uuids: Sequence[str]) -> str:
     argument("part", nargs="?", choices=("robots", "runs", "trials", "sizes"), default="robots",
              help="what to list (robots)"),
     argument("--sql", metavar="SELECT", help="one SELECT in the language of the pool, in quotes"),
-    count("-n", "the newest N, or N rows", default=20),
+    count("-n", "the newest N, or N rows (of a SELECT up to 1000)", default=20, dest="max_rows"),
 )  # fmt: skip
 def pool(arguments: argparse.Namespace) -> None:
     """List what is in a pool, or ask it one SELECT; nothing is changed.
+
+    A SELECT ends after a minute, and its values are cut to 200 characters.
 
     webots-mcp pool ./pool runs --robot rover
 
@@ -120,27 +122,16 @@ def pool(arguments: argparse.Namespace) -> None:
 
     with open_pool(arguments.url) as opened:
         if arguments.sql is not None:
-            return _print_selected(opened, arguments)
+            found = opened.select(arguments.sql, arguments.max_rows)
+            return print_result(found, as_json=arguments.json)
         return _LISTS[arguments.part](opened, arguments)
-
-
-def _print_selected(pool: Pool, arguments: argparse.Namespace) -> None:
-    columns, rows = pool.select(arguments.sql, arguments.limit + 1)
-    shown = rows[: arguments.limit]
-    notes = [] if shown else ["no row"]
-    if len(rows) > len(shown):
-        notes = [f"only the first {len(shown)} rows: -n shows more"]
-    if arguments.json:
-        return _print({"columns": columns, "rows": [list(row) for row in shown], "notes": notes})
-    print_table(columns, [[_plain(cell) for cell in row] for row in shown])
-    print_notes(notes)
 
 
 def _print_robots(pool: Pool, arguments: argparse.Namespace) -> None:
     from webots_mcp.pool.catalogue import chosen_runs, robots
 
     found = robots(chosen_runs(pool, _choice(arguments)))
-    shown = found[: arguments.limit]
+    shown = found[: arguments.max_rows]
     if arguments.json:
         return _print({"robots": [vars(robot) for robot in shown], "total": len(found)})
     print_table(
@@ -160,7 +151,7 @@ def _print_runs(pool: Pool, arguments: argparse.Namespace) -> None:
     from webots_mcp.pool.catalogue import chosen_runs
 
     found = chosen_runs(pool, _choice(arguments))[::-1]
-    shown = found[: arguments.limit]
+    shown = found[: arguments.max_rows]
     if arguments.json:
         return _print({"runs": [vars(run) for run in shown], "total": len(found)})
     print_table(
@@ -181,7 +172,7 @@ def _print_trials(pool: Pool, arguments: argparse.Namespace) -> None:
     from webots_mcp.pool.catalogue import chosen_trial_sets
 
     found = chosen_trial_sets(pool, _choice(arguments))[::-1]
-    shown = found[: arguments.limit]
+    shown = found[: arguments.max_rows]
     if arguments.json:
         return _print({"trial_sets": [vars(each) for each in shown], "total": len(found)})
     print_table(
@@ -229,11 +220,3 @@ def _say_more(shown: Sequence[object], found: Sequence[object], what: str) -> No
 
 def _print(found: dict[str, Any]) -> None:
     print(json.dumps(found, ensure_ascii=False, default=str))
-
-
-def _plain(cell: Any) -> int | float | str:
-    """A value as a table shows it."""
-    if isinstance(cell, int | float | str):
-        return cell
-    is_json = isinstance(cell, list | dict)
-    return "NULL" if cell is None else json.dumps(cell) if is_json else str(cell)

@@ -7,9 +7,12 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, is_dataclass
-from typing import Any, Final, TextIO, cast
+from typing import TYPE_CHECKING, Any, Final, TextIO, cast
 
 from webots_mcp.cli.wording import as_typed
+
+if TYPE_CHECKING:
+    from webots_mcp.store.questions.sql import Result
 
 _LONGEST_CELL: Final = 110
 _RIGHT: Final = (int, float)
@@ -88,6 +91,16 @@ def print_notes(notes: Sequence[str], file: TextIO | None = None) -> None:
     """What there is to know about an answer, below it; on stdout, or in that file."""
     for note in notes:
         print(f"note: {text_of(as_typed(note))}", file=file)
+
+
+def print_result(found: Result, *, as_json: bool) -> None:
+    """Print what a SELECT has answered."""
+    if as_json:
+        return print_json(found)
+    rows = [["NULL" if cell is None else cell for cell in row] for row in found.rows]
+    print_table(found.columns, rows)
+    cut = f"{found.shortened} long values are cut" if found.shortened else None
+    print_notes([note for note in (found.truncated, cut, None if rows else "no row") if note])
 
 
 def print_json(found: Any) -> None:

@@ -11,12 +11,15 @@ import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import TYPE_CHECKING, Final, Protocol
 from urllib.parse import parse_qsl
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.pool.batch import Batch
 from webots_mcp.pool.tables import Table
+
+if TYPE_CHECKING:
+    from webots_mcp.store.questions.sql import Result
 
 _SECRET: Final = re.compile(
     "password|passwd|secret|token|credential|signature|authorization|(access|api|account)[_-]?key|"
@@ -207,8 +210,8 @@ class Pool(Protocol):
         """A picture that was shipped, by the path in its row."""
         ...
 
-    def select(self, sql: str, limit: int) -> tuple[list[str], list[tuple[Any, ...]]]:
-        """The columns and the first rows of one SELECT, which cannot write, before a deadline."""
+    def select(self, sql: str, max_rows: int) -> Result:
+        """The first rows of one SELECT, which cannot write, before a deadline; see `query_sql`."""
         ...
 
 

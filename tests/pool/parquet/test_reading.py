@@ -6,7 +6,6 @@ import json
 import math
 from collections.abc import Iterator
 from contextlib import closing
-from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -57,7 +56,7 @@ def pool(many: Many) -> Iterator[ParquetPool]:
 
 
 def asked(pool: ParquetPool, sql: str) -> dict[str, object]:
-    return dict(row for row in pool.select(sql, 1000)[1])
+    return {str(name): value for name, value in pool.select(sql, 1000).rows}
 
 
 class Told(NamedTuple):
@@ -101,7 +100,7 @@ def test_the_means_of_a_signal_are_those_of_the_tools(
 
 def test_events_are_those_that_the_tools_find(pool: ParquetPool, told: dict[str, Told]) -> None:
     assert all(each.near_walls_s for each in told.values())
-    assert asked(pool, WALLS) == {uuid: each.near_walls_s for uuid, each in told.items()}
+    assert asked(pool, WALLS) == {uuid: str(each.near_walls_s) for uuid, each in told.items()}
 
 
 def test_what_is_there_is_listed(pool: ParquetPool, many: Many) -> None:
@@ -158,34 +157,32 @@ def test_an_object_store_is_asked_as_a_folder_is(bridge_recording: Path) -> None
     url = bucket.empty()
     ship(bridge_recording, url)
     with ParquetPool(url) as pool:
-        columns, rows = pool.select("SELECT run_id, count(*) AS n FROM state GROUP BY 1", 10)
+        found = pool.select("SELECT run_id, count(*) AS n FROM state GROUP BY 1", 10)
     counted = len(rows_of(bridge_recording, table("state")))
-    assert columns == ["run_id", "n"]
-    assert sum(row[1] for row in rows) == counted
+    assert found.columns == ("run_id", "n")
+    assert sum(int(str(row[1])) for row in found.rows) == counted
 
 
 def test_a_table_without_rows_can_be_asked(pool: ParquetPool) -> None:
-    assert pool.select("SELECT count(*) FROM trial", 1)[1] == [(0,)]
-    assert pool.select("SELECT recording_uuid, plan FROM trial_set", 1) == (
-        ["recording_uuid", "plan"],
-        [],
-    )
+    assert pool.select("SELECT count(*) FROM trial", 1).rows == ((0,),)
+    found = pool.select("SELECT recording_uuid, plan FROM trial_set", 1)
+    assert (found.columns, found.rows) == (("recording_uuid", "plan"), ())
 
 
 def test_only_so_many_rows_come(pool: ParquetPool) -> None:
-    assert len(pool.select("SELECT * FROM state", 7)[1]) == 7
+    assert len(pool.select("SELECT * FROM state", 7).rows) == 7
 
 
 def test_a_wall_time_can_be_asked_as_a_time(pool: ParquetPool) -> None:
     sql = "SELECT to_timestamp(1.5) AS moment, id, id FROM run ORDER BY id"
-    columns, rows = pool.select(sql, 1)
-    assert columns[:2] == ["moment", "id"]
-    assert rows == [(datetime(1970, 1, 1, 0, 0, 1, 500_000), 1, 1)]
+    found = pool.select(sql, 1)
+    assert found.columns[:2] == ("moment", "id")
+    assert found.rows == (("1970-01-01 00:00:01.5+00", 1, 1),)
 
 
 def test_a_day_is_a_date(pool: ParquetPool) -> None:
-    found = pool.select("SELECT day, count(DISTINCT recording_uuid) FROM state GROUP BY 1", 9)[1]
-    assert sorted((str(day), count) for day, count in found) == [
+    found = pool.select("SELECT day, count(DISTINCT recording_uuid) FROM state GROUP BY 1", 9).rows
+    assert sorted(found) == [
         ("2023-11-14", 22),
         ("2023-11-15", RECORDINGS - 22),
     ]
@@ -230,5 +227,5 @@ def test_a_folder_without_a_pool_is_told(tmp_path: Path) -> None:
 
 
 def test_values_of_json_are_text_with_what_was_published(pool: ParquetPool) -> None:
-    ((data,),) = pool.select("SELECT data FROM state WHERE id = 1 LIMIT 1", 1)[1]
-    assert math.isfinite(json.loads(data)["front_m"])
+    ((data,),) = pool.select("SELECT data FROM state WHERE id = 1 LIMIT 1", 1).rows
+    assert math.isfinite(json.loads(str(data))["front_m"])

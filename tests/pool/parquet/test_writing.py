@@ -449,4 +449,4 @@ def test_a_folder_with_signs_of_patterns_in_its_name_is_a_pool_like_others(
     write_all(str(folder), STEPS)
     assert ids(pooled(str(folder), UUID, "log")) == [1, 2, 3, 4, 5, 6]
     with ParquetPool(str(folder)) as pool:
-        assert pool.select("SELECT count(*) FROM log", 1)[1] == [(6,)]
+        assert pool.select("SELECT count(*) FROM log", 1).rows == ((6,),)

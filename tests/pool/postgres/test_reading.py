@@ -133,11 +133,13 @@ def test_what_is_there_is_listed(pool: PostgresPool, recording: sqlite3.Connecti
 
 def test_one_select_is_answered_up_to_its_limit(pool: PostgresPool) -> None:
     sql = "SELECT robot, mode, x_m FROM robot_trajectory WHERE mode LIKE 'cr%' ORDER BY state_id;"
-    columns, rows = pool.select(sql, 2)
-    assert columns == ["robot", "mode", "x_m"]
-    assert rows == [("rover", "cruise", 0.0), ("rover", "cruise", pytest.approx(0.02))]
-    assert pool.select("SELECT 1.5 AS number, NULL", 9) == (["number", "?column?"], [(1.5, None)])
-    _, ((uuid,),) = pool.select("SELECT recording_uuid FROM robot", 1)
+    found = pool.select(sql, 2)
+    assert found.columns == ("robot", "mode", "x_m")
+    assert found.rows == (("rover", "cruise", 0.0), ("rover", "cruise", pytest.approx(0.02)))
+    assert found.truncated == "only the first 2 rows; narrow the question, or count and aggregate"
+    found = pool.select("SELECT 1.5 AS number, NULL, true -- and so on", 9)
+    assert (found.columns[:2], found.rows) == (("number", "?column?"), ((1.5, None, True),))
+    ((uuid,),) = pool.select("SELECT recording_uuid FROM robot", 1).rows
     assert isinstance(uuid, str)
 
 
@@ -157,12 +159,12 @@ def test_one_select_is_answered_up_to_its_limit(pool: PostgresPool) -> None:
 def test_anything_else_than_a_select_is_refused(pool: PostgresPool, sql: str, said: str) -> None:
     with pytest.raises(InvalidInputError, match=said):
         pool.select(sql, 10)
-    assert pool.select("SELECT count(*) FROM run", 1)[1] == [(3,)]
+    assert pool.select("SELECT count(*) FROM run", 1).rows == ((3,),)
 
 
 def test_nothing_that_a_select_makes_stays(pool: PostgresPool) -> None:
     pool.select("SELECT lo_from_bytea(0, 'made')", 1)
-    assert pool.select("SELECT count(*) FROM pg_largeobject_metadata", 1)[1] == [(0,)]
+    assert pool.select("SELECT count(*) FROM pg_largeobject_metadata", 1).rows == ((0,),)
 
 
 def test_a_select_that_takes_too_long_is_ended(
@@ -171,6 +173,8 @@ def test_a_select_that_takes_too_long_is_ended(
     monkeypatch.setattr(reading, "SELECT_S", 0.1)
     with pytest.raises(InvalidInputError, match="timeout"):
         pool.select("SELECT pg_sleep(60)", 1)
+    with pytest.raises(InvalidInputError, match="timeout"):  # while rows are fetched, too
+        pool.select("SELECT pg_sleep(0.06) FROM generate_series(1, 900)", 900)
 
 
 def test_an_empty_database_is_no_pool(postgres: Server, database: str) -> None:

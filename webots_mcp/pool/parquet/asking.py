@@ -2,7 +2,7 @@
 
 Each table is a view of its name, with `recording_uuid` before its columns. What keeps a statement
 harmless: it is one SELECT, DuckDB may open files below the root of the pool only, and it has a
-deadline and a limit of memory.
+deadline, a limit of memory, and the limits of `query_sql` on what it answers.
 """
 
 from __future__ import annotations
@@ -14,24 +14,30 @@ from contextlib import closing, contextmanager
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.pool.asking import Kind, answered, bounded
 from webots_mcp.pool.parquet.layout import files_of
 from webots_mcp.pool.parquet.packages import package
 from webots_mcp.pool.parquet.storage import Storage
 from webots_mcp.pool.tables import Table, tables
+from webots_mcp.store.questions.sql import Result, require_max_rows
 
 DEADLINE_S: Final = 60.0
 _MEMORY: Final = "2GB"
-_WITH_ZONE: Final = "TIMESTAMP WITH TIME ZONE"
+_NUMBERS: Final = (
+    "BOOLEAN", "TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
+    "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE",
+)  # fmt: skip
 _TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
 
 
-def select(storage: Storage, sql: str, limit: int) -> tuple[list[str], list[tuple[Any, ...]]]:
-    """The columns and the first rows of one SELECT.
+def select(storage: Storage, sql: str, max_rows: int) -> Result:
+    """The first rows of one SELECT.
 
     Raises:
         InvalidInputError: It is no single SELECT, is wrong, or takes too long.
         PoolError: DuckDB is not installed.
     """
+    require_max_rows(max_rows)
     duckdb = package("duckdb")
     with closing(duckdb.connect()) as connection:
         _prepare(connection, storage, sql)
@@ -39,8 +45,8 @@ def select(storage: Storage, sql: str, limit: int) -> tuple[list[str], list[tupl
             _require_select(duckdb, connection, sql)
             with _deadline(connection):
                 answer = connection.sql(sql)
-                rows = _without_zones(answer).limit(limit).fetchall()
-                return list(map(str, answer.columns)), list(rows)
+                rows = _bounded(answer).limit(max_rows + 1).fetchall()
+                return answered(map(str, answer.columns), rows, max_rows)
         except duckdb.InterruptException as error:
             raise InvalidInputError(
                 f"no answer within {DEADLINE_S:g} s: narrow it by recording_uuid and by day"
@@ -64,14 +70,17 @@ def _prepare(connection: Any, storage: Storage, sql: str) -> None:
     connection.execute("SET lock_configuration = true")
 
 
-def _without_zones(answer: Any) -> Any:
-    """Times with a zone, for which DuckDB's Python needs another package, as those of UTC."""
-    columns = (
-        f"CAST(#{at} AS TIMESTAMP)" if str(kind) == _WITH_ZONE else f"#{at}"
-        for at, kind in enumerate(answer.types, 1)
-    )
-    named = (f"{each} AS column_{at}" for at, each in enumerate(columns))
-    return answer.project(", ".join(named)) if _WITH_ZONE in map(str, answer.types) else answer
+def _bounded(answer: Any) -> Any:
+    """The answer with long values cut, and at the end of each row how many of it are."""
+    columns = bounded([_column(at, str(kind)) for at, kind in enumerate(answer.types, 1)])
+    return answer.project(", ".join(f"{each} AS c{at}" for at, each in enumerate(columns)))
+
+
+def _column(at: int, kind: str) -> tuple[str, Kind]:
+    """A column, the first is 1, and how it is shown."""
+    if kind.startswith("DECIMAL"):
+        return f"CAST(#{at} AS DOUBLE)", "number"
+    return f"#{at}", "number" if kind in _NUMBERS else "bytes" if kind == "BLOB" else "text"
 
 
 def _view(table: Table, paths: list[str]) -> str:

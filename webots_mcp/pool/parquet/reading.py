@@ -18,6 +18,7 @@ from webots_mcp.pool.parquet.rows import as_rows, decoded, footer_of, pieces_of,
 from webots_mcp.pool.parquet.storage import Storage
 from webots_mcp.pool.tables import Table, table, tables
 from webots_mcp.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
+from webots_mcp.store.questions.sql import Result
 
 _AT_ONCE: Final = 16  # footers that are read at the same time: most of it is waiting
 
@@ -109,14 +110,14 @@ class ParquetPool:
         """A picture that was shipped, by the path in its row."""
         return self._storage.read(f"{folder_of(recording_uuid)}/{picture_file(path)}")
 
-    def select(self, sql: str, limit: int) -> tuple[list[str], list[tuple[Any, ...]]]:
-        """The columns and the first rows of one SELECT of DuckDB.
+    def select(self, sql: str, max_rows: int) -> Result:
+        """The first rows of one SELECT of DuckDB.
 
         Raises:
             InvalidInputError: It is no single SELECT, is wrong, or takes too long.
             PoolError: DuckDB is not installed.
         """
-        return select(self._storage, sql, limit)
+        return select(self._storage, sql, max_rows)
 
     def _in_order(
         self, table: Table, pieces: Iterable[_Piece], where: Mapping[str, Collection[int]]

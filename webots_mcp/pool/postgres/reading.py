@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Generator, Iterator, Mapping
+import time
+from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any, Final, cast
+from typing import Any, Final, TypeVar, cast
 
 import psycopg
 from psycopg.types.numeric import FloatLoader
-from psycopg.types.string import TextLoader
 
 from webots_mcp.errors import InvalidInputError, PoolError
+from webots_mcp.pool.asking import Kind, answered, bounded
 from webots_mcp.pool.batch import Batch, Row, batches
 from webots_mcp.pool.postgres.connecting import Connection, clear_errors, connect, one_line
 from webots_mcp.pool.postgres.schema import OWNER, require_current
@@ -23,6 +24,7 @@ from webots_mcp.pool.target import (
     PooledTrialSet,
     redacted,
 )
+from webots_mcp.store.questions.sql import Result, require_max_rows
 
 SELECT_S: Final = 60
 _FETCHED: Final = 2000  # rows that are asked of the server at a time
@@ -53,7 +55,14 @@ SELECT sum(pg_total_relation_size(oid))::bigint,
   coalesce(bool_and(reltuples >= 0) FILTER (WHERE relkind = 'r'), false)
 FROM pg_class WHERE oid = %(name)s::regclass
   OR oid IN (SELECT relid FROM pg_partition_tree(%(name)s))"""
+# By their OIDs: bool, int8, int2, int4, oid, float4, float8, numeric; bytea.
+_KINDS: Final[dict[int, Kind]] = {
+    **dict.fromkeys((16, 20, 21, 23, 26, 700, 701, 1700), "number"), 17: "bytes",
+}  # fmt: skip
 _ASKED_WRONG: Final = ("22", "25006", "42", "57014", "0A")  # SQLSTATEs that a question has
+
+
+_Cursor = TypeVar("_Cursor", bound="psycopg.Cursor[Any] | psycopg.ServerCursor[Any]")
 
 
 class PostgresPool:
@@ -140,23 +149,32 @@ class PostgresPool:
         found = list(self._asked(query, (recording_uuid, path)))
         return bytes(found[0][0]) if found else None
 
-    def select(self, sql: str, limit: int) -> tuple[list[str], list[tuple[Any, ...]]]:
+    def select(self, sql: str, max_rows: int) -> Result:
         """The first rows of one SELECT.
 
         Raises:
             InvalidInputError: It is no SELECT, is wrong, or takes longer than a minute.
         """
+        require_max_rows(max_rows)
+        asked = sql.strip().rstrip(";").replace("%", "%%")
+        until_s = time.monotonic() + SELECT_S
         # Large objects may be made in a transaction that only reads: none of it stays.
         undone = self._connection.transaction(force_rollback=True)
         with clear_errors(self.address), _clear_question(), undone:
-            self._connection.execute(f"SET LOCAL statement_timeout = '{SELECT_S}s'".encode())
-            # With values, even none, PostgreSQL takes no more than one statement.
-            with self._connection.cursor(next(self._names)) as cursor:
+            # A cursor takes nothing but one SELECT, and knows its columns before it runs.
+            with self._limited(self._connection.cursor(next(self._names)), until_s) as cursor:
+                columns = cursor.execute(asked.encode(), ()).description or ()
+            with self._limited(self._connection.cursor(), until_s) as cursor:
                 cursor.adapters.register_loader("numeric", FloatLoader)
-                cursor.adapters.register_loader("uuid", TextLoader)
-                cursor.execute(sql.strip().rstrip(";").replace("%", "%%").encode(), ())
-                rows = cursor.fetchmany(limit)
-                return [each.name for each in cursor.description or ()], rows
+                query = _bounded(asked, [each.type_code for each in columns], max_rows + 1)
+                rows = cursor.execute(query.encode(), ()).fetchall()
+        return answered([each.name for each in columns], rows, max_rows)
+
+    def _limited(self, cursor: _Cursor, until_s: float) -> _Cursor:
+        """The cursor; the statements that follow end at that time of the monotonic clock."""
+        left_ms = max(1, round((until_s - time.monotonic()) * 1000))
+        self._connection.execute(f"SET LOCAL statement_timeout = {left_ms}".encode())
+        return cursor
 
     def _asked(self, query: str, values: Any = None) -> Iterator[tuple[Any, ...]]:
         """The rows of a query, a few of them in memory."""
@@ -164,6 +182,17 @@ class PostgresPool:
             cursor.itersize = _FETCHED
             cursor.execute(query.encode(), values)
             yield from cursor
+
+
+def _bounded(sql: str, types: Sequence[int], limit: int) -> str:
+    """The question with long values cut, and at the end of each row how many of it are."""
+    names = [f"c{at}" for at in range(len(types))]
+    kinds: list[Kind] = [_KINDS.get(each, "text") for each in types]
+    shown = bounded(list(zip(names, kinds, strict=True)))
+    asked = f"asked({', '.join(names)})" if names else "asked"
+    # OFFSET 0: else what a column is computed from would be computed for each mention of it.
+    once = f"SELECT * FROM (\n{sql}\n) AS {asked} OFFSET 0"
+    return f"SELECT {', '.join(shown)} FROM ({once}) AS once LIMIT {limit}"
 
 
 @contextmanager

@@ -81,12 +81,11 @@ def query_sql(
         InvalidInputError: It is no single SELECT, would do more than read, is wrong, or took too
             long to give its first row; the text says what to do.
     """
-    if not 1 <= max_rows <= MOST_ROWS:
-        raise InvalidInputError(f"max_rows={max_rows} must be from 1 to {MOST_ROWS}")
+    require_max_rows(max_rows)
     require_select(statement)
     deadline = Deadline(deadline_s)
     rows: list[tuple[Cell, ...]] = []
-    budget = _Budget(max_bytes)
+    budget = Budget(max_bytes)
     columns: tuple[str, ...] = ()
     why: str | None = None
     try:
@@ -97,7 +96,7 @@ def query_sql(
         ):
             cursor = connection.execute(statement)
             columns = tuple(str(column[0]) for column in cursor.description or ())
-            why = _fetch(cursor, rows, max_rows, budget)
+            why = fetch_rows(cursor, rows, max_rows, budget)
             cursor.close()
     except MemoryError as error:
         raise InvalidInputError(_TOO_LARGE) from error
@@ -108,6 +107,16 @@ def query_sql(
             raise InvalidInputError(too_slow(deadline_s)) from error
         why = f"stopped after {deadline_s:g} s; further rows may exist"
     return Result(columns, tuple(rows), why, budget.shortened)
+
+
+def require_max_rows(max_rows: int) -> None:
+    """Refuse more rows than an answer may have.
+
+    Raises:
+        InvalidInputError: The text says how many those are.
+    """
+    if not 1 <= max_rows <= MOST_ROWS:
+        raise InvalidInputError(f"max_rows={max_rows} must be from 1 to {MOST_ROWS}")
 
 
 def require_select(statement: str) -> None:
@@ -162,7 +171,7 @@ def _allow(*_: object) -> int:
     return sqlite3.SQLITE_OK
 
 
-class _Budget:
+class Budget:
     """Bytes that are left for values, and how many of these were shortened."""
 
     def __init__(self, max_bytes: int) -> None:
@@ -180,6 +189,7 @@ class _Budget:
             connection.text_factory = before
 
     def take(self, row: Iterable[object]) -> tuple[Cell, ...]:
+        """The values of a row as an answer has them; they are paid for."""
         cells = tuple(self._shown(value) for value in row)
         self.left -= sum(len(str(cell).encode("utf-8", "replace")) + 1 for cell in cells)
         return cells
@@ -199,11 +209,14 @@ class _Budget:
         return f"{text[:MAX_TEXT]}... ({len(text)} characters)"
 
 
-def _fetch(
-    cursor: sqlite3.Cursor, rows: list[tuple[Cell, ...]], max_rows: int, budget: _Budget
+def fetch_rows(
+    found: Iterable[Iterable[object]],
+    rows: list[tuple[Cell, ...]],
+    max_rows: int,
+    budget: Budget,
 ) -> str | None:
     """Fill `rows`; why there are more, or None."""
-    for row in cursor:
+    for row in found:
         if len(rows) == max_rows:
             return f"only the first {max_rows} rows; narrow the question, or count and aggregate"
         rows.append(budget.take(row))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -75,17 +76,17 @@ def test_a_worker_that_is_killed_costs_nothing_and_the_scores_are_those_of_this_
     dask_cluster: Cluster,
 ) -> None:
     workers = dask_cluster.start(4)
-    plan(GRID.format(4))
+    plan(GRID.format(2))
     process = started("--scheduler", dask_cluster.address, "--json")
     busy = found(lambda: next((each for each in workers if each.recording), None))
     simulator = busy.kill()
     out, said = process.communicate(timeout=120)
 
     answer = json.loads(out)
-    assert "12/12  speed " in said
-    assert [len(each["scores"]) for each in answer["sets"]] == [4, 4, 4]
+    assert "6/6  speed " in said
+    assert [len(each["scores"]) for each in answer["sets"]] == [2, 2, 2]
     counted = "SELECT count(*), count(DISTINCT uuid), count(DISTINCT label) FROM run"
-    assert rows(project, counted) == [(12, 12, 12)]
+    assert rows(project, counted) == [(6, 6, 6)]
     assert list((project / "data" / "trials").iterdir()) == []
     assert [each.trials for each in dask_cluster.workers] == [[], [], []]
     found(lambda: not any(each.is_running() for each in simulator))
@@ -146,7 +147,11 @@ def test_a_trial_that_kills_its_workers_fails_with_that_reason(
 
 
 def test_a_search_prunes_there_as_here_and_its_recordings_may_come_through_a_pool(
-    project: Path, plan: Write, run: Run, dask_cluster: Cluster
+    project: Path,
+    plan: Write,
+    run: Run,
+    refused: Callable[..., str],
+    dask_cluster: Cluster,
 ) -> None:
     dask_cluster.start(1)
     plan(
@@ -155,6 +160,8 @@ def test_a_search_prunes_there_as_here_and_its_recordings_may_come_through_a_poo
     )
     options = ("--scheduler", dask_cluster.address, "--search", "random", "--jobs", "1")
 
+    no_pool = refused(*options, "--ship-to", str(project / "plan.toml"))
+    assert re.match(r"webots-mcp: worker tcp://\S+ on \S+: .*plan\.toml", no_pool)
     answer_of(run(*options, "--ship-to", str(project / "pool"), "--json"))
 
     told = "SELECT status, ended_by, parameters FROM trial"

@@ -166,7 +166,9 @@ def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
             return Returned(result, shipped=_shipped(folder, needs.ship_to))
     except StoppedError:
         raise unwanted.as_dask_says() from None
-    except OSError as error:
+    except InvalidInputError:
+        raise  # no other worker could run it either
+    except (OSError, WebotsMCPError) as error:
         raise CommandRefusedError(f"{where}: {error}") from error
 
 

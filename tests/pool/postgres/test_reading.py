@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
@@ -165,6 +166,20 @@ def test_anything_else_than_a_select_is_refused(pool: PostgresPool, sql: str, sa
 def test_nothing_that_a_select_makes_stays(pool: PostgresPool) -> None:
     pool.select("SELECT lo_from_bytea(0, 'made')", 1)
     assert pool.select("SELECT count(*) FROM pg_largeobject_metadata", 1).rows == ((0,),)
+
+
+def test_the_role_of_the_page_reads_the_pool_and_nothing_else(
+    postgres: Server, pool_template: str
+) -> None:
+    pool = postgres.new_database(pool_template)
+    page = (Path(__file__).parents[3] / "docs" / "pool.md").read_text("utf-8")
+    found = re.search(r"```postgresql\n(CREATE ROLE reader.*?)```", page, re.DOTALL)
+    assert found
+    postgres.execute(pool, found[1])
+    with PostgresPool(postgres.url(pool, user="reader")) as opened:
+        assert opened.select("SELECT count(*) FROM run", 1).rows == ((0,),)
+        with pytest.raises(InvalidInputError, match="permission denied for function pg_read_file"):
+            opened.select("SELECT pg_read_file('/etc/passwd')", 1)
 
 
 def test_a_select_that_takes_too_long_is_ended(

@@ -242,7 +242,9 @@ def test_the_folder_tells_retention_what_is_shipped(shipped: Shipped) -> None:
     assert "state" not in told.last_ids
     assert told.complete_wall_time_s > 0
     assert read_shipped(shipped.folder / "webots.db", new_uuid()) == {}
-    (shipped.folder / "webots.db-shipped.json").write_text("{")
+    file = shipped.folder / "webots.db-shipped.json"
+    assert file.stat().st_mode & 0o777 == 0o600  # as the database
+    file.write_text("{")
     assert read_shipped(shipped.folder / "webots.db", shipped.uuid) == {}
     shipped.ship()
     assert read_shipped(shipped.folder / "webots.db", shipped.uuid)
@@ -428,7 +430,7 @@ def test_a_recording_that_is_not_there_yet_is_waited_for_and_one_in_its_place_is
     )
     with pytest.raises(KeyboardInterrupt):
         follow(order, Report(), hear, 0.0)
-    assert "It is shipped as soon as it is there" in said[0]
+    assert said[0] == f"nothing is recorded at {database} now: it is shipped as soon as it is there"
     assert f"the recording {other} stands now where {shipped.uuid} was" in said[1]
     assert pooled(shipped.pool, shipped.uuid) == shipped.rows()
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from webots_mcp.connection import FrozenConnection
+from webots_mcp.contract import Database
 from webots_mcp.errors import (
     DatabaseError,
     InvalidInputError,
@@ -25,7 +26,6 @@ from webots_mcp.errors import (
     PoolBusyError,
     PoolError,
     PoolUnavailableError,
-    WebotsMCPError,
 )
 from webots_mcp.pool.batch import Batch, row_bytes
 from webots_mcp.pool.kept import Kept
@@ -41,7 +41,7 @@ from webots_mcp.pool.target import Shipment, Target, whole_runs
 from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.merging import settled
-from webots_mcp.store.recording import Recording
+from webots_mcp.store.recording import Recording, name_of
 from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_shipped
 
 WRITE_BYTES: Final = 8_000_000
@@ -146,7 +146,9 @@ def _go_on_until_it_fails(
     except _ReplacedError as error:
         say(f"{error}: that one is shipped from here on")
         return 0.0
-    except (NoDatabaseError, PoolBusyError, PoolUnavailableError) as error:
+    except NoDatabaseError:
+        return patience.wait_for(order.recording.database)
+    except (PoolBusyError, PoolUnavailableError) as error:
         return patience.wait_after(error)
 
 
@@ -166,11 +168,14 @@ class _Patience:
             self._say(f"the pool {address} is there again")
         self._away_s, self._was_there, self._has_told = 0.0, True, False
 
-    def wait_after(self, error: WebotsMCPError) -> float:
+    def wait_for(self, database: Database) -> float:
+        """In seconds, where no recording is."""
+        there = f"nothing is recorded at {name_of(database)} now"
+        self._tell_once(f"{there}: it is shipped as soon as it is there")
+        return self._pause_s
+
+    def wait_after(self, error: PoolError) -> float:
         """In seconds; what would not be better after it is raised again."""
-        if isinstance(error, NoDatabaseError):
-            self._tell_once(f"{f'{error}'.rstrip('.')}. It is shipped as soon as it is there")
-            return self._pause_s
         if isinstance(error, PoolBusyError):
             if not self._was_there:
                 raise error

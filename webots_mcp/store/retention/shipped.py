@@ -16,6 +16,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from webots_mcp.contract import PRIVATE_FILE
+
 _NAME: Final = "{}-shipped.json"
 _FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
 _UUID: Final = "SELECT uuid FROM recording"
@@ -76,6 +78,7 @@ def write_shipped(database: Path, address: str, shipped: Shipped) -> None:
     told = {**_read(file), address: shipped}
     aside = file.with_name(f".{file.name}.{os.getpid()}.part")
     try:
+        aside.touch(PRIVATE_FILE)
         aside.write_text(json.dumps({key: asdict(each) for key, each in told.items()}, indent=1))
         aside.replace(file)
     except OSError:

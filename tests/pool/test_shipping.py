@@ -147,6 +147,10 @@ def test_a_run_that_another_recording_has_shipped_stays_that_ones(
     shipped: Shipped, tmp_path: Path
 ) -> None:
     shipped.add_run(60)
+    shipped.recorded.insert(
+        "parameter", robot_id=shipped.recorded.robot_id, session_id=1, name="kp", kind="float",
+        default_value="1.0", doc="", declared_wall_time_s=1.0,
+    )  # fmt: skip
     folder = tmp_path / "other"
     with closing(connect(folder / "webots.db", "writer", create=True)) as connection:
         create_schema(connection)
@@ -160,6 +164,9 @@ def test_a_run_that_another_recording_has_shipped_stays_that_ones(
         (run,) = other.pooled()["run"]
         assert run[0] == own
         assert {row[1] for row in other.pooled()["state"]} == {own}
+        for of_session, here, there in (("session", 2, 1), ("command", 2, 1), ("parameter", 1, 0)):
+            assert other.recorded.count(of_session) == here
+            assert len(other.pooled()[of_session]) == there
         assert list(report.foreign.values()) == [shipped.uuid]
     assert shipped.pooled() == shipped.rows()
 

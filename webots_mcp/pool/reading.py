@@ -23,6 +23,7 @@ NOT_YET: Final = -(2**62)  # before the first bucket
 ROLLED: Final = ("rollup", "coarse_rollup", "change")
 _UUID: Final = "SELECT uuid FROM recording LIMIT 2"
 _RUNS: Final = "SELECT id, uuid FROM run"
+_SESSIONS: Final = "SELECT id, session_id FROM run"
 _ENDED: Final = "SELECT id FROM run WHERE ended_wall_time_s IS NOT NULL"
 _SEQUENCE: Final = "SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = ?"
 _LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
@@ -88,6 +89,7 @@ class Source:
         self._connection = connection
         connection.text_factory = _text
         self.foreign = set[int]()
+        self._foreign_sessions = set[int]()
 
     def uuid(self) -> str:
         """The recording's.
@@ -107,6 +109,13 @@ class Source:
     def runs(self) -> dict[int, str | None]:
         """The UUIDs of the runs; those that an old version has recorded have none."""
         return dict(self._connection.execute(_RUNS).fetchall())
+
+    def leave_out(self, runs: set[int]) -> None:
+        """These runs are another's to ship, and sessions that have no others are as well."""
+        self.foreign = runs
+        sessions = dict(self._connection.execute(_SESSIONS).fetchall() if runs else ())
+        ours = {session for run_id, session in sessions.items() if run_id not in runs}
+        self._foreign_sessions = set(sessions.values()) - ours
 
     def ended_runs(self) -> set[int]:
         """The runs that are over."""
@@ -229,16 +238,9 @@ class Source:
         return self._connection.execute(_PICTURES, (after, upto)).fetchall()
 
     def ours(self, table: Table, rows: Sequence[Row]) -> list[Row]:
-        """Without what belongs to runs that another recording ships, or refers to them."""
-        if not self.foreign or table.run_column is None:
-            return list(rows)
-        at = table.columns.index(table.run_column)
-        if table.run_column in table.lasting:
-            return [
-                (*row[:at], None, *row[at + 1 :]) if row[at] in self.foreign else row
-                for row in rows
-            ]
-        return [row for row in rows if row[at] not in self.foreign]
+        """Without what belongs to runs and sessions of another recording, or refers to them."""
+        rows = _without(table, rows, table.run_column, self.foreign)
+        return _without(table, rows, table.session_column, self._foreign_sessions)
 
     def _some(self, query: str, values: tuple[Any, ...]) -> tuple[list[Row], bool]:
         """Rows up to a bounded size, and whether they are all; the transaction is over then."""
@@ -257,6 +259,16 @@ class Source:
 
     def _first(self, query: str, *values: object) -> int:
         return int(self._connection.execute(query, values).fetchone()[0])
+
+
+def _without(table: Table, rows: Sequence[Row], column: str | None, foreign: set[int]) -> list[Row]:
+    """Rows whose column names none of these; what outlasts them names nothing then."""
+    if column is None or not foreign:
+        return list(rows)
+    at = table.columns.index(column)
+    if table.outlasts_runs:
+        return [(*row[:at], None, *row[at + 1 :]) if row[at] in foreign else row for row in rows]
+    return [row for row in rows if row[at] not in foreign]
 
 
 def is_finite(value: SQLValue) -> TypeGuard[int | float]:

@@ -391,7 +391,7 @@ class _Shipper:
         runs = {run_id: uuid for run_id, uuid in source.runs().items() if uuid}
         if not self._owners.keys() >= set(runs.values()):
             return False
-        source.foreign = {run_id for run_id, uuid in runs.items() if self._owners[uuid]}
+        source.leave_out({run_id for run_id, uuid in runs.items() if self._owners[uuid]})
         return True
 
     def _ask_for_owners(self, source: Source) -> None:

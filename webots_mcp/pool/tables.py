@@ -13,6 +13,7 @@ _APPENDED: Final = ("state", "kept_state", "log", "event", "image", "parameter_v
 # to become log lines. Recent rollups are shipped as rollups: the difference is how they are
 # written here.
 _LOCAL: Final = ("lease", "watermark", "retention_limit", "console_line", "recent_rollup")
+_OF_TRIALS: Final = ("trial_set", "trial")
 _TYPES: Final[dict[str, type[int | float | str]]] = {
     "INTEGER": int, "BIGINT": int, "FLOAT": float, "TEXT": str, "VARCHAR": str,
 }  # fmt: skip
@@ -36,6 +37,8 @@ class Table:
         full_rate_only: Shipped only at full rate, but for the rows of kept stretches.
         time_column: The wall time by which a pool may cut it into parts, of appended tables.
         run_column: The column that names the row's run, where it belongs to one.
+        session_column: The column that names its session.
+        outlasts_runs: It stays where the run or session that it names is not shipped.
     """
 
     name: str
@@ -50,6 +53,8 @@ class Table:
     full_rate_only: bool
     time_column: str | None
     run_column: str | None
+    session_column: str | None
+    outlasts_runs: bool
 
 
 @cache
@@ -74,7 +79,6 @@ def _table(model: Any) -> Table:
     name: str = model.name
     columns = tuple(str(column.name) for column in model.columns)
     is_appended = name in _APPENDED
-    run_column = "id" if name == "run" else "run_id" if "run_id" in columns else None
     return Table(
         name=name,
         key=tuple(column.name for column in model.primary_key.columns),
@@ -87,8 +91,16 @@ def _table(model: Any) -> Table:
         is_appended=is_appended,
         full_rate_only=name == "state",
         time_column="wall_time_s" if is_appended else None,
-        run_column=run_column,
+        run_column=_column_of("run", name, columns),
+        session_column=_column_of("session", name, columns),
+        outlasts_runs=name in _OF_TRIALS,
     )
+
+
+def _column_of(owner: str, name: str, columns: tuple[str, ...]) -> str | None:
+    if name == owner:
+        return "id"
+    return f"{owner}_id" if f"{owner}_id" in columns else None
 
 
 def _is_json(column: Any) -> bool:

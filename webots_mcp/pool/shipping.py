@@ -313,8 +313,9 @@ class _Shipper:
 
     def note_unsummed(self) -> None:
         """Say that states are neither shipped nor in rollups, which only a server makes."""
-        behind = self._last_ids["state"] - self._watermark
-        if not self._order.full and behind > 0:
+        shipped = self._progress.get("state", 0)  # at full rate, now or before
+        behind = self._last_ids["state"] - max(self._watermark, shipped)
+        if behind > 0:
             self._report.note(
                 f"the newest {behind} states are in no rollups yet, which 'webots-mcp serve' makes "
                 "at the edge: ship with --full"

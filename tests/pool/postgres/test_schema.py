@@ -128,11 +128,11 @@ def test_a_role_that_may_not_make_tables_is_told_what_to_grant(
 
 
 def test_a_role_that_may_not_write_is_told_what_to_grant(postgres: Server, pool: str) -> None:
-    postgres.execute(pool, "CREATE ROLE reader LOGIN")
-    granted = re.search("'(GRANT .*)'", refusal(postgres, pool, user="reader"))
+    postgres.execute(pool, "CREATE ROLE visitor LOGIN")
+    granted = re.search("'(GRANT .*)'", refusal(postgres, pool, user="visitor"))
     assert granted
     postgres.execute(pool, granted[1])
-    prepare(postgres.url(pool, user="reader"), "here")
+    prepare(postgres.url(pool, user="visitor"), "here")
 
 
 def test_a_database_that_is_read_only_is_refused(postgres: Server, database: str) -> None:

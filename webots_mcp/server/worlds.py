@@ -85,7 +85,8 @@ class WorldRequest(Request):
         if self.robot is None:
             return True
         situation = await self._look_around("quit")
-        return situation.is_there and situation.address == ours.webots.address
+        address = await to_thread.run_sync(ours.webots.address_now)
+        return situation.is_there and situation.address == address
 
     async def _look_around(self, action: str) -> Situation:
         return await to_thread.run_sync(look_around, self.recording, self.robot, action)

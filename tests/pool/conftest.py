@@ -19,7 +19,8 @@ from tests.postgres import NoServerError, Server, running_server
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.pool.shipping import Order, Report, ship
+from webots_mcp.pool.report import Report
+from webots_mcp.pool.shipping import Order, ship
 from webots_mcp.pool.target import open_pool, open_target
 from webots_mcp.schema import create_schema
 from webots_mcp.store.recording import Recording

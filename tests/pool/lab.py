@@ -13,7 +13,8 @@ from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.pool.catalogue import Choice, meant
 from webots_mcp.pool.fetching import Fetched, fetch
-from webots_mcp.pool.shipping import Order, Report, ship
+from webots_mcp.pool.report import Report
+from webots_mcp.pool.shipping import Order, ship
 from webots_mcp.pool.target import Pool, Target
 from webots_mcp.schema import create_schema
 from webots_mcp.store.recording import Recording

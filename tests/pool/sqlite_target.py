@@ -172,7 +172,15 @@ class SQLitePool:
         self._connection.close()
 
     def recordings(self) -> Iterator[PooledRecording]:
-        raise NotImplementedError
+        query = (
+            "SELECT c.uuid, c.created_wall_time_s, (SELECT count(*) FROM run r WHERE "
+            "r.recording_uuid = c.uuid), EXISTS (SELECT 1 FROM state s WHERE s.recording_uuid = "
+            "c.uuid) FROM recording c ORDER BY 2"
+        )
+        names = "SELECT name FROM robot WHERE recording_uuid = ? ORDER BY id"
+        for uuid, created_s, runs, full in self._connection.execute(query).fetchall():
+            robots = tuple(name for (name,) in self._connection.execute(names, (uuid,)))
+            yield PooledRecording(uuid, created_s, robots, runs, bool(full))
 
     def runs(self, recording_uuid: str | None = None) -> Iterator[PooledRun]:
         query = (

@@ -21,7 +21,9 @@ from tests.postgres import Server
 from tests.recordings.bridge import STEP_MS, Rover
 from webots_mcp.connection import connect
 from webots_mcp.pool.batch import Row
-from webots_mcp.pool.shipping import Order, Report, follow, ship
+from webots_mcp.pool.following import follow
+from webots_mcp.pool.report import Report
+from webots_mcp.pool.shipping import Order, ship
 from webots_mcp.pool.tables import Table, tables
 from webots_mcp.pool.target import open_pool, open_target
 from webots_mcp.store.recording import Recording

@@ -24,7 +24,8 @@ from webots_mcp.errors import (
     SchemaTooOldError,
 )
 from webots_mcp.pool.batch import BATCH_BYTES
-from webots_mcp.pool.shipping import Report, follow
+from webots_mcp.pool.following import follow
+from webots_mcp.pool.report import Report
 from webots_mcp.pool.tables import table
 from webots_mcp.pool.target import is_whole
 from webots_mcp.schema import create_schema
@@ -288,7 +289,8 @@ def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
     code = (
         "import functools, sys; from pathlib import Path; "
         "from tests.pool.sqlite_target import SQLiteTarget; "
-        "from webots_mcp.pool.shipping import Order, Report, ship; "
+        "from webots_mcp.pool.report import Report; "
+        "from webots_mcp.pool.shipping import Order, ship; "
         "from webots_mcp.store.recording import Recording; folder, pool = map(Path, sys.argv[1:]); "
         "recording = Recording(folder / 'webots.db', folder, read_only=True); "
         "ship(Order(recording, functools.partial(SQLiteTarget, pool), full=True), Report())"

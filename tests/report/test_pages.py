@@ -7,6 +7,7 @@ import re
 import sqlite3
 import sys
 from base64 import b64decode
+from collections.abc import Mapping
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -125,16 +126,22 @@ def test_it_stays_as_small_as_was_asked_and_tells_what_is_not_in_it(tmp_path: Pa
     assert "line 119" in text, "the newest lines stay"
 
 
-def test_runs_of_two_robots_that_have_nothing_in_common_are_told_side_by_side(
-    tmp_path: Path,
-) -> None:
-    recorded = Recorded(tmp_path / "webots.db")
+def _hunter_and_runner(folder: Path, beside: Mapping[str, str]) -> tuple[Recorded, list[int]]:
+    """A run of each, with a number of its own and what both publish beside it."""
+    recorded = Recorded(folder / "webots.db")
     run_ids: list[int] = []
     for name in ("hunter", "runner"):
         robot = recorded.robot(name)
         run_ids.append(robot.run_id)
         for step in range(20):
-            robot.state(step * 0.1, {f"{name}_m": step})
+            robot.state(step * 0.1, {f"{name}_m": step, **beside})
+    return recorded, run_ids
+
+
+def test_runs_of_two_robots_that_have_nothing_in_common_are_told_side_by_side(
+    tmp_path: Path,
+) -> None:
+    recorded, run_ids = _hunter_and_runner(tmp_path, {})
     report = make_report(recorded.connection, run_ids, tmp_path, names=["hunter_m"])
     recorded.close()
     assert "the signals of both runs: none that was asked for is in both" in report.left_out
@@ -142,13 +149,7 @@ def test_runs_of_two_robots_that_have_nothing_in_common_are_told_side_by_side(
 
 
 def test_runs_that_share_only_texts_are_told_to_share_no_numbers(tmp_path: Path) -> None:
-    recorded = Recorded(tmp_path / "webots.db")
-    run_ids: list[int] = []
-    for name in ("hunter", "runner"):
-        robot = recorded.robot(name)
-        run_ids.append(robot.run_id)
-        for step in range(20):
-            robot.state(step * 0.1, {f"{name}_m": step, "mode": "ab"[step // 10]})
+    recorded, run_ids = _hunter_and_runner(tmp_path, {"mode": "a"})
     report = make_report(recorded.connection, run_ids, tmp_path)
     recorded.close()
     assert "the signals of both runs: they share no numeric signals" in report.left_out

@@ -13,7 +13,7 @@ from webots_mcp.cli.tables import print_notes
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.pool.shipping import Report
+    from webots_mcp.pool.report import Report
 
 
 def _seconds(text: str) -> float:
@@ -50,7 +50,9 @@ def ship(arguments: argparse.Namespace) -> None:
     with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
     from the URL.
     """
-    from webots_mcp.pool.shipping import Order, Report, follow
+    from webots_mcp.pool.following import follow
+    from webots_mcp.pool.report import Report
+    from webots_mcp.pool.shipping import Order
     from webots_mcp.pool.shipping import ship as ship_once
     from webots_mcp.pool.target import open_target, pause_of, redacted
 

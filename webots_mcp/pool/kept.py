@@ -8,10 +8,11 @@ state before.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from webots_mcp.pool.batch import Batch, Row
+from webots_mcp.pool.outbox import Put
 from webots_mcp.pool.reading import Source, Stretch, is_finite
 from webots_mcp.pool.tables import SQLValue, Table, table
 
@@ -24,8 +25,6 @@ _LACKING: Final = "state.lacking_us"
 _LAST: Final = "kept_stretch/{}"
 _FROM: Final = "kept_stretch/{}.from_us"
 _TO: Final = "kept_stretch/{}.to_us"
-
-Put = Callable[["Batch | None", Mapping[str, int]], None]
 
 
 class Kept:

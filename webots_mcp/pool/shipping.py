@@ -1,4 +1,4 @@
-"""Shipping a recording to a pool: once, or on and on while a robot records.
+"""Shipping a recording to a pool, as long as both are there; `following` goes on and on.
 
 What the pool holds is told by numbers that it stores in the same transaction as the rows. So a
 shipper may be killed anywhere, and the next one goes on; nothing at the edge has to be remembered.
@@ -9,51 +9,43 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from collections import Counter
 from collections.abc import Callable, Generator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, NoReturn
+from typing import Final
 
 from webots_mcp.connection import FrozenConnection
-from webots_mcp.contract import Database
 from webots_mcp.errors import (
     DatabaseError,
     InvalidInputError,
-    NoDatabaseError,
     NothingRecordedError,
     PoolBusyError,
     PoolError,
-    PoolUnavailableError,
 )
-from webots_mcp.pool.batch import Batch, row_bytes
+from webots_mcp.pool.batch import Batch
 from webots_mcp.pool.kept import Kept
+from webots_mcp.pool.outbox import WRITE_BYTES, Outbox
 from webots_mcp.pool.reading import (
     ROLLED,
     Mark,
     Source,
     digest,
 )
+from webots_mcp.pool.report import Report
 from webots_mcp.pool.summaries import Summaries
 from webots_mcp.pool.tables import Table, table, tables
 from webots_mcp.pool.target import Shipment, Target, whole_runs
 from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.merging import settled
-from webots_mcp.store.recording import Recording, name_of
+from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_shipped
 
-WRITE_BYTES: Final = 8_000_000
 MOST_BATCHES: Final = 8  # of a table in a round, before the others get their turn
-THOROUGH_S: Final = 30.0  # between two looks at all of what may change, and not only the newest
-_FIRST_WAIT_S: Final = 1.0
-_LONGEST_WAIT_S: Final = 60.0
 _HANDOVER_S: Final = (0.02, 0.1, 0.3, 0.6)
 _UNCHECKED: Final = -1
 _PICTURE: Final = "picture"  # of the progress: the last one whose file was shipped
-
-Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -73,34 +65,6 @@ class Order:
     pictures: bool = False
 
 
-@dataclass
-class Report:
-    """What was shipped so far, and what was not.
-
-    Attributes:
-        rows: By table; a row that changed counts each time that it was sent.
-        pictures: Files.
-        lost: By table, rows that retention had deleted before they could be shipped.
-        replaced: By column, values that the pool cannot hold, for which it has what comes nearest.
-        lost_pictures: Files that were not there any more, or are no pictures of ours.
-        foreign: By their UUIDs, runs that another recording had shipped before, with its UUID.
-        notes: What else a person should know.
-    """
-
-    rows: Counter[str] = field(default_factory=Counter[str])
-    pictures: int = 0
-    lost: Counter[str] = field(default_factory=Counter[str])
-    replaced: Counter[str] = field(default_factory=Counter[str])
-    lost_pictures: int = 0
-    foreign: dict[str, str] = field(default_factory=dict[str, str])
-    notes: list[str] = field(default_factory=list[str])
-
-    def note(self, text: str) -> None:
-        """Remember it, once."""
-        if text not in self.notes:
-            self.notes.append(text)
-
-
 def ship(order: Order, report: Report) -> None:
     """Ship all that is there, and end.
 
@@ -108,107 +72,26 @@ def ship(order: Order, report: Report) -> None:
         PoolError: The pool cannot be reached or written, or another ships this recording.
         DatabaseError: The recording cannot be read.
     """
-    with _shipper(order, report) as shipper:
-        while not shipper.round(thorough=True):
+    with shipper(order, report) as connected:
+        while not connected.round(thorough=True):
             pass
-        shipper.note_unsummed()
-
-
-def follow(order: Order, report: Report, say: Say, pause_s: float) -> None:
-    """Ship what is there and what comes, until a KeyboardInterrupt.
-
-    A pool that is away is tried again, each time after a longer wait; a recording that is not there
-    yet is waited for.
-
-    Args:
-        order: What.
-        report: Grows while it goes on.
-        say: Told in a sentence when the pool is away, and when it is back.
-        pause_s: Between two looks at the recording.
-
-    Raises:
-        PoolError: The pool will not be better by itself.
-        DatabaseError: The recording cannot be read.
-    """
-    patience = _Patience(say, pause_s)
-    while True:
-        time.sleep(_go_on_until_it_fails(order, report, say, pause_s, patience))
-
-
-def _go_on_until_it_fails(
-    order: Order, report: Report, say: Say, pause_s: float, patience: _Patience
-) -> float:
-    """Ship as long as recording and pool are there; returns how long to wait then."""
-    try:
-        with _shipper(order, report) as shipper:
-            patience.connected(shipper.address)
-            _go_on(shipper, pause_s)
-    except _ReplacedError as error:
-        say(f"{error}: that one is shipped from here on")
-        return 0.0
-    except NoDatabaseError:
-        return patience.wait_for(order.recording.database)
-    except (PoolBusyError, PoolUnavailableError) as error:
-        return patience.wait_after(error)
-
-
-class _Patience:
-    """How long to wait before the next attempt, and what is said of it."""
-
-    def __init__(self, say: Say, pause_s: float) -> None:
-        self._say = say
-        self._pause_s = pause_s
-        self._away_s = 0.0
-        self._was_there = False
-        self._has_told = False
-
-    def connected(self, address: str) -> None:
-        """The recording and the pool are there."""
-        if self._away_s:
-            self._say(f"the pool {address} is there again")
-        self._away_s, self._was_there, self._has_told = 0.0, True, False
-
-    def wait_for(self, database: Database) -> float:
-        """In seconds, where no recording is."""
-        there = f"nothing is recorded at {name_of(database)} now"
-        self._tell_once(f"{there}: it is shipped as soon as it is there")
-        return self._pause_s
-
-    def wait_after(self, error: PoolError) -> float:
-        """In seconds; what would not be better after it is raised again."""
-        if isinstance(error, PoolBusyError):
-            if not self._was_there:
-                raise error
-            self._tell_once(f"{error}; waiting until it ends")
-            return _FIRST_WAIT_S  # it may be our last connection, of which a server learns late
-        self._away_s = min(max(2 * self._away_s, _FIRST_WAIT_S), _LONGEST_WAIT_S)
-        self._say(f"{error}; trying again in {self._away_s:g} s, nothing is lost meanwhile")
-        return self._away_s
-
-    def _tell_once(self, text: str) -> None:
-        if not self._has_told:
-            self._say(text)
-        self._has_told = True
-
-
-def _go_on(shipper: _Shipper, pause_s: float) -> NoReturn:
-    next_s = 0.0
-    while True:
-        is_thorough = time.monotonic() >= next_s
-        if is_thorough:
-            next_s = time.monotonic() + THOROUGH_S
-        if shipper.round(thorough=is_thorough):
-            time.sleep(pause_s)
+        connected.note_unsummed()
 
 
 @contextmanager
-def _shipper(order: Order, report: Report) -> Generator[_Shipper]:
+def shipper(order: Order, report: Report) -> Generator[Shipper]:
+    """Be connected to recording and pool, as the one who ships the recording.
+
+    Raises:
+        PoolError: The pool cannot be reached or written, or another ships this recording.
+        DatabaseError: The recording cannot be read.
+    """
     with order.recording.reader() as connection:
         uuid = Source(connection).uuid()  # first: nothing is asked of the pool in vain
     with order.open_target() as target, ExitStack() as stack:
         target.prepare()
         shipment = _enter(stack, target, uuid)
-        yield _Shipper(order, report, uuid, target, shipment)
+        yield Shipper(order, report, uuid, target, shipment)
 
 
 def _enter(stack: ExitStack, target: Target, uuid: str) -> Shipment:
@@ -220,46 +103,16 @@ def _enter(stack: ExitStack, target: Target, uuid: str) -> Shipment:
     return stack.enter_context(target.shipment(uuid))
 
 
-class _ReplacedError(PoolError):
+class ReplacedError(PoolError):
     """Another recording stands where the one was that is shipped."""
 
 
-class _Outbox:
-    """What waits to be written together, with the progress that it makes."""
+class Shipper:
+    """One connection to a pool, as long as it lasts.
 
-    def __init__(self, shipment: Shipment, report: Report, progress: dict[str, int]) -> None:
-        self._shipment = shipment
-        self._report = report
-        self._batches: list[Batch] = []
-        self._told = dict[str, int]()
-        self._size = 0
-        self.progress = progress
-
-    @property
-    def is_full(self) -> bool:
-        """Whether to send before anything is added."""
-        return self._size >= WRITE_BYTES
-
-    def add(self, batch: Batch | None, told: Mapping[str, int]) -> None:
-        """Rows, and the numbers that hold once they are written."""
-        if batch is not None and batch.rows:
-            self._batches.append(batch)
-            self._size += sum(map(row_bytes, batch.rows))
-        self._told |= told
-        self.progress |= told
-
-    def send(self) -> None:
-        """Write it all, in one transaction of the pool's."""
-        if not self._batches and not self._told:
-            return
-        self._report.replaced.update(self._shipment.write(self._batches, self._told))
-        for batch in self._batches:
-            self._report.rows[batch.table.name] += len(batch.rows)
-        self._batches, self._told, self._size = [], {}, 0
-
-
-class _Shipper:
-    """One connection to a pool, as long as it lasts."""
+    Attributes:
+        address: The pool's URL without secrets.
+    """
 
     def __init__(
         self, order: Order, report: Report, uuid: str, target: Target, shipment: Shipment
@@ -268,7 +121,7 @@ class _Shipper:
         self._report = report
         self._uuid = uuid
         self._shipment = shipment
-        self._outbox = _Outbox(shipment, report, shipment.progress())
+        self._outbox = Outbox(shipment, report, shipment.progress())
         self._progress = self._outbox.progress
         self._owners = dict[str, str | None]()
         self._is_checked = False
@@ -344,7 +197,7 @@ class _Shipper:
             PoolError: It is not.
         """
         if (uuid := source.uuid()) != self._uuid:
-            raise _ReplacedError(f"the recording {uuid} stands now where {self._uuid} was")
+            raise ReplacedError(f"the recording {uuid} stands now where {self._uuid} was")
         if self._is_checked:
             return
         for each in (table("run"), *self._appended()):

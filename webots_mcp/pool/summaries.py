@@ -7,10 +7,10 @@ buckets that rows after that number lie in are sent again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
-from webots_mcp.pool.batch import Batch
+from webots_mcp.pool.outbox import Put
 from webots_mcp.pool.reading import NOT_YET, Mark, Source, coarse_after, digest
 from webots_mcp.pool.tables import table
 
@@ -22,8 +22,6 @@ _ENDS: Final = "coarse_rollup:{}"  # digests of how far coarse rollups are, so m
 _RUNS: Final = 64
 _LATER: Final = 2**62  # than any bucket
 _UNKNOWN: Final = -(2**61)  # is no end of coarse rollups
-
-Put = Callable[["Batch | None", Mapping[str, int]], None]
 
 
 class Summaries:

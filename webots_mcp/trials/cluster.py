@@ -193,7 +193,8 @@ def packed(result: Result, folder: Path) -> Returned:
 def _shipped(folder: Path, url: str) -> str:
     """The UUID of the recording, which is in the pool then."""
     from webots_mcp.pool.reading import Source
-    from webots_mcp.pool.shipping import Order, Report, ship
+    from webots_mcp.pool.report import Report
+    from webots_mcp.pool.shipping import Order, ship
 
     recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
     ship(Order(recording, partial(open_target, url), full=True, pictures=True), Report())

@@ -40,7 +40,7 @@ class Bucket(MemoryFileSystem):
         super().rm_file(path)
 
     def mv(self, *_: Any, **__: Any) -> None:
-        raise NotImplementedError("object stores rename nothing")
+        raise OSError("object stores rename nothing")
 
     def _count(self) -> None:
         Bucket.puts += 1

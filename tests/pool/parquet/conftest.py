@@ -14,7 +14,8 @@ from tests.pool.parquet import bucket
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.pool.parquet.writing import ParquetTarget
-from webots_mcp.pool.shipping import Order, Report, ship
+from webots_mcp.pool.report import Report
+from webots_mcp.pool.shipping import Order, ship
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.rollup.rolling import roll
 

@@ -20,6 +20,8 @@ from webots_mcp.errors import InvalidConditionError
         ("pose.0 + pose.1 > .5 and grid.2.11 < 1", ["pose.0", "pose.1", "grid.2.11"]),
         ("pose['x y'][0] > -.5e-3", ["pose.x y.0"]),
         ("signal('front left').x > 1", ["front left.x"]),
+        ("signal('wheels.left.is') < 5", ["wheels.left.is"]),
+        ("wheels.left.true < 5 and state == 'a.is'", ["wheels.left.true", "state"]),
         ("changed(mode) or missing(lidar.min)", ["mode", "lidar.min"]),
         ("not bumper", ["bumper"]),
         ("rate(abs(speed - target)) > max(1, limit)", ["speed", "target", "limit"]),
@@ -96,6 +98,13 @@ def test_a_condition_names_the_signals_that_it_reads(text: str, signals: list[st
         ("a < 1 # why", 7, "no meaning"),
         ("signal(a) < 1", 8, "in quotes"),
         ("héé < 1 fr 2", 9, "'fr 2'"),
+        ("wheels.left.is < 5", 1, "write signal('wheels.left.is')"),
+        ("a < 'x.is' and wheels.for > 1 for 2", 16, "write signal('wheels.for')"),
+        ("not.x < 5", 1, "write signal('not.x')"),
+        ("wheels[0].in.y < 5", 1, "write signal('wheels.0.in.y')"),
+        ("None.x < 5", 1, "write signal('None.x')"),
+        ("lambda < 5", 8, "write signal('lambda')"),
+        ("a < 1 and and b", 11, "'and b'"),
     ],
 )
 def test_a_refusal_names_the_column_and_what_would_do(text: str, column: int, why: str) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import keyword
+import re
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Any, Final
@@ -15,6 +17,8 @@ from webots_mcp.naming import NO_POSITION, Value, find_position, flatten, neares
 
 POSITION: Final = "the position"  # what a displacement reads, whatever its signals are called
 _MOST_OFFERED: Final = 3
+_NAME: Final = re.compile(r"""'[^']*'|"[^"]*"|(?P<name>[^\W\d]\w*(?:\.\w+|\[\d+\])*)""")
+_SIGNS: Final = ("and", "or", "not", "in", "is", "for", "if", "else", "True", "False", "None")
 
 
 def _as_it_is(value: Any) -> Any:
@@ -153,6 +157,9 @@ def parse(scanned: Scanned) -> ast.expr:
     Raises:
         InvalidConditionError: Its signs make no sense in this order.
     """
+    reserved = _reserved_name(scanned.original, dotted=True)
+    if reserved is not None:
+        raise refusal(scanned, scanned.columns.index(reserved.start()), _instead_of(reserved))
     try:
         return ast.parse(scanned.source, mode="eval").body
     except SyntaxError as error:
@@ -166,8 +173,28 @@ def parse(scanned: Scanned) -> ast.expr:
 def _why_unread(scanned: Scanned, place: int, error: SyntaxError) -> str:
     if "never closed" in str(error.msg) or "unmatched" in str(error.msg):
         return str(error.msg)
+    if reserved := _reserved_name(scanned.original, dotted=False):
+        return _instead_of(reserved)
     rest = scanned.original[scanned.columns[place] :].strip()
     return f"not understood from {rest[:20]!r} on" if rest else "something is missing at the end"
+
+
+def _reserved_name(text: str, *, dotted: bool) -> re.Match[str] | None:
+    """The first name that Python's parser takes for something else: a part of it is reserved.
+
+    One without a dot may be meant as what it is, a sign such as `and`.
+    """
+    for found in _NAME.finditer(text):
+        parts = re.split(r"[.\[]", found["name"] or "")
+        reserved = any(keyword.iskeyword(part) for part in parts)
+        if reserved and (len(parts) > 1) == dotted and (dotted or parts[0] not in _SIGNS):
+            return found
+    return None
+
+
+def _instead_of(reserved: re.Match[str]) -> str:
+    name = re.sub(r"\[(\d+)\]", r".\1", reserved.group())
+    return f"a part of {name!r} is a reserved word: write signal({name!r})"
 
 
 def _nearest(name: str, known: Collection[str]) -> str:

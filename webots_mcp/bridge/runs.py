@@ -5,6 +5,7 @@ from __future__ import annotations
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
+from webots_mcp.bridge.motors import Motors
 from webots_mcp.bridge.parameters import Parameters
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.reloads import Reloads
@@ -25,6 +26,7 @@ class Runs:
         parameters: Parameters,
         throttle: Throttle,
         scene: SceneEdits,
+        motors: Motors,
     ) -> None:
         self._clock = clock
         self._recorder = recorder
@@ -34,6 +36,7 @@ class Runs:
         self._parameters = parameters
         self._throttle = throttle
         self._scene = scene
+        self._motors = motors
 
     def look(self, *, after_step: bool = False) -> None:
         """Begin a run if simulation time went back since the last look.
@@ -56,9 +59,10 @@ class Runs:
         self._throttle.begin_run()
         self._reloads.happened()
         self._journal.event("reset")
-        # Before the callbacks, which may ask for values that waited for the reset.
+        # Before the callbacks, which may ask for values that waited for the reset, and for others.
         self._parameters.begin_run()
         self._scene.begin_run()
+        self._motors.begin_run()
         self._reloads.fire()
         self._heartbeat.beat()
 

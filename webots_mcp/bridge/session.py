@@ -19,6 +19,7 @@ from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.identity import identify
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.keeping import Keeper
+from webots_mcp.bridge.motors import Motors
 from webots_mcp.bridge.parameters import CODE, Parameters
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.pictures import Album
@@ -71,7 +72,10 @@ class Session:
         start_values = StartValues(given, self._identity.robot_name, errors)
         parameters = Parameters(clock, recorder, journal, start_values, self._set_parameter)
         scene = SceneEdits(simulation, clock, journal, errors.failed)
-        self.runs = Runs(clock, recorder, journal, heartbeat, reloads, parameters, throttle, scene)
+        motors = Motors(simulation, journal, errors.failed)
+        self.runs = Runs(
+            clock, recorder, journal, heartbeat, reloads, parameters, throttle, scene, motors
+        )
         album = Album(recorder, clock, data_dir)
         keeper = Keeper(clock, recorder, journal, album, throttle, keep_last_s)
         look = self.runs.look_after_step

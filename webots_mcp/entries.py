@@ -41,6 +41,7 @@ Kind = Literal[
     "reload confirmed",
     "breakpoint hit",
     "breakpoint failed",
+    "breakpoints forgotten",
     "kept stretch",
     "kept state",
 ]
@@ -130,6 +131,11 @@ STATEMENTS: Final[dict[Kind, str]] = {
     ),
     "breakpoint hit": "UPDATE breakpoint SET hits = hits + 1 WHERE id = ?",
     "breakpoint failed": "UPDATE breakpoint SET enabled = 0, error = ? WHERE id = ?",
+    # What a controller's code has set ends with its session.
+    "breakpoints forgotten": (
+        "DELETE FROM breakpoint WHERE robot_id = (SELECT robot_id FROM session "
+        "WHERE id = :session) AND created_by = :by AND coalesce(session_id, 0) < :session"
+    ),
     "kept stretch": (
         "INSERT INTO kept_stretch (run_id, uuid, start_sim_time_s, end_sim_time_s, wall_time_s, "
         "reason) VALUES (:run, :uuid, :start, :end, :wall_time, :reason) ON CONFLICT (uuid) "

@@ -279,9 +279,9 @@ def set_parameters(context: Context, command: Command) -> Progress:
 @_built_in
 def arm_breakpoints(context: Context, command: Command) -> Progress:
     """Read the breakpoints anew: some were set or removed."""
-    context.breakpoints.load()
+    while not context.breakpoints.load():
+        yield
     return context.breakpoints.describe()
-    yield
 
 
 @_built_in

@@ -32,9 +32,6 @@ _ARMED: Final = (
     "WHERE robot_id = ? AND enabled AND typeof(after_hits) = 'integer' "
     "AND (created_by IS NOT ? OR session_id = ?) ORDER BY id LIMIT ?"
 )
-_FORGET: Final = (
-    "DELETE FROM breakpoint WHERE robot_id = ? AND created_by = ? AND session_id IS NOT ?"
-)
 _SET: Final = (
     "INSERT INTO breakpoint (robot_id, session_id, condition, action, after_hits, "
     "created_wall_time_s, created_by) VALUES (?, ?, ?, ?, ?, ?, ?) RETURNING id"
@@ -103,7 +100,8 @@ class Breakpoints:
         self._journal = journal
         self._pause = pause
         self._keeper = keeper
-        self.run: Run = clock.run  # whose breakpoints are armed
+        self.run: Run | None = None  # in which the stored ones were read; None while that is owed
+        self._begun = clock.run
         self._off: dict[int, str] = {}
         self.armed: list[Breakpoint] = []
 
@@ -111,23 +109,33 @@ class Breakpoints:
 
     def begin(self) -> None:
         """At the start of a session: what is stored, without what sessions before have set."""
-        registration = self._recorder.session.registration
-        if registration is not None:
-            ids = (registration.robot_id, _OF_CONTROLLER, registration.session_id)
-            self._recorder.fetch(_FORGET, ids)
+        self._recorder.record("breakpoints forgotten", None, {"by": _OF_CONTROLLER})
         self.load()
 
-    def load(self) -> None:
-        """Arm what is stored now; what is armed already goes on."""
+    def load(self) -> bool:
+        """Arm what is stored now; what is armed already goes on, in a new run from its beginning.
+
+        Returns:
+            False where it could not be read: all stays as it is, and the next state tries again.
+        """
+        run, self.run = self._clock.run, None
+        if run is not self._begun:
+            self._begun = run
+            for each in self.armed:
+                each.begin_run()
         registration = self._recorder.session.registration
         if registration is None:
-            return
+            return False
         ids = (registration.robot_id, _OF_CONTROLLER, registration.session_id, MAX_BREAKPOINTS)
         rows = self._recorder.fetch(_ARMED, ids)
+        if rows is None:
+            return False
         known = {each.id: each for each in self.armed}
         unstored = [each for each in self.armed if each.id is None]
         stored = [known.get(row[0]) or self._read(*row) for row in rows]
         self.armed = [*unstored, *filter(None, stored)]
+        self.run = run
+        return True
 
     def _read(self, number: int, text: bytes, action: bytes, after_hits: int) -> Breakpoint | None:
         from webots_mcp.conditions import parse_condition
@@ -168,9 +176,8 @@ class Breakpoints:
             return None
         ids = (registration.robot_id, registration.session_id)
         values = (*ids, storable(text), action, after_hits, time.time(), _OF_CONTROLLER)
-        for (number,) in self._recorder.fetch(_SET, values):
-            return int(number)
-        return None
+        rows = self._recorder.fetch(_SET, values)
+        return int(rows[0][0]) if rows else None
 
     def describe(self) -> dict[str, object]:
         """What is armed and what is off, by id; and whether a pause is possible."""
@@ -183,16 +190,17 @@ class Breakpoints:
 
     # -- asking --------------------------------------------------------------------------------
 
-    @property
-    def concerned(self) -> bool:
-        """Whether the next state has to be looked at: one is armed, or may be in a new run."""
-        return bool(self.armed) or self._clock.run is not self.run
+    def ask_states(self) -> bool:
+        """Whether the next state has to be looked at; what is owed of the stored ones is read."""
+        if self.run is not self._clock.run:
+            self.load()
+        return bool(self.armed)
 
     def look(self, state: Any) -> list[Breakpoint]:
         """Those that begin to hold with a state, and whose action is due; usually none."""
         clock, hit = self._clock, list[Breakpoint]()
-        if clock.run is not self.run:
-            self._begin_run()
+        if self.run is not clock.run:
+            self.load()
         for each in tuple(self.armed):
             try:
                 if each.begins(state, clock.sim_time_s):
@@ -236,12 +244,6 @@ class Breakpoints:
         if each.action == "keep" and not self._keeper.enabled:
             data["not_kept"] = self._keeper.why_not
         self._journal.event("breakpoint", data, each.condition.text)
-
-    def _begin_run(self) -> None:
-        self.run = self._clock.run
-        self.load()
-        for each in self.armed:
-            each.begin_run()
 
     # -- what is wrong with one ----------------------------------------------------------------
 

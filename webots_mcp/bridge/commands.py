@@ -41,7 +41,7 @@ CLAIM: Final = (
 _SUCCESSOR: Final = (
     "SELECT pid FROM session WHERE robot_id = ? AND id > ? AND ended_wall_time_s IS NULL LIMIT 1"
 )
-# Commands are claimed in the order of their ids. One row always: none means that it failed.
+# Commands are claimed in the order of their ids. One row always.
 _CLAIMED_SINCE: Final = (
     "SELECT (SELECT max(id) FROM command WHERE session_id = ? AND status = 'claimed' AND id > ?)"
 )
@@ -84,10 +84,6 @@ class CommandQueue:
         """The oldest command that waits for this robot, now ours; None costs no lock.
 
         Call `begin` with it. One that an interrupt kept from that fails with the next call.
-
-        Raises:
-            sqlite3.Error: Another writer holds the lock (try again with the next call), or the
-                database is in trouble.
         """
         recorder, now = self._recorder, time.time()
         registration = recorder.session.registration
@@ -99,6 +95,8 @@ class CommandQueue:
         times = {"now": now, "sim_time": sim_time_s}
         self._claiming = True
         rows = recorder.fetch(CLAIM, {**ids, **times})
+        if rows is None:  # whether it was claimed is asked with the next call
+            return None
         command = self._read(rows[0], registration.session_id, sim_time_s) if rows else None
         if command is None:
             self._claiming = False
@@ -112,14 +110,16 @@ class CommandQueue:
 
     def _fail_interrupted(self, session_id: int, sim_time_s: float) -> None:
         found = self._recorder.fetch(_CLAIMED_SINCE, (session_id, self._last_begun))
-        for (command_id,) in found:
-            if command_id is not None:
-                self.fail(Command(command_id, "", {}, session_id), _INTERRUPTED, sim_time_s)
-            self._claiming = False
+        if found is None:
+            return
+        ((command_id,),) = found
+        if command_id is not None:
+            self.fail(Command(command_id, "", {}, session_id), _INTERRUPTED, sim_time_s)
+        self._claiming = False
 
     def _look_for_successor(self, registration: Registration) -> None:
         ids = (registration.robot_id, registration.session_id)
-        for (pid,) in self._recorder.fetch(_SUCCESSOR, ids):
+        for (pid,) in self._recorder.fetch(_SUCCESSOR, ids) or ():
             self._recorder.errors.warn(
                 "successor",
                 f"commands for robot {registration.robot_name!r} go to process {pid}, which began "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sqlite3
 import time
 from typing import Final
 
@@ -12,7 +11,6 @@ from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.handlers import Handlers
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S
 from webots_mcp.bridge.text import describe
-from webots_mcp.connection import is_busy
 from webots_mcp.contract import BUILT_IN_ACTIONS, ENDING, LOOPING
 from webots_mcp.errors import (
     CommandRefusedError,
@@ -82,12 +80,7 @@ class Control:
     def _serve_one(self) -> Command | None:
         if self._context.simulation.over:
             return None
-        try:
-            command = self._context.queue.claim(self._context.clock.sim_time_s)
-        except sqlite3.Error as error:
-            if not is_busy(error):
-                self._context.recorder.errors.warn("claim", f"commands cannot be read: {error}")
-            return None
+        command = self._context.queue.claim(self._context.clock.sim_time_s)
         if command is not None:
             self._start(command)
         return command

@@ -69,7 +69,7 @@ class Publisher:
             self._runs.begin()
         keeper, throttle = self._keeper, self._throttle
         due = keeper.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
-        if due or self._breakpoints.concerned or self._watch.asks_states:
+        if due or self._breakpoints.ask_states() or self._watch.asks_states:
             self.publish(self._read(extra, include_time), force)
             return
         if throttle.admits(force or self._heartbeat.loop is not None):

@@ -114,11 +114,11 @@ class Recorder:
         finally:
             self._lock.release()
 
-    def fetch(self, statement: str, values: Values) -> Sequence[Any]:
-        """The rows that a statement reads or changes; none while that is not possible."""
+    def fetch(self, statement: str, values: Values) -> Sequence[Any] | None:
+        """The rows that a statement reads or changes; None while that is not possible."""
         if self.session.connection is None:
-            return ()
-        return self._locked(lambda: self._writer.fetch(statement, values)) or ()
+            return None
+        return self._locked(lambda: self._writer.fetch(statement, values))
 
     def flush(self) -> bool:
         """Write what is waiting, as much as one call may; True if nothing waits any more."""

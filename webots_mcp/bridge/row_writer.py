@@ -74,10 +74,10 @@ class RowWriter:
             return
         self._counts.written += len(rows)
 
-    def fetch(self, statement: str, values: Values) -> Sequence[Any]:
-        """The rows that a statement reads or changes; none while something else comes first."""
+    def fetch(self, statement: str, values: Values) -> Sequence[Any] | None:
+        """The rows that a statement reads or changes; None while something else comes first."""
         if not self.is_ready(None):
-            return ()
+            return None
         connection, _ = self._session.opened
         # to the end: a RETURNING that is not read so far keeps the write lock
         return connection.execute(statement, values).fetchall()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sqlite3
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.bridge.conftest import (
+    STEP_MS,
     Recording,
     catch_up,
     keep_in_memory,
@@ -18,8 +20,10 @@ from tests.bridge.conftest import (
     write_lock,
 )
 from webots_mcp import MCPBridge
-from webots_mcp.bridge import backlog
+from webots_mcp.bridge import actions, backlog
+from webots_mcp.bridge.commands import Command
 from webots_mcp.connection import connect
+from webots_mcp.standin import InProcessSupervisor
 
 
 def test_rows_that_meet_a_lock_wait_and_are_written_in_order(
@@ -88,6 +92,63 @@ def test_an_answer_that_meets_a_lock_is_written_later(
     bridge.publish({"n": 1})
     catch_up(bridge)
     assert filed.fate(sent)[:2] == ("done", "locked")
+
+
+def test_breakpoints_stay_armed_through_a_reset_at_which_they_cannot_be_read(
+    robot: InProcessSupervisor, bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    bridge.breakpoint("n == 1", "log")
+    robot.step(2 * STEP_MS)
+    with write_lock(file) as other:
+        _store_breakpoint(other, "n == 2")
+        bridge.publish({"n": 0})  # it waits, and nothing is read before it is written
+        robot.simulationReset()
+        robot.step(STEP_MS)
+        bridge.publish({"n": 1})
+    catch_up(bridge)
+    for n in (0, 2):
+        robot.step(STEP_MS)
+        bridge.publish({"n": n})
+    catch_up(bridge)
+
+    told = filed.rows("SELECT name FROM event WHERE kind = 'breakpoint' ORDER BY id")
+    assert told == ["n == 1", "n == 2"]
+
+
+def test_arming_is_answered_once_the_breakpoints_could_be_read(
+    bridge: MCPBridge, file: Path
+) -> None:
+    context = bridge._session.context  # pyright: ignore[reportPrivateUsage]
+    with write_lock(file) as other:
+        _store_breakpoint(other, "n == 2")
+        bridge.publish({"n": 0})
+        progress = actions.begin(context, Command(1, "arm_breakpoints", {}, 1))
+        next(progress)
+    catch_up(bridge)
+
+    with pytest.raises(StopIteration) as answer:
+        next(progress)
+    assert answer.value.value == {"armed": [1]}
+
+
+def test_breakpoints_of_the_last_controllers_code_go_although_the_next_one_meets_a_lock(
+    bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    with write_lock(file) as other:
+        _store_breakpoint(other, "n == 1", "controller")
+        bridge.publish({"n": 0})
+        bridge._session.context.breakpoints.begin()  # pyright: ignore[reportPrivateUsage]
+    catch_up(bridge)
+
+    assert not filed.rows("SELECT condition FROM breakpoint")
+
+
+def _store_breakpoint(connection: sqlite3.Connection, condition: str, by: str = "mcp") -> None:
+    connection.execute(
+        "INSERT INTO breakpoint (robot_id, condition, action, created_wall_time_s, created_by) "
+        "SELECT max(id), ?, 'log', 0, ? FROM robot",
+        (condition, by),
+    )
 
 
 def test_rows_of_a_loop_that_stands_still_are_written_by_the_maintainer(

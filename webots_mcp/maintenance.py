@@ -63,7 +63,7 @@ _LEASE: Final = (
 )
 
 
-Kind = Literal["server", "bridge", "prune"]
+Kind = Literal["server", "bridge", "prune", "question"]
 
 
 class Maintainer(threading.Thread):

@@ -54,6 +54,7 @@ class Command(NamedTuple):
 
 _Run = TypeVar("_Run", bound=Callable[[argparse.Namespace], int | None])
 COMMANDS: Final[list[Command]] = []
+_SUM_UP_S: Final = 300.0  # a million rows of 40 values take 100 s
 # Not owed to a value in a row: asking past unsound rows would not help.
 _OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
 
@@ -191,6 +192,20 @@ def reading(arguments: argparse.Namespace) -> Generator[sqlite3.Connection]:
     with open_recording(arguments).reader() as connection:
         for said in storage(connection).values():
             print(f"webots-mcp: {said}", file=sys.stderr)
+        yield connection
+
+
+@contextmanager
+def reading_long(arguments: argparse.Namespace) -> Generator[sqlite3.Connection]:
+    """As `reading`, of any length of a run: what no server has rolled up is rolled up first."""
+    from webots_mcp.cli.progress import shown_progress
+    from webots_mcp.store.summing_up import sum_up
+
+    with shown_progress("summing up what was recorded") as progress:
+        left = sum_up(open_recording(arguments), progress, limit_s=_SUM_UP_S)
+    if left:
+        print(f"webots-mcp: {left}", file=sys.stderr)
+    with reading(arguments) as connection:
         yield connection
 
 

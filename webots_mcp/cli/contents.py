@@ -19,6 +19,7 @@ from webots_mcp.cli.command import (
     open_recording,
     question,
     reading,
+    reading_long,
 )
 from webots_mcp.cli.looking import wait
 from webots_mcp.cli.ranges import RUN, SIMULATION_TIMES
@@ -48,7 +49,7 @@ def signals(arguments: argparse.Namespace) -> None:
     """List what was published in a run: kind, last value, range, rows without a value."""
     from webots_mcp.store.signals.catalogue import list_signals
 
-    with reading(arguments) as connection:
+    with reading_long(arguments) as connection:
         found = list_signals(
             connection, robot=arguments.robot, run_id=arguments.run_id,
             pattern=arguments.pattern, limit=arguments.limit,

@@ -17,6 +17,7 @@ from webots_mcp.cli.command import (
     count,
     question,
     reading,
+    reading_long,
     row_id,
     settings_of,
 )
@@ -86,7 +87,7 @@ def history(arguments: argparse.Namespace) -> None:
     """
     from webots_mcp.store.questions.series import query_history
 
-    with reading(arguments) as connection:
+    with reading_long(arguments) as connection:
         found = query_history(
             connection, range_of(connection, arguments), arguments.signals,
             max_points=arguments.max_points,
@@ -106,7 +107,7 @@ def trends(arguments: argparse.Namespace) -> None:
     """Say in one line each what the signals did; what changed most comes first."""
     from webots_mcp.store.questions.trends import trends as find_trends
 
-    with reading(arguments) as connection:
+    with reading_long(arguments) as connection:
         found = find_trends(
             connection, range_of(connection, arguments), arguments.signals or ["*"],
             limit=arguments.limit,
@@ -145,7 +146,7 @@ def events(arguments: argparse.Namespace) -> None:
     """Find what happened: changes, stuck, standstills, gaps, jumps, silent sensors, warnings."""
     from webots_mcp.store.questions.events import find_events
 
-    with reading(arguments) as connection:
+    with reading_long(arguments) as connection:
         found = find_events(
             connection, range_of(connection, arguments), _options(arguments), limit=arguments.limit,
             group=arguments.group, after=arguments.after,
@@ -196,7 +197,7 @@ def plot(arguments: argparse.Namespace) -> None:
     file = Path(arguments.output)
     run_ids = [each for each in arguments.run_ids if isinstance(each, int)]
     behind_runs = [each for each in arguments.run_ids if isinstance(each, str)]
-    with reading(arguments) as connection:
+    with reading_long(arguments) as connection:
         picture = plotting.plot(
             connection,
             "trajectory" if arguments.trajectory else "signals",
@@ -246,7 +247,7 @@ def compare(arguments: argparse.Namespace) -> None:
     }  # fmt: skip
     if arguments.run_ids and arguments.trial_set is not None:
         raise InvalidInputError("name runs or give --trials, not both")
-    with reading(arguments) as connection:
+    with reading_long(arguments) as connection:
         if arguments.trial_set is not None:
             found = compare_trials(connection, arguments.trial_set, **wanted)
         elif arguments.run_ids:

@@ -12,7 +12,7 @@ from webots_mcp.cli.command import (
     argument,
     open_recording,
     question,
-    reading,
+    reading_long,
     row_id,
 )
 from webots_mcp.cli.progress import shown_progress
@@ -44,7 +44,7 @@ def report(arguments: argparse.Namespace) -> None:
     from webots_mcp.store.reading.subject import find_subject
 
     data_dir = open_recording(arguments).data_dir
-    with reading(arguments) as connection, shown_progress("reporting") as progress:
+    with reading_long(arguments) as connection, shown_progress("reporting") as progress:
         run_ids = arguments.run_ids or [find_subject(connection, arguments.robot).run_id]
         file = Path(arguments.output or file_name(run_ids))
         require_free(file, overwrite=arguments.overwrite)

@@ -171,7 +171,7 @@ class Shipper:
         if behind > 0:
             self._report.note(
                 f"the newest {behind} states are in no rollups yet, which 'webots-mcp serve' makes "
-                "at the edge: ship with --full"
+                "at the edge, or a question there such as 'webots-mcp trends': ship with --full"
             )
 
     def _end_what_was_killed(self, connection: sqlite3.Connection) -> None:

@@ -1,0 +1,123 @@
+"""Who asks first rolls up what no server has."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+
+from tests.recordings.long import build
+from webots_mcp.cli import main
+from webots_mcp.connection import connect
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.rollup.rolling import BATCH_ROWS, watermark
+from webots_mcp.store.summing_up import sum_up
+
+ROWS = 3 * BATCH_ROWS
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    file = tmp_path_factory.mktemp("long") / "webots.db"
+    build(file, ROWS, rolled=False)
+    return file
+
+
+@pytest.fixture
+def recording(built: Path, tmp_path: Path) -> Iterator[Recording]:
+    shutil.copy(built, tmp_path / "webots.db")
+    yield Recording(tmp_path / "webots.db", tmp_path, read_only=True)
+
+
+def rolled(recording: Recording) -> int:
+    with recording.reader() as connection:
+        return watermark(connection)
+
+
+def hold_lease(recording: Recording, holder: str) -> None:
+    with closing(connect(recording.database, "writer")) as connection:
+        values = ("maintainer", f"{holder} 1 ab", time.time() + 5)
+        connection.execute("INSERT INTO lease VALUES (?, ?, ?)", values)
+
+
+def test_all_rows_are_rolled_up_and_counted_on_the_way(recording: Recording) -> None:
+    told: list[tuple[int, int]] = []
+    assert sum_up(recording, lambda done, of: told.append((done, of))) == ""
+    assert rolled(recording) == ROWS
+    assert told == sorted(told)
+    assert told[-1] == (ROWS, ROWS)
+
+
+def test_a_server_that_maintains_it_is_left_to_it(recording: Recording) -> None:
+    hold_lease(recording, "server")
+    assert sum_up(recording).startswith(f"{ROWS} of the newest rows are in no rollup yet: the serv")
+    assert rolled(recording) == 0
+
+
+def test_beside_a_bridge_it_is_done_because_a_bridge_does_not(recording: Recording) -> None:
+    hold_lease(recording, "bridge")
+    assert sum_up(recording) == ""
+    assert rolled(recording) == ROWS
+
+
+def test_what_is_called_off_or_interrupted_goes_on_with_the_next_question(
+    recording: Recording,
+) -> None:
+    assert "ask again" in sum_up(recording, called_off=lambda: True)
+    assert rolled(recording) == BATCH_ROWS
+
+    def interrupt(_done: int, _of: int) -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sum_up(recording, interrupt)
+    assert rolled(recording) == 2 * BATCH_ROWS
+    assert sum_up(recording) == ""
+    assert rolled(recording) == ROWS
+
+
+def test_a_database_that_another_holds_locked_is_read_as_it_is(recording: Recording) -> None:
+    with closing(connect(recording.database, "writer")) as other:
+        other.execute("BEGIN IMMEDIATE")
+        assert "stayed locked by another process" in sum_up(recording)
+    assert rolled(recording) == 0
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["history", "mode"],
+        ["trends"],
+        ["events"],
+        ["signals"],
+        ["compare", "1"],
+        ["plot", "mode", "-o", "x.png"],
+        ["report", "-o", "x.html"],
+    ],
+    ids=lambda command: command[0],
+)
+def test_questions_of_the_command_line_roll_up_before_they_answer(
+    recording: Recording,
+    command: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if command[0] == "report":
+        pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
+    monkeypatch.chdir(tmp_path)
+    assert main([*command, "--database", "webots.db"]) == 0
+    assert rolled(recording) == ROWS
+    assert capsys.readouterr().err == ""
+
+
+def test_a_question_says_that_another_is_still_at_it(
+    recording: Recording, capsys: pytest.CaptureFixture[str]
+) -> None:
+    hold_lease(recording, "server")
+    assert main(["history", "mode", "--database", str(recording.database)]) == 0
+    assert f"{ROWS} of the newest rows are in no rollup yet" in capsys.readouterr().err

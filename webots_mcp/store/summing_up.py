@@ -1,0 +1,97 @@
+"""Rolling up for who asks, where no server does it beside.
+
+What is in no rollup is read row by row until a deadline, and what was not read is left out of the
+answer. A server rolls up what comes; of a recording that none looks after, who asks does it first.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.connection import FrozenConnection
+from webots_mcp.errors import DatabaseError
+from webots_mcp.maintenance import Maintainer
+from webots_mcp.store.leases import holder_of
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.robots import list_robots
+from webots_mcp.store.rollup.rolling import BATCH_ROWS, roll, watermark
+
+LEAST_ROWS: Final = BATCH_ROWS  # a question reads fewer as they are
+_PAUSE_S: Final = 0.002  # between two short writes, for robots to write theirs
+_NEWEST: Final = "SELECT coalesce(max(id), 0) FROM state"
+
+
+def sum_up(
+    recording: Recording,
+    progress: Callable[[int, int], object] | None = None,
+    *,
+    limit_s: float = math.inf,
+    called_off: Callable[[], bool] = lambda: False,
+) -> str:
+    """Roll up the states that are there now and in no rollup yet, unless a server does.
+
+    It may end at any moment, also by an exception: what is rolled up stays, and the next call goes
+    on from there.
+
+    Args:
+        recording: Of the current schema.
+        progress: Called now and then with how many rows are done, and how many there are to do.
+        limit_s: Wall seconds after which it stops.
+        called_off: Asked between two batches whether to stop.
+
+    Returns:
+        How many states are left in no rollup, and why; "" where there are none, or so few that a
+        question reads all of them.
+
+    Raises:
+        DatabaseError: There is no such recording, or it cannot be read.
+    """
+    with recording.reader() as connection:
+        first, last = watermark(connection), int(connection.execute(_NEWEST).fetchone()[0])
+        holder = holder_of(connection, "maintainer") or ""
+        is_frozen = isinstance(connection, FrozenConnection)
+    if last - first < LEAST_ROWS:
+        return ""
+    if is_frozen:
+        return _left(last - first, "the file cannot be written from here")
+    if holder.startswith("server "):
+        return _left(last - first, "the server that maintains the recording is at it")
+    until_s, mark, why = time.monotonic() + limit_s, first, ""
+    try:
+        with recording.writer() as connection, _checkpoints(recording):
+            live = any(robot.live for robot in list_robots(connection, time.time()))
+            while not why and mark <= last:
+                done = roll(connection, BATCH_ROWS, _PAUSE_S if live else 0.0).done
+                mark = watermark(connection)
+                if progress is not None:
+                    progress(min(mark, last) - first, last - first)
+                if done:
+                    return ""
+                if called_off() or time.monotonic() > until_s:
+                    why = "ask again to go on with it"
+    except DatabaseError as error:
+        why = str(error)
+    return _left(last - mark, why) if last - mark >= LEAST_ROWS else ""
+
+
+@contextmanager
+def _checkpoints(recording: Recording) -> Generator[None]:
+    """With somebody who keeps the log of the database short meanwhile."""
+    if not isinstance(recording.database, Path):
+        yield
+        return
+    maintainer = Maintainer(recording.database, "question")  # idle while a bridge is it
+    maintainer.start()
+    try:
+        yield
+    finally:
+        maintainer.stop()
+
+
+def _left(rows: int, why: str) -> str:
+    return f"{rows} of the newest rows are in no rollup yet: {why}"

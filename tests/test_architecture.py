@@ -15,7 +15,7 @@ PACKAGE = Path(webots_mcp.__file__).parent
 # Part of the package: the parts that it may import. Everything below the line of `connection` is
 # standard library only, because it runs inside a robot's controller.
 ALLOWED = {
-    "contract": set[str](),
+    "contract": {"errors"},
     "errors": set[str](),
     "bundled": set[str](),
     "forked": set[str](),

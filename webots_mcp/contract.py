@@ -11,6 +11,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, get_args
 
+from webots_mcp.errors import InvalidInputError
+
 if TYPE_CHECKING:
     import tempfile
 
@@ -18,6 +20,7 @@ APPLICATION_ID: Final = 0x57424D43  # "WBMC", shown by the `file` command
 SCHEMA_VERSION: Final = 9  # PRAGMA user_version of a database that this version reads and writes
 
 DATABASE_NAME: Final = "webots.db"
+WORLD_ENDING: Final = ".wbt"
 PROJECT_DATA_FOLDER: Final = "mcp_data"  # in a Webots project
 CAMERA_FOLDER: Final = "camera"
 SCREENSHOT_FOLDER: Final = "screenshots"
@@ -202,12 +205,12 @@ def full_path(path: str | os.PathLike[str]) -> Path:
     """The path with `~` and links followed.
 
     Raises:
-        OSError: `~` is nobody's home, or links lead round in a circle.
+        OSError: `~` is nobody's home, links lead round in a circle, or no file has such a name.
     """
     try:
         return Path(path).expanduser().resolve()
-    except RuntimeError as error:
-        raise OSError(f"{path} cannot be followed: {error}; give the full path") from error
+    except (RuntimeError, ValueError) as error:
+        raise OSError(f"{str(path)!r} cannot be followed: {error}; give the full path") from error
 
 
 class DataFolder(NamedTuple):
@@ -245,6 +248,28 @@ def find_project(folder: Path) -> Path | None:
         if (each / "worlds").is_dir() and (each / "controllers").is_dir():
             return each
     return None
+
+
+def require_world_of(project: Path | None, world: Path) -> Path:
+    """The project of a world that may be opened: a world starts the controllers of its project.
+
+    Args:
+        project: It has to lie in this one; None for any.
+        world: Its file, with links followed.
+
+    Raises:
+        InvalidInputError: It is no world, or lies in no project, or in another one.
+    """
+    if world.suffix != WORLD_ENDING:
+        raise InvalidInputError(f"{world} is no world: its name does not end with {WORLD_ENDING}")
+    if project is not None and not world.is_relative_to(project):
+        raise InvalidInputError(f"{world} lies outside of the project {project}")
+    own = find_project(world.parent)
+    if own is None:
+        raise InvalidInputError(
+            f"{world} lies in no Webots project: that is a folder with worlds/ and controllers/"
+        )
+    return project or own
 
 
 def resolve_database(

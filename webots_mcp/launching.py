@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.contract import find_project, full_path
+from webots_mcp.contract import WORLD_ENDING, find_project, full_path, require_world_of
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.setup.project import controllers_in, has_bridge
 from webots_mcp.store.beginnings import Beginning, beginnings, newest_session
@@ -16,7 +16,6 @@ from webots_mcp.webots.command_line import Start
 from webots_mcp.webots.launched import LaunchedWebots, Show
 from webots_mcp.webots.stream import Address, ConsoleLine, address_of
 
-WORLD_ENDING: Final = ".wbt"
 _SHOWN_LINES: Final = 3
 _EXTERN: Final = "<extern>"
 _NOBODYS: Final = (_EXTERN, "<none>", "<generic>", "void")
@@ -35,19 +34,13 @@ def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, 
 
     Raises:
         InvalidInputError: There is no such world, or it lies in no project, or in another one.
-        OSError: The path cannot be followed.
     """
-    world = _found(Path(path), project)
-    if world.suffix != WORLD_ENDING:
-        raise InvalidInputError(f"{world} is no world: its name does not end with {WORLD_ENDING}")
-    if project is not None and not world.is_relative_to(project):
-        raise InvalidInputError(f"{world} lies outside of the project {project}")
-    own = find_project(world.parent)
-    if own is None:
-        raise InvalidInputError(
-            f"{world} lies in no Webots project: that is a folder with worlds/ and controllers/"
-        )
-    return world, project or own
+    try:
+        world = _found(Path(path), project)
+    except OSError as error:  # of the name: too long, a NUL, links in a circle
+        why = error.strerror or str(error)
+        raise InvalidInputError(f"{str(path)[:100]!r} is no name of a world: {why}") from error
+    return world, require_world_of(project, world)
 
 
 def _found(path: Path, project: Path | None) -> Path:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -302,6 +304,36 @@ def test_a_world_that_is_not_there_is_not_loaded(
         "failed", "world must be the full path of a world file, not '/nowhere/arena.wbt'"
     )  # fmt: skip
     drive(1)
+
+
+@pytest.mark.parametrize("way", ["by its path", "by a link in the project"])
+def test_a_world_of_another_project_is_not_loaded(
+    database: MemoryDatabase, recording: Recording, tmp_path: Path, way: str
+) -> None:
+    for project in ("own", "foreign"):
+        (tmp_path / project / "controllers").mkdir(parents=True)
+        (tmp_path / project / "worlds").mkdir()
+        shutil.copy(DEFAULT_WORLD, tmp_path / project / "worlds" / "arena.wbt")
+    foreign, link = tmp_path / "foreign/worlds/arena.wbt", tmp_path / "own/worlds/link.wbt"
+    link.symlink_to(foreign)
+    robot = InProcessSupervisor("rover", world=tmp_path / "own/worlds/arena.wbt")
+    with MCPBridge(robot, database=database) as bridge:
+        sent = recording.send("load_world", world=str(foreign if way == "by its path" else link))
+        eager(bridge)
+        error = f"{foreign} lies outside of the project {tmp_path / 'own'}"
+        assert recording.fate(sent) == ("failed", None, error)
+        assert robot.step(STEP_MS) != -1
+
+
+@pytest.mark.parametrize("world", ["a\0b.wbt", "x" * 5000, "~nobody/a.wbt", 3])
+def test_what_is_no_name_of_a_world_is_refused_in_words(
+    bridge: MCPBridge, recording: Recording, world: object
+) -> None:
+    sent = recording.send("load_world", world=world)
+    eager(bridge)
+    status, _, error = recording.fate(sent)
+    assert status == "failed" and error is not None
+    assert error == f"world must be the full path of a world file, not {world!r:.200}"
 
 
 def test_each_action_that_the_server_offers_is_one_that_bridges_run() -> None:

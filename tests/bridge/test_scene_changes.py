@@ -76,6 +76,9 @@ def test_a_list_is_set_with_more_or_fewer_entries(scene: Scene, values: list[flo
         ("BALL.children", [], "webots_add_node and webots_remove_node"),
         ("BALL", 5, "name the field to set, such as BALL.translation"),
         ("ROVER.controllerArgs", "x", "a list of at most 200"),
+        ("ROVER.controller", "../../evil", "controller is a name, by which Webots finds"),
+        ("ROVER.controller", "/tmp/evil", "and no path: '/tmp/evil'"),
+        ("ROVER.window", "..\\evil", "window is a name"),
         ("ROVER.supervisor", False, "the bridge that would set it needs the right itself"),
     ],
 )
@@ -190,6 +193,11 @@ def test_a_field_that_is_null_takes_a_node(scene: Scene) -> None:
         ({"vrml": "Solid { children [ }"}, "1 [ and 0 ]"),
         ({"vrml": ""}, "give vrml as one node"),
         ({"vrml": None}, "give vrml as one node"),
+        ({"vrml": 'Robot { controller # it\n "../evil" }'}, "and no path: '../evil'"),
+        (
+            {"vrml": 'Group { children [ Robot { remoteControl"/evil" } ] }'},
+            "remoteControl is a name",
+        ),
         ({"vrml": PILL, "path": "ROVER.translation"}, "it takes no nodes"),
         ({"vrml": PILL, "path": "WorldInfo"}, "has no field children"),
         ({"vrml": PILL, "path": "nowhere"}, "no node is called 'nowhere'"),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +155,8 @@ async def test_webots_that_ends_at_its_start_is_an_error_with_what_it_said(
         ("../outside.wbt", "lies outside of the project"),
         ("arna.wbt", "/worlds there is arena.wbt, field.wbt"),
         ("controllers/rover/rover.py", "its name does not end with .wbt"),
+        ("a\0b.wbt", "'a\\x00b.wbt' is no name of a world: "),
+        ("x" * 900, "is no name of a world: File name too long"),
     ],
 )
 @pytest.mark.parametrize("tool", ["webots_launch_world", "webots_load_world"])
@@ -192,6 +196,21 @@ async def test_without_stream_it_is_said_how_to_have_another_world(begin: Begin)
     assert "bridge: load_world needs a Supervisor" in text
     assert "was started without --stream" in text
     assert "Open it in Webots (File, Open World); or end Webots and start it with that" in text
+
+
+async def test_a_world_of_the_same_name_in_another_project_is_not_opened_instead(
+    begin: Begin, start_webots: StartWebots, project: Path, tmp_path: Path
+) -> None:
+    async with begin(PLAIN) as client:
+        _two_robots_of_the_past(project / "mcp_data")
+        foreign = write_project(tmp_path / "foreign", "print('ready', flush=True)")
+        with closing(sqlite3.connect(project / "mcp_data" / "webots.db")) as connection:
+            connection.execute("UPDATE run SET world = ?", (str(foreign),))
+            connection.commit()
+        port = free_port()
+        wait_for_line(start_webots("--stdout", "--stream", f"--port={port}", foreign), "ready")
+        text = await fail(client, "webots_load_world", world="arena.wbt")
+    assert f"only worlds of the folder of the present one, {foreign.parent}" in text
 
 
 async def test_an_observer_opens_another_world_for_a_robot_that_is_no_supervisor(

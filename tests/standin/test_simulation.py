@@ -244,6 +244,36 @@ def test_a_missing_controller_is_a_warning(world: Path) -> None:
         assert has_line(simulation, "WARNING: rover: the controller")
 
 
+@pytest.mark.parametrize("way", ["from the root", "out of controllers/"])
+def test_a_controller_outside_of_controllers_is_not_started(
+    world: Path, tmp_path: Path, way: str
+) -> None:
+    for folder in ("controllers", "evil"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "evil.py").write_text("print('here I am', flush=True)", encoding="utf-8")
+    name = "../evil" if way == "out of controllers/" else (tmp_path / "evil").as_posix()
+    text = world.read_text(encoding="utf-8")
+    assert 'controller "rover"' in text
+    world.write_text(text.replace('controller "rover"', f'controller "{name}"'), encoding="utf-8")
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: simulation.time_s > 0.1)
+        assert has_line(simulation, f"the controller '{name}' is no name of a folder in")
+        assert simulation.controller("rover").pid is None
+
+
+def test_a_controller_that_is_linked_into_the_project_is_started(
+    world: Path, tmp_path: Path
+) -> None:
+    elsewhere = tmp_path / "elsewhere" / "rover"
+    elsewhere.mkdir(parents=True)
+    (elsewhere / "rover.py").write_text("print('here I am', flush=True)", encoding="utf-8")
+    link = world.parent.parent / "controllers" / "rover"
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(elsewhere)
+    with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "here I am"))
+
+
 def test_waiting_in_vain_shows_the_console(world: Path, write_controller: WriteController) -> None:
     write_controller("print('here I am', flush=True)", LOOP)
     with fast(world) as simulation:

@@ -68,6 +68,8 @@ def test_nested_places_add_up(tmp_path: Path) -> None:
         ('WorldInfo { coordinateSystem "NUE" }', 2, "no coordinateSystem but ENU"),
         ("WorldInfo {}\nRectangleArena { floorSize 1 }", 3, "floorSize has to be SFVec2f"),
         ("Solid {}", 1, "no WorldInfo"),
+        ("WorldInfo {}\n" + "Solid { children [ " * 500 + "] } " * 500, 3, "one in the other"),
+        ("WorldInfo {}\nSolid { children " + "[" * 500, 3, "one in the other"),
         ("WorldInfo { basicTimeStep 0 }", 2, "positive"),
     ],
 )
@@ -87,6 +89,8 @@ def test_a_file_that_is_no_world_is_refused(tmp_path: Path) -> None:
         load_world(path)
     with pytest.raises(WorldError, match="cannot read the world"):
         load_world(tmp_path / "missing.wbt")
+    with pytest.raises(WorldError, match="cannot read the world"):
+        load_world("a\0b.wbt")
 
 
 def test_what_is_left_out_is_counted_by_type_and_scaling_is_said_to_be_ignored(

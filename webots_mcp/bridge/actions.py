@@ -18,7 +18,14 @@ from webots_mcp.bridge.parameters import SETTERS, Setter
 from webots_mcp.bridge.pictures import complete_png_size
 from webots_mcp.bridge.picturing import find_pictured, take_picture
 from webots_mcp.bridge.text import describe
-from webots_mcp.contract import BUILT_IN_ACTIONS, MAX_STEPS, SCREENSHOT_FOLDER, Then
+from webots_mcp.contract import (
+    BUILT_IN_ACTIONS,
+    MAX_STEPS,
+    SCREENSHOT_FOLDER,
+    Then,
+    full_path,
+    require_world_of,
+)
 from webots_mcp.errors import (
     CommandRefusedError,
     ControllerEndedError,
@@ -183,13 +190,25 @@ def reload(context: Context, command: Command) -> Progress:
 
 @_built_in
 def load_world(context: Context, command: Command) -> Progress:
-    """Ask for another world; this process ends, as all controllers do."""
-    world = command.params.get("world")
-    if not isinstance(world, str) or not Path(world).is_file():
-        raise InvalidInputError(f"world must be the full path of a world file, not {world!r}")
+    """Ask for another world of the project; this process ends, as all controllers do."""
+    world = _world_of_project(context, command.params.get("world"))
     context.pause.end(command)  # first: a paused simulation makes no physics step
-    context.simulation.robot.worldLoad(world)
+    context.simulation.robot.worldLoad(str(world))
     return (yield from _until_ended("worldLoad"))
+
+
+def _world_of_project(context: Context, world: object) -> Path:
+    """A world of the present one's project, whoever asks: it starts controllers."""
+    try:
+        file = full_path(world) if isinstance(world, str) else Path()
+        is_file = file.is_file()
+    except OSError:  # of the name: too long, a NUL, links in a circle
+        file, is_file = Path(), False
+    if not is_file:
+        raise InvalidInputError(f"world must be the full path of a world file, not {world!r:.200}")
+    present = full_path(context.simulation.robot.getWorldPath())
+    require_world_of(require_world_of(None, present), file)
+    return file
 
 
 @_built_in

@@ -6,6 +6,7 @@ is an event, and is remembered, so that a reset puts it back.
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import time
@@ -18,7 +19,15 @@ from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.scene_edits import MOST_EDITS, FieldEdit, Removal
 from webots_mcp.bridge.scene_path import Place, children, find, find_node, label
 from webots_mcp.bridge.scene_restoring import find_again, import_node, spot_of
-from webots_mcp.bridge.scene_values import MOST_ENTRIES, checked, is_nearer, is_same, read, write
+from webots_mcp.bridge.scene_values import (
+    MOST_ENTRIES,
+    checked,
+    is_nearer,
+    is_same,
+    read,
+    require_no_path,
+    write,
+)
 from webots_mcp.bridge.text import cut
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
@@ -27,6 +36,7 @@ _LONGEST_SHOWN: Final = 1_000  # characters of a value
 _LONGEST_STEP_S: Final = 3.0  # of wall time, until the next round of the loop
 _STAY: Final = ("WorldInfo", "Viewpoint")
 _ONE_NODE: Final = re.compile(r"\s*(?:DEF\s+\S+\s+)?[A-Za-z_][\w-]*\s*\{.*\}\s*\Z", re.DOTALL)
+_WORD: Final = re.compile(r'"(?:[^"\\]|\\.)*"|#[^\r\n]*|[{}\[\]]|[^\s,"#{}\[\]]+', re.DOTALL)
 _ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
 _SAYS: Final = "Webots' console (webots_get_logs, if it is recorded) says why"
 
@@ -37,6 +47,7 @@ def set_field(context: Context, command: Command) -> Progress:
     place = yield from find(robot, params.get("path"))
     _require_settable(robot, place)
     value = checked(place.path, place.type_name, params.get("value"))
+    require_no_path(str(place.webots_field.getName()), value)
     before = read(place.field, place.index)
     is_remembered = context.scene.remember_field(_edit(place, before, value))
     write(place.field, value, place.index)
@@ -171,13 +182,14 @@ def _require_one_node(text: object) -> str:
     what = 'give vrml as one node of a world file, such as DEF BOX Solid { name "box" }'
     if not isinstance(text, str) or len(text) > _LONGEST_NODE or not _ONE_NODE.match(text):
         raise InvalidInputError(f"{what}; got {text!r:.100}")
-    unquoted = re.sub(r'"(?:[^"\\]|\\.)*"|#[^\n]*', "", text)
+    words = [word for word in _WORD.findall(text) if not word.startswith("#")]
+    for field, value in itertools.pairwise(words):
+        if value.startswith('"'):
+            require_no_path(field, value[1:-1])
     for opening, closing in ("{}", "[]"):
-        if unquoted.count(opening) != unquoted.count(closing):
-            raise InvalidInputError(
-                f"{what}; this has {unquoted.count(opening)} {opening} and "
-                f"{unquoted.count(closing)} {closing}"
-            )
+        opened, closed = words.count(opening), words.count(closing)
+        if opened != closed:
+            raise InvalidInputError(f"{what}; this has {opened} {opening} and {closed} {closing}")
     return text
 
 

@@ -20,6 +20,10 @@ _LARGEST_FLOAT: Final = 3.4028234e38  # beyond it Webots refuses a number
 _TOLERANCE: Final = 1e-6  # Webots may hold what it was given in single precision
 
 
+# Fields that name what Webots runs: it looks for each in a folder of its own of the project.
+_PROGRAMS: Final = ("controller", "window", "remoteControl", "physics")
+
+
 class _RefusedError(ValueError):
     """A value that a field cannot have."""
 
@@ -92,6 +96,21 @@ _KINDS: Final[dict[str, _Kind]] = {
     "Color": _Kind(_color, "red, green and blue, each from 0 to 1", "[1, 0.5, 0]"),
     "String": _Kind(_string, f"a text of at most {MOST_CHARACTERS} characters", '"text"'),
 }
+
+
+def require_no_path(field: str, value: object) -> None:
+    """See that a field which names a program names none that lies elsewhere.
+
+    Raises:
+        InvalidInputError: It does.
+    """
+    if field not in _PROGRAMS or not isinstance(value, str):
+        return
+    if value == ".." or any(each in value for each in "/\\"):
+        raise InvalidInputError(
+            f"{field} is a name, by which Webots finds the program in its folder of the project, "
+            f"and no path: {value!r:.200}"
+        )
 
 
 def checked(path: str, type_name: str, value: object) -> Any:

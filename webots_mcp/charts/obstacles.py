@@ -69,7 +69,7 @@ def _standing(file: Path, _changed_ns: int) -> tuple[Obstacle, ...]:
 
     try:
         bodies = Arena(load_world(file)).bodies
-    except (WorldError, OSError, RecursionError):
+    except (WorldError, OSError):
         return ()  # the way is drawn without them
     return tuple(each for body in bodies for each in _outlines(body))
 

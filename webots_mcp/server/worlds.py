@@ -122,8 +122,8 @@ class WorldRequest(Request):
             CommandRefusedError: It cannot be asked so, or does not obey.
         """
         try:
-            await to_thread.run_sync(self._require_beside, situation, world)
             address = await to_thread.run_sync(self._address, situation)
+            await to_thread.run_sync(self._require_beside, situation, address, world)
             reply = await to_thread.run_sync(load_world, address, world.name, ANSWER_S)
             if reply.heard is None:
                 raise CommandRefusedError(await to_thread.run_sync(why_no_word, address, reply))
@@ -136,20 +136,25 @@ class WorldRequest(Request):
             ) from error
         return f"Webots said {reply.heard!r}"
 
-    def _require_beside(self, situation: Situation, world: Path) -> None:
+    def _require_beside(self, situation: Situation, address: Address, world: Path) -> None:
         """Webots looks for it in the folder of the present world, and there alone."""
-        present = self._present_world(situation)
-        if present is not None and present.parent != world.parent:
+        present = self._present_world(situation, address)
+        if present is None or present.parent != world.parent:
+            folder = present.parent if present else "which is not known"
             raise CommandRefusedError(
-                f"Webots opens only worlds of the folder of the present one, {present.parent}"
+                f"Webots opens only worlds of the folder of the present one, {folder}"
             )
 
-    def _present_world(self, situation: Situation) -> Path | None:
+    def _present_world(self, situation: Situation, address: Address) -> Path | None:
         if situation.robot is not None:
             with self.recording.view(situation.robot) as view:
                 known = view.run.world if view.run else None
-            return Path(known).resolve() if known else None
-        return self.launcher.running.world if self.launcher.running else None
+        elif self.launcher.running:
+            known = self.launcher.running.world
+        else:
+            found = instance_at(address.port)
+            known = found.world if found is not None and found.address == address else None
+        return Path(known).resolve() if known else None
 
     def _address(self, situation: Situation) -> Address:
         """Of the robot's Webots, else of that which this server has started, else of the only one.

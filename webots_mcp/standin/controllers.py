@@ -49,11 +49,21 @@ class Launch:
     """None before the simulator has started."""
 
     def file_of(self, robot: Robot, simulator: Simulator) -> Path | None:
-        """The controller's file; None if the robot has none or it is started by somebody else."""
+        """The controller's file; None if the robot has none or it is started by somebody else.
+
+        Only the world's own name has to be one: links that stand in the project are followed, as
+        Webots does, and a file that the caller names may lie anywhere.
+        """
         name: str = robot.node.fields["controller"]
         if robot.name in self.overrides:
             return self.overrides[robot.name].resolve()
         if name in (*_NOBODY, _EXTERN):
+            return None
+        if name == ".." or Path(name).name != name:
+            self.print_line(
+                f"WARNING: {robot.name}: the controller {name!r} is no name of a folder in "
+                "controllers/ but a path: it is not started."
+            )
             return None
         return simulator.world.path.parent.parent / "controllers" / name / f"{name}.py"
 

@@ -81,7 +81,12 @@ class Parser:
         nodes: list[Node] = []
         while self._next < len(self._tokens):
             if not self._takes_externproto():
-                nodes.append(self._node())
+                line = self._tokens[self._next].line
+                try:
+                    nodes.append(self._node())
+                except RecursionError:
+                    why = "this node holds more, one in the other, than the stand-in can read"
+                    raise WorldError(why, line) from None
         return nodes
 
     def _takes_externproto(self) -> bool:

@@ -214,13 +214,15 @@ def load_world(path: str | Path) -> World:
     Raises:
         WorldError: The file is missing, not text, or not a world that the stand-in can use.
     """
-    path = Path(path).resolve()
     try:
-        return World(path, parse(path.read_text(encoding="utf-8")))
+        path = Path(path).resolve()
+        text = path.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:  # a NUL in its name, and what is not UTF-8
+        raise WorldError(f"cannot read the world {str(path)!r}: {error}") from error
+    try:
+        return World(path, parse(text))
     except WorldError as error:
         raise WorldError(f"{path.name}: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise WorldError(f"cannot read the world {path}: {error}") from error
 
 
 def own_frame(node: Node) -> Frame:

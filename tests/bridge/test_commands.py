@@ -242,11 +242,11 @@ def test_a_name_that_is_no_text_is_refused(
     assert recording.rows("SELECT actions FROM session") == ['{"wave": ""}']
 
 
-@pytest.mark.parametrize("name", ["lone \udcff", "null \0", "two\nlines", "x" * 101])
+@pytest.mark.parametrize("name", ["", "lone \udcff", "null \0", "two\nlines", "x" * 101])
 def test_a_name_that_cannot_be_sent_is_refused(
     bridge: MCPBridge, recording: Recording, name: str
 ) -> None:
-    with pytest.raises(ValueError, match="choose a name of printable characters, at most 100"):
+    with pytest.raises(ValueError, match="choose a name of 1 to 100 printable characters"):
         bridge.register_command(name, lambda _: None)
     bridge.register_command("größe", lambda _: None)
     assert recording.rows("SELECT actions FROM session") == ['{"größe": ""}']
@@ -267,12 +267,36 @@ def test_a_handlers_docstring_never_stops_the_registration(
     assert json.loads(actions)["wave"].startswith(told)
 
 
-@pytest.mark.parametrize("name", ["", "pause", "reset_state"])
-def test_a_name_that_is_built_in_or_empty_cannot_be_registered(
-    bridge: MCPBridge, name: str
+def test_a_function_for_what_is_built_in_is_never_called_which_is_said_once_and_stops_no_loop(
+    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
 ) -> None:
-    with pytest.raises(ValueError, match="choose another name"):
-        bridge.register_command(name, lambda _: None)
+    calls: list[str] = []
+    with MCPBridge(robot, database=database) as bridge:
+        for _ in range(3):  # as a loop may
+            bridge.register_command("fast", lambda _: calls.append("fast"))
+        sent = recording.send("fast")
+        eager(bridge)
+        assert bridge.stats().failures == 3
+    assert recording.fate(sent)[0] == "done"
+    assert (robot.simulationGetMode(), calls) == (robot.SIMULATION_MODE_FAST, [])
+    (said,) = recording.rows("SELECT message FROM log WHERE level = 'warning'")
+    assert said.startswith("action 'fast' is built in") and "'my_fast'" in said
+    assert recording.rows("SELECT actions FROM session") == ["{}"]
+
+
+def test_a_function_for_reset_state_is_run_in_place_of_the_callbacks_which_is_said_once(
+    bridge: MCPBridge, recording: Recording
+) -> None:
+    calls: list[object] = []
+    bridge.on_reload(lambda: calls.append("callback"))
+    for _ in range(2):
+        bridge.register_command("reset_state", lambda command: calls.append(command["action"]))
+    sent = recording.send("reset_state")
+    eager(bridge)
+    assert calls == ["reset_state"]
+    assert recording.fate(sent) == ("done", None, None)
+    (said,) = recording.rows("SELECT message FROM log")
+    assert "'reset_state'" in said and "in place of the callbacks" in said
 
 
 def test_a_coroutine_cannot_be_a_handler(bridge: MCPBridge) -> None:

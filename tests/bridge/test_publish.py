@@ -331,6 +331,22 @@ def test_auto_publish_reads_enabled_devices_only(
     assert state["time"] == pytest.approx(0.032)
 
 
+def test_auto_publish_answers_with_the_state_and_its_time_in_throttled_calls_too(
+    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
+) -> None:
+    robot.getDevice("ds_left").enable(STEP_MS)
+    with MCPBridge(robot, throttle_interval=2, keep_last_s=0, database=database) as bridge:
+        robot.step(STEP_MS)
+        robot.step(STEP_MS)
+        throttled = bridge.auto_publish({"mode": "rest"})
+        read = bridge.auto_publish({"mode": "search"})
+        untimed = bridge.auto_publish({"mode": "rest"}, include_time=False)
+    (recorded,) = recording.states()
+    assert throttled == {"mode": "rest", "time": robot.getTime(), "sim_time": robot.getTime()}
+    assert "sensors" in read and read == recorded | {"sim_time": recorded["time"]}
+    assert untimed == {"mode": "rest"}
+
+
 def test_motors_are_recorded_in_the_unit_of_their_kind(
     robot: InProcessSupervisor,
     bridge: MCPBridge,

@@ -259,12 +259,14 @@ def take_frame(context: Context, command: Command) -> Progress:
 
 @_built_in
 def reset_state(context: Context, command: Command) -> Progress:
-    """Run what the controller registered with `on_reload`."""
+    """Run what the controller registered with `on_reload`; not asked where it has its own."""
     with context.pause.user_code():
         outcomes = context.reloads.call_back()
     if not outcomes:
         raise CommandRefusedError(
-            "nothing to reset: this controller registered no callback with bridge.on_reload()"
+            "nothing to reset: this controller registered no callback with bridge.on_reload() and "
+            "no function for 'reset_state'; only a loop that looks at what get_command() returned "
+            "can have done it"
         )
     if errors := [describe(error) for error in outcomes if error is not None]:
         raise CommandRefusedError(

@@ -32,7 +32,7 @@ class Control:
 
     def __init__(self, context: Context) -> None:
         self._context = context
-        self.handlers = Handlers(context.recorder, context.pause)
+        self.handlers = Handlers(context.recorder, context.journal, context.pause)
         self.why_ended = "the controller ended"
         self._under_way: dict[Command, Progress] = {}
         self._reported = False
@@ -89,7 +89,7 @@ class Control:
         built_in = BUILT_IN_ACTIONS.get(command.action)
         try:
             self._context.queue.begin(command)
-            if built_in is None:
+            if built_in is None or self.handlers.knows(command.action):
                 self._succeed(command, self.handlers.run(command))
             else:
                 progress = actions.begin(self._context, command)

@@ -223,7 +223,7 @@ class MCPBridge:
 
     def auto_publish(
         self, extra: Mapping[Any, Any] | None = None, include_time: bool = True
-    ) -> None:
+    ) -> dict[Any, Any]:
         """Publish what all enabled devices say: `sensors`, `motors`, `actuators`, `pose`, ...
 
         The rule for each class of devices is in `webots_mcp.bridge.devices`. Nothing is enabled or
@@ -232,11 +232,21 @@ class MCPBridge:
         Args:
             extra: More keys; they win over those read from the devices.
             include_time: Add the simulation time as `time` (seconds).
+
+        Returns:
+            The state; without the devices where this call was throttled and did not read them.
+            It has the simulation time as `sim_time`, too. Empty where publishing failed.
         """
         try:
-            self._publisher.publish_devices(extra or {}, include_time)
+            extra = extra or {}
+            state = self._publisher.publish_devices(extra, include_time)
+            if state is None:
+                state = self._publisher.unread(extra, include_time)
+            times = {"sim_time": self._session.context.clock.sim_time_s} if include_time else {}
+            return times | state
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self._errors.failed("auto_publish", error)
+            return {}
 
     def keep(self, reason: str) -> None:
         """Keep the last `keep_last_s` seconds at full rate, and the two that follow.
@@ -341,6 +351,9 @@ class MCPBridge:
     def register_command(self, action: str, handler: Handler) -> None:
         """Let an assistant run `handler` as the custom action `action`.
 
+        Built-in actions stay the bridge's own: a handler for one is never called, which is said
+        once in the log. But that of `reset_state` is, in place of the callbacks of `on_reload`.
+
         Args:
             action: Its name; the handler's docstring tells the assistant what it does.
             handler: Called inside `get_command()` with the command as one dict: `id`, `action`,
@@ -348,7 +361,7 @@ class MCPBridge:
                 exception is its error.
 
         Raises:
-            ValueError: The name is built in, empty, over 100 characters, or not printable.
+            ValueError: The name is empty, over 100 characters, or not printable.
             TypeError: The name is no text, or the handler is not a plain function.
         """
         self._session.control.handlers.register(action, handler)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from itertools import islice
-from typing import Any
+from typing import Any, cast
 
 from webots_mcp.bridge.changes import Changes
 from webots_mcp.bridge.context import Context
@@ -59,27 +59,38 @@ class Publisher:
 
     def publish_devices(
         self, extra: Mapping[Any, Any], include_time: bool, force: bool = False
-    ) -> None:
+    ) -> dict[Any, Any] | None:
         """Record what the devices say; they are read if it is this call's turn.
 
         Where breakpoints are armed or a run has a goal, they are read in every call; where the
         last seconds are held, as often as its bound on the time for it allows.
+
+        Returns:
+            The state; None where the devices were not read.
         """
+        state = None
         if self._clock.look():
             self._runs.begin()
         keeper, throttle = self._keeper, self._throttle
         due = keeper.fills and (throttle.calls + 1) % self.devices.ring_interval == 0
         if due or self._breakpoints.ask_states() or self._watch.asks_states:
-            self.publish(self._read(extra, include_time), force)
-            return
+            state = self._read(extra, include_time)
+            self.publish(state, force)
+            return state
         if throttle.admits(force or self._heartbeat.loop is not None):
-            self._record(self._read(extra, include_time))
+            state = self._read(extra, include_time)
+            self._record(state)
         elif keeper.fills:
             keeper.leave_out(self.devices.why)
         if keeper.frames.cameras:
             self._look_at_cameras(at_once=False)
         if keeper.busy:
             keeper.go_on()
+        return state
+
+    def unread(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
+        """A state without the devices."""
+        return ({"time": self._clock.sim_time_s} if include_time else {}) | _finite(extra)
 
     def _look_at_cameras(self, *, at_once: bool) -> None:
         """What the cameras see is held with the states; at a hit whatever the time."""
@@ -88,10 +99,7 @@ class Publisher:
             keeper.look_at_cameras(at_once=at_once)
 
     def _read(self, extra: Mapping[Any, Any], include_time: bool) -> dict[Any, Any]:
-        state: dict[Any, Any] = self.devices.read()
-        if include_time:
-            state["time"] = self._clock.sim_time_s
-        return state | _finite(extra)
+        return self.devices.read() | self.unread(extra, include_time)
 
     def _record(self, state: Mapping[Any, Any]) -> None:
         started_s = time.perf_counter()
@@ -115,6 +123,8 @@ class Publisher:
 
 def _finite(extra: Mapping[Any, Any]) -> dict[Any, Any]:
     """As many items as it says; a mapping of the user's own may never come to its end."""
+    if extra.__class__ is dict:
+        return cast("dict[Any, Any]", extra)
     if not isinstance(extra, Mapping):  # pyright: ignore[reportUnnecessaryIsInstance]
         raise TypeError(f"a state is a dict, got {type(extra).__name__}")
     return dict(islice(extra.items(), len(extra)))

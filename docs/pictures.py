@@ -50,7 +50,12 @@ TURNS: Final[tuple[demo.Turn, ...]] = (
     (
         "Which cruising speed gets farther in five seconds?",
         "webots_run_trials",
-        {"parameters": {"speed": [3.0, 8.0]}, "score": "max(pose.x) - first(pose.x)", "for_s": 5},
+        {
+            "parameters": {"speed": [3.0, 8.0]},
+            "score": "max(pose.x) - first(pose.x)",
+            "for_s": 5,
+            "repeats": 4,
+        },
     ),
 )
 CHROMIUM: Final = shutil.which("chromium") or shutil.which("chromium-browser")

@@ -36,7 +36,7 @@ def tried() -> Iterator[Tried]:
         yield write
 
 
-def test_over_one_parameter_each_score_its_median_and_the_best_are_shown(tried: Tried) -> None:
+def test_over_one_parameter_each_score_its_mean_and_the_best_are_shown(tried: Tried) -> None:
     connection = tried(
         ({"kp": 1.0}, 4.0), ({"kp": 1.0}, 5.0), ({"kp": 2.0}, 9.0), ({"kp": 3.0}, None)
     )
@@ -46,10 +46,10 @@ def test_over_one_parameter_each_score_its_median_and_the_best_are_shown(tried: 
     shown = words(plot_trials(connection, 1, sheet=SVG))
     assert shown >= {"kp", "score", "best", "one trial", "with failures"}
     assert "trial set 1, 4 trials: max(x)" in shown
-    assert "median, and least to greatest" in shown
+    assert "mean, and least to greatest" in shown
 
 
-def test_over_two_parameters_each_cell_has_its_median_and_spread(tried: Tried) -> None:
+def test_over_two_parameters_each_cell_has_its_mean_and_spread(tried: Tried) -> None:
     grid = [{"kp": kp, "gait": gait} for kp in (1.0, 2.0) for gait in ("trot", "walk")]
     scores = [4.0, 5.0, 9.0, None]
     connection = tried(*zip(grid, scores, strict=True), ({"kp": 1.0, "gait": "trot"}, 6.0))

@@ -216,7 +216,7 @@ class _Progress:
             first = ranking_of(trials_of(connection, self._set_id), self._plan.best).sets[0]
         if first.score is not None and first.parameters != self._leader:
             self._leader = first.parameters
-            said = f"{text_of(first.parameters)}, median {text_of(first.score.median)}"
+            said = f"{text_of(first.parameters)}, mean {text_of(first.score.mean)}"
             print(f"      best so far: {said}", file=sys.stderr, flush=True)
 
 
@@ -231,7 +231,7 @@ def _show(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) 
         print(json.dumps({"trial_set_id": set_id, **_as_json(ranking), "runs": runs}))
         return
     print_table(
-        ("rank", "parameters", "median", "least", "greatest", "scores", "pruned", "failed", "why"),
+        ("rank", "parameters", "mean", "least", "greatest", "scores", "pruned", "failed", "why"),
         [_row(number, each) for number, each in enumerate(ranking.sets, 1)],
     )
     ids = [each.run_id for each in found if each.run_id is not None]

@@ -43,14 +43,14 @@ def paint_trials(figure: Any, plot: TrialAxes) -> None:
 
 
 def _paint_scores(figure: Any, axes: Any, plot: TrialAxes) -> None:
-    """Over one parameter: each score, and the median of each value with its range."""
+    """Over one parameter: each score, and the mean of each value with its range."""
     (name,) = plot.names
     axes.set_ylabel("score")
     axes.grid(color="#E9E9E9", linewidth=0.6)
     places = _places(axes.xaxis, [each.parameters[name] for each in plot.sets])
     told = [(places[repr(each.parameters[name])], each) for each in plot.sets]
     scored = sorted((pair for pair in told if pair[1].score is not None), key=lambda pair: pair[0])
-    entries = [_paint_medians(axes, scored), _paint_each(axes, scored)]
+    entries = [_paint_means(axes, scored), _paint_each(axes, scored)]
     if plot.best is not None:
         entries.append(_paint_best(axes, places[repr(plot.best[name])], plot))
     failed = [place for place, each in told if each.failures]
@@ -59,14 +59,14 @@ def _paint_scores(figure: Any, axes: Any, plot: TrialAxes) -> None:
     paint_legend(figure, entries)
 
 
-def _paint_medians(axes: Any, scored: Sequence[tuple[float, Ranked]]) -> Entry:
+def _paint_means(axes: Any, scored: Sequence[tuple[float, Ranked]]) -> Entry:
     spreads = [(place, each.score) for place, each in scored if each.score is not None]
     places = [place for place, _ in spreads]
     low, high = [each.low for _, each in spreads], [each.high for _, each in spreads]
     axes.vlines(places, low, high, color=LINES[0], linewidth=4, alpha=0.3)
-    medians = [each.median for _, each in spreads]
-    (line,) = axes.plot(places, medians, color=LINES[0], marker="o", markersize=6)
-    return line, "median, and least to greatest"
+    means = [each.mean for _, each in spreads]
+    (line,) = axes.plot(places, means, color=LINES[0], marker="o", markersize=6)
+    return line, "mean, and least to greatest"
 
 
 def _paint_each(axes: Any, scored: Sequence[tuple[float, Ranked]]) -> Entry:
@@ -81,7 +81,7 @@ def _paint_best(axes: Any, place: float, plot: TrialAxes) -> Entry:
     (best,) = (each for each in plot.sets if each.parameters == plot.best)
     assert best.score is not None
     (ring,) = axes.plot(
-        [place], [best.score.median], color=LINES[1], marker="o", linestyle="", markersize=14,
+        [place], [best.score.mean], color=LINES[1], marker="o", linestyle="", markersize=14,
         markerfacecolor="none", markeredgewidth=2,
     )  # fmt: skip
     return ring, "best"
@@ -96,19 +96,19 @@ def _paint_failed(axes: Any, places: Sequence[float]) -> Entry:
 
 
 def _paint_grid(figure: Any, axes: Any, plot: TrialAxes) -> None:
-    """Over two parameters: a cell for each pair of values, coloured by its median."""
+    """Over two parameters: a cell for each pair of values, coloured by its mean."""
     first, second = plot.names
     axes.set_ylabel(short(second))
     x = _ordered([each.parameters[first] for each in plot.sets])
     y = _ordered([each.parameters[second] for each in plot.sets])
-    medians = [[math.nan] * len(x) for _ in y]
+    means = [[math.nan] * len(x) for _ in y]
     for each in plot.sets:
         if each.score is not None:
             column, row = _cell(each.parameters, plot.names, x, y)
-            medians[row][column] = each.score.median
-    image = axes.imshow(medians, cmap="cividis", origin="lower", aspect="auto")
+            means[row][column] = each.score.mean
+    image = axes.imshow(means, cmap="cividis", origin="lower", aspect="auto")
     axes.set_facecolor("#EEEEEE")  # seen where no trial has a score
-    figure.colorbar(image, ax=axes, label="median score")
+    figure.colorbar(image, ax=axes, label="mean score")
     for axis, values in ((axes.xaxis, x), (axes.yaxis, y)):
         axis.set_ticks(range(len(values)), [_text(value) for value in values])
     if len(plot.sets) <= _MOST_TOLD_CELLS:
@@ -123,10 +123,10 @@ def _paint_text(axes: Any, image: Any, ranked: Ranked, cell: tuple[int, int]) ->
     lines = [f"{len(ranked.failures)} failed"] if ranked.failures else []
     colour = INK
     if ranked.score is not None:
-        low, median, high = ranked.score.low, ranked.score.median, ranked.score.high
+        low, mean, high = ranked.score.low, ranked.score.mean, ranked.score.high
         spread = [f"{low:.3g} to {high:.3g}"] if low != high else []
-        lines = [f"{median:.4g}", *spread, *lines]
-        colour = "white" if image.norm(median) < _DARK else INK
+        lines = [f"{mean:.4g}", *spread, *lines]
+        colour = "white" if image.norm(mean) < _DARK else INK
     axes.text(*cell, "\n".join(lines), ha="center", va="center", color=colour, fontsize=8)
 
 
@@ -140,7 +140,7 @@ def _paint_frame(axes: Any, cell: tuple[int, int]) -> None:
 def _frame_entry() -> Entry:
     from matplotlib.patches import Patch
 
-    return Patch(fill=False, edgecolor=LINES[1], linewidth=2), "best; cells: median, spread"
+    return Patch(fill=False, edgecolor=LINES[1], linewidth=2), "best; cells: mean, spread"
 
 
 def _places(axis: Any, values: Sequence[Any]) -> dict[str, float]:

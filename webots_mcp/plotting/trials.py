@@ -23,7 +23,7 @@ def plot_trials(
     *,
     sheet: Sheet | None = None,
 ) -> Picture:
-    """The scores of a trial set: each, their median and their spread; the best is marked.
+    """The scores of a trial set: each, their mean and their spread; the best is marked.
 
     Args:
         connection: Any.

@@ -200,13 +200,13 @@ class TrialsAnswer(NotedAnswer):
     score: str | None = None
     ranked: Table | None = Field(
         default=None,
-        description="The best first; score is the median, range least and greatest of repeats.",
+        description="The best first; score is the mean, range least and greatest of repeats.",
     )
     noise: float | None = Field(
         default=None, description="Standard deviation of the scores of like trials."
     )
     best_is_better: bool | None = Field(
-        default=None, description="Than the next, beyond the noise; null: it cannot be told."
+        default=None, description="Than the next, beyond what repeats differ; null: not shown."
     )
     verdict: str | None = None
 

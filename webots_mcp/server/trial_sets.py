@@ -294,7 +294,7 @@ def _row(ranked: Ranked, names: Sequence[str], runs: Sequence[int]) -> list[Any]
     several = spread is not None and len(ranked.scores) > 1
     return [
         *(shown(ranked.parameters.get(name)) for name in names),
-        figure(spread.median) if spread else None,
+        figure(spread.mean) if spread else None,
         figures([spread.low, spread.high]) if spread and several else None,
         len(ranked.scores),
         ranked.pruned or None,

@@ -17,12 +17,12 @@ def outcomes(**scores: list[float | None]) -> list[Outcome]:
     ]
 
 
-@pytest.mark.parametrize(("best", "order"), [("highest", [2, 3, 1]), ("lowest", [1, 3, 2])])
-def test_sets_are_ranked_by_their_median(best: Best, order: list[float]) -> None:
+@pytest.mark.parametrize(("best", "order"), [("highest", [2, 1, 3]), ("lowest", [3, 1, 2])])
+def test_sets_are_ranked_by_their_mean(best: Best, order: list[float]) -> None:
     ranking = rank(outcomes(k1=[1.0, 1.1, 9.0], k2=[5.0, 5.1, 5.2], k3=[2.0, 2.1, 2.2]), best)
 
     assert [each.parameters["kp"] for each in ranking.sets] == order
-    assert ranking.sets[order.index(1)].score == (1.1, 1.0, 9.0)
+    assert ranking.sets[order.index(1)].score == (pytest.approx(3.7), 1.0, 9.0)
 
 
 def test_a_set_with_failures_comes_after_those_without_and_names_them() -> None:
@@ -34,17 +34,53 @@ def test_a_set_with_failures_comes_after_those_without_and_names_them() -> None:
     assert (ranking.better, ranking.verdict) == (None, "every other parameter set had failures")
 
 
-def test_one_repeated_set_tells_the_noise_of_all() -> None:
-    ranking = rank(outcomes(k1=[1.0, 1.001, 0.999], k2=[5.0], k3=[2.0]))
+def test_a_set_is_better_only_where_the_repeats_of_both_show_it() -> None:
+    ranking = rank(outcomes(k1=[1.0, 1.001, 0.999], k2=[5.0, 5.001, 4.999], k3=[2.0, 2.1]))
 
-    assert ranking.noise == (pytest.approx(0.001), 2)
-    assert ranking.better
-    assert rank(outcomes(k1=[1.0, 4.0], k2=[5.0], k3=[2.0])).better is False
+    assert ranking.noise == (pytest.approx(0.032, abs=0.001), 5)
+    assert ranking.better is None, "two trials do not tell how much they differ"
+    assert rank(outcomes(k1=[1.0, 1.001, 0.999], k2=[5.0, 5.001, 4.999])).better
+    once = rank(outcomes(k1=[1.0, 1.001, 0.999], k2=[5.0]))
+    assert (once.better, once.chance) == (None, None)
+    assert "not both repeated" in once.verdict
 
 
-def test_repeats_that_agree_to_the_last_digit_leave_no_doubt() -> None:
-    assert rank(outcomes(k1=[1.0, 1.0], k2=[1.1])).better
-    assert rank(outcomes(k1=[1.0, 1.0], k2=[1.0])).better is False
+def test_a_set_that_is_exact_by_chance_does_not_beat_noisy_ones() -> None:
+    source = random.Random(3)
+    for repeats in ([1] * 4, [2] * 4, [3] * 4):
+        told = 0
+        for _ in range(600):
+            noisy = {f"k{i}": [source.gauss(0, 1) for _ in range(n)] for i, n in enumerate(repeats)}
+            exact = [source.gauss(0, 1)] * 2
+            told += bool(rank(outcomes(k9=exact, **noisy)).better)  # pyright: ignore[reportArgumentType]
+        assert told <= 6
+
+
+def test_repeats_that_agree_to_the_last_digit_are_no_proof_before_there_are_enough() -> None:
+    few = rank(outcomes(k1=[1.0] * 3, k2=[1.1] * 3))
+    assert (few.better, few.verdict.partition(": ")[2]) == (None, "repeat each 4 times")
+    assert rank(outcomes(k1=[1.0] * 4, k2=[1.1] * 4)).better
+
+
+@pytest.mark.parametrize("often", [0.5, 0.9, 0.02])
+def test_counts_that_agree_by_chance_are_called_better_at_most_once_in_a_hundred_sets(
+    often: float,
+) -> None:
+    source = random.Random(5)
+    for repeats in (2, 4, 6):
+        told = 0
+        for _ in range(1000):
+            groups = {
+                f"k{i}": [float(source.random() < often) for _ in range(repeats)] for i in range(2)
+            }
+            told += bool(rank(outcomes(**groups)).better)  # pyright: ignore[reportArgumentType]
+        assert told <= 15
+
+
+def test_scores_that_are_all_equal_are_told_so() -> None:
+    ranking = rank(outcomes(k1=[0.0, 0.0], k2=[0.0], k3=[0.0, None]))
+    assert ranking.better is None
+    assert ranking.verdict == "all 4 scores are 0: nothing that was tried changed them"
 
 
 def test_without_repeats_nobody_can_tell_whether_the_best_is_better() -> None:

@@ -52,7 +52,7 @@ def test_each_trial_is_a_row_with_its_parameters_and_how_those_did(
     assert [row["score"] for row in rows] == [score for _, score in TRIED]
     for row, (parameters, _) in zip(rows, TRIED, strict=True):
         assert (row["kp"], row["gait"], row["parameter score"]) == tuple(parameters.values())
-    figures = ("rank", "median", "least", "greatest", "scores", "pruned", "failed")
+    figures = ("rank", "mean", "least", "greatest", "scores", "pruned", "failed")
     assert [[row[name] for name in figures] for row in rows[2:]] == [
         [2, 5.0, 4.0, 6.0, 2, 0, 0],
         [1, 8.75, 8.5, 9.0, 2, 0, 0],
@@ -70,7 +70,7 @@ def test_csv_has_a_column_for_each_parameter_and_figure(connection: sqlite3.Conn
     assert [row["kp"] for row in rows] == ["1", "2.5", "1", "2.5", "7", "9"]
     assert [row["gait"] for row in rows[:2]] == ["trot", "'=walk"]
     assert [row["parameter score"] for row in rows[:2]] == ["true", "false"]
-    assert [row["median"] for row in rows] == ["5.0", "8.75", "5.0", "8.75", "", ""]
+    assert [row["mean"] for row in rows] == ["5.0", "8.75", "5.0", "8.75", "", ""]
 
 
 def test_parquet_reads_back_with_types(connection: sqlite3.Connection) -> None:

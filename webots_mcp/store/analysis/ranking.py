@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Sequence
 from typing import Any, Final, Literal, NamedTuple
 
-from webots_mcp.store.analysis.spread import Spread, chance_beyond, spread_of
+from webots_mcp.store.analysis.spread import chance_beyond
 
 Best = Literal["highest", "lowest"]
 MOST_CHANCE: Final = 0.01  # that a set is called better than the next one, and is not
@@ -22,18 +22,26 @@ class Outcome(NamedTuple):
     pruned: bool = False
 
 
+class Score(NamedTuple):
+    """Of the trials of a set: by the mean they are ranked and compared."""
+
+    mean: float
+    low: float
+    high: float
+
+
 class Ranked(NamedTuple):
     """A parameter set and its trials.
 
     Attributes:
-        score: Median, least and greatest of those that gave one; None if none did.
+        score: Mean, least and greatest of those that gave one; None if none did.
         scores: Of each of them.
         failures: Why others gave none.
         pruned: How many were ended early because they were not worth going on with.
     """
 
     parameters: dict[str, Any]
-    score: Spread | None
+    score: Score | None
     scores: list[float]
     failures: list[str]
     pruned: int = 0
@@ -60,14 +68,15 @@ class Ranking(NamedTuple):
     """Parameter sets, the best first; those of which every trial gave a score come first.
 
     Attributes:
-        better: Whether the best beats the next by more than the noise; None if nobody can tell.
-        chance: How often noise alone would set the two as far apart.
+        better: True where the best beats the next by more than its trials and those of the next
+            differ; None where they do not show it.
+        chance: How often that alone would set the two as far apart; None where it is not known.
         verdict: The same as a sentence.
     """
 
     sets: list[Ranked]
     noise: Noise
-    better: bool | None
+    better: Literal[True] | None
     chance: float | None
     verdict: str
 
@@ -75,11 +84,10 @@ class Ranking(NamedTuple):
 def rank(outcomes: Sequence[Outcome], best: Best = "highest") -> Ranking:
     """Rank the parameter sets of finished trials."""
     sets = sorted(_grouped(outcomes), key=lambda each: _place(each, best))
-    noise = _noise(sets)
-    chance = _chance(sets, noise)
+    chance = _chance(sets)
     limit = MOST_CHANCE / max(1, len(sets) - 1)
-    better = None if chance is None else chance < limit
-    return Ranking(sets, noise, better, chance, _verdict(sets, noise, better))
+    better = True if chance is not None and chance < limit else None
+    return Ranking(sets, _noise(sets), better, chance, _verdict(sets, chance, limit))
 
 
 def _grouped(outcomes: Sequence[Outcome]) -> list[Ranked]:
@@ -95,14 +103,15 @@ def _ranked(group: Sequence[Outcome]) -> Ranked:
         each.failure or "no score" for each in group if each.score is None and not each.pruned
     ]
     pruned = sum(each.pruned for each in group)
-    return Ranked(group[0].parameters, spread_of(scores), scores, failures, pruned)
+    score = Score(statistics.fmean(scores), min(scores), max(scores)) if scores else None
+    return Ranked(group[0].parameters, score, scores, failures, pruned)
 
 
 def _place(ranked: Ranked, best: Best) -> tuple[bool, bool, float]:
     if ranked.score is None:
         return True, True, 0.0
-    median = ranked.score.median
-    return False, not ranked.is_whole, -median if best == "highest" else median
+    mean = ranked.score.mean
+    return False, not ranked.is_whole, -mean if best == "highest" else mean
 
 
 def _noise(sets: Sequence[Ranked]) -> Noise:
@@ -113,30 +122,55 @@ def _noise(sets: Sequence[Ranked]) -> Noise:
     return Noise(math.sqrt(squares / freedom) if freedom else 0.0, freedom)
 
 
-def _chance(sets: Sequence[Ranked], noise: Noise) -> float | None:
-    """Of the best and the next; where one is not whole, they are not compared by their scores."""
-    if len(sets) < 2 or not sets[1].is_whole or not noise.freedom:
+def _chance(sets: Sequence[Ranked]) -> float | None:
+    """Of the best and the next; where one is not whole, they are not compared by their scores.
+
+    How much like trials differ has to be known of each of the two, from its own repeats (B. L.
+    Welch, The generalization of "Student's" problem, Biometrika 34, 1947). Repeats that are all
+    equal may be so by chance: of two outcomes that are as likely, half of the pairs are.
+    """
+    if len(sets) < 2 or not sets[1].is_whole:
         return None
-    first, other = sets[0].scores, sets[1].scores
+    groups = [each.scores for each in sets[:2]]
+    if min(map(len, groups)) < 2:
+        return None
+    first, other = groups
     apart = abs(statistics.fmean(first) - statistics.fmean(other))
     if math.isclose(apart, 0, abs_tol=1e-9 * max(map(abs, (*first, *other)))):
         return 1.0
-    variance = noise.deviation**2 * (1 / len(first) + 1 / len(other))
-    return chance_beyond(apart, variance, noise.freedom)
+    errors = [statistics.variance(each) / len(each) for each in groups]
+    if not any(errors):
+        return _chance_of_equal_repeats(len(first) + len(other))
+    parts = sum(e**2 / (len(g) - 1) for e, g in zip(errors, groups, strict=True))
+    return chance_beyond(apart, sum(errors), max(1, int(sum(errors) ** 2 / parts)))
 
 
-def _verdict(sets: Sequence[Ranked], noise: Noise, better: bool | None) -> str:
-    if not sets or sets[0].score is None:
+def _chance_of_equal_repeats(trials: int) -> float:
+    """How often chance makes all of the one set equal, and all of the other."""
+    return 0.5 ** (trials - 1)
+
+
+def _verdict(sets: Sequence[Ranked], chance: float | None, limit: float) -> str:
+    scores = [score for each in sets for score in each.scores]
+    if not scores:
         return "no trial gave a score"
     if len(sets) == 1:
         return "one parameter set: there is nothing to compare it with"
+    if len(scores) > 1 and min(scores) == max(scores):
+        return f"all {len(scores)} scores are {scores[0]:g}: nothing that was tried changed them"
     if not sets[1].is_whole:
         which = "every other" if sets[0].is_whole else "every"
         failed = ["had failures"] if any(each.failures for each in sets) else []
         pruned = ["was pruned"] if any(each.pruned for each in sets) else []
         return f"{which} parameter set {' or '.join(failed + pruned)}"
-    if not noise.freedom:
-        return "nothing was repeated with success: how much like trials differ is not known"
-    if better:
+    if chance is None:
+        return "the best and the next were not both repeated: how much theirs differ is not known"
+    if chance < limit:
         return "the best beats the next by more than repeats differ"
+    if all(min(each.scores) == max(each.scores) for each in sets[:2]) and chance < 1:
+        wanted = next(n for n in range(2, 100) if _chance_of_equal_repeats(2 * n) < limit)
+        return (
+            "repeats of the best and of the next agree, which so few may by chance: repeat each "
+            f"{wanted} times"
+        )
     return "the best and the next are not farther apart than repeats may be: repeat more"

@@ -22,7 +22,7 @@ _OF_TRIAL: Final = (
     "trial_set_id", "number", "run_id", "status", "score", "ended_by", "ended_sim_time_s", "error",
     "started_wall_time_s", "finished_wall_time_s",
 )  # fmt: skip
-_OF_PARAMETERS: Final = ("rank", "median", "least", "greatest", "scores", "pruned", "failed")
+_OF_PARAMETERS: Final = ("rank", "mean", "least", "greatest", "scores", "pruned", "failed")
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class TrialTable(Table):
     """The trials of a set, in order.
 
     Columns are those of the table `trial`, the parameters by name, and how trials with the same
-    parameters did: rank (1 is the best), median, least and greatest score, and how many gave a
+    parameters did: rank (1 is the best), mean, least and greatest score, and how many gave a
     score, were pruned, and failed. A parameter called like one of those is `parameter NAME`.
     """
 

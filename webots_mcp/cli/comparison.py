@@ -42,7 +42,7 @@ def _group_row(group: Group) -> list[object]:
 
 
 def _measure_row(measure: Measure) -> list[object]:
-    verdicts = map(_verdict, measure.different[1:], measure.runs_wanted[1:])
+    verdicts = map(_verdict, measure.different[1:], measure.interval[1:], measure.runs_wanted[1:])
     return [measure.name, *map(_spelled_spread, measure.spread), *verdicts]
 
 
@@ -76,7 +76,7 @@ def _print_differences(found: Comparison, verdicts: Sequence[str]) -> None:
 def _difference_row(difference: Difference) -> list[object]:
     means = map(_spelled_spread, difference.mean)
     ratios = [each if each is None else f"x {each:.3g}" for each in difference.deviation_ratio[1:]]
-    verdicts = map(_verdict, difference.different[1:])
+    verdicts = map(_verdict, difference.different[1:], difference.interval[1:])
     return [difference.name, *means, *difference.effect[1:], *ratios, *verdicts]
 
 
@@ -88,7 +88,11 @@ def _spelled_spread(spread: Spread | None) -> str | None:
     return f"{spread.median:.4g}{several}"
 
 
-def _verdict(different: bool | None, runs_wanted: int | None = None) -> str:
-    if runs_wanted is not None:
-        return f"not known yet: {runs_wanted} runs of each would tell"
-    return {True: "yes", False: "no", None: "not known"}[different]
+def _verdict(
+    different: bool | None,
+    interval: tuple[float, float] | None,
+    runs_wanted: int | None = None,
+) -> str:
+    said = {True: "yes", False: "no", None: "not known"}[different]
+    said += f" ({interval[0]:+.3g} to {interval[1]:+.3g})" if interval else ""
+    return said if runs_wanted is None else f"{said}: {runs_wanted} runs of each would tell"

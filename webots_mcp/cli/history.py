@@ -233,6 +233,8 @@ def write_picture(file: Path, picture: Picture) -> None:
     argument("--trials", type=row_id, dest="trial_set", metavar="SET",
              help="the runs of a trial set, by their parameters"),
     argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
+    argument("--matters", type=float, default=1.0, dest="matters_sd", metavar="SD",
+             help="a difference of SD standard deviations between like runs matters (1)"),
     *MOTION,
     count("-n", "the N that differ most", default=15),
 )  # fmt: skip
@@ -244,6 +246,7 @@ def compare(arguments: argparse.Namespace) -> None:
     options = EventOptions(position=both_of(arguments.position), mode=arguments.mode)
     wanted: dict[str, Any] = {
         "names": arguments.signal or ["*"], "limit": arguments.limit, "options": options,
+        "matters_sd": arguments.matters_sd,
     }  # fmt: skip
     if arguments.run_ids and arguments.trial_set is not None:
         raise InvalidInputError("name runs or give --trials, not both")

@@ -261,8 +261,9 @@ class ComparisonAnswer(NotedAnswer):
     measures: Table | None = Field(
         default=None,
         description="Each run as a whole: median over the runs of each group, and their range. "
-        "different: of each group but the first; null where it cannot be told, then runs_wanted: "
-        "this many runs of each would tell, if they went on like these.",
+        "Of each group but the first: different; null where it cannot be told, then runs_wanted: "
+        "this many runs of each would tell, if they went on like these. interval: of the "
+        "difference of the means, 90 %.",
     )
     not_known: dict[str, str] | None = Field(
         default=None, description="Figures that are null, or not of everything: why; what to do."
@@ -272,7 +273,7 @@ class ComparisonAnswer(NotedAnswer):
         description="Signals, most different first; lists are in the order of the groups. Of each "
         "group but the first (a list where there are several): effect, how far the mean is from "
         "the first group's, in standard deviations (0.8 is large, null: unequal constants), "
-        "deviation_ratio, different. min and max where signals were named.",
+        "deviation_ratio, different, interval of the mean. min and max where signals were named.",
     )
     total: int | None = Field(default=None, description="Numeric signals that all groups have.")
     only_in: dict[str, list[str]] | None = Field(

@@ -54,7 +54,7 @@ def compare_last_edit(robot: Robot = "") -> str:
         "3. webots_plot(run_ids=[...], signals=[...]): one run of each group and the signals "
         "that differ most, laid over each other.\n"
         "Call a measure better or worse only where different is true. Where it is null it "
-        "cannot be told from single runs: say how many more runs of each would tell, and how "
+        "cannot be told yet: say how many more runs of each would tell, and how "
         f"long. {_TRUTH}"
     )
 

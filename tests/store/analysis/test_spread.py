@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+import random
+from collections import Counter
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from webots_mcp.store.analysis.spread import (
+    MATTERS_SD,
     Spread,
     Verdict,
     chance_of,
@@ -41,8 +44,10 @@ def test_the_chance_is_a_share_and_the_same_both_ways(one: list[float], other: l
     assert chance == pytest.approx(chance_of(other, one))
 
 
-def told(groups: list[list[float]], tests: int = 1) -> list[bool | None]:
-    return [each.different for each in verdicts_on(groups, tests)]
+def told(
+    groups: list[list[float]], tests: int = 1, matters_sd: float = MATTERS_SD
+) -> list[bool | None]:
+    return [each.different for each in verdicts_on(groups, tests, matters_sd=matters_sd)]
 
 
 def test_of_one_run_each_nothing_can_be_told() -> None:
@@ -50,9 +55,18 @@ def test_of_one_run_each_nothing_can_be_told() -> None:
     assert told([[1.0], [2.0]]) == [False, None]
 
 
-def test_runs_that_agree_to_the_last_digit_differ_by_any_change() -> None:
-    assert told([[1.0, 1.0], [1.0001, 1.0001]], tests=100) == [False, True]
-    assert told([[1.0, 1.0], [1.0, 1.0]], tests=100) == [False, False]
+@pytest.mark.parametrize("other", [1.0, 1.0001])
+def test_a_few_runs_that_agree_to_the_last_digit_prove_nothing(other: float) -> None:
+    """Like runs may keep to one lane of two: a fourth of such pairs was called different."""
+    unsure = Verdict(None, runs_wanted=7)
+    assert verdicts_on([[1.0] * 2, [other] * 2], tests=100)[1] == unsure
+    assert verdicts_on([[1.0] * 6, [other] * 6], tests=100)[1] == unsure
+    assert told([[1.0] * 7, [other] * 7], tests=100) == [False, other != 1.0]
+
+
+def test_two_clusters_of_few_runs_are_not_two_codes() -> None:
+    assert told([[1.0, 1.001, 1.002], [2.0, 2.001, 2.002]]) == [False, None]
+    assert told([[1.0, 1.001, 1.002, 1.0], [2.0, 2.001, 2.002, 2.0]]) == [False, True]
 
 
 def test_groups_that_more_runs_would_tell_apart_are_not_called_equal() -> None:
@@ -61,7 +75,40 @@ def test_groups_that_more_runs_would_tell_apart_are_not_called_equal() -> None:
     assert unsure.different is None and unsure.runs_wanted is not None
     repeated = (unsure.runs_wanted + 2) // 3
     assert told([near * repeated, far * repeated], tests=10) == [False, True]
-    assert verdicts_on([near, [1.0, 1.2, 0.95]], tests=10) == [Verdict(False), Verdict(False)]
+    alike = verdicts_on([near, [1.0, 1.2, 0.95]], tests=10)[1]
+    assert (alike.different, alike.runs_wanted) == (None, 8)
+
+
+def test_the_interval_is_that_of_the_textbook() -> None:
+    """4 runs of each, a pooled variance of 5 / 3, and 1.943 of the table for 6 degrees."""
+    (_, found) = verdicts_on([[1.0, 2.0, 3.0, 4.0], [3.0, 4.0, 5.0, 6.0]], tests=1)
+    within = 1.943 * math.sqrt(5 / 3 / 2)
+    assert found.interval == pytest.approx((2 - within, 2 + within), abs=1e-3)
+    assert verdicts_on([[1.0, 1.0], [2.0, 2.0]], tests=1)[1].interval is None
+
+
+def rates(runs: int, effect_sd: float) -> dict[bool | None, int]:
+    """What is said of 200 pairs of groups."""
+    dice = random.Random(runs)
+    return Counter(
+        told([[100 + dice.gauss(by, 1) for _ in range(runs)] for by in (0, effect_sd)], tests=20)[1]
+        for _ in range(200)
+    )
+
+
+def test_no_is_said_only_where_a_difference_that_matters_is_excluded() -> None:
+    """At 10 runs each two standard deviations were "no" in 62 % of pairs, and in 99 % one."""
+    assert rates(4, 0.0)[None] == 200
+    assert rates(10, 1.0)[False] <= 20
+    assert rates(10, 2.0)[False] == rates(30, 2.0)[False] == 0
+    assert rates(30, 0.0)[False] >= 180
+    assert rates(30, 2.0)[True] == 200
+
+
+def test_how_much_matters_is_the_askers_to_say() -> None:
+    first, other = [1.0, 2.0, 3.0, 4.0], [2.0, 3.0, 4.0, 5.0]
+    assert told([first, other]) == [False, None]
+    assert told([first, other], matters_sd=3.0) == [False, False]
 
 
 @pytest.mark.parametrize(
@@ -94,12 +141,12 @@ def test_a_few_counts_that_happen_to_agree_are_not_certain() -> None:
 
 
 def test_counts_that_spread_more_than_chance_need_more_than_chance() -> None:
-    assert verdicts_on([[0, 30, 2, 40], [9, 0, 60, 80]], 1, chance_of_counts)[1].different is False
+    assert verdicts_on([[0, 30, 2, 40], [9, 0, 60, 80]], 1, chance_of_counts)[1].different is None
 
 
 @given(st.lists(st.integers(0, 30), min_size=2, max_size=6))
 def test_like_counts_are_never_called_different(counts: list[float]) -> None:
-    assert verdicts_on([counts, counts[::-1]], 1, chance_of_counts) == [Verdict(False)] * 2
+    assert not verdicts_on([counts, counts[::-1]], 1, chance_of_counts)[1].different
 
 
 def test_a_figure_that_one_run_lacks_is_not_told_of_its_group() -> None:

@@ -146,7 +146,7 @@ def test_a_rare_event_that_is_gone_asks_for_more_runs(empty: sqlite3.Connection,
             record(empty, code, state)
     stuck = measure(compare_code(empty), "stuck per min")
     assert medians(stuck) == [pytest.approx(3.0, abs=0.02), 0.0]
-    assert (stuck.different, stuck.runs_wanted) == ([False, None], [None, 6])
+    assert (stuck.different, stuck.runs_wanted) == ([False, None], [None, 7])
 
 
 def test_a_rare_event_that_is_gone_from_many_runs_is_a_difference(
@@ -179,11 +179,63 @@ def test_what_is_behind_the_compared_stretch_is_said_to_be_left_out(
     assert "the first 19.9 s of run 1 (39.9 s)" in note
 
 
-def test_repeats_among_single_runs_are_named(empty: sqlite3.Connection) -> None:
+@pytest.mark.parametrize(
+    ("run_ids", "groups"),
+    [
+        ([1, 2, 3, 4, 5], {"runs 1, 2": [1, 2], "runs 3, 5": [3, 5], "run 4": [4]}),
+        ([4, 2, 1], {"run 4": [4], "runs 2, 1": [2, 1]}),
+        ([1, 2], {"run 1": [1], "run 2": [2]}),
+        ([1, 3], {"run 1": [1], "run 3": [3]}),
+    ],
+)
+def test_repeats_among_given_runs_are_one_group(
+    empty: sqlite3.Connection, run_ids: list[int], groups: dict[str, list[int]]
+) -> None:
+    for code in "aabcb":
+        record(empty, code, driving)
+    told = {
+        each.name: [run.run_id for run in each.runs] for each in compare_runs(empty, run_ids).groups
+    }
+    assert (told, list(told)) == (groups, list(groups))
+
+
+def test_runs_of_one_code_with_other_parameters_are_no_repeats(empty: sqlite3.Connection) -> None:
     for code in "aab":
         record(empty, code, driving)
-    (note,) = (note for note in compare_runs(empty, [1, 2, 3]).notes if "one run each" in note)
-    assert "Runs 1 and 2 had the same controller file: without run_ids" in note
+    empty.execute(
+        "INSERT INTO parameter_value (run_id, name, sim_time_s, wall_time_s, value, is_default, "
+        "set_by) VALUES (2, 'kp', 0.0, 0.0, '3.0', 0, 'command')"
+    )
+    assert [each.name for each in compare_runs(empty, [1, 2, 3]).groups] == [
+        "run 1", "run 2", "run 3",
+    ]  # fmt: skip
+
+
+def test_of_what_was_not_read_in_time_no_figure_is_told(empty: sqlite3.Connection) -> None:
+    """A way that a deadline cut had a length of 0.0 m, and modes took the time that was read."""
+    for code in "aabb":
+        record(empty, code, driving, end_s=300)
+    found = compare_code(empty, deadline_s=0.0)
+    assert all(spread is None for each in found.measures for spread in each.spread)
+    assert {verdict for each in found.differences for verdict in each.different} == {None}
+    assert all(mean is None for each in found.differences for mean in each.mean)
+    assert found.only_in == {}
+    told = {name for names in found.not_known for name in names.split(", ")}
+    unread = {"distance_m", "mean_speed_m_s", "share of each mode", "events per min"}
+    assert told == unread | {"means of signals"}
+    assert all(why.startswith("the time was over") for why in found.not_known.values())
+
+
+def test_how_much_runs_differ_is_told_as_an_interval(empty: sqlite3.Connection) -> None:
+    for code in "ab":
+        for speed_m_s in (0.30, 0.31, 0.29):
+            record(empty, code, lambda time_s, v=speed_m_s: {"pose": [v * time_s, 0.0]}, end_s=10)
+    speed = measure(compare_code(empty), "mean_speed_m_s")
+    (_, interval) = speed.interval
+    assert interval == pytest.approx((-0.0174, 0.0174), rel=0.02)  # 2.132 * 0.01 * (2 / 3)**0.5
+    assert speed.different == [False, None]
+    speed = measure(compare_code(empty, matters_sd=3.0), "mean_speed_m_s")
+    assert speed.different == [False, False]
 
 
 def test_what_only_adding_tells_apart_asks_for_no_more_certainty(empty: sqlite3.Connection) -> None:

@@ -42,7 +42,7 @@ from webots_mcp.server.parameters import (
 )
 from webots_mcp.server.results import Table
 from webots_mcp.server.shortening import DETAIL_BUDGET, WHOLE, shorten
-from webots_mcp.store.analysis.spread import Spread
+from webots_mcp.store.analysis.spread import MATTERS_SD, Spread
 from webots_mcp.store.detection.event import EventOptions, both_of
 from webots_mcp.store.questions.compare import (
     Comparison,
@@ -72,10 +72,10 @@ GROUP_COLUMNS: Final = (
     "name", "robot", "runs", "labels", "parameters", "sha256", "ended_by",
     "total_duration_s", "real_time_factor",
 )  # fmt: skip
-MEASURE_COLUMNS: Final = ("name", "median", "range", "different", "runs_wanted")
+MEASURE_COLUMNS: Final = ("name", "median", "range", "different", "interval", "runs_wanted")
 DIFFERENCE_COLUMNS: Final = (
     "signal", "unit", "mean", "mean_range", "deviation", "effect", "deviation_ratio", "different",
-    "min", "max",
+    "interval", "min", "max",
 )  # fmt: skip
 DEFAULT_DIFFERENCES: Final = 15
 _SHOWN_HASH: Final = 10
@@ -130,14 +130,18 @@ def webots_compare_runs(
     trial_set: TrialSetId = None,
     position: Position = None,
     mode: Mode = None,
+    matters_sd: Annotated[
+        float, Field(gt=0, le=100, description="Matters: so many deviations between like runs.")
+    ] = MATTERS_SD,
     robot: RobotName = None,
 ) -> ComparisonAnswer:
     """Did my edit help? Runs beside each other; or how fast, how far and in which modes one ran.
 
-    Without run_ids: the runs before and after the last edit of the controller's file. Over the
-    same stretch of each run: distance, mean speed, share of time per mode, events per minute,
-    and the signals that differ most. `different` is true only beyond the spread of like runs,
-    so it takes several runs of each; null: it cannot be told yet.
+    Without run_ids: the runs before and after the last edit of the controller's file. Given ones
+    of one code and parameters are one group. Over the same stretch of each run: distance, mean
+    speed, share of time per mode, events per minute, and the signals that differ most.
+    `different`: true beyond the spread of like runs (4 of each or more), false where a difference
+    that matters is excluded, null: it cannot be told yet.
     """
     if run_ids and trial_set:
         raise InvalidInputError("give run_ids or trial_set, not both")
@@ -147,7 +151,7 @@ def webots_compare_runs(
         return answer_about(
             view,
             ComparisonAnswer,
-            lambda: _compared(view, run_ids, trial_set, signals, limit, options),
+            lambda: _compared(view, run_ids, trial_set, signals, limit, options, matters_sd),
         )
 
 
@@ -245,8 +249,9 @@ def _compared(
     names: Sequence[str] | None,
     limit: int | None,
     options: EventOptions,
+    matters_sd: float,
 ) -> dict[str, Any]:
-    asked: dict[str, Any] = {"names": names or ("*",), "options": options}
+    asked: dict[str, Any] = {"names": names or ("*",), "options": options, "matters_sd": matters_sd}
     asked["limit"] = limit or DEFAULT_DIFFERENCES
     if run_ids:
         found = compare_runs(view.connection, run_ids, **asked)
@@ -289,6 +294,7 @@ def _measures(found: Comparison) -> Table | None:
             _medians(each.spread),
             _ranges(each.spread),
             _told(each.different),
+            _intervals(each.interval),
             _told(each.runs_wanted),
         ]
         for each in found.measures
@@ -341,6 +347,7 @@ def _difference_row(difference: Difference, *, with_extremes: bool) -> list[Any]
         _against_first(figures(difference.effect)),
         _against_first(figures(difference.deviation_ratio)),
         _told(difference.different),
+        _intervals(difference.interval),
         figures(difference.min) if with_extremes else None,
         figures(difference.max) if with_extremes else None,
     ]
@@ -355,6 +362,10 @@ def _against_first(figures: Sequence[Any]) -> Any:
 def _told(verdicts: Sequence[Any]) -> Any:
     """What is said of each group but the first; None where nothing is said of any."""
     return _against_first(verdicts) if any(each is not None for each in verdicts[1:]) else None
+
+
+def _intervals(found: Sequence[tuple[float, float] | None]) -> Any:
+    return _told([None if each is None else figures(each) for each in found])
 
 
 def _hint(found: Comparison, told: int, differing: int, only_in: int) -> str | None:

@@ -5,10 +5,15 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Final, NamedTuple, TypeAlias
 
 MOST_CHANCE: Final = 0.002  # that any of the figures compared at once differs among like runs
+MATTERS_SD: Final = 1.0  # a difference that matters, in standard deviations between like runs
 MOST_REPEATED: Final = 10  # runs of each group: who asks for more of them has no answer
+_OUTSIDE: Final = 0.1  # how often an interval does not hold the difference
+_MOST_SPLIT: Final = 0.05  # 4 runs of each: the least that tell normal figures from two clusters
+_DUST: Final = 1e-9  # of the largest figure: what differs by less differs by rounding
 
 
 class Spread(NamedTuple):
@@ -31,35 +36,68 @@ class Verdict(NamedTuple):
     """Whether a group differs from the first by more than like runs do.
 
     Attributes:
-        different: None where that cannot be told; False where even 10 runs of each that went on
-            like these would not show a difference.
-        runs_wanted: So many runs of each would show it, if they went on like these; None where
-            they need not, or would not.
+        different: None where that cannot be told yet; False where a difference that matters is
+            excluded.
+        runs_wanted: So many runs of each would tell, if they went on like these; None where they
+            need not, or where even 10 would not.
+        interval: The difference from the mean of the first group lies in it nine times of ten;
+            None where like runs were not seen to differ.
     """
 
     different: bool | None
     runs_wanted: int | None = None
+    interval: tuple[float, float] | None = None
 
 
 Chance: TypeAlias = Callable[[Sequence[float], Sequence[float]], "float | None"]
 
 
-def chance_of(first: Sequence[float], other: Sequence[float]) -> float | None:
-    """How often two groups of like runs would lie as far apart as these: Student's t test.
+class _Apart(NamedTuple):
+    """How far the means of two groups are apart, and how well that is known.
 
-    Two-sided, with the pooled variance (Student, The probable error of a mean, Biometrika 6,
-    1908). 0 where like runs agree to the last digit and the groups do not. None for one run each:
-    then nothing tells how much like runs differ.
+    Attributes:
+        by: The other mean less the first.
+        deviation: The standard deviation between like runs, pooled over both groups (Student, The
+            probable error of a mean, Biometrika 6, 1908); 0 where they agree but for rounding.
+        error: The standard error of `by`.
+        freedom: The degrees of freedom of `deviation`.
+        split: How often runs that fall into two clusters by chance alone, whatever their figures,
+            would be parted as these groups are: two of all ways to choose the runs of one group
+            (R. A. Fisher, The Design of Experiments, 1935, section 21).
     """
+
+    by: float
+    deviation: float
+    error: float
+    freedom: int
+    split: float
+
+
+def _apart(first: Sequence[float], other: Sequence[float]) -> _Apart | None:
+    """None for one run each: then nothing tells how much like runs differ."""
     freedom = len(first) + len(other) - 2
     if freedom < 1 or not first or not other:
         return None
-    apart = abs(statistics.fmean(other) - statistics.fmean(first))
-    squares = sum(statistics.pvariance(group) * len(group) for group in (first, other))
-    variance = squares / freedom * (1 / len(first) + 1 / len(other))
-    if math.isclose(apart, 0, abs_tol=1e-9 * max(map(abs, (*first, *other)))):
-        return 1.0
-    return chance_beyond(apart, variance, freedom)
+    means = [math.fsum(group) / len(group) for group in (first, other)]
+    groups = zip(means, (first, other), strict=True)
+    squares = math.fsum((each - mean) ** 2 for mean, group in groups for each in group)
+    dust = _DUST * max(map(abs, (*first, *other)))
+    by, deviation = means[1] - means[0], math.sqrt(squares / freedom)
+    by, deviation = (0.0 if abs(each) <= dust else each for each in (by, deviation))
+    error = deviation * math.sqrt(1 / len(first) + 1 / len(other))
+    return _Apart(by, deviation, error, freedom, 2 / math.comb(freedom + 2, len(first)))
+
+
+def chance_of(first: Sequence[float], other: Sequence[float]) -> float | None:
+    """How often two groups of like runs would lie as far apart as these: Student's t test.
+
+    Two-sided, with the pooled variance. 0 where like runs agree to the last digit and the groups do
+    not. None for one run each: then nothing tells how much like runs differ.
+    """
+    apart = _apart(first, other)
+    if apart is None:
+        return None
+    return chance_beyond(abs(apart.by), apart.error**2, apart.freedom) if apart.by else 1.0
 
 
 def chance_beyond(apart: float, variance: float, freedom: int) -> float:
@@ -120,49 +158,76 @@ def verdicts_on(
     tests: int,
     chance: Chance = chance_of,
     tests_of_more: int = 0,
+    matters_sd: float = MATTERS_SD,
 ) -> list[Verdict]:
     """Of each group whether it differs from the first by more than like runs do.
 
-    False for the first; None where that cannot be told, or a figure of any run is missing.
+    True where like runs would lie as far apart too seldom, both as normal figures (`chance`) and as
+    figures that fall into two clusters (`_Apart.split`); the latter takes at least 4 runs of each,
+    and 7 where the runs of each group agree to the last digit. False where a difference that
+    matters is excluded: two one-sided tests at 5 %, which is the same as an interval of 90 % within
+    the margin (D. J. Schuirmann, A comparison of the two one-sided tests procedure, J.
+    Pharmacokinetics and Biopharmaceutics 15, 1987). Of a figure whose unit nobody told, the one
+    scale there is is how much like runs differ: the margin is `matters_sd` of their standard
+    deviations, as far as these runs tell it. Where like runs agree to the last digit and the groups
+    do as well, False takes as many runs as True would. The first is False; None where that cannot
+    be told, or a figure of any run is missing.
 
     Args:
         groups: A figure of each run of each group.
-        tests: How many such questions are asked at once: the more, the surer each has to be.
+        tests: How many such questions are asked at once: the more, the surer True has to be.
         chance: How often like runs lie as far apart.
         tests_of_more: How many are asked once there are more runs, if not as many.
+        matters_sd: The least difference that matters.
     """
     known = [[each for each in group if each is not None] for group in groups]
     if any(len(a) < len(b) for a, b in zip(known, groups, strict=True)):
         return [Verdict(None)] * len(groups)
     limits = [MOST_CHANCE / max(each, 1) for each in (tests, tests_of_more or tests)]
-    others = (_verdict(known[0], other, limits, chance) for other in known[1:])
+    others = (_verdict(known[0], other, limits, chance, matters_sd) for other in known[1:])
     return [Verdict(False), *others]
 
 
 def _verdict(
-    first: Sequence[float], other: Sequence[float], limits: Sequence[float], chance: Chance
+    first: Sequence[float],
+    other: Sequence[float],
+    limits: Sequence[float],
+    chance: Chance,
+    matters_sd: float,
 ) -> Verdict:
-    limit, of_more = limits
-    found = chance(first, other)
-    if found is None or found < limit:
-        return Verdict(None if found is None else True)
-    wanted = _runs_wanted(first, other, of_more, chance)
-    return Verdict(None if wanted else False, wanted)
-
-
-def _runs_wanted(
-    first: Sequence[float], other: Sequence[float], limit: float, chance: Chance
-) -> int | None:
-    """The fewest runs of each that would show a difference, if they went on like these."""
-
-    def shows(runs: int) -> bool:
-        found = chance(_so_many(first, runs), _so_many(other, runs))
-        return found is not None and found < limit
-
-    if not shows(MOST_REPEATED):
-        return None
+    apart = _apart(first, other)
+    if apart is None:
+        return Verdict(None)
+    within = apart.error * _student_quantile(apart.freedom)
+    interval = (apart.by - within, apart.by + within) if apart.deviation else None
+    different = _differs(first, other, limits[0], chance, matters_sd)
+    if different is not None:
+        return Verdict(different, None, interval)
     fewest = min(len(first), len(other)) + 1
-    return next((runs for runs in range(fewest, MOST_REPEATED) if shows(runs)), MOST_REPEATED)
+    for runs in range(fewest, MOST_REPEATED + 1):
+        more = _so_many(first, runs), _so_many(other, runs)
+        if _differs(*more, limits[1], chance, matters_sd) is not None:
+            return Verdict(None, runs, interval)
+    return Verdict(None, None, interval)
+
+
+def _differs(
+    first: Sequence[float],
+    other: Sequence[float],
+    limit: float,
+    chance: Chance,
+    matters_sd: float,
+) -> bool | None:
+    apart, found = _apart(first, other), chance(first, other)
+    if apart is None or found is None:
+        return None
+    is_repeated = apart.split < (_MOST_SPLIT if apart.deviation else MOST_CHANCE)
+    if found < limit and is_repeated:
+        return True
+    if not apart.deviation:
+        return False if is_repeated and not apart.by else None
+    farthest = abs(apart.by) + apart.error * _student_quantile(apart.freedom)
+    return False if farthest < matters_sd * apart.deviation else None
 
 
 def _so_many(figures: Sequence[float], runs: int) -> list[float]:
@@ -185,3 +250,13 @@ def _student_tail(t: float, freedom: int) -> float:
         total += term
     inside = 2 / math.pi * (angle + sine * total) if odd else sine * total
     return max(0.0, 1 - inside)
+
+
+@cache
+def _student_quantile(freedom: int) -> float:
+    """The |t| that chance exceeds in one case of ten."""
+    low, high = 0.0, 10.0  # of one degree of freedom it is 6.3
+    while high - low > 1e-9:
+        middle = (low + high) / 2
+        low, high = (middle, high) if _student_tail(middle, freedom) > _OUTSIDE else (low, middle)
+    return high

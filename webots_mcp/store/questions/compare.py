@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
 import time
 from collections.abc import Sequence
@@ -10,12 +11,19 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
+from webots_mcp.store.analysis.spread import MATTERS_SD
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.differences import Difference, difference_of, only_in, size_of
-from webots_mcp.store.questions.outcomes import Measure, RunPart, outcomes_of, sampling_notes
+from webots_mcp.store.questions.outcomes import (
+    OUT_OF_TIME,
+    Measure,
+    RunPart,
+    outcomes_of,
+    sampling_notes,
+)
 from webots_mcp.store.questions.runs import RunInfo, run_infos
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import whole_run
@@ -43,7 +51,7 @@ _CODE_OF_RUNS: Final = (
 
 @dataclass(frozen=True)
 class Group:
-    """Runs that are looked at as one: a single run, or all with the same code.
+    """Runs that are looked at as one: a single run, or all that repeat it.
 
     Attributes:
         total_duration_s: Simulated seconds of all its runs together, as long as they are.
@@ -89,11 +97,13 @@ def compare_runs(
     names: Sequence[str] = ("*",),
     limit: int = 30,
     options: EventOptions | None = None,
+    matters_sd: float = MATTERS_SD,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Comparison:
-    """Compare runs, aligned at their start; the first one is the reference.
+    """Compare runs, aligned at their start; that of the first one is the reference.
 
-    Of a single run it tells what that came to.
+    Where some of them have the same robot, code and parameters and others have not, those that
+    have are one group. Of a single run it tells what that came to.
 
     Args:
         connection: Any.
@@ -101,17 +111,30 @@ def compare_runs(
         names: Signals, with `*`.
         limit: The most differences to return.
         options: What counts as an event, and what the position and the mode are.
-        deadline_s: After it, the answer is made from what was read, and the notes say so.
+        matters_sd: The least difference that matters, in standard deviations between like runs.
+        deadline_s: After it, figures for which not all rows were read are None.
 
     Raises:
-        InvalidInputError: No run, more than 10, or one twice.
+        InvalidInputError: No run, more than 10, or one twice; nothing could matter.
         UnknownRunError, UnknownSignalError: As they say.
         NothingRecordedError: A run has no state row.
     """
     if not 1 <= len(run_ids) <= MOST_COMPARED or len(set(run_ids)) < len(run_ids):
         raise InvalidInputError(f"give 1 to {MOST_COMPARED} different runs, not {list(run_ids)}")
-    groups = {f"run {run_id}": [run_id] for run_id in run_ids}
-    return _compare(connection, groups, names, limit, options or EventOptions(), deadline_s)
+    asked = _Asked(names, limit, options or EventOptions(), matters_sd, deadline_s)
+    return _compare(connection, _repeats(connection, run_ids), asked)
+
+
+def _repeats(connection: sqlite3.Connection, run_ids: Sequence[int]) -> dict[str, list[int]]:
+    """Runs by robot, code and parameters, if that makes groups; by themselves where it does not."""
+    had = parameters_of(connection, run_ids)
+    groups: dict[object, list[int]] = {}
+    for run_id, run in zip(run_ids, run_infos(connection, run_ids), strict=True):
+        values = sorted((name, repr(each.values)) for name, each in had.get(run_id, {}).items())
+        code = run.controller_sha256 or run_id  # of unknown code nothing is a repeat
+        groups.setdefault((run.robot, code, *values), []).append(run_id)
+    alike = groups.values() if len(groups) > 1 else [[run_id] for run_id in run_ids]
+    return {f"run{'s' * (len(each) > 1)} {', '.join(map(str, each))}": each for each in alike}
 
 
 @in_one_snapshot
@@ -122,6 +145,7 @@ def compare_code(
     names: Sequence[str] = ("*",),
     limit: int = 30,
     options: EventOptions | None = None,
+    matters_sd: float = MATTERS_SD,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Comparison:
     """Compare the runs before and after the last edit of the robot's controller.
@@ -149,7 +173,8 @@ def compare_code(
         )
     (_, after), (_, before) = blocks
     groups = {"before": before[:MOST_COMPARED][::-1], "after": after[:MOST_COMPARED][::-1]}
-    return _compare(connection, groups, names, limit, options or EventOptions(), deadline_s)
+    asked = _Asked(names, limit, options or EventOptions(), matters_sd, deadline_s)
+    return _compare(connection, groups, asked)
 
 
 @in_one_snapshot
@@ -160,6 +185,7 @@ def compare_trials(
     names: Sequence[str] = ("*",),
     limit: int = 30,
     options: EventOptions | None = None,
+    matters_sd: float = MATTERS_SD,
     deadline_s: float = COMPARE_DEADLINE_S,
 ) -> Comparison:
     """Compare the runs of a trial set by their parameters; the best is the reference.
@@ -173,41 +199,51 @@ def compare_trials(
     """
     found = scored_runs(connection, set_id)
     groups = {name: found[name][:MOST_COMPARED] for name in list(found)[:MOST_SETS]}
-    compared = _compare(connection, groups, names, limit, options or EventOptions(), deadline_s)
+    asked = _Asked(names, limit, options or EventOptions(), matters_sd, deadline_s)
+    compared = _compare(connection, groups, asked)
     if len(found) == len(groups):
         return compared
     note = f"the best {len(groups)} of {len(found)} sets of parameters"
     return replace(compared, notes=(note, *compared.notes))
 
 
+@dataclass(frozen=True)
+class _Asked:
+    names: Sequence[str]
+    limit: int
+    options: EventOptions
+    matters_sd: float
+    deadline_s: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.matters_sd < math.inf:
+            raise InvalidInputError(f"matters_sd={self.matters_sd} must be a number above 0")
+
+
 def _compare(
-    connection: sqlite3.Connection,
-    groups: dict[str, list[int]],
-    names: Sequence[str],
-    limit: int,
-    options: EventOptions,
-    deadline_s: float,
+    connection: sqlite3.Connection, groups: dict[str, list[int]], asked: _Asked
 ) -> Comparison:
+    options = asked.options
     parts = [[_part(connection, run_id, options) for run_id in found] for found in groups.values()]
     segments = [part.segment for found in parts for part in found]
     durations_s = {segment.run_id: segment.end_s - segment.start_s for segment in segments}
     compared_s = min(durations_s.values())
     cut = [[each.cut(compared_s) for each in found] for found in parts]
-    deadline = Deadline(deadline_s)
-    differences = _differences(connection, cut, names, deadline)
-    shared = sorted((each for each in differences if all(each.count)), key=size_of, reverse=True)
+    deadline = Deadline(asked.deadline_s)
+    differences = _differences(connection, cut, asked, deadline)
+    shared = [each for each in differences if 0 not in each.count]
+    shared.sort(key=size_of, reverse=True)
     told = _groups(connection, groups)
-    outcomes = outcomes_of(connection, cut, options, deadline)
+    outcomes = outcomes_of(connection, cut, options, deadline, asked.matters_sd)
+    unread = any(None in each.count for each in differences)
     notes = _notes(told) + _cut_notes(durations_s, compared_s)
     notes += sampling_notes(connection, [part for found in cut for part in found])
-    if deadline.passed:
-        notes.append(f"the time of {deadline_s:g} s was over: not all rows were looked at")
     return Comparison(
         groups=told,
         compared_s=compared_s,
         measures=outcomes.measures,
-        not_known=outcomes.not_known,
-        differences=tuple(shared[:limit]),
+        not_known=outcomes.not_known | ({"means of signals": OUT_OF_TIME} if unread else {}),
+        differences=tuple(shared[: asked.limit]),
         total=len(shared),
         only_in=only_in(differences, list(groups)),
         notes=tuple(notes),
@@ -217,18 +253,19 @@ def _compare(
 def _differences(
     connection: sqlite3.Connection,
     groups: Sequence[Sequence[RunPart]],
-    names: Sequence[str],
+    asked: _Asked,
     deadline: Deadline,
 ) -> list[Difference]:
     """The numbers of those names, group beside group; none where a run stands alone."""
     parts = [part for group in groups for part in group]
     known = {name: signal for part in reversed(parts) for name, signal in part.known.items()}
-    found = resolve_signals(known, names)
+    found = resolve_signals(known, asked.names)
     numbers = [each for each in found if each.is_number and len(parts) > 1]
     summaries = [
         [_summarise(connection, part, numbers, deadline) for part in group] for group in groups
     ]
-    return [difference_of(signal, summaries, 2 * len(numbers)) for signal in numbers]
+    tests = 2 * len(numbers)
+    return [difference_of(signal, summaries, tests, asked.matters_sd) for signal in numbers]
 
 
 def _notes(groups: Sequence[Group]) -> list[str]:
@@ -237,7 +274,6 @@ def _notes(groups: Sequence[Group]) -> list[str]:
     if 1 < len(runs) == len(groups):
         notes.append(
             "one run each: whether they differ by more than like runs do is not known; repeat them"
-            + _of_like_code(runs)
         )
     robots = list(dict.fromkeys(run.robot for run in runs))
     if len(robots) > 1:
@@ -249,21 +285,6 @@ def _notes(groups: Sequence[Group]) -> list[str]:
             "not known (null)"
         )
     return notes
-
-
-def _of_like_code(runs: Sequence[RunInfo]) -> str:
-    """Which of the runs are repeats of each other, and how they are compared as such."""
-    by_code: dict[str | None, list[str]] = {}
-    for run in runs:
-        by_code.setdefault(run.controller_sha256, []).append(str(run.run_id))
-    alike = [" and ".join(ids) for code, ids in by_code.items() if code and len(ids) > 1]
-    if len(by_code) < 2 or not alike:
-        return ""
-    which = "; ".join(alike)
-    return (
-        f". Runs {which} had the same controller file: without run_ids, the runs before and after "
-        "the last edit are compared as two groups"
-    )
 
 
 def _cut_notes(durations_s: dict[int, float], compared_s: float) -> list[str]:
@@ -289,10 +310,12 @@ def _part(connection: sqlite3.Connection, run_id: int, options: EventOptions) ->
 
 def _summarise(
     connection: sqlite3.Connection, part: RunPart, signals: Sequence[Signal], deadline: Deadline
-) -> dict[str, Summary]:
-    """Each signal that the run has over its compared stretch."""
+) -> dict[str, Summary] | None:
+    """Each signal that the run has over its compared stretch; None where not all was read."""
     own = [part.known[signal.name] for signal in signals if signal.name in part.known]
     pieces = read_pieces(connection, part.segment, own, deadline, COARSE_S)
+    if pieces.cut_at_s is not None:
+        return None
     return {signal.name: pieces.summaries(signal.name).whole() for signal in own}
 
 

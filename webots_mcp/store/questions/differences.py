@@ -30,6 +30,7 @@ class Difference:
             be independent, so it describes, and proves nothing.
         different: Whether the means or the deviations differ by more than those of like runs do;
             None where that cannot be told (`analysis.spread`).
+        interval: The difference of the means of the groups lies in it nine times of ten.
     """
 
     name: str
@@ -39,23 +40,41 @@ class Difference:
     deviation: list[Spread | None]
     min: list[float | None]
     max: list[float | None]
-    count: list[int]
+    count: list[int | None]
     deviation_ratio: list[float | None]
     effect: list[float | None]
     different: list[bool | None]
+    interval: list[tuple[float, float] | None]
 
 
 def difference_of(
-    signal: Signal, groups: Sequence[Sequence[dict[str, Summary]]], tests: int
+    signal: Signal,
+    groups: Sequence[Sequence[dict[str, Summary] | None]],
+    tests: int,
+    matters_sd: float,
 ) -> Difference:
-    """A signal in each run of each group; of so many tests that are made at once."""
-    runs = [[run.get(signal.name, Summary()) for run in group] for group in groups]
+    """A signal in each run of each group.
+
+    Args:
+        signal: Which.
+        groups: Of each run its summaries; None of one of which not all was read.
+        tests: So many are made at once.
+        matters_sd: See `analysis.spread`.
+    """
+    whole = [[run for run in group if run is not None] for group in groups]
+    is_whole = [len(a) == len(b) for a, b in zip(whole, groups, strict=True)]
+    runs = [[run.get(signal.name, Summary()) for run in group] for group in whole]
     runs = [[each for each in group if each.sum is not None] for group in runs]
     known = all(each.sines is not None for group in runs for each in group)
     turn = signal.turn if known else None
-    means, deviations = _means(turn, runs), _deviations(turn, runs)
+    means, deviations = (
+        [each if all_read else [None] for each, all_read in zip(figures, is_whole, strict=True)]
+        for figures in (_means(turn, runs), _deviations(turn, runs))
+    )
     mean, deviation = [spread_of(each) for each in means], [spread_of(each) for each in deviations]
-    verdicts = zip(verdicts_on(means, tests), verdicts_on(deviations, tests), strict=True)
+    of_means = verdicts_on(means, tests, matters_sd=matters_sd)
+    of_deviations = verdicts_on(deviations, tests, matters_sd=matters_sd)
+    verdicts = zip(of_means, of_deviations, strict=True)
     return Difference(
         name=signal.name,
         kind=signal.kind,
@@ -70,10 +89,14 @@ def difference_of(
             max((each.max for each in group if each.max is not None), default=None)
             for group in runs
         ],
-        count=[sum(each.present for each in group) for group in runs],
+        count=[
+            sum(each.present for each in group) if all_read else None
+            for group, all_read in zip(runs, is_whole, strict=True)
+        ],
         deviation_ratio=[_ratio(each, deviation[0]) for each in deviation],
         effect=[_effect(turn, mean, deviation, index) for index in range(len(groups))],
         different=[_either(a.different, b.different) for a, b in verdicts],
+        interval=[each.interval for each in of_means],
     )
 
 
@@ -139,7 +162,7 @@ def size_of(difference: Difference) -> tuple[bool, float]:
     effects = (math.inf if each is None else abs(each) for each in difference.effect[1:])
     ratios = (each for each in difference.deviation_ratio[1:] if each is not None)
     doublings = (math.inf if each == 0 else abs(math.log2(each)) for each in ratios)
-    return any(difference.different), max((*effects, *doublings))
+    return any(difference.different), max((0.0, *effects, *doublings))
 
 
 def only_in(differences: Sequence[Difference], groups: Sequence[str]) -> dict[str, tuple[str, ...]]:
@@ -147,5 +170,5 @@ def only_in(differences: Sequence[Difference], groups: Sequence[str]) -> dict[st
     return {
         each.name: tuple(group for group, count in zip(groups, each.count, strict=True) if count)
         for each in differences
-        if any(each.count) and not all(each.count)
+        if any(each.count) and 0 in each.count
     }

@@ -12,6 +12,7 @@ from webots_mcp.naming import NAME_POSITION
 from webots_mcp.store.analysis.spread import (
     Spread,
     Verdict,
+    chance_of,
     chance_of_counts,
     may_differ,
     spread_of,
@@ -37,6 +38,10 @@ _DUST: Final = 1e-9  # of a figure
 _RATE: Final = " per min"
 NO_MODE: Final = (
     "no mode is known: publish one as a text, such as mode, or name the signal of one: mode=NAME"
+)
+OUT_OF_TIME: Final = (
+    "the time was over before all rows were read: compare fewer runs at once, or ask again once a "
+    "server has summed them up"
 )
 _SPEED: Final = "mean_speed_m_s"
 
@@ -66,15 +71,17 @@ class Measure:
         spread: Over the runs of the group; None where it is not known of all of them.
         different: Whether the group differs from the first by more than like runs do; None where
             that cannot be told, because both groups are one run each, a figure is missing, or
-            more runs are wanted.
-        runs_wanted: So many runs of each group would show a difference, if they went on like
-            these; None where nothing shows that they would.
+            more runs are wanted; False where a difference that matters is excluded.
+        runs_wanted: So many runs of each group would tell, if they went on like these; None where
+            nothing shows that they would.
+        interval: The difference of the means lies in it nine times of ten (`analysis.spread`).
     """
 
     name: str
     spread: list[Spread | None]
     different: list[bool | None]
     runs_wanted: list[int | None]
+    interval: list[tuple[float, float] | None]
 
 
 @dataclass(frozen=True)
@@ -95,6 +102,7 @@ def outcomes_of(
     groups: Sequence[Sequence[RunPart]],
     options: EventOptions,
     deadline: Deadline,
+    matters_sd: float,
 ) -> Outcomes:
     """What the runs came to: the way, the modes and the events of the compared stretch."""
     found = [[_outcome(connection, part, options, deadline) for part in group] for group in groups]
@@ -103,11 +111,11 @@ def outcomes_of(
     kinds: list[str] = list(dict.fromkeys(kind for run in runs for kind in run.events))
     tests, of_more = _facts(found, list(names), kinds)
     measures = [
-        _measure(name, figures, verdicts_on(figures, tests, tests_of_more=of_more))
+        _measure(name, figures, verdicts_on(figures, tests, chance_of, of_more, matters_sd))
         for name in names
         for figures in [[[run.figure(name) for run in group] for group in found]]
     ]
-    measures += [_counted(kind, found, tests, of_more) for kind in kinds]
+    measures += [_counted(kind, found, tests, of_more, matters_sd) for kind in kinds]
     return Outcomes(tuple(measures), _not_known(runs))
 
 
@@ -140,23 +148,27 @@ def _varies(figures: Sequence[float | None]) -> bool:
 def _measure(
     name: str, groups: Sequence[Sequence[float | None]], verdicts: Sequence[Verdict]
 ) -> Measure:
-    different, wanted = zip(*verdicts, strict=True)
-    return Measure(name, [spread_of(each) for each in groups], list(different), list(wanted))
+    different, wanted, interval = map(list, zip(*verdicts, strict=True))
+    return Measure(name, [spread_of(each) for each in groups], different, wanted, interval)
 
 
-def _counted(kind: str, groups: Sequence[Sequence[_Outcome]], tests: int, of_more: int) -> Measure:
-    """Events per minute; whether they differ is asked of their counts."""
+def _counted(
+    kind: str,
+    groups: Sequence[Sequence[_Outcome]],
+    tests: int,
+    of_more: int,
+    matters_sd: float,
+) -> Measure:
+    """Events per minute; whether they differ is asked of their counts, in stretches of a length."""
     counts = [[run.events_of(kind) for run in group] for group in groups]
-    per_min = [
-        [
-            None if (count := run.events_of(kind)) is None else 60 * count / run.duration_s
-            for run in each
-        ]
-        for each in groups
+    rate = 60 / groups[0][0].duration_s
+    per_min = [[None if each is None else each * rate for each in group] for group in counts]
+    verdicts = verdicts_on(counts, tests, chance_of_counts, of_more, matters_sd)
+    scaled = [
+        each._replace(interval=each.interval and (each.interval[0] * rate, each.interval[1] * rate))
+        for each in verdicts
     ]
-    return _measure(
-        f"{kind}{_RATE}", per_min, verdicts_on(counts, tests, chance_of_counts, of_more)
-    )
+    return _measure(f"{kind}{_RATE}", per_min, scaled)
 
 
 def _not_known(runs: Sequence[_Outcome]) -> dict[str, str]:
@@ -216,19 +228,26 @@ def _outcome(
     if position is None:
         not_known["distance_m, mean_speed_m_s"] = NAME_POSITION
     else:
-        way = None if purged else read_way(connection, part.segment, position, deadline).length
+        read = None if purged else read_way(connection, part.segment, position, deadline)
+        way = None if read is None or deadline.passed else read.length
         speed = None if way is None else way.length_m / duration_s
         figures |= {"distance_m": way and way.length_m, _SPEED: speed}
         doubt = doubt_of_unit(position, speed or 0.0)
+        doubt = OUT_OF_TIME if deadline.passed else doubt
         if doubt := doubt or (way and doubt_of_length(way)):
             not_known["distance_m, mean_speed_m_s"] = doubt
     modes = _mode_times(connection, part, deadline)
+    if deadline.passed:
+        modes = {}
     figures |= {f"{_SHARE}{mode}": seconds / duration_s for mode, seconds in modes.items()}
     if not modes:
-        not_known["share of each mode"] = NO_MODE
+        not_known["share of each mode"] = OUT_OF_TIME if deadline.passed else NO_MODE
     found = _events(connection, part, options, deadline)
     verdicts = found.ledger.verdicts(found.kinds, found.events)
-    not_known |= {f"{kind}{_RATE}": why for kind, why in verdicts.not_searched.items()}
+    if deadline.passed:
+        not_known[f"events{_RATE}"] = OUT_OF_TIME
+    else:
+        not_known |= {f"{kind}{_RATE}": why for kind, why in verdicts.not_searched.items()}
     return _Outcome(
         run_id,
         duration_s,

@@ -22,6 +22,7 @@ from mcp import Client, StdioServerParameters
 from mcp.types import CallToolResult, ImageContent, TextContent
 
 from webots_mcp.cli.answers import answer_lines
+from webots_mcp.cli.terminal import rewrite
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, PRIVATE_FILE
 from webots_mcp.errors import NothingRecordedError, WebotsMCPError
@@ -150,13 +151,11 @@ async def _client(data_dir: Path) -> AsyncGenerator[Client, None]:
 
 
 async def _show_progress(progress: float, total: float | None, message: str | None) -> None:
-    if sys.stdout.isatty():
-        print(f"\r  {message or progress}", end="\x1b[K", flush=True)
+    rewrite(sys.stdout, f"  {message or progress}")
 
 
 def _clear_progress() -> None:
-    if sys.stdout.isatty():
-        print("\r\x1b[K", end="", flush=True)
+    rewrite(sys.stdout)
 
 
 def _show(result: CallToolResult) -> None:

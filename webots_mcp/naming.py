@@ -6,6 +6,7 @@ Recorded rows are read by these names, and so are the states that a controller p
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any, Final, TypeAlias
 
@@ -54,6 +55,9 @@ USUAL_POSITIONS: Final = (
 )
 NO_POSITION: Final = "no position is known: publish pose: [x, y], position: {x, y} or gps in metres"
 NAME_POSITION: Final = f"{NO_POSITION}, or name the signals of both: position=[x, y]"
+_OBEYED: Final = re.compile(
+    r"[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u206f]|\r(?!\n)"
+)
 _LONGEST_COMPARED: Final = 100  # characters of a name
 
 
@@ -234,6 +238,15 @@ def listed(names: Collection[str], most: int = 10) -> str:
     """The first of several names, and how many more there are."""
     more = len(names) - most
     return ", ".join(list(names)[:most]) + (f" and {more} more" if more > 0 else "")
+
+
+def spelled_out(text: str) -> str:
+    """A text without what a terminal obeys or what turns the direction of writing.
+
+    Control characters other than tabs and the ends of lines, and Unicode's marks of direction, are
+    spelled as JSON spells them.
+    """
+    return _OBEYED.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
 
 
 def nearest_first(name: str, known: Iterable[str]) -> list[str]:

@@ -9,6 +9,7 @@ from typing import Any, Final, TypeVar
 import numpy as np
 from bokeh.models import ColumnDataSource, HoverTool, LayoutDOM, Legend, LegendItem
 
+from webots_mcp.naming import spelled_out
 from webots_mcp.plotting.palette import FAINT, INK
 
 Key = TypeVar("Key", bound="tuple[object, ...]")
@@ -35,6 +36,7 @@ class Chart:
 
 def plain(text: str) -> str:
     """A text that is shown as it is: Bokeh takes what stands between `$$` for a formula."""
+    text = spelled_out(text)
     for mark in ("$$", "\\(", "\\["):
         text = text.replace(mark, f"{mark[0]}\u200b{mark[1]}")
     return text
@@ -44,6 +46,11 @@ def sources_of(data: Mapping[Key, dict[str, Any]]) -> dict[Key, ColumnDataSource
     """Data sources of columns; their names in the browser are such as "curve pose.x 3"."""
     names = {key: " ".join(str(part) for part in key if part != "") for key in data}
     return {key: ColumnDataSource(data=data[key], name=names[key]) for key in data}
+
+
+def texts(column: Sequence[str]) -> list[str]:
+    """A column of texts that were recorded."""
+    return [spelled_out(text) for text in column]
 
 
 def numbers(values: Sequence[float]) -> np.ndarray[Any, Any]:
@@ -74,7 +81,8 @@ def style(fig: Any) -> None:
 def hover(renderers: Sequence[Any], tooltips: Sequence[tuple[str, str]], **options: Any) -> Any:
     """What is told under the pointer; it is one of many and needs no button of its own."""
     tool: Any = HoverTool  # its types do not take a list of renderers of one kind
-    return tool(renderers=list(renderers), tooltips=list(tooltips), visible=False, **options)
+    told = [(spelled_out(name), value) for name, value in tooltips]
+    return tool(renderers=list(renderers), tooltips=told, visible=False, **options)
 
 
 def legend(items: Sequence[LegendItem]) -> Legend:

@@ -23,7 +23,7 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
-from webots_mcp.charts.chart import Chart, hover, legend, numbers, plain, sources_of, style
+from webots_mcp.charts.chart import Chart, hover, legend, numbers, plain, sources_of, style, texts
 from webots_mcp.plotting.canvas import Room, short
 from webots_mcp.plotting.curves import Curve, Point
 from webots_mcp.plotting.intervals import Interval, Lane
@@ -357,7 +357,7 @@ def _columns(intervals: Sequence[Interval]) -> dict[str, Any]:
     return {
         "start_s": numbers([each.start_s for each in intervals]),
         "end_s": numbers([each.end_s for each in intervals]),
-        "value": [each.value for each in intervals],
+        "value": texts([each.value for each in intervals]),
     }
 
 

@@ -21,7 +21,7 @@ from bokeh.models import (
 )
 from bokeh.plotting import figure
 
-from webots_mcp.charts.chart import Chart, hover, legend, numbers, plain, sources_of, style
+from webots_mcp.charts.chart import Chart, hover, legend, numbers, plain, sources_of, style, texts
 from webots_mcp.charts.obstacles import Obstacle, obstacles_of
 from webots_mcp.plotting.canvas import short
 from webots_mcp.plotting.intervals import Lane
@@ -157,14 +157,14 @@ def _obstacles(fig: Any, obstacles: Sequence[Obstacle]) -> None:
     shapes = ColumnDataSource({
         "xs": [[x for x, _ in each.outline] for each in outlined],
         "ys": [[y for _, y in each.outline] for each in outlined],
-        "name": [each.name for each in outlined],
+        "name": texts([each.name for each in outlined]),
     })  # fmt: skip
     areas = fig.patches("xs", "ys", source=shapes, fill_color="#D0D0D0", line_color=FAINT)
     points = [each for each in obstacles if not each.outline]
     marks = ColumnDataSource({
         "x": [each.x for each in points],
         "y": [each.y for each in points],
-        "name": [each.name for each in points],
+        "name": texts([each.name for each in points]),
     })  # fmt: skip
     dots = fig.scatter(
         "x", "y", source=marks, marker="square", size=9, color="#BBBBBB", line_color=FAINT
@@ -211,7 +211,7 @@ def _steps(track: Track, colour: str) -> dict[str, Any]:
         "x1": numbers([after.x for _, after in steps]),
         "y1": numbers([after.y for _, after in steps]),
         "time_s": numbers([after.time_s for _, after in steps]),
-        "value": values,
+        "value": texts(values),
         "colour": [styles[value].colour if value in styles else colour for value in values],
     }
 

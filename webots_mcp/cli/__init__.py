@@ -37,8 +37,10 @@ from webots_mcp.cli import (
 )
 from webots_mcp.cli.command import COMMANDS
 from webots_mcp.cli.ending import ended_by, ending_by_signals
+from webots_mcp.cli.terminal import spelling_out
 from webots_mcp.cli.wording import as_typed, speak_of
 from webots_mcp.errors import WebotsMCPError
+from webots_mcp.naming import spelled_out
 
 __all__ = ["COMMANDS", "main"]
 
@@ -78,8 +80,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         with ending_by_signals():
             arguments = _parser().parse_args(argv)
             speak_of(arguments.arguments)
-            code = arguments.run(arguments) or 0
-            sys.stdout.flush()
+            with spelling_out():
+                code = arguments.run(arguments) or 0
+                sys.stdout.flush()
             return code
     except WebotsMCPError as error:
         return _end(EXIT_BAD_INPUT, as_typed(str(error)))
@@ -100,7 +103,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _end(code: int, text: str) -> int:
     """Say why in one line; what could not be printed before is not tried again at the exit."""
     with contextlib.suppress(OSError):
-        print(f"webots-mcp: {text}", file=sys.stderr, flush=True)
+        print(f"webots-mcp: {spelled_out(text)}", file=sys.stderr, flush=True)
     try:
         sys.stdout.flush()
     except OSError:

@@ -27,6 +27,7 @@ from webots_mcp.cli.limits import LIMITS, limits_of
 from webots_mcp.cli.progress import shown_progress
 from webots_mcp.cli.ranges import RANGE, range_of, scope_of
 from webots_mcp.cli.tables import id_ranges, print_json, print_notes, print_table
+from webots_mcp.cli.terminal import binary_stdout
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -80,7 +81,7 @@ def export(arguments: argparse.Namespace) -> None:
             else:
                 wanted = range_of(connection, arguments)
             if file is None:
-                write(connection, wanted, form, sys.stdout.buffer, progress, safe_cells=safe)
+                write(connection, wanted, form, binary_stdout(), progress, safe_cells=safe)
             else:
                 rows = export_file(connection, wanted, form, file, progress, safe_cells=safe)
                 print(f"{file}: {rows} rows")

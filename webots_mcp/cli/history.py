@@ -23,7 +23,7 @@ from webots_mcp.cli.command import (
 )
 from webots_mcp.cli.comparison import print_comparison
 from webots_mcp.cli.ranges import RANGE, range_of, scope_of
-from webots_mcp.cli.tables import clock_text, print_json, print_notes, print_table
+from webots_mcp.cli.tables import clock_text, print_json, print_notes, print_table, printable
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -222,7 +222,7 @@ def write_picture(file: Path, picture: Picture) -> None:
         file.write_bytes(picture.data)
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error
-    print(f"{file}: {picture.caption}")
+    print(f"{file}: {printable(picture.caption)}")
     print_notes(picture.notes)
 
 

@@ -21,6 +21,7 @@ from webots_mcp.cli.command import (
     question,
     reading,
 )
+from webots_mcp.cli.tables import printable
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -146,15 +147,14 @@ def _robot_as_text(robot: dict[str, Any]) -> str:
     ]
     lines += [f"  {robot['why']}"] if robot["why"] else []
     lines += [f"  last error: {robot['last_error']}"] if robot["last_error"] else []
-    return "\n".join(lines)
+    return "\n".join(map(printable, lines))
 
 
 def _print_lines(lines: Sequence[Line]) -> None:
     for line in lines:
         clock = time.strftime("%H:%M:%S", time.localtime(line.wall_time_s))
         at = "" if line.sim_time_s is None else f"{line.sim_time_s:.3f} s"
-        text = line.text.replace("\n", "\\n")
-        print(f"{clock} {line.robot} {at:>11} {line.kind:<8} {text}", flush=True)
+        print(printable(f"{clock} {line.robot} {at:>11} {line.kind:<8} {line.text}"), flush=True)
 
 
 def _newest_states_only(lines: Sequence[Line]) -> list[Line]:

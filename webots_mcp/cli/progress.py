@@ -8,6 +8,8 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Final
 
+from webots_mcp.cli.terminal import rewrite
+
 _INTERVAL_S: Final = 0.1
 
 
@@ -23,7 +25,7 @@ def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
         nonlocal next_s
         if time.monotonic() >= next_s:
             next_s = time.monotonic() + _INTERVAL_S
-            print(f"\r{doing}: {100 * done // max(of, 1)} %", end="\x1b[K", file=sys.stderr)
+            rewrite(sys.stderr, f"{doing}: {100 * done // max(of, 1)} %")
 
     if not sys.stderr.isatty():
         yield lambda done, of: None
@@ -31,4 +33,4 @@ def shown_progress(doing: str) -> Generator[Callable[[int, int], None]]:
     try:
         yield show
     finally:
-        print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        rewrite(sys.stderr)

@@ -16,7 +16,7 @@ from webots_mcp.cli.command import (
     row_id,
 )
 from webots_mcp.cli.progress import shown_progress
-from webots_mcp.cli.tables import print_notes
+from webots_mcp.cli.tables import print_notes, printable
 
 
 @question(
@@ -56,5 +56,5 @@ def report(arguments: argparse.Namespace) -> None:
         write_report(file, made.html, overwrite=arguments.overwrite)
     held = ", ".join(f"{name} {count}" for name, count in made.holds.items())
     holds = f"; {held}" if held else ""
-    print(f"{file}: {made.title}, {size(len(made.html))}{holds}")
+    print(f"{file}: {printable(made.title)}, {size(len(made.html))}{holds}")
     print_notes([f"left out: {each}" for each in made.left_out])

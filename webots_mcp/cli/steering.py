@@ -21,6 +21,7 @@ from webots_mcp.cli.command import (
     settings_of,
 )
 from webots_mcp.cli.tables import print_table, text_of
+from webots_mcp.cli.terminal import rewrite
 from webots_mcp.cli.tuning import parameters_of
 from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError
@@ -184,14 +185,12 @@ def _line_of_progress() -> Generator[None]:
     try:
         yield
     finally:
-        if sys.stderr.isatty():
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)
+        rewrite(sys.stderr)
 
 
 async def show_progress(progress: float, total: float | None, text: str) -> None:
     """On a terminal one line that changes; in a pipe nothing, as for all commands."""
-    if sys.stderr.isatty():
-        print(f"\r{text}", end="\x1b[K", file=sys.stderr, flush=True)
+    rewrite(sys.stderr, text)
 
 
 def writable(arguments: argparse.Namespace) -> Recording:

@@ -10,6 +10,7 @@ from bokeh.layouts import column
 from bokeh.models import Button, CheckboxGroup, Column, Div, NumericInput, Row, Select, TextInput
 from bokeh.models import Checkbox as Switch
 
+from webots_mcp.naming import spelled_out
 from webots_mcp.page.looking import Look, Surroundings, run_title
 from webots_mcp.page.style import STATUS, sheet
 from webots_mcp.parameter import Value
@@ -44,11 +45,13 @@ class SignalTree:
         children: list[Any] = []
         for branch, below in _by_branch(names).items():
             labels = [name if branch == _ABOVE else name[len(branch) + 1 :] for name in below]
-            group = CheckboxGroup(labels=labels, margin=(0, 0, 4, 8))
+            group = CheckboxGroup(labels=list(map(spelled_out, labels)), margin=(0, 0, 4, 8))
             group.on_change("active", self._on_change)
             self._groups[group] = below
             if branch != _ABOVE:
-                children.append(Div(text=branch, render_as_text=True, margin=(2, 0, 0, 0)))
+                children.append(
+                    Div(text=spelled_out(branch), render_as_text=True, margin=(2, 0, 0, 0))
+                )
             children.append(group)
         self.layout.children = children
         self.choose(chosen)
@@ -121,7 +124,7 @@ class Selectors:
         """Show what there is to choose from; what is chosen and gone is chosen no more."""
         runs = [(str(run.run_id), run_title(run)) for run in around.runs]
         self._is_told = True
-        _offer(self.robot, [(name, name) for name in around.robots], shown.robot)
+        _offer(self.robot, [(name, spelled_out(name)) for name in around.robots], shown.robot)
         _offer(self.run, [(NEWEST, "newest run"), *runs], NEWEST)
         _offer(self.beside, [(NONE, "no other"), *runs], NONE)
         self._is_told = False

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from webots_mcp.charts import SignalsChart, WayChart
-from webots_mcp.naming import Value
+from webots_mcp.naming import Value, spelled_out
 from webots_mcp.plotting.palette import FAINT, area_styles
 from webots_mcp.store.reading.changes import spelled
 from webots_mcp.store.reading.rows import Columns
@@ -77,7 +77,9 @@ def _go_on(source: Any, times: Sequence[float], values: Sequence[Value]) -> None
 
 def _spelled(value: Value) -> str:
     """As the rows and the legend name it."""
-    return spelled(value) if value is None or isinstance(value, (str, bool)) else f"{value:g}"
+    if value is None or isinstance(value, (str, bool)):
+        return spelled_out(spelled(value))
+    return f"{value:g}"
 
 
 def _colour(value: str, known: dict[str, str]) -> str:

@@ -18,6 +18,7 @@ from webots_mcp.errors import (
     UnknownRobotError,
     UnknownSignalError,
 )
+from webots_mcp.naming import spelled_out
 from webots_mcp.page.choice import Choice
 from webots_mcp.plotting.question import changed_most
 from webots_mcp.plotting.signal_axes import SignalAxes
@@ -232,6 +233,6 @@ def rows_after(
 
 def run_title(run: RunInfo) -> str:
     """A run in a list: its number, label, begin and length."""
-    label = f" “{run.label}”" if run.label else ""
+    label = f" “{spelled_out(run.label)}”" if run.label else ""
     began = datetime.fromtimestamp(run.started_wall_time_s).strftime("%d %b %H:%M:%S")
     return f"run {run.run_id}{label} · {began} · {run.duration_s:.1f} s"

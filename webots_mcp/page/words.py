@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
+import html
 import io
 from collections.abc import Sequence
-from html import escape
 from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.errors import NoDatabaseError, NothingRecordedError, WebotsMCPError
+from webots_mcp.naming import spelled_out
 from webots_mcp.page.looking import Look
 from webots_mcp.store.images import StoredImage, opened
 from webots_mcp.store.logs import LogLine
@@ -23,6 +24,11 @@ _DEFECT: Final = (
 _SIDE_PX: Final = 640
 _JPEG_QUALITY: Final = 80
 _LEVELS: Final = {"warning": "warning", "error": "error", "critical": "error"}
+
+
+def escape(text: str) -> str:
+    """A text that was recorded, as one that is only shown."""
+    return html.escape(spelled_out(text))
 
 
 def status_markup(shown: Look) -> str:

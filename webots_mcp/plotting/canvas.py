@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.naming import spelled_out
 from webots_mcp.plotting.fonts import fit_fonts
 from webots_mcp.plotting.palette import FAINT, INK
 from webots_mcp.store.questions.series import MOST_POINTS
@@ -146,10 +147,19 @@ def draw(sheet: Sheet, paint: Callable[[Any], None]) -> tuple[bytes, tuple[str, 
         warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a note says so
         figure: Any = Figure(figsize=size, dpi=_DPI, layout="constrained")
         paint(figure)
+        _spell_out(figure)
         # In an SVG text stays text, for which the viewer has fonts.
         notes = fit_fonts(figure) if sheet.image_format == "png" else ()
         figure.savefig(buffer, format=sheet.image_format, metadata=_metadata(sheet))
     return buffer.getvalue(), notes
+
+
+def _spell_out(figure: Any) -> None:
+    """No text turns the direction of what stands beside it, nor breaks the XML of an SVG."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_text(spelled_out(text.get_text()))
 
 
 def _metadata(sheet: Sheet) -> dict[str, str | None]:
@@ -188,6 +198,6 @@ def wrapped(text: str, width_px: float) -> str:
 
 def short(name: str) -> str:
     """A name that fits a legend, in one line: of a long one the end, which tells more."""
-    line = " ".join(name.split())
+    line = " ".join(spelled_out(name).split())
     line = line if len(line) <= _LONGEST_NAME else f"…{line[1 - _LONGEST_NAME :]}"
     return f" {line}" if line.startswith("_") else line  # matplotlib hides labels in "_"

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp import __version__
+from webots_mcp.naming import spelled_out
 from webots_mcp.report.chapter import Chapter
 from webots_mcp.report.comparison import Beside
 from webots_mcp.report.figures import Figures, moment_key
@@ -48,6 +49,11 @@ class Page:
     size_bytes: int | None = None
 
 
+def _spelled_out(value: object) -> object:
+    """Texts, but for what is markup of ours."""
+    return spelled_out(value) if type(value) is str else value
+
+
 def render(page: Page) -> bytes:
     """The file. Every text of the recording is escaped: it is shown, and never run."""
     from jinja2 import Environment, FileSystemLoader, StrictUndefined
@@ -55,6 +61,7 @@ def render(page: Page) -> bytes:
     environment = Environment(
         loader=FileSystemLoader(_TEMPLATES),
         autoescape=True,
+        finalize=_spelled_out,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

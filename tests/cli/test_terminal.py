@@ -1,0 +1,116 @@
+"""What a recording holds is shown on a terminal, and never obeyed by it."""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from tests.recordings.rows import Recorded
+from webots_mcp.cli import main
+from webots_mcp.cli.terminal import rewrite, spelling_out
+
+# Sets the title of the terminal, clears it in one character (C1), and turns what follows round.
+HOSTILE = "a\x1b]0;owned\x07\x9b2J\u202egnp.exe\u2066\u200f"
+OBEYED = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+
+
+@pytest.fixture
+def recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recorded]:
+    monkeypatch.chdir(tmp_path)
+    recording = Recorded(tmp_path / "webots.db")
+    robot = recording.robot(HOSTILE)
+    for step in range(20):
+        state = {HOSTILE: step, "mode": HOSTILE, "x": step, "y": -step, "f": step % 2 == 0}
+        robot.state(step / 10, {**state, "kind": f"{HOSTILE}{step // 9}"})
+    robot.log(1.0, HOSTILE, level="error")
+    recording.connection.execute("UPDATE run SET label = ?, note = ?", (HOSTILE, HOSTILE))
+    recording.connection.execute("UPDATE session SET last_error = ?", (f"{HOSTILE}\nmore",))
+    yield recording
+    recording.close()
+
+
+COMMANDS = [
+    ["status"],
+    ["status", "--json"],
+    ["tail", "--no-follow"],
+    ["runs"],
+    ["runs", "--json"],
+    ["signals"],
+    ["history", "*"],
+    ["history", "*", "--json"],
+    ["trends"],
+    ["trends", "--json"],
+    ["events"],
+    ["events", "--json"],
+    ["compare", "1"],
+    ["logs"],
+    ["logs", "--json"],
+    ["history", HOSTILE],
+    ["sql", "SELECT data FROM state"],
+    ["sql", "SELECT name FROM robot", "--json"],
+    ["plot", "*", "-o", "x.svg"],
+    ["plot", "--trajectory", "-o", "x.svg"],
+    ["report", "-o", "x.html"],
+    ["history", "nothing"],
+]
+
+
+@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: " ".join(map(ascii, command)))
+def test_no_command_lets_a_recording_steer_the_terminal(
+    recorded: Recorded, command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    if command[0] == "report":
+        pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
+    main([*command, "--database", "webots.db"])
+    said = capsys.readouterr()
+    assert said.out or said.err
+    assert not OBEYED.search(said.out + said.err), ascii(said)
+
+
+def test_json_is_the_same_data(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["runs", "--json", "--database", "webots.db"]) == 0
+    (run,) = json.loads(capsys.readouterr().out)["runs"]
+    assert run["robot"] == run["label"] == HOSTILE
+
+
+def test_pictures_and_reports_are_files_that_nothing_turns_round(recorded: Recorded) -> None:
+    for more in ([], ["--trajectory"]):
+        assert main(["plot", *more, "-o", "x.svg", "--database", "webots.db"]) == 0
+        text = Path("x.svg").read_text("utf-8")
+        assert not OBEYED.search(text)
+        ElementTree.fromstring(text)
+    pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
+    assert main(["report", "-o", "x.html", "--database", "webots.db"]) == 0
+    text = Path("x.html").read_text("utf-8")
+    assert not OBEYED.search(text)
+    assert "\\u202e" in text
+    data = text[text.rindex("<script") :]
+    assert not re.search(r"(?<!\\)\\u202e", data), "a figure would show it"
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_on_a_terminal_exported_data_is_shown_so_as_well_and_progress_stays_one_line(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = Terminal()
+    monkeypatch.setattr("sys.stdout", shown)
+    assert main(["export", "--database", "webots.db"]) == 0
+    assert shown.getvalue().startswith("run")
+    assert not OBEYED.search(shown.getvalue().replace("\r\n", "\n"))
+    with spelling_out():
+        import sys
+
+        rewrite(sys.stdout, HOSTILE)
+        assert shown.getvalue().endswith("\x1b[K")
+        print("\rgone")
+    assert shown.getvalue().endswith("\\u000dgone\n")

@@ -1,0 +1,71 @@
+"""What a command writes, which a terminal may show: nothing of a recording that it would obey.
+
+Names, texts and log lines come from controllers and from recordings of others. Whatever a command
+prints goes through one stream, in which control characters and such as turn the direction of
+writing are spelled out; as JSON escapes, so that JSON stays the same data.
+"""
+
+from __future__ import annotations
+
+import codecs
+import contextlib
+import io
+import sys
+from collections.abc import Generator
+from typing import Any, TextIO, cast
+
+from webots_mcp.naming import spelled_out
+
+
+class _SpelledOut:
+    """A text stream to another one."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        self.stream.write(spelled_out(text))
+        return len(text)
+
+    def writelines(self, lines: Any) -> None:
+        for line in lines:
+            self.write(line)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+class _Bytes(io.RawIOBase):
+    """A binary stream to a text stream; what is no UTF-8 is replaced."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self._stream.write(self._decoder.decode(bytes(data)))
+        return len(data)
+
+
+@contextlib.contextmanager
+def spelling_out() -> Generator[None]:
+    """Inside, whatever is printed to stdout or stderr is spelled out."""
+    out, err = (cast("TextIO", _SpelledOut(stream)) for stream in (sys.stdout, sys.stderr))
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        yield
+
+
+def binary_stdout() -> Any:
+    """Where data is written as it is; on a terminal it is spelled out as all else."""
+    return _Bytes(sys.stdout) if sys.stdout.isatty() else sys.stdout.buffer
+
+
+def rewrite(stream: TextIO, text: str = "") -> None:
+    """Put a text in the place of the line that stands there, on a terminal; elsewhere nothing."""
+    if stream.isatty():
+        raw = stream.stream if isinstance(stream, _SpelledOut) else stream
+        raw.write(f"\r{spelled_out(text)}\x1b[K")
+        raw.flush()

@@ -193,6 +193,21 @@ def test_ctrl_c_leaves_the_simulation_as_then_says(
     assert recording.rows("SELECT hold FROM session") == ["paused"]
 
 
+def test_ctrl_c_ends_steps_and_leaves_the_simulation_paused(file: Path, driver: Driver) -> None:
+    recording = Recording(file)
+    line = [sys.executable, "-m", "webots_mcp", "step", "--database", str(file), "5000"]
+    process = subprocess.Popen(line, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+    wanted = "SELECT count(*) FROM command WHERE action = 'step' AND status = ?"
+    wait_for(lambda: recording.rows(wanted, "claimed") == [1] or process.poll() is not None)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 128 + signal.SIGINT, said
+    wait_for(lambda: recording.rows(wanted, "done") == [1])
+    (result,) = recording.rows("SELECT result FROM command WHERE action = 'step'")
+    assert json.loads(result)["why"] == "it was cancelled before the last step"
+    assert recording.rows("SELECT hold FROM session") == ["paused"]
+
+
 def test_send_needs_an_action_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main(["send"])

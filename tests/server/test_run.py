@@ -106,6 +106,23 @@ async def test_a_cancelled_call_leaves_the_simulation_as_then_says(
     assert driver.is_alive()
 
 
+async def test_a_cancelled_step_ends_and_leaves_the_simulation_paused(
+    connect: Connect, driver: Driver
+) -> None:
+    async with connect() as client:
+        async with anyio.create_task_group() as tasks:
+            arguments = {"command": "step", "steps": 5000}
+            tasks.start_soon(client.call_tool, "webots_simulation_control", arguments)
+            await _until_run_is(client, "claimed", "step")
+            tasks.cancel_scope.cancel()
+        ended = await _until_run_is(client, "done", "step")
+        assert ended["result"]["steps"] < 5000
+        assert ended["result"]["why"] == "it was cancelled before the last step"
+        assert (await ask(client, "webots_get_robot_state"))["status"] == "paused"
+        again = await ask(client, "webots_simulation_control", command="step", steps=2)
+        assert (again["outcome"], again["result"]["steps"]) == ("done", 2)
+
+
 async def test_an_interrupt_that_meets_the_waiting_itself_ends_the_run(
     connect: Connect, driver: Driver, file: Path
 ) -> None:
@@ -121,13 +138,13 @@ async def test_an_interrupt_that_meets_the_waiting_itself_ends_the_run(
         assert ended["result"]["why"] == "it was cancelled"
 
 
-async def _until_run_is(client: Client, outcome: str) -> dict[str, Any]:
-    """The newest `run` command, once it is that far."""
+async def _until_run_is(client: Client, outcome: str, action: str = "run") -> dict[str, Any]:
+    """The newest command of that action, once it is that far."""
     with anyio.fail_after(60):
         while True:
             answer = await ask(client, "webots_list_commands")
             for row in rows_of(answer.get("commands")):
-                if row["action"] == "run" and row["outcome"] == outcome:
+                if row["action"] == action and row["outcome"] == outcome:
                     return row
             await anyio.sleep(0.02)
 

@@ -113,17 +113,24 @@ def step(context: Context, command: Command) -> Progress:
     A loop that does not ask for commands in every round makes more; those made are told. A world
     that does not wait for the robot goes on in real time meanwhile, so that it can be stopped.
     """
-    clock, steps = context.clock, _whole_number(command.params, "steps", 1, MAX_STEPS)
+    clock, watch = context.clock, context.watch
+    steps = _whole_number(command.params, "steps", 1, MAX_STEPS)
     from_s, from_step = clock.sim_time_s, clock.steps_seen
     mode = None if context.simulation.waits_for_robot else "real_time"
     context.pause.end(command, mode, stepping=True)
+    watch.stepping = command.id
     try:
         while (made := clock.steps_seen - from_step) < steps and not context.pause.active:
+            if watch.stepping != command.id:
+                break
             yield
     except InterruptedCommandError as interruption:
         made = clock.steps_seen - from_step
+        watch.stepping = None
         raise CommandRefusedError(f"{interruption} after {made} of {steps} steps") from None
-    why = {"why": "a breakpoint paused it before the last step"} if made < steps else {}
+    ended_by = "it was cancelled" if watch.stepping != command.id else "a breakpoint paused it"
+    why = {"why": f"{ended_by} before the last step"} if made < steps else {}
+    watch.stepping = None
     context.pause.begin(command_id=command.id)
     advanced_s = round(clock.sim_time_s - from_s, 6)
     return {"steps": made, "advanced_s": advanced_s, **_mode(context), **why}
@@ -139,7 +146,7 @@ def run(context: Context, command: Command) -> Progress:
 
 @_built_in
 def cancel_run(context: Context, command: Command) -> Progress:
-    """End the `run` command of that id, as its `then` says: nobody waits for it any more."""
+    """End the `run` command of that id, as its `then` says, or the `step`: nobody waits for it."""
     return {"was_under_way": context.watch.cancel(command.params.get("command_id"))}
     yield
 

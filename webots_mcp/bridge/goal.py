@@ -143,12 +143,16 @@ class Watch:
     Args:
         clock: Tells time and run.
         tolerance_s: A clock that adds up steps reaches a time by as much less.
+
+    Attributes:
+        stepping: The `step` command that is under way; None also once it was cancelled.
     """
 
     def __init__(self, clock: Clock, tolerance_s: float) -> None:
         self._clock = clock
         self._tolerance_s = tolerance_s
         self._watched: _Watched | None = None
+        self.stepping: int | None = None
 
     @property
     def asks_states(self) -> bool:
@@ -221,7 +225,10 @@ class Watch:
             watched.finished = True
 
     def cancel(self, command_id: object) -> bool:
-        """Have the run of that command end now, as its `then` says; False where there is none."""
+        """Have that `run` end now, as its `then` says, or `step`; False where there is none."""
+        if command_id is not None and command_id == self.stepping:
+            self.stepping = None
+            return True
         watched = self._watched
         if watched is None or watched.command_id != command_id:
             return False

@@ -44,7 +44,7 @@ class ClusterWorker(threading.Thread):
         super().__init__(name=f"trials on {scheduler}", daemon=True)
         _require_allowed(scheduler)
         self._stopping = threading.Event()
-        self._set_id = 0
+        self.set_id = 0
         self._open = ExitStack()
         simulators = self._open.enter_context(cluster(scheduler, plan, is_stand_in=is_stand_in))
         search = next_parameters if plan.search else None
@@ -57,13 +57,13 @@ class ClusterWorker(threading.Thread):
             CommandRefusedError: Another process does.
         """
         try:
-            self._set_id = enter()
-            self._workshop = taken_up(self._workshop, self._set_id)
+            self.set_id = enter()
+            self._workshop = taken_up(self._workshop, self.set_id)
         except BaseException:
             self._open.close()
             raise
         self.start()
-        return self._set_id
+        return self.set_id
 
     def stop(self) -> None:
         """The server ends: leave the set as it is."""
@@ -74,7 +74,7 @@ class ClusterWorker(threading.Thread):
         """Run what is left of the set; why it does not go on is noted in it."""
         with self._open:
             try:
-                run_taken_up(self._workshop, self._set_id, _tell_nobody)
+                run_taken_up(self._workshop, self.set_id, _tell_nobody)
             except StoppedError:
                 pass
             except LeaseLostError as error:

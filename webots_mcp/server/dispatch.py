@@ -11,7 +11,7 @@ from typing import Any, Final
 import anyio
 from anyio import to_thread
 
-from webots_mcp.contract import HEARTBEAT_LATE_S
+from webots_mcp.contract import HEARTBEAT_LATE_S, LOOPING
 from webots_mcp.server.history_results import RunAnswer
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.running import ACTION as RUN
@@ -140,11 +140,11 @@ class Dispatcher:
         return self._take_back(command.id, "nobody claimed it in time; it will not run")
 
     def _leave(self, command: Command) -> None:
-        """Nobody waits any more; a run that has begun ends now, as its `then` says."""
+        """Nobody waits any more; a run that has begun ends now, as its `then` says, or a step."""
         with self._recording.writer() as connection:
             queue = CommandQueue(connection)
             goes_on = queue.leave(command.id, "the asker went away")
-            if goes_on and command.action == RUN:
+            if goes_on and command.action in LOOPING:
                 params, asker = {"command_id": command.id}, self._recording.asker
                 queue.enqueue(command.robot_id, "cancel_run", params, requested_by=asker)
 

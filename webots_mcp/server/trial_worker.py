@@ -70,8 +70,8 @@ _HANGS: Final = (
 _log = logging.getLogger(__name__)
 
 
-class _ServerEndsError(Exception):
-    """The server ends; the set waits for another one."""
+class _StopError(Exception):
+    """The server ends, or the call was cancelled; the set waits for another one."""
 
 
 class TrialWorker(threading.Thread):
@@ -88,7 +88,7 @@ class TrialWorker(threading.Thread):
     def __init__(self, recording: Recording, set_id: int) -> None:
         super().__init__(name=f"trial set {set_id}", daemon=True)
         self._recording = recording
-        self._set_id = set_id
+        self.set_id = set_id
         self._stopping = threading.Event()
         with recording.writer() as connection:
             self._job = Job(recording, take_up(connection, set_id))
@@ -97,7 +97,7 @@ class TrialWorker(threading.Thread):
         self._plan: Plan = stored_plan(self._set.plan)
 
     def stop(self) -> None:
-        """The server ends: leave the set as it is."""
+        """End the trial that runs, which waits to be run again, and leave the set as it is."""
         self._stopping.set()
         self.join(2 * _END_PATIENCE_S + 1)
 
@@ -115,12 +115,12 @@ class TrialWorker(threading.Thread):
                 self._try(trial)
         except LeaseLostError:
             raise
-        except _ServerEndsError:
+        except _StopError:
             pass
         except WebotsMCPError as error:
             self._say_why(str(error))
         except Exception as error:  # noqa: BLE001  (no thread ends without a word)
-            _log.exception("trial set %d failed", self._set_id)
+            _log.exception("trial set %d failed", self.set_id)
             self._say_why(f"a defect of webots-mcp ({type(error).__name__}: {error})")
         finally:
             self._leave()
@@ -130,10 +130,10 @@ class TrialWorker(threading.Thread):
     def _next(self) -> Trial | None:
         """What a killed server has begun comes first; a set that stops begins no other."""
         if self._stopping.is_set():
-            raise _ServerEndsError
+            raise _StopError
         with self._recording.reader() as connection:
-            trial = next_trial(connection, self._set_id)
-            stops = fetch_trial_set(connection, self._set_id).stop_reason is not None
+            trial = next_trial(connection, self.set_id)
+            stops = fetch_trial_set(connection, self.set_id).stop_reason is not None
         return None if trial and trial.status == "waiting" and stops else trial
 
     def _try(self, trial: Trial) -> None:
@@ -157,7 +157,7 @@ class TrialWorker(threading.Thread):
                 return known
             view = self._borrow(connection)
             begun = begin_trial(connection, trial) if trial.status == "waiting" else trial
-            former = fetch_trial_set(connection, self._set_id).former_values or "{}"
+            former = fetch_trial_set(connection, self.set_id).former_values or "{}"
             return CommandQueue(connection).enqueue(
                 view.robot.id,
                 ACTION,
@@ -183,13 +183,13 @@ class TrialWorker(threading.Thread):
     def _borrow(self, connection: sqlite3.Connection) -> View:
         """The robot; what its parameters are is noted first, of each controller once."""
         view = find_target(connection, self._robot, ACTION)
-        noted = fetch_trial_set(connection, self._set_id)
+        noted = fetch_trial_set(connection, self.set_id)
         assert view.session is not None  # it is live
         if noted.former_values is None or noted.session_id != view.session.id:
             tried = {name for values in self._plan.parameters for name in values}
             known = {each["name"]: each for each in described(connection, view.require_run())}
             former = {name: _value(known[name]) for name in known if name in tried}
-            borrow_parameters(connection, self._set_id, view.session.id, former)
+            borrow_parameters(connection, self.set_id, view.session.id, former)
         return view
 
     def _watched(self, command: Command, timeout_s: float) -> Command:
@@ -216,7 +216,7 @@ class TrialWorker(threading.Thread):
                 elif self._stopping.wait(_LOOK_EVERY_S):
                     self._take_back(command)
                     self._settled(command_id, _END_PATIENCE_S, hurried=True)
-                    raise _ServerEndsError
+                    raise _StopError
         return command
 
     def _take_back(self, command: Command) -> None:
@@ -281,7 +281,7 @@ class TrialWorker(threading.Thread):
         try:
             scored = score_run(connection, run_id, self._plan.score, end_s=end_s)
         except InvalidInputError as error:
-            if not any(each.score is not None for each in trials_of(connection, self._set_id)):
+            if not any(each.score is not None for each in trials_of(connection, self.set_id)):
                 raise
             return Result(run_id, None, str(error), *ended)
         return Result(run_id, scored.value, scored.why, *ended)
@@ -291,8 +291,8 @@ class TrialWorker(threading.Thread):
     def _say_why(self, reason: str) -> None:
         """Why the set does not go on; what was said first counts."""
         with self._job.writer() as connection:
-            if fetch_trial_set(connection, self._set_id).stop_reason is None:
-                stop_trial_set(connection, self._set_id, reason)
+            if fetch_trial_set(connection, self.set_id).stop_reason is None:
+                stop_trial_set(connection, self.set_id, reason)
 
     def _leave(self) -> None:
         """Set the parameters back, and let others work on the set."""
@@ -301,14 +301,14 @@ class TrialWorker(threading.Thread):
         except LeaseLostError:
             raise
         except WebotsMCPError as error:
-            _log.warning("trial set %d: the parameters were not set back: %s", self._set_id, error)
+            _log.warning("trial set %d: the parameters were not set back: %s", self.set_id, error)
         with self._job.writer() as connection:
-            lay_down(connection, self._set_id, self._job.lease)
+            lay_down(connection, self.set_id, self._job.lease)
 
     def _give_back(self) -> None:
         """A controller that has ended has no values any more."""
         with self._job.writer() as connection:
-            noted = fetch_trial_set(connection, self._set_id)
+            noted = fetch_trial_set(connection, self.set_id)
             if noted.former_values is None:
                 return
             assert noted.robot_id is not None and noted.session_id is not None
@@ -318,7 +318,7 @@ class TrialWorker(threading.Thread):
             command = self._settled(command.id, patience_s, hurried=True)
         if command is None or command.status == "done":
             with self._job.writer() as connection:
-                borrow_parameters(connection, self._set_id, noted.session_id, None)
+                borrow_parameters(connection, self.set_id, noted.session_id, None)
         else:
             self._say_why(f"its parameters were not set back: {command.error or command.status}")
 
@@ -390,6 +390,12 @@ class TrialWorkers:
 
     def _keep(self, worker: TrialWorker | ClusterWorker) -> None:
         self._workers = [each for each in self._workers if each.is_alive()] + [worker]
+
+    def end(self, set_id: int) -> None:
+        """End the trials of a set that run here."""
+        for worker in self._workers:
+            if worker.set_id == set_id:
+                worker.stop()
 
     def stop(self) -> None:
         """The server ends."""

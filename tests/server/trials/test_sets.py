@@ -6,6 +6,7 @@ import json
 from contextlib import closing
 from pathlib import Path
 
+import anyio
 import pytest
 from mcp import Client
 
@@ -141,6 +142,35 @@ async def test_cancel_stops_after_the_current_trial_and_sets_the_parameters_back
         assert await value_of(client, "kp") == 2.0
         again = await trials(client, parameters={"kp": [1.0]})
         assert again["state"] == "done"
+
+
+async def test_a_cancelled_call_ends_the_trial_that_runs_and_no_other_begins(
+    connect: Connect, tunable: TunableDriver
+) -> None:
+    tried = "SELECT count(*) AS n, max(id) AS last FROM command WHERE action = 'run'"
+    async with connect() as client:
+        async with anyio.create_task_group() as tasks:
+            asked = {
+                "parameters": {"kp": [5.0]},
+                "score": "last(distance)",
+                "until": "distance < 0",
+            }
+            tasks.start_soon(client.call_tool, "webots_run_trials", {**asked, "repeats": 50})
+            with anyio.fail_after(60):
+                while await value_of(client, "kp") != 5.0:
+                    await anyio.sleep(0.01)
+            tasks.cancel_scope.cancel()
+        with anyio.fail_after(60):
+            while (left := await ask(client, "webots_get_trials"))["state"].startswith("stopping"):
+                await anyio.sleep(0.01)
+        assert (left["state"], left["over"]) == ("stopped: it was cancelled", 0)
+        (count,) = rows_of((await ask(client, "webots_query_sql", sql=tried))["result"])
+        assert count["n"] == 1
+        assert await value_of(client, "kp") == 2.0
+        assert (await ask(client, "webots_get_robot_state"))["status"] == "paused"
+        resets = tunable.resets
+        assert (await trials(client, parameters={"kp": [1.0]}))["state"] == "done"
+        assert tunable.resets > resets
 
 
 async def test_what_a_set_does_not_name_is_as_it_was_before_the_trials(

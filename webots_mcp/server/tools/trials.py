@@ -92,7 +92,8 @@ async def webots_run_trials(
 ) -> TrialsAnswer:
     """Which parameters are best? Each trial resets the world, sets them, runs fast, is scored.
 
-    After timeout_s they go on: trial_set alone waits on, or resumes. At the end they are set back.
+    After timeout_s they go on: trial_set alone waits on, or resumes. A cancelled call stops them.
+    At the end parameters are set back.
     """
     given = parameters is not None or score is not None
     if (trial_set is None) != given:
@@ -111,7 +112,12 @@ async def webots_run_trials(
     else:
         number = trial_set
         await to_thread.run_sync(_take_up, recording, workers, number, scheduler, cancel)
-    await _wait(recording, ctx, number, timeout_s)
+    try:
+        await _wait(recording, ctx, number, timeout_s)
+    except anyio.get_cancelled_exc_class():
+        with anyio.CancelScope(shield=True):
+            await to_thread.run_sync(_end, recording, workers, number)
+        raise
     return TrialsAnswer(**await to_thread.run_sync(trial_sets.told_of_set, recording, number))
 
 
@@ -179,6 +185,12 @@ def _take_up_elsewhere(
     else:
         plan, is_stand_in = stored_world_plan(found.plan)
         workers.begin_on_cluster(scheduler, plan, lambda: found.id, is_stand_in=is_stand_in)
+
+
+def _end(recording: Recording, workers: TrialWorkers, set_id: int) -> None:
+    """The client has cancelled the call: no other trial begins, and the one that runs here ends."""
+    trial_sets.cancel(recording, set_id)
+    workers.end(set_id)
 
 
 async def _wait(recording: Recording, ctx: Context[Any], set_id: int, timeout_s: float) -> None:

@@ -42,7 +42,8 @@ class Server:
         said = self.process.stdout.readline()
         assert "the page is at" in said, self.process.communicate(timeout=30)
         self.url = said.split(" at ")[1].split()[0]
-        self.port = int(self.url.rstrip("/").rpartition(":")[2])
+        self.path = "/" + self.url.split("/", 3)[3]
+        self.port = int(self.url.split(":")[2].partition("/")[0])
 
     def stop(self) -> str:
         """End it as Ctrl-C does; returns what it said on stderr."""

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import http.client
 from collections.abc import Callable
+from http.client import HTTPMessage
 from pathlib import Path
 
 import pytest
 
 from tests.page.conftest import Server
 from webots_mcp.cli import main
+from webots_mcp.page.server import MOST_TABS
 
 UPGRADE = {
     "Upgrade": "websocket",
@@ -20,6 +22,13 @@ UPGRADE = {
 
 
 def answer(server: Server, path: str, **headers: str) -> tuple[int, str]:
+    """What is answered to a request; a path that begins with / is not below the page's own."""
+    status, text, _ = answer_and_headers(server, path, **headers)
+    return status, text
+
+
+def answer_and_headers(server: Server, path: str, **headers: str) -> tuple[int, str, HTTPMessage]:
+    path = path if path.startswith("/") else server.path + path
     connection = http.client.HTTPConnection("127.0.0.1", server.port, timeout=20)
     named = {name.replace("_", "-"): value for name, value in headers.items()}
     connection.request("GET", path, headers=named)
@@ -27,18 +36,18 @@ def answer(server: Server, path: str, **headers: str) -> tuple[int, str]:
     status = response.status
     text = "" if status == 101 else response.read().decode()
     connection.close()
-    return status, text
+    return status, text, response.headers
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1:{}", "localhost:{}"])
 def test_the_page_is_for_this_computer(told: Server, host: str) -> None:
-    status, text = answer(told, "/", Host=host.format(told.port))
+    status, text = answer(told, "", Host=host.format(told.port))
     assert status == 200
     assert "webots-mcp" in text
     assert "cdn.bokeh.org" not in text
 
 
-@pytest.mark.parametrize("path", ["/", "/static/js/bokeh.min.js", "/ws", "/metadata"])
+@pytest.mark.parametrize("path", ["", "static/js/bokeh.min.js", "ws", "metadata"])
 def test_a_request_for_another_host_is_refused(told: Server, path: str) -> None:
     status, text = answer(told, path, Host=f"robots.example:{told.port}")
     assert status == 403
@@ -47,8 +56,45 @@ def test_a_request_for_another_host_is_refused(told: Server, path: str) -> None:
 
 def test_a_page_of_another_site_gets_no_websocket(told: Server) -> None:
     headers = {**UPGRADE, "Host": f"127.0.0.1:{told.port}", "Origin": "http://robots.example"}
-    status, _ = answer(told, "/ws", **headers)
+    status, _ = answer(told, "ws", **headers)
     assert status == 403
+
+
+@pytest.mark.parametrize("path", ["/", "/static/js/bokeh.min.js", "/ws", "/autoload.js", "/x/"])
+def test_without_the_token_of_the_printed_address_nothing_is_shown(told: Server, path: str) -> None:
+    status, text = answer(told, path)
+    assert status == 403
+    assert "open the address that 'webots-mcp view' printed" in text
+    assert told.path.strip("/") not in text
+
+
+def test_each_start_has_a_token_of_its_own(
+    told: Server, serve: Callable[..., Server], tmp_path: Path
+) -> None:
+    assert serve(tmp_path).path != told.path
+    assert len(told.path.strip("/")) == 24
+
+
+def test_no_other_page_can_hold_it_or_is_told_its_address(told: Server) -> None:
+    for path in ("", "static/js/bokeh.min.js", "/"):
+        _, _, headers = answer_and_headers(told, path)
+        assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+        assert headers["Referrer-Policy"] == "no-referrer"
+    status, _ = answer(told, "autoload.js?bokeh-autoload-element=1")
+    assert status == 403
+
+
+def test_a_session_is_begun_by_the_page_only(told: Server) -> None:
+    status, _ = answer(told, "?bokeh-session-id=mine")
+    assert status == 403
+
+
+def test_only_so_many_tabs_are_open_at_once(serve: Callable[..., Server], tmp_path: Path) -> None:
+    server = serve(tmp_path, "--read-only")
+    answers = [answer(server, "") for _ in range(MOST_TABS + 1)]
+    assert [status for status, _ in answers] == [200] * MOST_TABS + [503]
+    assert f"{MOST_TABS} tabs of this page are open" in answers[-1][1]
+    assert answer(server, "static/js/bokeh.min.js")[0] == 200
 
 
 def test_a_port_that_is_taken_is_said(

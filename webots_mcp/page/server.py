@@ -1,8 +1,14 @@
-"""The server of the page: on loopback only, for requests that mean it."""
+"""The server of the page: on loopback only, for who was told its address.
+
+Everything lies below a token that is drawn anew at each start and is part of the address: other
+programs of this computer, and web sites that a browser here shows, do not know it.
+"""
 
 from __future__ import annotations
 
 import logging
+import re
+import secrets
 import socket
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,10 +20,11 @@ from bokeh.application.handlers import FunctionHandler
 from bokeh.server.server import BaseServer
 from bokeh.server.tornado import BokehTornado
 from tornado.httpserver import HTTPServer
+from tornado.httputil import HTTPHeaders, HTTPServerRequest
 from tornado.ioloop import IOLoop
-from tornado.routing import AnyMatches, HostMatches, Rule, RuleRouter
+from tornado.routing import AnyMatches, HostMatches, Matcher, PathMatches, Rule, RuleRouter
 from tornado.web import Application as WebApplication
-from tornado.web import RequestHandler
+from tornado.web import OutputTransform, RequestHandler
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.page.tab import open_tab
@@ -26,20 +33,56 @@ from webots_mcp.store.recording import Recording
 HOST: Final = "127.0.0.1"
 _NAMES: Final = (HOST, "localhost")
 _HOSTS: Final = r"^(127\.0\.0\.1|localhost)$"
-_REFUSED: Final = (
+MOST_TABS: Final = 20  # each reads the recording ten times a second
+_FOREIGN: Final = (
     "This page is shown to requests for 127.0.0.1 and localhost only: another name may be one that "
     "a web site has pointed here.\n"
+)
+_UNTOLD: Final = (
+    "The address of this page has a token, without which nothing is shown: open the address that "
+    "'webots-mcp view' printed when it started.\n"
+)
+_FULL: Final = (
+    f"{MOST_TABS} tabs of this page are open: close one, wait a quarter of a minute, and open this "
+    "one again.\n"
 )
 
 
 class _Refusal(RequestHandler):
-    """What a request for another host is answered with."""
+    """What a request is answered with that the page is not for."""
+
+    def initialize(self, status: int, why: str) -> None:
+        self._refused = status, why
 
     def prepare(self) -> None:
-        self.set_status(403)
+        status, why = self._refused
+        self.set_status(status)
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         answer: Any = self
-        answer.finish(_REFUSED)
+        answer.finish(why)
+
+
+class _Guarded(OutputTransform):
+    """What each answer tells the browser: no other page may show it, or be told its address."""
+
+    def transform_first_chunk(
+        self, status_code: int, headers: HTTPHeaders, chunk: bytes, finishing: bool
+    ) -> tuple[int, HTTPHeaders, bytes]:
+        headers["Content-Security-Policy"] = "frame-ancestors 'none'"
+        headers["X-Frame-Options"] = "DENY"
+        headers["Referrer-Policy"] = "no-referrer"
+        return status_code, headers, chunk
+
+
+class _OneTooMany(Matcher):
+    """Matches what would open a further tab while no more may be open."""
+
+    def __init__(self, path: str, pages: BokehTornado) -> None:
+        self._path, self._pages = path, pages
+
+    def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
+        opens = request.path.rstrip("/") == self._path
+        return {} if opens and len(self._pages.get_sessions("/")) >= MOST_TABS else None
 
 
 @dataclass(frozen=True)
@@ -48,11 +91,12 @@ class PageServer:
 
     server: BaseServer
     port: int
+    token: str
 
     @property
     def url(self) -> str:
         """Where the page is."""
-        return f"http://{HOST}:{self.port}/"
+        return f"http://{HOST}:{self.port}/{self.token}/"
 
     def run(self, ready: Callable[[str], object]) -> None:
         """Serve, and tell `ready` the address as soon as a browser may ask."""
@@ -88,11 +132,37 @@ def create_page_server(recording: Recording, port: int, *, read_only: bool = Fal
     application = Application(FunctionHandler(partial(open_tab, recording, read_only)))
     port = int(listening.getsockname()[1])
     origins = [f"{name}:{port}" for name in _NAMES]
-    pages = BokehTornado({"/": application}, extra_websocket_origins=origins)
-    refusals = WebApplication([(r".*", _Refusal)])
-    http = HTTPServer(RuleRouter([Rule(HostMatches(_HOSTS), pages), Rule(AnyMatches(), refusals)]))
+    token = secrets.token_urlsafe(18)
+    pages = BokehTornado(
+        {"/": application},
+        prefix=token,
+        extra_websocket_origins=origins,
+        secret_key=secrets.token_bytes(32),
+        sign_sessions=True,  # a session is begun by loading the page, and by nothing else
+        transforms=[_Guarded],
+    )
+    http = HTTPServer(_router(token, pages))
     http.add_sockets([listening])
-    return PageServer(BaseServer(IOLoop.current(), pages, http), port)
+    return PageServer(BaseServer(IOLoop.current(), pages, http), port, token)
+
+
+def _router(token: str, pages: BokehTornado) -> RuleRouter:
+    """The page alone below its token, without what would put it into a page of others."""
+    of_page = RuleRouter([
+        Rule(PathMatches(f"/{re.escape(token)}/autoload.js"), _refusing(403, _UNTOLD)),
+        Rule(_OneTooMany(f"/{token}", pages), _refusing(503, _FULL)),
+        Rule(PathMatches(f"/{re.escape(token)}(/.*)?"), pages),
+        Rule(AnyMatches(), _refusing(403, _UNTOLD)),
+    ])  # fmt: skip
+    return RuleRouter([
+        Rule(HostMatches(_HOSTS), of_page), Rule(AnyMatches(), _refusing(403, _FOREIGN)),
+    ])  # fmt: skip
+
+
+def _refusing(status: int, why: str) -> WebApplication:
+    return WebApplication(
+        [(r".*", _Refusal, {"status": status, "why": why})], transforms=[_Guarded]
+    )
 
 
 def _listening(port: int) -> socket.socket:

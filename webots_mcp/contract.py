@@ -110,6 +110,16 @@ Then = Literal["pause", "go_on", "as_before"]  # what it does at its end
 RunEnd = Literal[
     "condition held", "time over", "pruned", "run ended", "interrupted", "condition failed"
 ]
+SEE_STEPS: Final = (
+    "call bridge.publish({...}) and bridge.get_command() in every round of the loop, or "
+    "MCPBridge.attach(robot) before anything takes or replaces robot.step"
+)
+UNSEEN: Final = "the controller's loop steps in a way that the bridge does not see, which missed"
+UNMOVED: Final = (
+    "the bridge has seen no simulation time go by since it began: the simulation is paused in "
+    "Webots, the controller has not reached its loop, or its loop steps in a way that the bridge "
+    f"does not see; then {SEE_STEPS}"
+)
 ENDED_BY: Final = "the controller ended by"  # an exception, as it is logged
 MAX_RUN_S: Final = 1e6  # of simulation time, of one `run` command
 

@@ -21,7 +21,7 @@ from tests.webots.conftest import (
     world,
     write_project,
 )
-from webots_mcp.contract import ENDED_BY, host_name
+from webots_mcp.contract import ENDED_BY, SEE_STEPS, UNMOVED, UNSEEN, host_name
 from webots_mcp.diagnosis.finding import Finding
 from webots_mcp.liveness import process_identity
 
@@ -172,6 +172,26 @@ def test_an_exception_that_ended_a_controller_is_named(look: Look, recorded: Rec
     assert found.verdict == "wrong"
     assert "ValueError: no such wheel" in found.seen
     assert "webots-mcp logs" in (found.fix or "")
+
+
+def test_a_controller_whose_steps_no_bridge_saw_is_told_of_while_it_lives_and_when_it_has_finished(
+    look: Look, recorded: Recorded
+) -> None:
+    began_s = time.time() - 20
+    robot = recorded.robot(now=began_s, moved_wall_time_s=None, last_poll_wall_time_s=None)
+    lives = look("Simulation")
+    robot.beat(
+        ended_wall_time_s=robot.now,
+        end_reason="finished",
+        last_error=f"{UNSEEN} 9.6 s of simulation time: {SEE_STEPS}",
+    )
+    ended = look("Simulation")
+
+    assert lives.verdict == "wrong" and UNMOVED in lives.seen
+    assert ended.verdict == "warning" and "missed 9.6 s" in ended.seen
+    assert all(
+        SEE_STEPS in found.seen and "#simulation" in (found.fix or "") for found in (lives, ended)
+    )
 
 
 def test_a_controller_that_has_finished_is_well(look: Look, recorded: Recorded) -> None:

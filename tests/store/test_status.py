@@ -14,6 +14,7 @@ import pytest
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
+from webots_mcp.contract import SEE_STEPS, UNSEEN
 from webots_mcp.entries import waiting_paths
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.queue import CommandQueue
@@ -146,6 +147,39 @@ def test_a_controller_that_has_just_started_is_starting_and_soon_called_stopped(
     robot.beat(last_seen_wall_time_s=NOW + 5)
     assert status_of(robot, after_s=5).text == "stopped 5.0 s ago"
     assert "not moved since" in (status_of(robot, after_s=5).why or "")
+
+
+def test_a_controller_of_which_no_step_was_ever_seen_is_not_said_to_have_stopped(
+    recorded: Recorded,
+) -> None:
+    robot = recorded.robot(now=NOW, moved_wall_time_s=None, last_poll_wall_time_s=None)
+    status = status_of(robot, after_s=42)
+    assert status.text == "not seen moving for 42 s"
+    for part in ("paused in Webots", "not reached its loop", "bridge.get_command()", "attach"):
+        assert part in (status.why or "")
+
+
+@pytest.mark.parametrize(("mode", "why"), [("fast", "does not see"), ("pause", "paused in Webots")])
+def test_that_an_observer_sees_time_go_on_does_not_make_an_unseen_loop_hang(
+    recorded: Recorded, mode: str, why: str
+) -> None:
+    instance = "webots 1"
+    observer = recorded.robot("observer", now=NOW, instance=instance)
+    observer.event(0.0, "mode", None, {"mode": mode})
+    robot = recorded.robot(
+        now=NOW, instance=instance, moved_wall_time_s=None, last_poll_wall_time_s=None
+    )
+    status = status_of(robot, after_s=1.9)
+    assert why in (status.why or "") and "hangs" not in (status.why or "")
+
+
+def test_a_loop_that_was_found_to_step_unseen_is_said_to(recorded: Recorded) -> None:
+    found = f"{UNSEEN} 18.5 s of simulation time: {SEE_STEPS}"
+    robot = recorded.robot(now=NOW, sim_time_s=20.0, last_error=found)
+    robot.state(0.0, {}, at=NOW - 20)
+    assert status_of(robot, after_s=0.6) == ("running", found)
+    robot.beat(ended_wall_time_s=NOW, end_reason="finished")
+    assert status_of(robot).why == found
 
 
 def test_a_loop_that_fell_silent_when_its_time_stopped_is_not_said_to_be_alive(

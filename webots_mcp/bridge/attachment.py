@@ -37,6 +37,7 @@ class Attachment:
         self._errors = errors
         self._throttle = session.context.throttle
         self._pause = session.context.pause
+        self._clock = session.context.clock
         self._calls = self._throttle.calls  # of publish, up to the end of the last step
         self._left_to_controller = False
         self._unlooked: Command | None = None
@@ -44,6 +45,7 @@ class Attachment:
     def begin(self) -> None:
         """From now on each step is gone along with."""
         self._session.control.handlers.loop_looks = False
+        self._clock.stepped_s = self._session.context.simulation.time_s
         self._pause.go_along(self)
 
     def end(self) -> None:
@@ -55,7 +57,13 @@ class Attachment:
         """The command that was served last, for a loop that asks for it by itself."""
         self._session.control.handlers.loop_looks = True
         command, self._unlooked = self._unlooked, None
+        if self._clock.sim_time_s > self._clock.stepped_s:
+            self.look_for_unseen()
         return command
+
+    def look_for_unseen(self) -> None:
+        """Say it once where time went on by steps that did not come by here."""
+        self._session.look_for_unseen(self._clock.stepped_s)
 
     def before(self, step: Step) -> None:
         """The controller's round is over: publish what it did not, and serve commands."""

@@ -21,6 +21,7 @@ class Clock:
         self._simulation = simulation
         self.sim_time_s = simulation.time_s
         self.moved_s: float | None = None  # by the monotonic clock
+        self.stepped_s = self.sim_time_s  # at the end of the newest step that was gone along with
         self.steps_seen = 0  # looks at which time had gone forward, or the steps between them
         self.step_s: float | None = None  # of a loop that does not make the steps itself
         self.run = Run("start", self.sim_time_s)
@@ -36,6 +37,8 @@ class Clock:
         """
         before, now = self.sim_time_s, self._simulation.time_s
         self.sim_time_s = now
+        if after_step:
+            self.stepped_s = now
         if now > before + _EPSILON_S:
             self.moved_s = time.monotonic()
             self.steps_seen += max(round((now - before) / self.step_s), 1) if self.step_s else 1

@@ -16,6 +16,7 @@ QUIT: Final = -1
 Method = Callable[..., int]
 
 _STEPPING: Final = ("step", "stepBegin", "stepEnd")
+_VEHICLE: Final = "vehicle"  # the package
 _GUARD: Final = "_webots_mcp_guard"  # of a robot; None of its class
 _MARK: Final = "_webots_mcp_asks"  # of a method
 
@@ -54,10 +55,11 @@ class StepGate:
         self._of_robot: dict[str, Any] = vars(robot)
         owner: Any = _owner_of_step(robot)
         setattr(owner, _GUARD, None)
-        for name in _STEPPING:
-            method: Any = getattr(owner, name, None)
-            if method is not None and not hasattr(method, _MARK):
-                setattr(owner, name, _guarded(name, method))
+        for cls in (owner, *_vehicles(robot)):
+            for name in _STEPPING:
+                method: Any = getattr(cls, name, None)
+                if method is not None and not hasattr(method, _MARK):
+                    setattr(cls, name, _guarded(name, method))
         self._own_step: Method = owner.step.__wrapped__
 
     def exchange(self) -> int:
@@ -86,6 +88,11 @@ def _guarded(name: str, method: Method) -> Method:
 
     setattr(ask_first, _MARK, True)
     return ask_first
+
+
+def _vehicles(robot: Any) -> list[Any]:
+    """Webots' own classes whose `step` is a call in C that does not come by Robot's: `Driver`."""
+    return [cls for cls in type(robot).__mro__ if cls.__module__.partition(".")[0] == _VEHICLE]
 
 
 def _owner_of_step(robot: Any) -> Any:

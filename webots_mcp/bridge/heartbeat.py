@@ -25,6 +25,11 @@ class Heartbeat:
         self._mode_before: str | None = None
         self.loop: str | None = None
 
+    @property
+    def polled(self) -> bool:
+        """Whether the loop ever asked for commands."""
+        return self._last_poll_s is not None
+
     def poll(self) -> None:
         """The loop asked for commands; beat if it is time to."""
         self._last_poll_s = time.monotonic()

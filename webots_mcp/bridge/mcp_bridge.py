@@ -138,8 +138,9 @@ class MCPBridge:
                 ...
 
         It does not matter where and how the controller steps: in a subclass with a `step` of its
-        own, in a function of another module, by `stepBegin` and `stepEnd`; only a method that
-        was stored before (`step = robot.step`) is not seen. Each step that lets time pass
+        own, in a function of another module, by `stepBegin` and `stepEnd`, or of a
+        `vehicle.Driver`; only a method that was stored before (`step = robot.step`) or put in its
+        place (`robot.step = mine`) is not seen, which is warned of. Each step that lets time pass
         publishes once (see `auto_publish`), when it ends; commands are served when a step
         begins, `step(0)` too. The step returns what Webots answers. After a -1 all is written,
         and Webots is asked nothing any more.
@@ -500,6 +501,9 @@ class MCPBridge:
         try:
             if self._attachment is not None:
                 self._attachment.publish_missing()
+                self._attachment.look_for_unseen()
+            elif self._session.context.clock.moved_s is None:
+                self._session.look_for_unseen(self._session.context.clock.sim_time_s)
             self.detach()
             self._session.let_go()
         except Exception as error:  # noqa: BLE001  (the robot comes first)

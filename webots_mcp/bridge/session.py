@@ -32,11 +32,20 @@ from webots_mcp.bridge.scene_edits import SceneEdits
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.start_values import StartValues
 from webots_mcp.bridge.throttle import Throttle
-from webots_mcp.contract import PARAMETERS_VARIABLE, Database, MemoryDatabase
+from webots_mcp.contract import (
+    PARAMETERS_VARIABLE,
+    SEE_STEPS,
+    UNMOVED,
+    UNSEEN,
+    Database,
+    MemoryDatabase,
+)
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.maintenance import Maintainer
 
 _IDLE_S: Final = 0.5  # a loop that recorded nothing for so long stands still
+_UNSEEN_S: Final = 1.0  # of simulation time; an interrupt may keep the end of a step from us
+_UNMOVED_S: Final = 10.0  # of wall time
 
 
 class Session:
@@ -99,7 +108,9 @@ class Session:
         )
         self.control = Control(self.context)
         self.publisher = Publisher(self.context, self.runs)
-        self._maintainer = _start_maintainer(database, self._flush_if_idle)
+        self._unseen_told = False
+        self._began_s: float | None = time.monotonic()  # None once nothing is to be told of it
+        self._maintainer = _start_maintainer(database, self._look_after)
 
     @property
     def robot_name(self) -> str:
@@ -156,6 +167,23 @@ class Session:
         except Exception as error:  # noqa: BLE001  (the robot comes first)
             self.context.recorder.errors.failed("Parameter.set", error)
 
+    def look_for_unseen(self, seen_s: float) -> None:
+        """Say once that the loop steps in a way that the bridge does not see.
+
+        Args:
+            seen_s: The newest simulation time that it saw the loop at.
+        """
+        simulation = self.context.simulation
+        if self._unseen_told or simulation.over:
+            return
+        unseen_s = simulation.time_s - seen_s
+        if unseen_s < _UNSEEN_S or not simulation.waits_for_robot:
+            return
+        self._unseen_told = True
+        text = f"{UNSEEN} {unseen_s:.1f} s of simulation time: {SEE_STEPS}"
+        self.context.journal.log("warning", "bridge", text)
+        self.context.recorder.errors.warn("unseen", text)
+
     def close(self, reason: str | None) -> None:
         """Write what waits and end; for the reason given, or as far as it is known."""
         if self._maintainer is not None:
@@ -179,11 +207,20 @@ class Session:
         self.context.keeper.write_all()
         self.context.recorder.end(self._end_reason, self.context.clock.sim_time_s)
 
-    def _flush_if_idle(self) -> None:
-        """Called from the maintainer's thread: write what waits if the loop stands still."""
-        recorder = self.context.recorder
+    def _look_after(self) -> None:
+        """Called from the maintainer's thread: for a loop that stands still, or is not seen.
+
+        What waits is written. Webots is not asked for anything here: whether time goes on without
+        the bridge is not known before the loop's thread comes by.
+        """
+        recorder, began_s = self.context.recorder, self._began_s
         if recorder.rows_waiting and time.monotonic() - recorder.last_use_s > _IDLE_S:
             recorder.flush()
+        if began_s is None or time.monotonic() - began_s < _UNMOVED_S:
+            return
+        self._began_s = None
+        if self.context.clock.moved_s is None and not self.context.heartbeat.polled:
+            self.context.journal.log("warning", "bridge", UNMOVED)
 
 
 def _start_maintainer(database: Database, on_tick: Callable[[], Any]) -> Maintainer | None:

@@ -18,7 +18,7 @@ from webots_mcp.store.waiting import waiting
 
 _GET_COMMAND: Final = (
     "call bridge.get_command() in every round of the controller's loop, or use "
-    "MCPBridge.attach(robot), which does"
+    "MCPBridge.attach(robot), which does, before anything takes or replaces robot.step"
 )
 _LONG_AT_WORK_S: Final = 30.0
 _NOT_POLLED_S: Final = 5.0

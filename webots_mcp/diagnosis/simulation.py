@@ -15,7 +15,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.contract import PAUSED, host_name
+from webots_mcp.contract import PAUSED, UNSEEN, host_name
 from webots_mcp.diagnosis.finding import Finding, Subject, last_seen_s, worst
 from webots_mcp.store.recording import View
 from webots_mcp.store.sessions import Session, companions
@@ -34,6 +34,7 @@ _BUSY: Final = 0.5  # of a processor; a controller that waits for its next step 
 _EXTERN: Final = re.compile(r'^\s*controller\s+"<extern>"', re.MULTILINE)
 _LARGEST_WORLD_BYTES: Final = 50_000_000
 _ENDED_BADLY: Final = ("crashed", "reload")
+_SEE_PAGE: Final = "see docs/troubleshooting.md#simulation"
 _PRESS_PLAY: Final = "press play in Webots"
 _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift+R in Webots)"
 _OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by its WebSocket"
@@ -77,7 +78,7 @@ def _judged(subject: Subject, view: View) -> Finding:
     if (status.why or "").startswith(SEEN_PAUSED):
         return Finding("warning", seen, "webots_simulation_control('resume'), or press play")
     if not _is_unclear(view):
-        return Finding("wrong", seen, "see docs/troubleshooting.md#simulation")
+        return Finding("wrong", seen, _SEE_PAGE)
     return _narrowed(subject, view, session)
 
 
@@ -87,6 +88,8 @@ def _is_unclear(view: View) -> bool:
 
 
 def _ended(view: View, seen: str) -> Finding:
+    if (view.status.why or "").startswith(UNSEEN):
+        return Finding("warning", seen, _SEE_PAGE)
     if view.session is None or (view.session.end_reason or "crashed") not in _ENDED_BADLY:
         return Finding("ok", seen)
     fix = "see 'webots-mcp logs --level error', mend the controller and start it again"

@@ -15,7 +15,7 @@ import anyio
 from anyio import to_thread
 
 from webots_mcp.belonging import belongs
-from webots_mcp.contract import HEARTBEAT_LATE_S
+from webots_mcp.contract import HEARTBEAT_LATE_S, UNMOVED
 from webots_mcp.errors import (
     AmbiguousRobotError,
     CommandRefusedError,
@@ -344,7 +344,8 @@ def _moved(before: Moment, view: View) -> str | None:
 
 
 def _standing(before: Moment, view: View) -> str | None:
-    return None if view.status.is_moving else f"status: {view.status.text}"
+    unknown = view.status.is_moving or view.status.why == UNMOVED
+    return None if unknown else f"status: {view.status.text}"
 
 
 _SIGNS: Final[dict[Order, Callable[[Moment, View], str | None]]] = {

@@ -5,7 +5,15 @@ from __future__ import annotations
 import sqlite3
 from typing import Final, NamedTuple
 
-from webots_mcp.contract import BUILT_IN_ACTIONS, ENDED_BY, HEARTBEAT_INTERVAL_S, MODE_EVENT, PAUSED
+from webots_mcp.contract import (
+    BUILT_IN_ACTIONS,
+    ENDED_BY,
+    HEARTBEAT_INTERVAL_S,
+    MODE_EVENT,
+    PAUSED,
+    UNMOVED,
+    UNSEEN,
+)
 from webots_mcp.settlement import EXTERN
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.runs import Run
@@ -172,12 +180,20 @@ def _why_unpublished(
         or unpublished_s <= 0
     ):
         return None
-    return _UNPUBLISHED.format(unpublished_s)
+    return _unseen(session) or _UNPUBLISHED.format(unpublished_s)
+
+
+def _unseen(session: Session) -> str | None:
+    """That its loop stepped in a way that the bridge did not see, as its bridge found."""
+    error = session.last_error or ""
+    return error if error.startswith(UNSEEN) else None
 
 
 def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:
     if session.end_reason == "reload" and session.extern:
         return _RELOADED_EXTERN
+    if session.end_reason == "finished" and (unseen := _unseen(session)):
+        return unseen
     if session.end_reason == "crashed" and (error := ended_by(connection, session.id)):
         return f"its controller ended by {error}"
     return _ENDED.get(session.end_reason or "crashed")
@@ -195,8 +211,12 @@ def _why_standing(
     """Why the time of a living controller, which its bridge does not hold, stands still."""
     if inside := handler_at_work(connection, session, now_s):
         return inside
-    if seen := _seen_by_observer(connection, session, now_s):
+    unseen = moved_s is None and session.last_poll_wall_time_s is None
+    seen = _seen_by_observer(connection, session, now_s)
+    if seen and not (unseen and seen.startswith(SEEN_RUNNING)):
         return seen
+    if unseen:
+        return UNMOVED
     if moved_s is None:
         return _NOT_STARTED
     # A loop that hangs in a step beat last when it last moved: only a later beat shows it alive.
@@ -244,8 +264,10 @@ def stopped_for(seconds: float) -> str:
 
 
 def _stopped(session: Session, moved_s: float | None, now_s: float, why: str | None) -> Status:
-    since_s = moved_s or session.started_wall_time_s
-    return Status(stopped_for(session.age_s(since_s, now_s)), why)
+    seconds = session.age_s(moved_s or session.started_wall_time_s, now_s)
+    if why == UNMOVED:
+        return Status(f"not seen moving for {max(seconds, 0.0):.0f} s", why)
+    return Status(stopped_for(seconds), why)
 
 
 def find_holder(connection: sqlite3.Connection, session: Session, now_s: float) -> Session | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -70,6 +71,24 @@ def test_a_subclass_with_a_step_of_its_own_keeps_what_it_returns(
     with MCPBridge.attach(robot, database=database, throttle_interval=1):
         assert robot.step("left") == ("observation", False)
     assert times(recording) == [0.016, 0.032, 0.048, 0.064]
+
+
+class Driver(InProcessSupervisor):
+    """As Webots' own for cars: its step is one call in C, which comes by no other method."""
+
+    __module__ = "vehicle.driver"
+
+    def step(self) -> int:  # type: ignore[override]
+        return inspect.unwrap(InProcessSupervisor.step)(self, STEP_MS)
+
+
+def test_each_step_of_a_vehicles_driver_is_published(
+    database: MemoryDatabase, recording: Recording
+) -> None:
+    car = Driver("car")
+    with MCPBridge.attach(car, database=database, throttle_interval=1):
+        assert [car.step() for _ in range(3)] == [0, 0, 0]
+    assert times(recording) == [0.016, 0.032, 0.048]
 
 
 class Owner:

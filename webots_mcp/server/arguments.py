@@ -2,14 +2,19 @@
 
 The SDK ignores an argument that a tool does not have, so that the answer would be to another
 question than was asked; and it tells what is wrong with a value in the words of its validator.
+
+What another server with tools of these names takes is taken as well: all arguments in one object
+`params`, and a `response_format`, whatever it says. Parameters whose type has pydantic's
+`SkipJsonSchema` are for its habits too: they are taken, and stand in no schema.
 """
 
 from __future__ import annotations
 
 import difflib
+import json
 import re
-from collections.abc import Iterable
-from typing import Any, Final
+from collections.abc import Collection, Iterable
+from typing import Any, Final, cast
 
 from mcp.server.mcpserver.exceptions import ToolError
 from mcp.server.mcpserver.tools import Tool
@@ -18,6 +23,9 @@ from pydantic_core import ErrorDetails
 
 from webots_mcp.naming import nearest_first
 
+_WRAPPER: Final = "params"
+_FORMAT: Final = "response_format"
+_FORMATS: Final = (None, "json", "markdown")
 _MOST_FAULTS: Final = 3
 _UNSAID: Final = ("title", "anyOf", "maxLength", "maxProperties")
 _LONGEST_VALUE: Final = 80
@@ -41,8 +49,14 @@ class CheckedTool(Tool):
             ToolError: An argument is unknown, missing or out of bounds, or the tool refused.
         """
         properties = self.parameters["properties"]
-        _require_known(arguments, properties)
-        meant = {name: _as_meant(value, properties[name]) for name, value in arguments.items()}
+        required = self.parameters.get("required", ())
+        arguments = _unwrapped(arguments, properties, required)
+        _require_known(arguments, self.fn_metadata.arg_model.model_fields, properties)
+        meant = {
+            name: _as_meant(value, properties.get(name, {}))
+            for name, value in arguments.items()
+            if value is not None or name in required  # null is as good as left out
+        }
         try:
             return await super().run(meant, context, convert_result)
         except ToolError as error:
@@ -66,10 +80,34 @@ def _slim(schema: dict[str, Any]) -> dict[str, Any]:
     return kept | ({"anyOf": choices} if len(choices) > 1 else {})
 
 
-def _require_known(arguments: Iterable[str], known: Iterable[str]) -> None:
+def _unwrapped(
+    arguments: dict[str, Any], own: Collection[str], required: Iterable[str]
+) -> dict[str, Any]:
+    """The arguments of a client, without what was written for another server."""
+    is_needed = any(name not in arguments for name in required)
+    if arguments.keys() == {_WRAPPER} and (_WRAPPER not in own or is_needed):
+        inner = _as_object(arguments[_WRAPPER])
+        arguments = arguments if inner is None else inner
+    asked = arguments.get(_FORMAT)
+    if asked not in _FORMATS:
+        raise ToolError(f"{_FORMAT} must be 'json' or 'markdown', not {_shown(asked)}")
+    return {name: value for name, value in arguments.items() if name != _FORMAT}
+
+
+def _as_object(value: Any) -> dict[str, Any] | None:
+    """An object, or the JSON text of one."""
+    if isinstance(value, str):
+        try:
+            value = json.loads(value)
+        except (ValueError, RecursionError):
+            return None
+    return cast("dict[str, Any]", value) if isinstance(value, dict) else None
+
+
+def _require_known(arguments: Iterable[str], known: Collection[str], listed: Iterable[str]) -> None:
     for name in arguments:
         if name not in known:
-            there = ", ".join(nearest_first(name, known)) or "none"
+            there = ", ".join(nearest_first(name, listed)) or "none"
             raise ToolError(f"no parameter {_shown(name)}: there is {there}")
 
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final
 from anyio import to_thread
 from mcp.server.mcpserver import Context
 from pydantic import Field
+from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.contract import MAX_STEPS
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
@@ -74,12 +75,13 @@ async def webots_simulation_control(
 async def webots_world_reload(
     recording: Recording,
     ctx: Context[Any],
+    force: SkipJsonSchema[Force] = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _RELOAD_WAIT_S,
 ) -> CommandAnswer:
     """Load world and code anew: webots_simulation_control("reload") by another name."""
     dispatcher = Dispatcher(recording, ctx.report_progress)
-    return await Attempt(recording, dispatcher, robot, timeout_s, "reload", {}).steer()
+    return await Attempt(recording, dispatcher, robot, timeout_s, "reload", {}, force).steer()
 
 
 @tool("Reset the world", RESTARTS)
@@ -101,7 +103,7 @@ async def webots_reset_controller_state(
 ) -> CommandAnswer:
     """Put the controller's own variables back; world and time go on as they are.
 
-    Runs the callbacks that it registered with bridge.on_reload().
+    Runs its own action reset_state, else the callbacks that it registered with bridge.on_reload().
     """
     return await Dispatcher(recording, ctx.report_progress).ask(robot, "reset_state", timeout_s)
 

@@ -12,6 +12,7 @@ import anyio
 from anyio import to_thread
 from mcp.server.mcpserver import Context
 from pydantic import Field
+from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.server.budget import BUDGET, answer_about, notes_of
@@ -35,14 +36,15 @@ _SHOWN_EVENTS: Final = 30
 _TOLD_RUNS: Final = 2  # whose trends are told: that before a reset, and that after it
 _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "noticed"))  # without any row
 
+_WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
+
 
 @tool("Watch the robot", READS)
 async def webots_monitor(
     recording: Recording,
     ctx: Context[Any],
     duration_s: Annotated[
-        Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None,
-        Field(description="How long to watch, wall seconds; by default 10."),
+        _WatchS, Field(description="How long to watch, wall seconds; by default 10.")
     ] = None,
     lookback_s: Annotated[
         float | None,
@@ -53,6 +55,7 @@ async def webots_monitor(
             "newest row.",
         ),
     ] = None,
+    duration: SkipJsonSchema[_WatchS] = None,
     robot: RobotName = None,
 ) -> MonitorAnswer:
     """What does it do now? Watch it live for some seconds of wall time, then report.
@@ -60,11 +63,11 @@ async def webots_monitor(
     Movement, trends and events of exactly the rows of that window. For longer ago, another run,
     or chosen signals: webots_get_trends and webots_find_events, which take simulation time.
     """
-    if lookback_s is not None and duration_s is not None:
+    if sum(each is not None for each in (duration_s, lookback_s, duration)) > 1:
         raise InvalidInputError(
             "give either duration_s, to watch from now on, or lookback_s, to look back at once"
         )
-    duration_s = duration_s or USUAL_DURATION_S
+    duration_s = duration_s or duration or USUAL_DURATION_S
     if lookback_s is not None:
         return await to_thread.run_sync(look_back, recording, robot, lookback_s)
     name, started_s, is_live = await to_thread.run_sync(_start, recording, robot)

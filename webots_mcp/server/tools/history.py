@@ -90,7 +90,7 @@ def _series(
     points = min(max_points or DEFAULT_POINTS, _likely_points(view, asked, names, budget))
     while True:
         history = query_history(view.connection, asked, names, max_points=points)
-        runs = [_run_series(run) for run in history.runs if run.rows != 0]
+        runs = [_run_series(run) for run in history.runs if run.rows or run.cut_at_s is not None]
         size = _size(runs)
         if size <= budget or points == 1:
             break
@@ -129,16 +129,15 @@ def _drop_signals(run: RunSeries, budget: int) -> str | None:
 
 def _run_series(run: RunHistory) -> RunSeries:
     counts = _usual_counts(run.numbers)
-    rows_only = run.step_s is None
     return RunSeries(
         run_id=run.run_id,
         start_s=seconds(run.start_s),
         end_s=seconds(run.end_s),
         step_s=run.step_s,
         sim_time_s=[seconds(time_s) for time_s in run.sim_time_s] if run.numbers else None,
-        count=None if rows_only else counts,
+        count=None if run.step_s is None else counts,
         numbers={
-            str(short_name(columns.name)): _number_series(columns, counts, rows_only=rows_only)
+            str(short_name(columns.name)): _number_series(columns, counts, run)
             for columns in run.numbers
         }
         or None,
@@ -158,14 +157,14 @@ def _usual_counts(numbers: Sequence[NumberColumns]) -> list[int] | None:
 
 
 def _number_series(
-    columns: NumberColumns, counts: list[int] | None, *, rows_only: bool
+    columns: NumberColumns, counts: list[int] | None, run: RunHistory
 ) -> NumberSeries:
     whole, replaced = columns.whole, columns.odd or None
     if not whole.present:
-        return NumberSeries(silent=True, replaced=replaced)
+        return NumberSeries(silent=run.cut_at_s is None or None, replaced=replaced)
     if whole.min is None:
         return NumberSeries(replaced={**(replaced or {}), "beyond 1e100": whole.present})
-    if rows_only:
+    if run.step_s is None:
         return NumberSeries(unit=columns.unit, value=figures(columns.last), replaced=replaced)
     if whole.min == whole.max and columns.count == counts:
         return NumberSeries(unit=columns.unit, constant=figure(whole.min), replaced=replaced)
@@ -189,8 +188,11 @@ def _number_series(
 
 def _change_series(columns: ChangeColumns) -> ChangeSeries:
     """A text or a flag as columns."""
+    times_s = [seconds(point.sim_time_s) for point in columns.points]
+    if columns.since_before and columns.total == len(times_s):
+        times_s[:1] = [None]
     return ChangeSeries(
-        since_s=[seconds(point.sim_time_s) for point in columns.points],
+        since_s=times_s,
         value=[shown(point.value) for point in columns.points],
         total=columns.total if columns.total > len(columns.points) else None,
         time_by_value_s={

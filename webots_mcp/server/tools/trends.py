@@ -65,7 +65,7 @@ def webots_get_trends(
 def _found(view: View, asked: TimeRange, names: Sequence[str], limit: int | None) -> dict[str, Any]:
     found = trends(view.connection, asked, names, limit=MOST_SIGNALS)
     budget = (BUDGET if limit is None else LARGE_BUDGET) // max(len(found.runs), 1)
-    recorded = [run for run in found.runs if run.rows]
+    recorded = [run for run in found.runs if run.rows or run.cut_at_s is not None]
     runs = [trend_tables(run, limit or DEFAULT_LIMIT, budget) for run in recorded]
     return {
         "runs": runs or None,
@@ -87,7 +87,7 @@ def trend_tables(run: RunTrends, limit: int, budget: int) -> RunTrendTables:
     return RunTrendTables(
         run_id=run.run_id,
         start_s=seconds(run.start_s),
-        end_s=seconds(run.end_s),
+        end_s=seconds(run.end_s if run.cut_at_s is None else run.cut_at_s),
         rows=run.rows,
         from_means_of_s=run.resolution_s,
         numbers=table(TREND_COLUMNS, rows),

@@ -14,7 +14,7 @@ import numpy as np
 from webots_mcp.naming import Value
 from webots_mcp.store.analysis.track import Track, path_length_m
 from webots_mcp.store.detection.motion import Motion, position_noise, tracks_in
-from webots_mcp.store.reading.changes import Point, change_points
+from webots_mcp.store.reading.changes import Changes, Point, change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, just_after, recorded_bounds
 from webots_mcp.store.reading.rows import read_columns
@@ -60,7 +60,7 @@ class MovedIn:
         self._motion = motion
         self._deadline = deadline
         self.cut: set[Value] = set()
-        self._points: dict[int, list[Point]] = {}
+        self._changes: dict[int, Changes] = {}
         self._noises_m: dict[int, float | None] = {}
         self._seen: dict[Value, Seen | None] = {}
 
@@ -100,13 +100,13 @@ class MovedIn:
         if bounds is None or signal is None:
             return
         whole = Segment(run_id, bounds[0], just_after(bounds[1]))
-        points = self._points.get(run_id)
-        if points is None:
+        found = self._changes.get(run_id)
+        if found is None:
             found = change_points(self._connection, whole, [signal], self._deadline)
-            points = found[signal.name]
-            if not self._deadline.passed:
-                self._points[run_id] = points
-        for at, (point, after) in enumerate(pairwise([*points, Point(whole.end_s, None)])):
+            if found.unread_from_s is None:
+                self._changes[run_id] = found
+        end = Point(found.read_to_s(whole.end_s), None)
+        for at, (point, after) in enumerate(pairwise([*found.points[signal.name], end])):
             if point.value == mode:
                 yield point.sim_time_s + (ROLLS_OUT_S if at else 0.0), after.sim_time_s
 

@@ -96,7 +96,9 @@ def gap_events(search: Search) -> Iterator[Event]:
     if exceeds(search.connection, around):
         rhythm = rhythm_in(search.connection, around)
     else:
-        rhythm = rhythm_of(read_columns(search.connection, around, (), search.deadline).times)
+        columns = read_columns(search.connection, around, (), search.deadline)
+        _note_unread(search, "gap", columns.cut_at_s)
+        rhythm = rhythm_of(columns.times)
     details = {"usual_interval_s": rhythm.interval_s}
     _note_hidden_gaps(search, segment, rhythm.interval_s)
     for gap in rhythm.gaps:
@@ -129,10 +131,16 @@ def change_events(search: Search) -> Iterator[Event]:
     _note_purged(search, [each.name for each in states if each.is_number])
     around = Segment(segment.run_id, segment.start_s - AROUND_S, segment.end_s + AROUND_S)
     found = change_points(search.connection, around, states, search.deadline, since=False)
+    _note_unread(search, "change", found.unread_from_s)
     for signal in states:
-        name, points = signal.name, found[signal.name]
+        name, points = signal.name, found.points[signal.name]
         told = _without_measurements(points)
-        ends_s = [*(point.sim_time_s for point in told[2:]), _last_ends_s(search, signal, told)]
+        last_s, cut_at_s = _last_ends_s(search, signal, told)
+        if cut_at_s is not None:
+            last_s = max(cut_at_s, told[-1].sim_time_s)
+            why = f"the time was over: that of {told[-1].sim_time_s:.3f} s may be longer"
+            search.not_searched("change", why)
+        ends_s = [*(point.sim_time_s for point in told[2:]), last_s]
         changes = [
             _Change(before, point, newest_s if end_s is None else end_s, end_s is None)
             for (before, point), end_s in zip(pairwise(told), ends_s, strict=False)
@@ -142,6 +150,13 @@ def change_events(search: Search) -> Iterator[Event]:
             why = f"not from number to number of {name}, which measures: ask signals=['{name}']"
             search.not_searched("change", f"{why} of webots_query_history")
         yield from _told(search, name, changes)
+
+
+def _note_unread(search: Search, kind: str, from_s: float | None) -> None:
+    if from_s is not None and from_s < search.segment.end_s:
+        from_s = max(from_s, search.segment.start_s)
+        why = f"not after {from_s:.3f} s, the time was over; ask start_s={from_s:.3f}"
+        search.not_searched(kind, why)
 
 
 def _note_purged(search: Search, numbers: Sequence[str]) -> None:
@@ -185,11 +200,13 @@ def _change(search: Search, name: str, change: _Change, details: dict[str, Any])
     return Event("change", *place, name, details, ongoing=change.ongoing)
 
 
-def _last_ends_s(search: Search, signal: Signal, told: Sequence[Point]) -> float | None:
-    """When the newest of some values ended; None where it goes on, or began elsewhere."""
+def _last_ends_s(
+    search: Search, signal: Signal, told: Sequence[Point]
+) -> tuple[float | None, float | None]:
+    """As `value_ended_s` of the newest of some values; None where it began elsewhere."""
     begin_s = told[-1].sim_time_s if told else math.inf
     if not search.segment.start_s <= begin_s < search.segment.end_s:
-        return None
+        return None, None
     after = Segment(search.segment.run_id, begin_s, just_after(search.ended_s))
     return value_ended_s(search.connection, after, signal, search.deadline)
 

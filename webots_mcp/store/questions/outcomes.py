@@ -28,7 +28,7 @@ from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.questions.events import Collected, collect
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.questions.ways import read_way, sampling_interval_s
-from webots_mcp.store.reading.changes import change_points, longest_values
+from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.signals.registry import Signal
@@ -275,9 +275,8 @@ def _mode_times(
 ) -> dict[str, float]:
     if part.motion.mode is None:
         return {}
-    points = change_points(connection, part.segment, [part.motion.mode], deadline)
-    segment = part.segment
-    return longest_values(points[part.motion.mode.name], segment.start_s, segment.end_s)
+    changes = change_points(connection, part.segment, [part.motion.mode], deadline)
+    return changes.longest_values(part.motion.mode.name, part.segment.end_s)
 
 
 def _events(

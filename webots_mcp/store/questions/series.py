@@ -12,7 +12,7 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.analysis.rhythm import Gap
 from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.reading.buckets import Table, Tier, tabulate
-from webots_mcp.store.reading.changes import Point, change_points, longest_values
+from webots_mcp.store.reading.changes import Changes, Point, change_points
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
 from webots_mcp.store.reading.snapshot import in_one_snapshot
@@ -21,6 +21,7 @@ from webots_mcp.store.signals.registry import Signal
 
 DEFAULT_POINTS: Final = 50
 MOST_POINTS: Final = 500
+STATES_SHARE: Final = 0.5  # of the time, where numbers are asked for as well
 
 _NEWEST_WALL: Final = (
     "SELECT coalesce((SELECT wall_time_s FROM state WHERE run_id = run.id "
@@ -64,6 +65,8 @@ class ChangeColumns:
             force when the range begins.
         total: How many points there are; `points` are the last of them.
         time_by_value_s: Simulated seconds in each value, the longest first.
+        since_before: The first of all points was in force before the time that it tells.
+        cut_at_s: The deadline passed; what was after that is not in the points.
     """
 
     name: str
@@ -71,6 +74,8 @@ class ChangeColumns:
     points: list[Point]
     total: int
     time_by_value_s: dict[str, float]
+    since_before: bool = False
+    cut_at_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -82,10 +87,10 @@ class RunHistory:
             from rows at both ends).
         step_s: Length of a bucket; None in the tier "rows".
         sim_time_s: Begin of each bucket.
-        rows: Rows of the range; None if it is long and only text was asked for.
+        rows: Rows of the range that were read.
         interval_s: Median simulated time between rows.
         gaps: Where rows are missing.
-        cut_at_s: The deadline passed; from there on rows are missing in the answer.
+        cut_at_s: The deadline passed; from there on something is missing in the answer.
         age_s: Wall time since the run's newest row.
     """
 
@@ -97,7 +102,7 @@ class RunHistory:
     sim_time_s: list[float]
     numbers: tuple[NumberColumns, ...]
     changes: tuple[ChangeColumns, ...]
-    rows: int | None
+    rows: int
     interval_s: float | None
     gaps: tuple[Gap, ...]
     cut_at_s: float | None
@@ -173,8 +178,10 @@ def _run_history(
 ) -> RunHistory:
     numbers = [signal for signal in signals if signal.is_number]
     states = [signal for signal in signals if not signal.is_number]
+    for_states = deadline.part(STATES_SHARE) if numbers else deadline
+    changes = change_points(connection, segment, states, for_states)
     table = tabulate(connection, segment, numbers, max_points, deadline, least_step_s)
-    points = change_points(connection, segment, states, deadline)
+    cuts_s = [each for each in (table.cut_at_s, changes.unread_from_s) if each is not None]
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
     return RunHistory(
         run_id=segment.run_id,
@@ -185,15 +192,13 @@ def _run_history(
         sim_time_s=list(table.starts),
         numbers=tuple(_columns(signal, table) for signal in numbers),
         changes=tuple(
-            _change_columns(
-                signal, points[signal.name], segment, bounds[1], max_changes or max_points
-            )
+            _change_columns(signal, changes, bounds[1], max_changes or max_points)
             for signal in states
         ),
         rows=table.rows,
         interval_s=table.rhythm.interval_s,
         gaps=table.rhythm.gaps,
-        cut_at_s=table.cut_at_s,
+        cut_at_s=min(cuts_s, default=None),
         age_s=time.time() - connection.execute(_NEWEST_WALL, (segment.run_id,)).fetchone()[0],
     )
 
@@ -217,8 +222,14 @@ def _columns(signal: Signal, table: Table) -> NumberColumns:
     )
 
 
-def _change_columns(
-    signal: Signal, points: list[Point], segment: Segment, newest_s: float, most: int
-) -> ChangeColumns:
-    seconds = longest_values(points, segment.start_s, min(segment.end_s, newest_s))
-    return ChangeColumns(signal.name, signal.kind, points[-most:], len(points), seconds)
+def _change_columns(signal: Signal, changes: Changes, newest_s: float, most: int) -> ChangeColumns:
+    points = changes.points[signal.name]
+    return ChangeColumns(
+        signal.name,
+        signal.kind,
+        points[-most:],
+        len(points),
+        changes.longest_values(signal.name, min(changes.segment.end_s, newest_s)),
+        since_before=signal.name in changes.since_before,
+        cut_at_s=changes.unread_from_s,
+    )

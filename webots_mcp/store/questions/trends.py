@@ -13,8 +13,9 @@ from webots_mcp.store.analysis.features import find_spikes
 from webots_mcp.store.analysis.summaries import Summaries
 from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_numbers, with_extremes
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
+from webots_mcp.store.questions.series import STATES_SHARE
 from webots_mcp.store.questions.trend import Trend, judge
-from webots_mcp.store.reading.changes import change_points, longest_values
+from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.coverage import purged_until_s
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
@@ -34,7 +35,7 @@ class StateTrend:
 
     Attributes:
         changes: How often it changed within the range.
-        since_s: Since when it has its last value.
+        since_s: Since when it has its last value; None where that was not found.
         time_by_value_s: Simulated seconds in each value, the longest first.
     """
 
@@ -55,7 +56,8 @@ class RunTrends:
             shape, slope and swings come (counts, extremes, mean and deviation stay exact).
         numbers: What changed most comes first; at most `limit` of `total`.
         silent: Names that have no value in the range, or none that can be reckoned with.
-        cut_at_s: The deadline passed; from there on rows are missing in the answer.
+        rows: Rows that were read, be it as rollups.
+        cut_at_s: The deadline passed; from there on something is missing in the answer.
         rows_left: Whether less time would be seen in rows: they were not purged, or not all.
     """
 
@@ -132,6 +134,8 @@ def _run_trends(
     numbers = [signal for signal in signals if signal.is_number and not signal.is_choice]
     states = [signal for signal in signals if signal not in numbers]
     found: list[Trend | None]
+    for_states = deadline.part(STATES_SHARE) if numbers else deadline
+    told, states_cut_s = _state_trends(connection, segment, states, for_states)
     purged_s = purged_until_s(connection, segment.run_id, segment.start_s)
     rows_left = purged_s is None or purged_s < segment.end_s
     if exceeds(connection, segment):
@@ -144,21 +148,20 @@ def _run_trends(
             for signal, of_signal in zip(numbers, parts, strict=True)
         ]
         has_values = [bool(of_signal["present"].any()) for of_signal in parts]
-        rows = max((of_signal.rows for of_signal in parts), default=0)
-        resolution_s, cut_at_s = piece_s, pieces.cut_at_s
+        rows, resolution_s, numbers_cut_s = pieces.rows, piece_s, pieces.cut_at_s
     else:
         read = read_numbers(connection, segment, numbers, deadline)
         kept = None if segment.full_rate else kept_columns(connection, segment, numbers, deadline)
         found = [_trend_of_rows(signal, read, kept) for signal in numbers]
         has_values = [not np.isnan(read.values[signal.name]).all() for signal in numbers]
-        rows, resolution_s = len(read.times), None
-        cut_at_s = [segment.start_s, *read.times.tolist()][-1] if read.cut else None
+        rows, resolution_s, numbers_cut_s = len(read.times), None, read.cut_at_s
     held = sorted((trend for trend in found if trend), key=lambda trend: -trend.change)
     silent = [
         f"{signal.name} ({TOO_LARGE})" if has_value else signal.name
         for signal, trend, has_value in zip(numbers, found, has_values, strict=True)
-        if trend is None
+        if trend is None and (has_value or numbers_cut_s is None)
     ]
+    cuts_s = [each for each in (numbers_cut_s, states_cut_s) if each is not None]
     return RunTrends(
         run_id=segment.run_id,
         start_s=segment.start_s,
@@ -166,10 +169,10 @@ def _run_trends(
         resolution_s=resolution_s,
         rows=rows,
         numbers=tuple(held[:limit]),
-        states=_state_trends(connection, segment, states, deadline),
+        states=told,
         silent=tuple(silent),
         total=len(held),
-        cut_at_s=cut_at_s,
+        cut_at_s=min(cuts_s, default=None),
         rows_left=rows_left,
     )
 
@@ -218,21 +221,25 @@ def _state_trends(
     segment: Segment,
     states: Sequence[Signal],
     deadline: Deadline,
-) -> tuple[StateTrend, ...]:
-    """Text, flags and numbers that name a mode, those that changed most often first."""
-    points = change_points(connection, segment, states, deadline)
+) -> tuple[tuple[StateTrend, ...], float | None]:
+    """Text, flags and numbers that name a mode, those that changed most often first.
+
+    And from where on they were not read; None where they all were.
+    """
+    found = change_points(connection, segment, states, deadline)
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
     end_s = min(segment.end_s, bounds[1])
-    found = [
+    told = [
         StateTrend(
             name=signal.name,
             kind=signal.kind,
-            changes=len(points[signal.name]) - 1,
-            last=points[signal.name][-1].value,
-            since_s=points[signal.name][-1].sim_time_s,
-            time_by_value_s=longest_values(points[signal.name], segment.start_s, end_s),
+            changes=len(points) - 1,
+            last=points[-1].value,
+            since_s=None if is_open else points[-1].sim_time_s,
+            time_by_value_s=found.longest_values(signal.name, end_s),
         )
         for signal in states
-        if points[signal.name]
+        if (points := found.points[signal.name])
+        for is_open in [len(points) == 1 and signal.name in found.since_before]
     ]
-    return tuple(sorted(found, key=lambda state: -state.changes))
+    return tuple(sorted(told, key=lambda state: -state.changes)), found.unread_from_s

@@ -35,16 +35,17 @@ class Table:
         step_s: Length of a bucket; None in the tier "rows".
         starts: Begin of each bucket.
         cells: Per signal one summary per bucket.
-        rows: Rows of the segment; None if it is long and no numeric signal tells.
+        rows: Rows of the segment that were read, be it as rollups.
         odd: Per signal, how often each value that JSON cannot hold; None if long.
-        cut_at_s: Where the deadline stopped the reading of rows; None if it did not.
+        cut_at_s: Where the deadline stopped the reading: nothing behind it is in the table. None
+            if it did not.
     """
 
     tier: Tier
     step_s: float | None
     starts: list[float]
     cells: dict[str, list[Summary]]
-    rows: int | None
+    rows: int
     rhythm: Rhythm
     odd: dict[str, Counter[str]] | None
     cut_at_s: float | None
@@ -121,10 +122,9 @@ def _from_rows(
         ]
         for signal in signals
     }
-    cut_at_s = (times[-1] if times else math.inf) if columns.cut else None
     tier = "rows" if step_s is None else "raw"
     rhythm = rhythm_of(times)
-    return Table(tier, step_s, starts, cells, len(times), rhythm, columns.odd, cut_at_s)
+    return Table(tier, step_s, starts, cells, len(times), rhythm, columns.odd, columns.cut_at_s)
 
 
 def _edges(times: Sequence[float], step_s: float) -> tuple[list[float], list[int]]:
@@ -177,7 +177,7 @@ def _from_rollups(
     numbers = [piece for of_signal in found.values() for piece, _ in of_signal]
     rhythm = rhythm_in(connection, segment)
     if not numbers:
-        return Table("rollup", unit_s, [], {}, None, rhythm, None, pieces.cut_at_s)
+        return Table("rollup", unit_s, [], {}, pieces.rows, rhythm, None, pieces.cut_at_s)
     first, last = min(numbers), max(numbers)
     bounds = (first * unit_s, last * unit_s)
     step_s = _step(*bounds, max_points, unit_s=unit_s, least_s=least_step_s)
@@ -185,8 +185,8 @@ def _from_rollups(
     indexes = range(first // width, last // width + 1)
     starts = [index * step_s for index in indexes]
     cells = {name: _widened(pieces, width, indexes) for name, pieces in found.items()}
-    rows = max(sum(cell.rows for cell in column) for column in cells.values())
-    return Table("rollup", step_s, starts, cells, rows, rhythm, None, pieces.cut_at_s)
+    cut_at_s = pieces.cut_at_s
+    return Table("rollup", step_s, starts, cells, pieces.rows, rhythm, None, cut_at_s)
 
 
 def _widened(pieces: list[tuple[int, Summary]], width: int, indexes: range) -> list[Summary]:

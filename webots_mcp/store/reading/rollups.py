@@ -50,6 +50,7 @@ _ROW_IN: Final = (
 
 
 _BEFORE_ALL: Final = -(2**62)
+_BUCKETS_AT_ONCE: Final = 500  # of all signals, between two looks at what they hold together
 _Part = tuple["Indexes", "Array"]  # the numbers of pieces, and a table of their summaries
 
 
@@ -58,11 +59,14 @@ class Pieces:
 
     Attributes:
         piece_s: The length of a piece.
-        cut_at_s: Where the deadline stopped the reading of rows; None if it did not.
+        rows: How many state rows are in all pieces, with whatever signals.
+        cut_at_s: Where the deadline stopped the reading: nothing behind it is in the pieces. None
+            if it did not.
     """
 
     def __init__(self, signals: Sequence[Signal], piece_s: float) -> None:
         self.piece_s = piece_s
+        self.rows = 0
         self.cut_at_s: float | None = None
         self._signals = signals
         nothing = np.empty(0, np.intp), Summaries.of([]).table
@@ -70,8 +74,8 @@ class Pieces:
 
     def add_rows(self, columns: Columns) -> None:
         """Add state rows."""
-        if columns.cut:
-            self._note_cut(columns.times[-1] if columns.times else math.inf)
+        self.rows += len(columns.times)
+        self.cut_at_s = columns.cut_at_s
         pieces: Indexes = (columns.moments // self.piece_s).astype(np.intp)
         starts = np.flatnonzero(np.diff(pieces, prepend=_BEFORE_ALL))
         spans = list(pairwise([*starts.tolist(), len(pieces)]))
@@ -88,19 +92,23 @@ class Pieces:
         span: range,
         deadline: Deadline,
     ) -> None:
-        """Add the stored rollups of those buckets, signal by signal until the deadline.
+        """Add the stored rollups of those buckets, of all signals or of none.
 
         As with rows, all count: also those that do not hold the signal.
         """
         rows = rows_by_bucket(connection, run_id, grain, span)
+        found: dict[str, _Part] = {}
         for signal in self._signals:
             if signal.id is None:
                 continue
             if deadline.passed:
-                self._note_cut(span.start * grain.bucket_s)
+                self.cut_at_s = span.start * grain.bucket_s
                 return
             table = bucket_table(connection, run_id, signal.id, span, grain)
-            self._parts[signal.name].append(self._counted(table, rows, grain))
+            found[signal.name] = self._counted(table, rows, grain)
+        self.rows += sum(rows.values())
+        for name, part in found.items():
+            self._parts[name].append(part)
 
     def of(self, name: str) -> list[tuple[int, Summary]]:
         """The pieces of a signal that have rows, by their numbers, in order."""
@@ -136,9 +144,6 @@ class Pieces:
         table[places, 0] = np.maximum(table[places, 0], list(rows.values()))
         return (numbers * grain.bucket_s // self.piece_s).astype(np.intp), table
 
-    def _note_cut(self, at_s: float) -> None:
-        self.cut_at_s = at_s if self.cut_at_s is None else min(self.cut_at_s, at_s)
-
 
 def piece_length_s(
     connection: sqlite3.Connection, segment: Segment, pieces: int, least_s: float = 0.0
@@ -169,7 +174,8 @@ def read_pieces(
         connection: Any.
         segment: Which stretch.
         signals: Which numbers of it.
-        deadline: After it nothing more is read, and the answer says where.
+        deadline: After it nothing more is read: the pieces say from where on, and hold nothing of
+            what lies behind that.
         piece_s: How fine the pieces are: `BUCKET_S` or, from coarse rollups, `COARSE_S`.
     """
     pieces = Pieces(signals, piece_s)
@@ -184,10 +190,15 @@ def read_pieces(
     pieces.add_rows(read_columns(connection, head, signals, deadline))
     parts = [(FINE, span)] if piece_s < COARSE_S else by_grain(connection, segment.run_id, span)
     for grain, part in parts:
-        pieces.add_rollups(connection, segment.run_id, grain, part, deadline)
-    if (late := rows_after(connection, middle, mark)) is not None:
+        for first in part[::_BUCKETS_AT_ONCE]:
+            some = range(first, min(first + _BUCKETS_AT_ONCE, part.stop))
+            if pieces.cut_at_s is None:
+                pieces.add_rollups(connection, segment.run_id, grain, some, deadline)
+    late = rows_after(connection, middle, mark)
+    if late is not None and pieces.cut_at_s is None:
         pieces.add_rows(read_columns(connection, late, signals, deadline, after=mark))
-    pieces.add_rows(read_columns(connection, foot, signals, deadline))
+    if pieces.cut_at_s is None:
+        pieces.add_rows(read_columns(connection, foot, signals, deadline))
     return pieces
 
 

@@ -62,7 +62,8 @@ class Columns:
     Attributes:
         values: Per signal one value per row; None where the row has none.
         odd: Per signal, how often each value that JSON cannot hold ("nan", "inf") stood there.
-        cut: The deadline passed; the rows after the last one were not read.
+        cut_at_s: The deadline passed after this row, or before any where it is the begin of what
+            was to be read; None where all was read.
     """
 
     run_id: int
@@ -71,8 +72,13 @@ class Columns:
     walls: list[float] = field(default_factory=list[float])
     values: dict[str, list[Value]] = field(default_factory=dict[str, list[Value]])
     odd: dict[str, Counter[str]] = field(default_factory=dict[str, Counter[str]])
-    cut: bool = False
+    cut_at_s: float | None = None
     _aligned: dict[str, Array] = field(default_factory=dict[str, Array], repr=False)
+
+    @property
+    def cut(self) -> bool:
+        """Whether not all rows were read."""
+        return self.cut_at_s is not None
 
     @cached_property
     def moments(self) -> Array:
@@ -106,13 +112,13 @@ class Numbers:
         values: Per signal one number per row; NaN where the row has none.
         stretch_rows: How many rows the stretch has in which only these may hold a large step; None
             where these are all of it.
-        cut: The deadline passed; the rows after the last one were not read.
+        cut_at_s: As of `Columns`.
     """
 
     times: Array
     values: dict[str, Array]
     stretch_rows: int | None = None
-    cut: bool = False
+    cut_at_s: float | None = None
 
     def of(self, name: str) -> tuple[Array, Array]:
         """Times and numbers of a signal, of the rows that have a usable one."""
@@ -122,7 +128,7 @@ class Numbers:
 def numbers_of(columns: Columns, signals: Sequence[Signal]) -> Numbers:
     """The numbers of some signals."""
     values = {each.name: columns.aligned(each.name) for each in signals}
-    return Numbers(columns.moments, values, cut=columns.cut)
+    return Numbers(columns.moments, values, cut_at_s=columns.cut_at_s)
 
 
 def exceeds(connection: sqlite3.Connection, segment: Segment) -> bool:
@@ -165,7 +171,7 @@ def read_columns(
     """
     columns = Columns(segment.run_id, values={signal.name: [] for signal in signals})
     read = _read_decoded if exact or _are_decoded(signals) else _read_extracted
-    with _until(deadline, connection, columns):
+    with _until(deadline, connection, columns, segment.start_s):
         read(connection, signals, _rows_of(segment, after, limit, tables), columns, deadline)
     for signal in signals:
         columns.values[signal.name] = cleaned(signal, columns.values[signal.name])
@@ -184,13 +190,13 @@ def read_numbers(
     columns = Columns(segment.run_id)
     parts: list[Array] = []
     paths = tuple(signal.path for signal in signals)
-    with _until(deadline, connection, columns):
+    with _until(deadline, connection, columns, segment.start_s):
         rows = _rows_of(segment)
         for _, texts in _chunks(connection, rows, extracted("data", paths), columns, deadline):
             parts.append(_numbers_at(signals, texts))
     numbers = np.concatenate(parts, axis=1) if parts else np.empty((len(signals), 0))
     values = {signal.name: row for signal, row in zip(signals, numbers, strict=True)}
-    return Numbers(columns.moments, values, cut=columns.cut)
+    return Numbers(columns.moments, values, cut_at_s=columns.cut_at_s)
 
 
 def _are_decoded(signals: Sequence[Signal]) -> bool:
@@ -198,7 +204,9 @@ def _are_decoded(signals: Sequence[Signal]) -> bool:
 
 
 @contextlib.contextmanager
-def _until(deadline: Deadline, connection: sqlite3.Connection, columns: Columns) -> Generator[None]:
+def _until(
+    deadline: Deadline, connection: sqlite3.Connection, columns: Columns, start_s: float
+) -> Generator[None]:
     """What is read inside ends at the deadline, and the columns are cut then."""
     try:
         with deadline.interrupting(connection):
@@ -206,7 +214,7 @@ def _until(deadline: Deadline, connection: sqlite3.Connection, columns: Columns)
     except sqlite3.OperationalError:
         if not deadline.passed:
             raise
-        columns.cut = True
+        columns.cut_at_s = columns.times[-1] if columns.times else start_s
 
 
 def _rows_of(
@@ -377,7 +385,7 @@ def _chunks(
         columns.walls.extend(walls)
         yield odds, texts
         if ahead and deadline.passed:
-            columns.cut = True
+            columns.cut_at_s = columns.times[-1]
             return
 
 

@@ -55,7 +55,7 @@ def read_sampled(
     except sqlite3.OperationalError:
         if not deadline.passed:
             raise
-        columns.cut = True
+        columns.cut_at_s = rows[-1][1] if rows else segment.start_s
     distinct = list({row[0]: row for row in rows}.values())  # a gap gives one row several times
     *heads, texts = list(zip(*distinct, strict=True)) or [()] * 4
     columns.ids, columns.times, columns.walls = (list(column) for column in heads)

@@ -193,7 +193,7 @@ class RowView:
         self.notes: list[str] = []
         self._lasting: list[str] = []
         if columns.cut:
-            after = f"after {columns.times[-1]:.3f} s" if columns.times else "at all"
+            after = f"after {columns.cut_at_s:.3f} s" if columns.times else "at all"
             self._lasting.append(f"the time was over: not read {after}; ask for less time")
         self._columns = columns
         length_s = columns.times[-1] - columns.times[0] if columns.times else 0.0
@@ -546,12 +546,11 @@ class LongView:
             return kept
         wanted = list({each.name: each for each in signals}.values())
         numbers = read_numbers(self._connection, part, wanted, self._deadline)
-        if numbers.cut:
-            reached_s = [part.start_s, *numbers.times.tolist()][-1]
+        if (reached_s := numbers.cut_at_s) is not None:
             span = f"start_s={reached_s:.3f}, end_s={part.end_s:.3f}"
             self.notes.append(f"not from {reached_s:.3f} s on, the time was over; ask {span}")
         held = sum(len(each.times) * len(each.values) for each in self._kept.values())
-        if not numbers.cut and held < MOST_KEPT:
+        if reached_s is None and held < MOST_KEPT:
             self._kept[part] = numbers
         return numbers
 

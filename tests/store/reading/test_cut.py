@@ -1,0 +1,147 @@
+"""What there was no time to read is left out of an answer, and the answer says from where on."""
+
+from __future__ import annotations
+
+import itertools
+import sqlite3
+from collections.abc import Iterator
+
+import pytest
+
+from tests.memory import memory_connection
+from tests.recordings.rover import start_run
+from webots_mcp.store.questions.series import query_history
+from webots_mcp.store.questions.trends import trends
+from webots_mcp.store.reading.changes import change_points
+from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.ranges import Scope, Segment, find_range, whole_run
+from webots_mcp.store.reading.rollups import read_pieces
+from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.store.signals.catalogue import known_signals
+from webots_mcp.store.signals.registry import Signal
+
+ROWS = 20_000
+INTERVAL_S = 0.1
+MODES = {0.0: "rest", 500.0: "walk", 1500.0: "turn"}  # from when on
+ENOUGH = 10_000  # looks at the clock
+SOME = range(60)
+
+
+@pytest.fixture(scope="module")
+def unsummed() -> Iterator[sqlite3.Connection]:
+    """A run that has ended and that nobody has summed up."""
+    with memory_connection() as connection:
+        recorder = start_run(connection)
+        for step in range(ROWS):
+            time_s = round(step * INTERVAL_S, 1)
+            recorder.publish(
+                time_s, {"mode": mode_at(time_s), "gear": gear_at(time_s), "x": time_s}
+            )
+        recorder.end_run("finished")
+        yield connection
+
+
+def mode_at(time_s: float) -> str:
+    return [mode for from_s, mode in MODES.items() if from_s <= time_s][-1]
+
+
+def gear_at(time_s: float) -> str | int:
+    """At first a number, of which no change is stored."""
+    return 1 if time_s < 800 else "reverse"
+
+
+def after(looks: int) -> Deadline:
+    """A deadline that has passed when its clock was looked at so often."""
+    return Deadline(looks, itertools.count().__next__)
+
+
+def signals_of(connection: sqlite3.Connection, *names: str) -> list[Signal]:
+    known = known_signals(connection, find_range(connection, Scope()))
+    return [known[name] for name in names]
+
+
+@pytest.mark.parametrize(("start_s", "is_cut"), [(0.0, True), (900.0, True), (1990.0, False)])
+def test_no_mode_is_told_but_that_of_the_rows_wherever_the_time_was_over(
+    unsummed: sqlite3.Connection, start_s: float, *, is_cut: bool
+) -> None:
+    segment = Segment(1, start_s, 2000.0)
+    wanted = signals_of(unsummed, "mode", "gear")
+    reached_s = set[float | None]()
+    for looks in SOME:
+        found = change_points(unsummed, segment, wanted, after(looks))
+        points = found.points["mode"]
+        assert [point.value for point in points] == [mode_at(p.sim_time_s) for p in points]
+        assert all(point.sim_time_s <= found.read_to_s(2000.0) for point in points)
+        if points and "mode" not in found.since_before:
+            assert points[0].sim_time_s == max(each for each in MODES if each <= start_s)
+        seconds = found.longest_values("mode", 2000.0)
+        assert sum(seconds.values()) == pytest.approx(found.read_to_s(2000.0) - start_s)
+        reached_s.add(found.unread_from_s)
+    whole = change_points(unsummed, segment, wanted, after(ENOUGH))
+    assert whole.unread_from_s is None and not whole.since_before
+    assert whole.points["gear"][-1].value == "reverse"
+    assert (len(reached_s) > 3) is is_cut
+
+
+def test_since_when_a_mode_is_in_force_is_looked_for_backwards(
+    unsummed: sqlite3.Connection,
+) -> None:
+    """So that what is asked about is known before what was long before it."""
+    segment = Segment(1, 1990.0, 2000.0)
+    found = [
+        change_points(unsummed, segment, signals_of(unsummed, "mode"), after(looks))
+        for looks in (*SOME, ENOUGH)
+    ]
+    told = [each for each in found if each.points["mode"]]
+    assert [each.points["mode"][0].value for each in told] == ["turn"] * len(told)
+    assert all(each.unread_from_s is None for each in told), "ten seconds are read at once"
+    assert any("mode" in each.since_before for each in told)
+    assert told[-1].points["mode"][0].sim_time_s == 1500.0
+
+
+def test_pieces_hold_the_rows_up_to_where_they_were_cut_and_none_behind(
+    unsummed: sqlite3.Connection,
+) -> None:
+    whole = whole_run(unsummed, 1)
+    assert whole is not None
+    for looks in (*SOME, ENOUGH):
+        pieces = read_pieces(unsummed, whole, signals_of(unsummed, "x"), after(looks))
+        last_s = [summary.last for _, summary in pieces.of("x")][-1:]
+        if pieces.cut_at_s is None:
+            assert (pieces.rows, last_s) == (ROWS, [1999.9])
+        else:
+            assert last_s == [pieces.cut_at_s] * bool(pieces.rows)
+            rows = unsummed.execute(
+                "SELECT count(*) FROM state WHERE sim_time_s <= ?", (last_s or [-1.0],)[0]
+            )
+            assert (pieces.rows,) == rows.fetchone()
+
+
+def test_rollups_of_all_signals_end_together() -> None:
+    with memory_connection() as connection:
+        recorder = start_run(connection)
+        for step in range(13_000):
+            recorder.publish(float(step), {"x": step, "y": -step})
+        assert roll(connection, 100_000).done
+        whole = whole_run(connection, 1)
+        assert whole is not None
+        x, y = signals_of(connection, "x", "y")
+        ends = set[float | None]()
+        for looks in range(20):
+            pieces = read_pieces(connection, whole, [x, y], after(looks))
+            assert pieces.summaries("x").rows == pieces.summaries("y").rows == pieces.rows
+            ends.add(pieces.cut_at_s)
+        assert {0.0, 5000.0, 10_000.0, None} <= ends
+
+
+def test_who_had_no_time_at_all_says_so_of_text_as_of_numbers(
+    unsummed: sqlite3.Connection,
+) -> None:
+    found = find_range(unsummed, Scope(start_s=100.0))
+    for names in (["mode"], ["x"], ["mode", "x"]):
+        (history,) = query_history(unsummed, found, names, deadline_s=0.0).runs
+        (trend,) = trends(unsummed, found, names, deadline_s=0.0).runs
+        assert (history.cut_at_s, trend.cut_at_s) == (100.0, 100.0)
+        assert (history.rows, trend.rows) == (0, 0)
+        assert trend.silent == (), "nobody has looked"
+        assert not any(each.points or each.time_by_value_s for each in history.changes)

@@ -8,6 +8,8 @@ from __future__ import annotations
 import os
 import sqlite3
 import sys
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, get_args
 
@@ -209,6 +211,23 @@ def make_folder(folder: Path) -> None:
         OSError: It cannot be made.
     """
     folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+
+
+@contextmanager
+def whole_file(file: Path) -> Generator[Path]:
+    """A file beside it to write to, of its owner alone, which takes its place when it is whole.
+
+    Raises:
+        OSError: It cannot be written; nothing is left beside it.
+    """
+    aside = file.with_name(f"{file.name}.part")
+    aside.touch(PRIVATE_FILE)
+    try:
+        aside.chmod(PRIVATE_FILE)  # also of one that a killed process has left
+        yield aside
+        os.replace(aside, file)  # noqa: PTH105
+    finally:
+        aside.unlink(missing_ok=True)
 
 
 def full_path(path: str | os.PathLike[str]) -> Path:

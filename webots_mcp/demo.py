@@ -24,7 +24,7 @@ from mcp.types import CallToolResult, ImageContent, TextContent
 from webots_mcp.cli.answers import answer_lines
 from webots_mcp.cli.terminal import rewrite
 from webots_mcp.connection import connect
-from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, PRIVATE_FILE
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, whole_file
 from webots_mcp.errors import NothingRecordedError, WebotsMCPError
 from webots_mcp.setup.clients import server_command
 from webots_mcp.setup.interpreter import quoted
@@ -184,8 +184,8 @@ def _show_answer(answer: Mapping[str, Any]) -> None:
 def _save_plot(result: CallToolResult, file: Path) -> None:
     """A plot is in its answer alone; what cameras saw and screenshots lie in files already."""
     (image,) = (block for block in result.content if isinstance(block, ImageContent))
-    file.write_bytes(_bytes(image))
-    file.chmod(PRIVATE_FILE)
+    with whole_file(file) as aside:
+        aside.write_bytes(_bytes(image))
     _say(f"  The plot is saved: {file}")
 
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 from collections.abc import Callable, Iterator
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -237,11 +239,11 @@ def test_a_disabled_camera_is_counted_and_told_once_until_it_is_enabled(
 class Broken:
     """A camera that is asked for what it does not have, as Webots' answers it or worse."""
 
-    def __init__(self, image: Any) -> None:
-        self._image = image
+    def __init__(self, image: Any, name: str = "broken") -> None:
+        self._image, self._name = image, name
 
     def getName(self) -> str:
-        return "broken"
+        return self._name
 
     def getSamplingPeriod(self) -> int:
         return STEP_MS
@@ -283,6 +285,51 @@ def test_a_camera_without_an_image_costs_its_frames_and_nothing_else(
     assert re.search(re.escape(said), told)
     assert recording.rows("SELECT count(*) FROM state") == [60]
     assert recording.rows(FRAMES) == []
+
+
+def test_cameras_whose_names_are_no_file_names_keep_pictures_of_their_own(
+    robot: InProcessSupervisor, make: Make, recording: Recording, data_dir: Path
+) -> None:
+    bridge, names = make(), ("a/b", "a:b", "a_b", "x" * 300, f"{'x' * 300}y", "")
+    reds = {name: 40 * number for number, name in enumerate(names)}
+    for name, red in reds.items():
+        camera = Broken(bytes((0, 0, red, 255)) * 1200, name)
+        bridge.keep_camera(camera)
+        bridge.save_camera_frame(camera)
+    drive(robot, bridge, range(60))
+    bridge.keep("a look")
+    bridge.close()
+
+    rows = recording.rows("SELECT device, kind, path FROM image")
+    assert {(device, kind) for device, kind, _ in rows} == set(product(names, ("camera", "kept")))
+    for device, _, path in rows:
+        with Image.open(data_dir / path) as picture:
+            assert picture.getpixel((0, 0)) == (reds[device], 0, 0), path
+    assert "camera/rover.a_b.000001.png" in {path for *_, path in rows}
+
+
+@pytest.mark.skipif(os.name == "nt", reason="no limits and no modes of this kind")
+def test_pictures_are_their_owners_alone_and_a_full_disk_leaves_no_halves(
+    robot: InProcessSupervisor, make: Make, data_dir: Path
+) -> None:
+    import resource
+
+    bridge, camera = make(), Broken(os.urandom(4800))
+    bridge.keep_camera(camera)
+    drive(robot, bridge, range(60))
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+    try:
+        bridge.save_camera_frame(camera)
+        bridge.keep("a look")
+        drive(robot, bridge, range(60, 80))
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(data_dir.glob("camera/*")) == []
+    assert "File too large" in str(bridge.stats().last_error)
+    bridge.save_camera_frame(camera)
+    (file,) = data_dir.glob("camera/*")
+    assert stat.S_IMODE(file.stat().st_mode) == 0o600
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import stat
 import subprocess
 import sys
 from collections.abc import Callable
@@ -116,6 +117,7 @@ def test_json_names_the_fields_of_what_it_has(say: Say) -> None:
 def test_plot_writes_a_picture(say: Say, tmp_path: Path, name: str, start: bytes) -> None:
     file = tmp_path / name
     assert str(file) in say("plot", "pose.0", "--run", "1", "-o", str(file))
+    assert sys.platform == "win32" or stat.S_IMODE(file.stat().st_mode) == 0o600
     assert file.read_bytes().startswith(start)
 
 

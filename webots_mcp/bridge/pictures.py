@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import struct
 import time
 import zlib
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.run import Run
-from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME, make_folder
+from webots_mcp.contract import CAMERA_FOLDER, KEPT_FRAME, make_folder, whole_file
 from webots_mcp.errors import CommandRefusedError
 
 if TYPE_CHECKING:
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
 
 MOST_FRAMES: Final = 50  # of a camera that are kept
 
+_LONGEST_NAME_BYTES: Final = 80  # of a robot or a device, in the name of a file
 _PNG_HEAD: Final = b"\x89PNG\r\n\x1a\n"
 _PNG_TAIL: Final = b"IEND\xaeB`\x82"
 
@@ -110,10 +110,8 @@ class Album:
 
     def _write(self, path: str, data: bytes) -> int:
         """Written aside and renamed: a reader never sees half a picture."""
-        file = self.make_room(path)
-        aside = file.with_suffix(".part")
-        aside.write_bytes(data)
-        os.replace(aside, file)  # noqa: PTH105
+        with whole_file(self.make_room(path)) as aside:
+            aside.write_bytes(data)
         return len(data)
 
     def _forget(self, path: str) -> None:
@@ -175,8 +173,12 @@ def complete_png_size(file: Path) -> tuple[int, int, int] | None:
 
 
 def _file_name(text: str) -> str:
-    """A part of a file name, on every system."""
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in text) or "_"
+    """A part of a file name, on every system; no two texts have the same."""
+    name = "".join(c if c.isalnum() or c in "-_" else "_" for c in text)
+    if name == text and 0 < len(name.encode()) <= _LONGEST_NAME_BYTES:
+        return name
+    short = name.encode()[:_LONGEST_NAME_BYTES].decode(errors="ignore")
+    return f"{short}~{zlib.crc32(text.encode(errors='surrogatepass')):08x}"
 
 
 def _next_number(kept: deque[str]) -> int:

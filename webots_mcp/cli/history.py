@@ -24,6 +24,7 @@ from webots_mcp.cli.command import (
 from webots_mcp.cli.comparison import print_comparison
 from webots_mcp.cli.ranges import RANGE, range_of, scope_of
 from webots_mcp.cli.tables import clock_text, print_json, print_notes, print_table, printable
+from webots_mcp.contract import whole_file
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
@@ -213,13 +214,14 @@ def plot(arguments: argparse.Namespace) -> None:
 
 
 def write_picture(file: Path, picture: Picture) -> None:
-    """Write a picture, and say what it shows.
+    """Write a picture as a file of its owner alone, and say what it shows.
 
     Raises:
         InvalidInputError: The file cannot be written.
     """
     try:
-        file.write_bytes(picture.data)
+        with whole_file(file) as aside:
+            aside.write_bytes(picture.data)
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error
     print(f"{file}: {printable(picture.caption)}")

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from webots_mcp.contract import PRIVATE_FILE, make_folder
+from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError
 
 
@@ -54,14 +53,9 @@ def write_report(file: Path, html: bytes, *, overwrite: bool = False) -> None:
         InvalidInputError: It cannot be written, or something is there already.
     """
     require_free(file, overwrite=overwrite)
-    aside = file.with_name(f"{file.name}.part")
     try:
         make_folder(file.parent)
-        try:
+        with whole_file(file) as aside:
             aside.write_bytes(html)
-            aside.chmod(PRIVATE_FILE)
-            os.replace(aside, file)  # noqa: PTH105
-        finally:
-            aside.unlink(missing_ok=True)
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error

@@ -8,7 +8,6 @@ one run.
 
 from __future__ import annotations
 
-import os
 import shutil
 import sqlite3
 import time
@@ -19,7 +18,7 @@ from typing import Any, Final
 
 from webots_mcp.adoption import adopt
 from webots_mcp.connection import transaction
-from webots_mcp.contract import make_folder
+from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.settlement import settle
 from webots_mcp.store.images import PICTURES, inside
@@ -330,9 +329,8 @@ def _copy_pictures(
         if target.exists():
             continue  # a whole one, from an import that was killed
         make_folder(target.parent)
-        aside = target.with_suffix(".part")
-        shutil.copyfile(file, aside)
-        os.replace(aside, target)  # noqa: PTH105
+        with whole_file(target) as aside:
+            shutil.copyfile(file, aside)
 
 
 def _copy_image_rows(connection: sqlite3.Connection, run_id: int, run: int, run_uuid: str) -> None:

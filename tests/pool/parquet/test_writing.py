@@ -6,6 +6,7 @@ import errno
 import io
 import json
 import os
+import stat
 import subprocess
 import sys
 import threading
@@ -409,6 +410,24 @@ def test_a_full_folder_is_told_and_the_same_shipment_goes_on_once_there_is_room(
         shipment.write([logs(2, 3)], {"log": 3})
     assert [row["id"] for row in globbed(tmp_path, "log")] == [1, 2, 3]
     assert list((tmp_path / "_incoming").iterdir()) == []
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")
+@pytest.mark.parametrize(("made", "files"), [(None, 0o600), (0o755, 0o600), (0o2770, 0o660)])
+def test_what_is_shipped_is_its_owners_alone_and_whose_the_folder_lets_write(
+    tmp_path: Path, made: int | None, files: int
+) -> None:
+    pool = tmp_path / "pool"
+    if made is not None:
+        pool.mkdir()
+        pool.chmod(made)
+    with shipping(pool) as shipment:
+        shipment.write([logs(1)], {"log": 1})
+    modes = {each: stat.S_IMODE(each.stat().st_mode) for each in (pool, *pool.rglob("*"))}
+    assert modes.pop(pool) == (0o700 if made is None else made)
+    assert {mode for path, mode in modes.items() if path.is_file()} == {files}
+    folders = {mode & 0o777 for path, mode in modes.items() if path.is_dir()}
+    assert folders == {0o770 if made == 0o2770 else 0o700}
 
 
 @pytest.mark.skipif(not unprivileged.POSSIBLE, reason="this user may write everywhere")

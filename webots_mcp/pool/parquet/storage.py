@@ -16,6 +16,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Final
 from uuid import uuid4
 
+from webots_mcp.contract import PRIVATE_FOLDER, make_folder
 from webots_mcp.errors import InvalidInputError, PoolError, PoolUnavailableError, WebotsMCPError
 from webots_mcp.pool.parquet.packages import package
 from webots_mcp.pool.target import redacted
@@ -26,6 +27,10 @@ _PUT_WHOLE: Final = frozenset(
 _INCOMING: Final = "_incoming"  # what is written, before it is moved to its place
 _NO_ROOM: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _REFUSED: Final = (errno.EACCES, errno.EPERM, errno.EROFS)
+_OTHERS: Final = (0o070, 0o007)  # the group, and everybody
+_WRITING: Final = 0o022
+_SEARCH: Final = 0o111
+_INHERITED: Final = 0o7000  # the group's sign, which a folder hands on
 _NOT_A_FOLDER: Final = (errno.ENOTDIR, errno.EISDIR, errno.ENAMETOOLONG)
 
 
@@ -71,7 +76,7 @@ class Storage:
             full = self.full(path)
             if self.is_local:
                 with self._written(content) as written:
-                    _make_folder(Path(full).parent)
+                    self._make_folder(Path(full).parent)
                     written.replace(full)
             elif self._puts_whole:
                 self.files.pipe_file(full, content)
@@ -94,7 +99,7 @@ class Storage:
             return self.read(path) == content
         with self._answering(path), self._written(content) as written:
             full = Path(self.full(path))
-            _make_folder(full.parent)
+            self._make_folder(full.parent)
             return _linked(written, full, content)
 
     def remove(self, path: str) -> None:
@@ -142,13 +147,31 @@ class Storage:
         root = str(self.root).strip("/")
         return str(PurePosixPath(full.strip("/").removeprefix(root).lstrip("/")))
 
+    @property
+    def _rights(self) -> int:
+        """Of folders: the owner's alone, and whose the folder of the pool lets write into it."""
+        root = Path(self.root).stat().st_mode
+        return PRIVATE_FOLDER | sum(who for who in _OTHERS if root & who & _WRITING)
+
+    def _make_folder(self, folder: Path) -> None:
+        if folder.is_dir():
+            return
+        if folder == Path(self.root):
+            make_folder(folder)
+            return
+        self._make_folder(folder.parent)
+        with suppress(FileExistsError):  # another shipper was first
+            folder.mkdir(PRIVATE_FOLDER)
+            folder.chmod(folder.stat().st_mode & _INHERITED | self._rights)
+
     @contextmanager
     def _written(self, content: bytes) -> Generator[Path]:
         """The content in a file beside the others, which is gone afterwards."""
         file = Path(self.full(f"{_INCOMING}/{uuid4().hex}"))
-        _make_folder(file.parent)
+        self._make_folder(file.parent)
         try:
             with file.open("xb") as sink:
+                file.chmod(self._rights & ~_SEARCH)
                 sink.write(content)
                 sink.flush()
                 os.fsync(sink.fileno())
@@ -226,7 +249,3 @@ def _linked(written: Path, full: Path, content: bytes) -> bool:
         except FileExistsError:
             return False
     return True
-
-
-def _make_folder(folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sqlite3
 from collections import Counter
 from collections.abc import Callable, Generator
@@ -11,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-from webots_mcp.contract import PRIVATE_FILE
+from webots_mcp.contract import whole_file
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.export.contents import Contents
 from webots_mcp.store.export.layout import layout
@@ -150,15 +149,9 @@ def placed(file: Path) -> Generator[Path]:
     Raises:
         InvalidInputError: It cannot be written.
     """
-    aside = file.with_name(f"{file.name}.part")
     try:
-        aside.touch(PRIVATE_FILE)
-        try:
-            aside.chmod(PRIVATE_FILE)
+        with whole_file(file) as aside:
             yield aside
-            os.replace(aside, file)  # noqa: PTH105
-        finally:
-            aside.unlink(missing_ok=True)
     except OSError as error:
         raise InvalidInputError(f"{file} cannot be written: {error}") from error
 

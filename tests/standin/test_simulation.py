@@ -194,8 +194,10 @@ def test_a_program_of_ones_own_can_be_an_extern_controller(
     text = world.read_text(encoding="utf-8")
     world.write_text(text.replace('"rover"\n  super', '"<extern>"\n  super'), encoding="utf-8")
     with fast(world) as simulation:
+        simulation.wait_for(lambda: has_line(simulation, "WARNING: rover: the controller is <ext"))
+        assert has_line(simulation, "the world waits for it. Let the stand-in do so with --robot")
         environment = simulation.environment_of("rover")
-        assert simulation.time_s == 0.0  # the world waits for it
+        assert simulation.time_s == 0.0
         assert environment["WEBOTS_CONTROLLER_URL"].startswith("tcp://127.0.0.1:")
         assert "WEBOTS_INSTANCE_PATH" not in environment
         done = subprocess.run(

@@ -159,6 +159,8 @@ class Controller:
         self.has_left = self._was_told = False
         self.process = None
         if self.file is None:
+            if self.robot.node.fields["controller"] == _EXTERN and self.connection is None:
+                self._tell_extern()
             return
         if not self.file.is_file():
             self.launch.print_line(f"WARNING: {self.name}: the controller {self.file} is missing.")
@@ -175,6 +177,16 @@ class Controller:
             self.launch.environment_of(self.robot),
             lambda line: self.launch.print_line(f"[{self.name}] {line}"),
             self._exited,
+        )
+
+    def _tell_extern(self) -> None:
+        """Nobody starts its controller, and the world may wait for that without end."""
+        waits = "the world waits for it" if self.robot.is_synchronous else "it has none until then"
+        self.launch.print_line(
+            f"WARNING: {self.name}: the controller is <extern>, so somebody else has to start it; "
+            f"{waits}. Let the stand-in do so with --robot '{self.name}=FILE.py' (in Python "
+            f"Simulation(..., controllers={{{self.name!r}: FILE}})), or start a program of yours "
+            f"with Simulation.environment_of({self.name!r})."
         )
 
     def tell_to_quit(self) -> None:

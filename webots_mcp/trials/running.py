@@ -153,7 +153,9 @@ def _watched(attempt: Attempt, watch: Watch, simulator: Simulator) -> tuple[End 
         if over:
             return None, f"its simulator ended ({simulator.last_line()})"
         if time.monotonic() > until_s:
-            return None, f"it took longer than {timeout_s:g} s of wall time"
+            last = simulator.last_line() if watch.run_id is None else ""
+            said = f" (its simulator printed last: {last})" if last else ""
+            return None, f"it took longer than {timeout_s:g} s of wall time{said}"
         if attempt.stopping.wait(_LOOK_EVERY_S):
             raise StoppedError
         ended = _ended(recording, watch)

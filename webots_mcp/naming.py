@@ -36,6 +36,14 @@ ELSEWHERE: Final = frozenset((
 OWN: Final = frozenset((*BRANCHES, *METRES, "robot", "rover", "current", "actual", "own", "self"))
 _SEEN: Final = f"{WORLD}."
 PAST_OR_FUTURE: Final = frozenset(("last", "previous", "prev", "old", "next", "desired", "target"))
+# Words of actions that ask for the same, whatever their letters; and words that say no more.
+_SAME_ACTION: Final = (
+    {"pause", "stop", "halt", "freeze"}, {"resume", "start", "play", "continue", "unpause"},
+    {"reset", "restart", "rewind"}, {"reload", "restart"}, {"quit", "exit", "shutdown"},
+    {"screenshot", "snapshot", "photo"}, {"set", "field", "teleport"},
+    {"add", "node", "spawn"}, {"remove", "node", "delete"}, {"drive", "move", "go", "goto"},
+)  # fmt: skip
+_OF_ACTIONS: Final = frozenset(("simulation", "sim", "world", "robot", "to"))
 _LENGTHS: Final = ("m", "cm", "mm")  # units that a place is published in
 _AXES: Final = (("0", "1"), ("x", "y"), *((f"x_{unit}", f"y_{unit}") for unit in _LENGTHS))
 _TARGETS: Final = frozenset((
@@ -247,6 +255,16 @@ def spelled_out(text: str) -> str:
     spelled as JSON spells them.
     """
     return _OBEYED.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def same_in_meaning(action: str, known: Iterable[str]) -> list[str]:
+    """The known actions that ask for the same in other words: `pause` for `stop`."""
+    return [each for each in known if _groups_of(each) & _groups_of(action)]
+
+
+def _groups_of(action: str) -> set[int]:
+    words = set(words_of(action)) - _OF_ACTIONS
+    return {number for number, group in enumerate(_SAME_ACTION) if words and words <= group}
 
 
 def nearest_first(name: str, known: Iterable[str]) -> list[str]:

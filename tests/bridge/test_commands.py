@@ -161,6 +161,9 @@ def test_an_unknown_action_is_refused_with_the_known_ones(
     status, _, error = recording.fate(sent)
     assert status == "failed"
     assert error is not None and "no action 'setspeed'; this robot knows set_speed, " in error
+    sent = recording.send("stop")
+    eager(bridge)
+    assert "no action 'stop'; this robot knows pause, " in (recording.fate(sent)[2] or "")
 
 
 def test_a_loop_without_registered_actions_gets_every_command_and_none_of_them_looks_like_success(

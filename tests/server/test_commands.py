@@ -285,6 +285,25 @@ async def test_an_action_that_was_never_registered_is_refused_with_near_names(
     assert list_commands(recorded.connection, robot.id, limit=1) == []
 
 
+@pytest.mark.parametrize(
+    ("action", "meant"),
+    [
+        ("stop", "'pause'"),
+        ("startSimulation", "'resume'"),
+        ("restart", "'reset' or 'reload'"),
+        ("goto", "'drive_to'"),
+        ("delete_node", "'remove_node'"),
+    ],
+)
+async def test_an_unknown_action_is_refused_with_what_asks_for_the_same_in_other_words(
+    connect: Connect, recorded: Recorded, action: str, meant: str
+) -> None:
+    recorded.robot(actions=json.dumps({"drive_to": "", "grip": ""}))
+    async with connect() as client:
+        told = await fail(client, "webots_send_command", action=action)
+    assert f"did you mean {meant}? " in told
+
+
 @pytest.mark.parametrize("params", [{"x": "y" * 70_000}])
 async def test_parameters_beyond_the_limit_are_refused(
     connect: Connect, recorded: Recorded, params: dict[str, Any]

@@ -12,7 +12,7 @@ from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.text import cut, storable
 from webots_mcp.contract import BUILT_IN_ACTIONS
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.naming import nearest_first
+from webots_mcp.naming import nearest_first, same_in_meaning
 
 Handler = Callable[[dict[str, Any]], object]
 
@@ -94,6 +94,7 @@ class Handlers:
     def _unknown(self, action: str) -> str:
         """Nothing is known of a loop that looks at what get_command() returns by itself."""
         known = nearest_first(action, (*self._handlers, *BUILT_IN_ACTIONS))
+        known = list(dict.fromkeys((*same_in_meaning(action, known), *known)))
         said = f"no action {action!r}; this robot knows {', '.join(known)}"
         if self._handlers:
             return said

@@ -21,7 +21,7 @@ from mcp.server.mcpserver.tools import Tool
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from webots_mcp.naming import nearest_first
+from webots_mcp.naming import nearest_first, same_in_meaning
 
 _WRAPPER: Final = "params"
 _FORMAT: Final = "response_format"
@@ -140,10 +140,11 @@ def _fault(error: ErrorDetails) -> str:
 
 
 def _near(error: ErrorDetails) -> str:
-    """The choice that was perhaps meant."""
+    """What was perhaps meant."""
     choices = re.findall(r"'([^']+)'", error["msg"])
-    near = difflib.get_close_matches(str(error["input"])[:_LONGEST_VALUE], choices, n=1)
-    return f"; did you mean {near[0]!r}?" if near else ""
+    given = str(error["input"])[:_LONGEST_VALUE]
+    near = same_in_meaning(given, choices) or difflib.get_close_matches(given, choices, n=1)
+    return f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
 
 
 def _shown(value: object) -> str:

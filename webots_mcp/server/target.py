@@ -9,6 +9,7 @@ from typing import Final
 
 from webots_mcp.contract import BUILT_IN_ACTIONS, ISSUED_TIME_TO_LIVE_S
 from webots_mcp.errors import CommandRefusedError, UnknownActionError
+from webots_mcp.naming import same_in_meaning
 from webots_mcp.store.recording import View, look
 from webots_mcp.store.robots import list_robots, robot_name, without_observers
 from webots_mcp.store.sessions import Session, companions
@@ -64,7 +65,9 @@ def _require_action(view: View, action: str) -> None:
     known = list(view.session.actions) if view.session else []
     if not known or action in known or action in BUILT_IN_ACTIONS:
         return
-    near = difflib.get_close_matches(action, [*known, *BUILT_IN_ACTIONS], n=3, cutoff=0.5)
+    possible = [*known, *BUILT_IN_ACTIONS]
+    near = same_in_meaning(action, possible)
+    near = near or difflib.get_close_matches(action, possible, n=3, cutoff=0.5)
     offer = f"did you mean {' or '.join(map(repr, near))}? " if near else ""
     raise UnknownActionError(
         f"robot {view.robot.name!r} has registered no action {action!r}; {offer}its actions are "

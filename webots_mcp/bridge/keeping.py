@@ -10,6 +10,7 @@ are held and kept with them, one file with each call.
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections import deque
 from itertools import islice
@@ -103,6 +104,7 @@ class Keeper:
         self._asked: deque[str] = deque(maxlen=_MOST_REASONS)
         self._unwritten: deque[tuple[Run, RingRow]] = deque()
         self._unwritten_frames: deque[tuple[Stretch, Frame]] = deque()
+        self._lock = threading.RLock()  # of all that is held: any thread may publish
         self.frames = CameraFrames(journal, last_s)
         self.enabled = last_s > 0
         self.fills = self.enabled and throttle.interval > 1
@@ -113,55 +115,61 @@ class Keeper:
     def add(self, state: object) -> None:
         """Take in a call of `publish` that is not recorded."""
         clock = self._clock
-        if clock.run is not self._run:
-            self._begin_run()
         held, odd = copy_or_encode(state), None
         if not isinstance(held, bytes):
             held, odd = held.text, held.odd_text
             if not held.startswith("{"):
                 return  # a call that is recorded says so
         row = RingRow(self._throttle.calls, clock.sim_time_s, time.time(), held, odd)
-        if self._stretch is not None and row.sim_time_s > self._stretch.end_s:
-            self._end_stretch(self._stretch.end_s)
-        if self._going_on:
-            self._unwritten.append((clock.run, row))
-        else:
-            self._ring.add(row)
+        with self._lock:
+            if clock.run is not self._run:
+                self._begin_run()
+            if self._stretch is not None and row.sim_time_s > self._stretch.end_s:
+                self._end_stretch(self._stretch.end_s)
+            if self._going_on:
+                self._unwritten.append((clock.run, row))
+            else:
+                self._ring.add(row)
 
     def look_at_cameras(self, *, at_once: bool) -> None:
         """Take a small frame of each camera whose time has come, or at once of each."""
-        if self._clock.run is not self._run:
-            self._begin_run()
-        now_s, stretch = self._clock.sim_time_s, self._stretch
-        if stretch is not None and now_s > stretch.end_s:
-            self._end_stretch(stretch.end_s)
-        for frame in self.frames.look(now_s, at_once=at_once):
-            if self._going_on and stretch is not None:
-                self._keep_frame(stretch, frame)
-            else:
-                self.frames.add(frame)
+        now_s = self._clock.sim_time_s
+        frames = self.frames.look(now_s, at_once=at_once)  # Webots may let that wait
+        with self._lock:
+            if self._clock.run is not self._run:
+                self._begin_run()
+            stretch = self._stretch
+            if stretch is not None and now_s > stretch.end_s:
+                self._end_stretch(stretch.end_s)
+            for frame in frames:
+                if self._going_on and stretch is not None:
+                    self._keep_frame(stretch, frame)
+                else:
+                    self.frames.add(frame)
 
     def leave_out(self, why: str) -> None:
         """A call is neither recorded nor held; a stretch with it says why."""
-        if self._clock.run is not self._run:
-            self._begin_run()
-        now_s = self._clock.sim_time_s
-        self._left_out = now_s, why
-        stretch = self._stretch
-        if self._going_on and stretch is not None and now_s <= stretch.end_s and not stretch.gaps:
-            stretch.gaps = why
-            self._record(stretch)
+        with self._lock:
+            if self._clock.run is not self._run:
+                self._begin_run()
+            now_s = self._clock.sim_time_s
+            self._left_out = now_s, why
+            stretch = self._stretch if self._going_on else None
+            if stretch is not None and now_s <= stretch.end_s and not stretch.gaps:
+                stretch.gaps = why
+                self._record(stretch)
 
     def go_on(self) -> None:
         """Keep what was asked for, write some rows, and end the stretch when it is over."""
-        if self._clock.run is not self._run:
-            self._begin_run()
-        while self._asked:
-            self.keep(self._asked.popleft())
-        self._write_some()
-        if self._stretch is not None and self._clock.sim_time_s >= self._stretch.end_s:
-            self._end_stretch(self._stretch.end_s)
-        self.busy = bool(self._going_on or self._unwritten or self._unwritten_frames or self._asked)
+        with self._lock:
+            if self._clock.run is not self._run:
+                self._begin_run()
+            self._keep_asked()
+            self._write_some()
+            if self._stretch is not None and self._clock.sim_time_s >= self._stretch.end_s:
+                self._end_stretch(self._stretch.end_s)
+            left = self._unwritten or self._unwritten_frames or self._asked
+            self.busy = bool(self._going_on or left)
 
     # -- keeping -------------------------------------------------------------------------------
 
@@ -173,25 +181,26 @@ class Keeper:
 
     def keep(self, reason: str) -> bool:
         """Keep the last seconds and those to come; whether that is possible."""
-        if not self.enabled or not self._may_keep():
-            return False
-        now_s = self._clock.sim_time_s
-        rows = self._ring.take()
-        before_s = min(now_s - self._last_s, rows[0].sim_time_s if rows else now_s)
-        start_s, stretch = max(self._ring.starts_s, before_s), self._stretch
-        if stretch is None or start_s > stretch.end_s:
-            stretch = self._stretch = Stretch(self._run, start_s)
-        self._kept_s += now_s + KEEP_AFTER_S - max(start_s, stretch.end_s)
-        stretch.end_s = now_s + KEEP_AFTER_S
-        stretch.add_reason(reason)
-        if self._left_out is not None and self._left_out[0] >= start_s:
-            stretch.gaps = stretch.gaps or self._left_out[1]
-        self._unwritten.extend((self._run, row) for row in rows)
-        for frame in self.frames.take(start_s):
-            self._keep_frame(stretch, frame)
-        self._going_on = self.busy = True
-        self._record(stretch)
-        return True
+        with self._lock:
+            if not self.enabled or not self._may_keep():
+                return False
+            now_s = self._clock.sim_time_s
+            rows = self._ring.take()
+            before_s = min(now_s - self._last_s, rows[0].sim_time_s if rows else now_s)
+            start_s, stretch = max(self._ring.starts_s, before_s), self._stretch
+            if stretch is None or start_s > stretch.end_s:
+                stretch = self._stretch = Stretch(self._run, start_s)
+            self._kept_s += now_s + KEEP_AFTER_S - max(start_s, stretch.end_s)
+            stretch.end_s = now_s + KEEP_AFTER_S
+            stretch.add_reason(reason)
+            if self._left_out is not None and self._left_out[0] >= start_s:
+                stretch.gaps = stretch.gaps or self._left_out[1]
+            self._unwritten.extend((self._run, row) for row in rows)
+            for frame in self.frames.take(start_s):
+                self._keep_frame(stretch, frame)
+            self._going_on = self.busy = True
+            self._record(stretch)
+            return True
 
     @property
     def why_not(self) -> str:
@@ -202,17 +211,26 @@ class Keeper:
 
     def write_all(self) -> None:
         """Keep what was asked for and write it now: the loop is about to stand still, or to end."""
-        while self._asked:
-            self.keep(self._asked.popleft())
+        with self._lock:
+            self._keep_asked()
         while self._unwritten or self._unwritten_frames:
             self._write_some()
 
     def close(self) -> None:
         """The session ends, and with it what was to be kept of the seconds to come."""
         self.write_all()
-        self._end_stretch(self._clock.sim_time_s)
+        with self._lock:
+            self._end_stretch(self._clock.sim_time_s)
+
+    def abandon(self) -> None:
+        """In a forked child: the thread that may have had the lock was not forked."""
+        self._lock = threading.RLock()
 
     # -- inside --------------------------------------------------------------------------------
+
+    def _keep_asked(self) -> None:
+        while self._asked:
+            self.keep(self._asked.popleft())
 
     def _may_keep(self) -> bool:
         if self._clock.run is not self._run:
@@ -260,9 +278,10 @@ class Keeper:
             self.frames.missed += 1
 
     def _write_some(self) -> None:
-        self._write_rows()
-        if self._unwritten_frames:
-            self._write_frame(*self._unwritten_frames[0])
+        with self._lock:
+            self._write_rows()
+            if self._unwritten_frames:
+                self._write_frame(*self._unwritten_frames[0])
 
     def _write_frame(self, stretch: Stretch, frame: Frame) -> None:
         """One file: to compress and write it takes about a millisecond."""

@@ -552,6 +552,7 @@ class MCPBridge:
         self.detach()
         self._capture.abandon()
         self._session.context.recorder.abandon()
+        self._session.context.keeper.abandon()
 
     def _close_at_exit(self) -> None:
         """The interpreter keeps the exception that ends it; at a prompt it keeps others too."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import threading
 from contextlib import closing
 from pathlib import Path
@@ -194,6 +195,28 @@ def test_an_error_that_any_thread_logs_keeps_and_a_warning_does_not(
     drive(robot, bridge, range(110, 112))
     ((*_, reason),) = recording.rows(STRETCHES)
     assert reason == "error: the gear is gone"
+
+
+def test_threads_may_publish_while_others_keep(robot: InProcessSupervisor, make: Make) -> None:
+    bridge, before_s = make(), sys.getswitchinterval()
+
+    def publish(thread: int) -> None:
+        for number in range(1500):
+            bridge.publish({"n": number, "thread": thread})
+            if number % 25 == 0:
+                bridge.keep("again")
+
+    threads = [threading.Thread(target=publish, args=(number,)) for number in range(3)]
+    sys.setswitchinterval(1e-6)
+    try:
+        for thread in threads:
+            thread.start()
+        while any(thread.is_alive() for thread in threads):
+            robot.step(STEP_MS)
+            bridge.get_command()
+    finally:
+        sys.setswitchinterval(before_s)
+    assert (bridge.stats().failures, bridge.stats().last_error) == (0, None)
 
 
 def test_a_handler_keeps(

@@ -116,7 +116,7 @@ SEE_STEPS: Final = (
     "call bridge.publish({...}) and bridge.get_command() in every round of the loop, or "
     "MCPBridge.attach(robot) before anything takes or replaces robot.step"
 )
-UNSEEN: Final = "the controller's loop steps in a way that the bridge does not see, which missed"
+UNSEEN: Final = f"the controller's loop steps in a way that the bridge does not see: {SEE_STEPS}"
 UNMOVED: Final = (
     "the bridge has seen no simulation time go by since it began: the simulation is paused in "
     "Webots, the controller has not reached its loop, or its loop steps in a way that the bridge "

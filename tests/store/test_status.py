@@ -14,7 +14,7 @@ import pytest
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
-from webots_mcp.contract import SEE_STEPS, UNSEEN
+from webots_mcp.contract import UNSEEN
 from webots_mcp.entries import waiting_paths
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.queue import CommandQueue
@@ -174,12 +174,11 @@ def test_that_an_observer_sees_time_go_on_does_not_make_an_unseen_loop_hang(
 
 
 def test_a_loop_that_was_found_to_step_unseen_is_said_to(recorded: Recorded) -> None:
-    found = f"{UNSEEN} 18.5 s of simulation time: {SEE_STEPS}"
-    robot = recorded.robot(now=NOW, sim_time_s=20.0, last_error=found)
+    robot = recorded.robot(now=NOW, sim_time_s=20.0, last_error=f"{UNSEEN}; 1.0 s so far")
     robot.state(0.0, {}, at=NOW - 20)
-    assert status_of(robot, after_s=0.6) == ("running", found)
+    assert status_of(robot, after_s=0.6) == ("running", UNSEEN)
     robot.beat(ended_wall_time_s=NOW, end_reason="finished")
-    assert status_of(robot).why == found
+    assert status_of(robot).why == UNSEEN
 
 
 def test_a_loop_that_fell_silent_when_its_time_stopped_is_not_said_to_be_alive(

@@ -34,7 +34,6 @@ from webots_mcp.bridge.start_values import StartValues
 from webots_mcp.bridge.throttle import Throttle
 from webots_mcp.contract import (
     PARAMETERS_VARIABLE,
-    SEE_STEPS,
     UNMOVED,
     UNSEEN,
     Database,
@@ -180,7 +179,7 @@ class Session:
         if unseen_s < _UNSEEN_S or not simulation.waits_for_robot:
             return
         self._unseen_told = True
-        text = f"{UNSEEN} {unseen_s:.1f} s of simulation time: {SEE_STEPS}"
+        text = f"{UNSEEN}; {unseen_s:.1f} s of simulation time went by unseen so far"
         self.context.journal.log("warning", "bridge", text)
         self.context.recorder.errors.warn("unseen", text)
 

@@ -145,8 +145,9 @@ def _robot_as_text(robot: dict[str, Any]) -> str:
         f"  run {robot['run_id']} (recorded: {robot['runs']}), {robot['rows']} rows, {time_text}",
         f"  rows waiting {robot['rows_waiting']}{where}, dropped {robot['rows_dropped']}",
     ]
-    lines += [f"  {robot['why']}"] if robot["why"] else []
-    lines += [f"  last error: {robot['last_error']}"] if robot["last_error"] else []
+    why, error = robot["why"], robot["last_error"]
+    lines += [f"  {why}"] if why else []
+    lines += [f"  last error: {error}"] if error and not (why and error.startswith(why)) else []
     return "\n".join(map(printable, lines))
 
 

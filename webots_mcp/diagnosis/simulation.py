@@ -88,7 +88,7 @@ def _is_unclear(view: View) -> bool:
 
 
 def _ended(view: View, seen: str) -> Finding:
-    if (view.status.why or "").startswith(UNSEEN):
+    if view.status.why == UNSEEN:
         return Finding("warning", seen, _SEE_PAGE)
     if view.session is None or (view.session.end_reason or "crashed") not in _ENDED_BADLY:
         return Finding("ok", seen)

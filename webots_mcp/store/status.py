@@ -185,8 +185,7 @@ def _why_unpublished(
 
 def _unseen(session: Session) -> str | None:
     """That its loop stepped in a way that the bridge did not see, as its bridge found."""
-    error = session.last_error or ""
-    return error if error.startswith(UNSEEN) else None
+    return UNSEEN if (session.last_error or "").startswith(UNSEEN) else None
 
 
 def _why_ended(connection: sqlite3.Connection, session: Session) -> str | None:

@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 
 import pytest
 from PIL import Image
+from pydantic import TypeAdapter
 
 from tests.plotting.conftest import Record, whole
 from webots_mcp.errors import (
@@ -27,13 +28,15 @@ from webots_mcp.errors import (
     UnknownRunError,
     UnknownSignalError,
 )
-from webots_mcp.plotting import Picture, Sheet, image_format_of, plot, plot_signals
+from webots_mcp.plotting import Picture, PlotKind, Sheet, image_format_of, plot, plot_signals
 from webots_mcp.plotting.canvas import draw
 from webots_mcp.plotting.fonts import fit_fonts
+from webots_mcp.plotting.palette import DASHES, LINES
 from webots_mcp.plotting.signal_axes import paint_signals
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import paint_trajectory
+from webots_mcp.server.parameters import RunIds
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.rollup.rolling import roll
 
@@ -360,9 +363,22 @@ def test_a_robot_without_a_position_is_asked_for_one(record: Record) -> None:
 
 def test_too_many_runs_in_one_picture_are_refused(record: Record) -> None:
     connection = record(lambda t: {"n": t}, 2)
-    ranges = [whole(connection)] * 5
-    with pytest.raises(InvalidInputError, match="holds 5 runs, and at most 4"):
+    ranges = [whole(connection)] * 11
+    with pytest.raises(InvalidInputError, match="holds 11 runs, and at most 10"):
         plot_signals(connection, ranges, ["n"])
+
+
+@pytest.mark.parametrize("kind", ["signals", "trajectory"])
+def test_as_many_runs_as_a_tool_may_be_given_are_drawn_and_told_apart(
+    record: Record, kind: PlotKind
+) -> None:
+    (given, _) = TypeAdapter[Any](RunIds).json_schema()["anyOf"]
+    run_ids = [*range(1, given["maxItems"] + 1)]
+    connection = record(lambda t: {"pose": [t, math.sin(t)]}, *[20] * len(run_ids))
+    picture = plot(connection, kind, run_ids=run_ids, image_format="svg")
+    assert {f"run {run}" for run in run_ids} <= words(picture)
+    pens = {(LINES[run % len(LINES)], DASHES[run % len(DASHES)]) for run in range(len(run_ids))}
+    assert len(pens) == len(run_ids)
 
 
 def test_the_name_of_a_file_tells_its_format() -> None:

@@ -137,6 +137,8 @@ MOTION: Final[tuple[Argument, ...]] = (
     argument("--below", type=float, metavar="X", help="where the signals were below X"),
     argument("--for", type=float, default=0.0, dest="for_s", metavar="S",
              help="for at least S simulated seconds"),
+    argument("--silent", type=float, default=1.0, dest="silent_s", metavar="S",
+             help="silent is who has no value for at least S simulated seconds (1)"),
     *MOTION,
     argument("--one-by-one", action="store_false", dest="group",
              help="alike events too, many of which are told as one else"),
@@ -277,6 +279,7 @@ def _options(arguments: argparse.Namespace) -> EventOptions:
         signals=tuple(arguments.signal or "*"),
         thresholds=limits,
         where=arguments.where,
+        silent_s=arguments.silent_s,
         position=both_of(arguments.position),
         mode=arguments.mode,
     )

@@ -21,7 +21,7 @@ from webots_mcp.store.signals.registry import Signal
 Known = dict[str, Signal]
 
 MOST_CHANGES: Final = 5000  # of one text or flag; more would be a grey haze
-MOST_RUNS: Final = 4  # more lines of each signal could not be told apart
+MOST_RUNS: Final = 10  # each with a colour and dashes of its own
 _SHOWN_PARAMETERS: Final = 3
 
 
@@ -75,7 +75,7 @@ def parts_of(
 
     Raises:
         UnknownSignalError: A name meets nothing.
-        InvalidInputError: No name is given, or there are more than four runs.
+        InvalidInputError: No name is given, or there are more than ten runs.
         NothingRecordedError: There is no row in the ranges.
     """
     count = sum(len(each.segments) for each in ranges)

@@ -42,7 +42,7 @@ def plot_signals(
 
     Args:
         connection: Any.
-        ranges: From `find_range`; each run in them counts, four at most.
+        ranges: From `find_range`; each run in them counts, ten at most.
         names: Signals, with `*`.
         bands: The text signal behind the curves; None for the mode, where there is one; "" for
             none. Of several runs it is drawn below, once per run.

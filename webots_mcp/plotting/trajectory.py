@@ -45,7 +45,7 @@ def plot_trajectory(
 
     Args:
         connection: Any.
-        ranges: From `find_range`; each run in them counts, four at most.
+        ranges: From `find_range`; each run in them counts, ten at most.
         position: The signals to the right and upwards; None finds them by their names.
         bands: The text signal that colours the way; None for the mode, where there is one; ""
             for the time. Of several runs each has its own colour.

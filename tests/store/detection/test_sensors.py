@@ -146,6 +146,42 @@ def test_many_silences_are_one_event_but_for_one_that_goes_on(empty: sqlite3.Con
     assert newest.ongoing and newest.start_s == pytest.approx(118.0)
 
 
+LOST_S = ((10.0, 12.0), (30.0, 30.5), (50.0, 50.3), (70.0, 73.0), (90.0, 90.8))
+
+
+def losing_the_line(time_s: float) -> dict[str, Any]:
+    lost = any(start_s <= time_s < end_s for start_s, end_s in LOST_S)
+    line = [None if lost else range_m(time_s + item) for item in range(3)]
+    return {"line": line, "x": time_s}
+
+
+@pytest.mark.parametrize(
+    ("bounds", "found", "note"),
+    [
+        ({}, 2, "line.* 3 times"),
+        ({"start_s": 20.0, "end_s": 45.0}, 0, "line.* 1 time"),
+    ],
+)
+def test_losses_shorter_than_what_counts_are_counted_beside(
+    empty: sqlite3.Connection, tier: str, bounds: dict[str, float], found: int, note: str
+) -> None:
+    record(empty, losing_the_line)
+    answer = ask(empty, "silent", **bounds)
+    assert len(answer.events) == found
+    (said,) = answer.notes
+    assert (
+        said == f"run 1: had no value for less than silent_s=1 s and counts not as silent: {note}"
+    )
+
+
+def test_how_long_a_silence_counts_is_the_askers_to_say(empty: sqlite3.Connection) -> None:
+    record(empty, losing_the_line)
+    options = EventOptions(kinds=("silent",), silent_s=0.15)
+    answer = find_events(empty, find_range(empty, Scope()), options, group=False)
+    assert {round(event.start_s, 1) for event in answer.events} == {start for start, _ in LOST_S}
+    assert answer.notes == ()
+
+
 def test_what_comes_now_and_then_is_not_silent_meanwhile_and_the_answer_says_so(
     empty: sqlite3.Connection,
 ) -> None:

@@ -208,6 +208,16 @@ def test_modes_are_counted_with_their_times(rover: sqlite3.Connection, tier: str
     assert (bumper.changes, bumper.last) == (2, False)
 
 
+def test_a_mode_alone_is_told_with_the_rows_that_it_is_of(
+    rover: sqlite3.Connection, tier: str
+) -> None:
+    """Of a long run it was "no row in that range"."""
+    (whole,) = trends(rover, find_range(rover, Scope(run_id=1))).runs
+    (run,) = trends(rover, find_range(rover, Scope(run_id=1)), ["mode"]).runs
+    assert (run.rows, run.resolution_s, run.cut_at_s) == (whole.rows, None, None)
+    assert run.states == tuple(each for each in whole.states if each.name == "mode")
+
+
 def test_a_signal_without_a_value_in_the_range_is_named(rover: sqlite3.Connection) -> None:
     run = ask(rover, "sensors.front", start_s=101.0, end_s=103.0)
     assert run.numbers == () and run.silent == ("sensors.front",)

@@ -71,6 +71,9 @@ def webots_find_events(
     stuck_m: Annotated[
         float, Field(gt=0, description="... within this many metres.")
     ] = EventOptions.stuck_m,
+    silent_s: Annotated[
+        float, Field(gt=0, description="Silent: without a value for at least so long.")
+    ] = EventOptions.silent_s,
     position: Position = None,
     mode: Mode = None,
     log_level: LogLevel = "warning",
@@ -91,6 +94,7 @@ def webots_find_events(
         thresholds=thresholds,
         stuck_s=stuck_s,
         stuck_m=stuck_m,
+        silent_s=silent_s,
         position=both_of(position),
         mode=mode,
         log_level=log_level,

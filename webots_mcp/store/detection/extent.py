@@ -62,7 +62,7 @@ class Detection:
         reaches_s = ((each.least_s, each.around_s) for each in search.kinds)
         reach_s = max((of(self.options) for both in reaches_s for of in both), default=0.0)
         looked_at = _around(search, segment, reach_s)
-        found = self._found(replace(search, segment=looked_at))
+        found = self._found(replace(search, segment=looked_at, asked=segment))
         events = [each for each in found if _reaches_into(each, segment)]
         lost: list[Event] = []
         while cut := [e for e in events if e not in lost and self._is_cut(e, looked_at, search)]:

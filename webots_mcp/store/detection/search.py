@@ -50,6 +50,7 @@ class Search:
         kinds: All that are looked for in it.
         only: Names of the signals that matter, where it is about the ends of some events; else
             None.
+        asked: The part of the segment that was asked about, where that was widened to find ends.
         ledger: What could not be looked at, and what came near to an event.
         habits: By run and motion, in which modes the robot moves: searches of one question share
             what they have seen of that.
@@ -63,6 +64,7 @@ class Search:
     deadline: Deadline
     ledger: Ledger = field(default_factory=Ledger)
     only: frozenset[str] | None = None
+    asked: Segment | None = None
     habits: Habits = field(default_factory=dict[Any, Any])
 
     @cached_property

@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+import re
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from webots_mcp.naming import LONGEST_SPREAD_ARRAY
+from webots_mcp.naming import LONGEST_SPREAD_ARRAY, listed
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.detection.kind import Alike, EventKind
 from webots_mcp.store.detection.resting import replaced_value
-from webots_mcp.store.detection.search import Search
+from webots_mcp.store.detection.search import MOST_NAMED, Search
 from webots_mcp.store.reading.intervals import MOSTLY, Silent, Span, common
 from webots_mcp.store.rollup.tables import watermark
 from webots_mcp.store.signals.catalogue import other_form
 from webots_mcp.store.signals.registry import Signal
 
 MANY_SILENCES: Final = 10  # of a signal that mostly has no value: it comes so by nature
+_INDEX: Final = re.compile(r"\.\d+$")  # what falls silent together is told as the array
 
 # Whether it had a value before, in the rollups or in rows that are not rolled up yet.
 _HAD_VALUE: Final = (
@@ -32,18 +35,21 @@ _TYPES_AT: Final = (  # of the array, and of the item in it
 
 def silent_events(search: Search) -> Iterator[Event]:
     """It has begun, and lasts to the signal's next value, if any."""
+    shorter: Counter[str] = Counter()
+    asked = search.asked or search.segment
     for index, signal in enumerate(search.required_numbers()):
         here = search.view.summary(signal)
         if here.present == here.rows:
             continue
         if search.is_over("silent", search.numbers[index:]):
-            return
+            break
         spans = [
             span
             for span in _without_value(search, signal)
             if _has_begun(search, signal, span) and not _is_shorter(search, signal, span)
         ]
         least_s = _least_silence_s(search, signal, here, spans)
+        short = 0
         for span in spans:
             lasts_s = span.end_s - span.start_s
             if lasts_s >= least_s:
@@ -53,6 +59,15 @@ def silent_events(search: Search) -> Iterator[Event]:
             elif lasts_s > 0:
                 what = f"{signal.name} had no value for {lasts_s:.3g} s from {span.start_s:.6g} s"
                 search.came_near("silent", lasts_s / least_s, what)
+                short += span.start_s < asked.end_s and span.end_s >= asked.start_s
+        if short and least_s == search.options.silent_s:
+            array = _INDEX.sub(".*", signal.name)
+            shorter[array] = max(short, shorter[array])
+    if shorter:
+        told = [f"{name} {count} time{'s' * (count > 1)}" for name, count in shorter.most_common()]
+        limit = f"for less than silent_s={search.options.silent_s:g} s"
+        note = f"had no value {limit} and counts not as silent: {listed(told, MOST_NAMED)}"
+        search.ledger.note_of_run(search.segment.run_id, note)
 
 
 def _without_value(search: Search, signal: Signal) -> list[Span]:

@@ -148,7 +148,8 @@ def _run_trends(
             for signal, of_signal in zip(numbers, parts, strict=True)
         ]
         has_values = [bool(of_signal["present"].any()) for of_signal in parts]
-        rows, resolution_s, numbers_cut_s = pieces.rows, piece_s, pieces.cut_at_s
+        rows, numbers_cut_s = pieces.rows, pieces.cut_at_s
+        resolution_s = piece_s if numbers else None
     else:
         read = read_numbers(connection, segment, numbers, deadline)
         kept = None if segment.full_rate else kept_columns(connection, segment, numbers, deadline)

@@ -27,7 +27,10 @@ from webots_mcp.server.tuning import settable
 from webots_mcp.store.analysis.ranking import Ranked, Ranking
 from webots_mcp.store.parameters import Declared, declared_for
 from webots_mcp.store.questions.score import require_kinds
+from webots_mcp.store.questions.ways import way_of_run
+from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.trials import (
@@ -52,6 +55,14 @@ _FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: be
 _LONGEST_WHY: Final = 120
 _FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
 _MOST_NAMED_RUNS: Final = 5
+_STANDING_DEADLINE_S: Final = 1.0
+_MOVED_M: Final = 0.1  # and more: it went somewhere
+_STILL_M: Final = 0.01  # less: it stood
+_STILL_NOISES: Final = 4.0  # deviations of the position's noise that are no motion either
+_BEFORE: Final = (
+    "SELECT id FROM run WHERE robot_id = ? AND id < ? "
+    "ORDER BY start_reason = 'reset', id DESC LIMIT 5"
+)
 
 
 # -- before anything is begun -----------------------------------------------------------------
@@ -248,7 +259,13 @@ def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
         "noise": figure(ranking.noise.deviation) if ranking.noise.freedom else None,
         "best_is_better": ranking.better,
         "verdict": ranking.verdict if over else None,
-        "notes": notes_of([*_left_out(left_out), *_gone(connection, trials)]),
+        "notes": notes_of(
+            [
+                *_standing(connection, found, trials),
+                *_left_out(left_out),
+                *_gone(connection, trials),
+            ]
+        ),
         "hint": hint,
     }
 
@@ -302,6 +319,32 @@ def _row(ranked: Ranked, names: Sequence[str], runs: Sequence[int]) -> list[Any]
         why and cut_text(why, _LONGEST_WHY),
         list(runs[:_MOST_NAMED_RUNS]),
     ]
+
+
+def _standing(
+    connection: sqlite3.Connection, found: TrialSet, trials: Sequence[Trial]
+) -> list[str]:
+    """That a robot moved before its trials and stood still in all of them: they say nothing."""
+    runs = [each.run_id for each in trials if each.is_over and each.run_id is not None]
+    if found.robot_id is None or not runs:
+        return []
+    robot, deadline = robot_name(connection, found.robot_id), Deadline(_STANDING_DEADLINE_S)
+    stood = 0
+    for run_id in runs:
+        way = way_of_run(connection, Subject(found.robot_id, robot, run_id), deadline)
+        if way is not None and way.length_m >= max(_STILL_M, _STILL_NOISES * way.noise_m):
+            return []
+        stood += way is not None
+    before = connection.execute(_BEFORE, (found.robot_id, min(runs))).fetchall()
+    for (run_id,) in before if stood else ():
+        way = way_of_run(connection, Subject(found.robot_id, robot, run_id), deadline)
+        if way is not None and way.length_m >= max(_MOVED_M, _STILL_NOISES * way.noise_m):
+            return [
+                f"the robot went {figure(way.length_m)} m in run {run_id}, before the trials, and "
+                f"stood still in all {stood} that were looked at: a reset does not do again what "
+                "its controller does once, before its loop (docs/trials.md: motors after a reset)"
+            ]
+    return []
 
 
 def _left_out(count: int) -> list[str]:

@@ -10,7 +10,9 @@ import anyio
 import pytest
 from mcp import Client
 
-from tests.server.conftest import Connect, ask, fail, pictures_of, text_of
+from tests.bridge.conftest import Recording
+from tests.processes.conftest import Start, has_states
+from tests.server.conftest import STEP_MS, Connect, ask, fail, pictures_of, text_of
 from tests.server.story import rows_of
 from tests.server.trials.conftest import SPEEDS, TunableDriver, trials, value_of
 from webots_mcp import MCPBridge
@@ -142,6 +144,66 @@ async def test_cancel_stops_after_the_current_trial_and_sets_the_parameters_back
         assert await value_of(client, "kp") == 2.0
         again = await trials(client, parameters={"kp": [1.0]})
         assert again["state"] == "done"
+
+
+WHEELS_TOLD_ONCE = """
+import math
+
+speed = bridge.parameter("speed", 1.0, low=0.0, high=10.0, unit="rad/s")
+motors = [robot.getDevice(f"{side} wheel motor") for side in ("left", "right")]
+gps = robot.getDevice("gps")
+gps.enable(16)
+for motor in motors:
+    motor.setPosition(math.inf)
+while robot.step(16) != -1:
+    for motor in motors:
+        motor.setVelocity(speed.value)
+    x, y, _ = gps.getValues()
+    bridge.publish({"pose": {"x": x, "y": y}})
+    bridge.get_command()
+"""
+
+
+async def test_wheels_that_were_told_once_to_turn_without_end_turn_in_every_trial(
+    start: Start, filed: Recording, data_dir: Path
+) -> None:
+    arena = start(WHEELS_TOLD_ONCE)
+    arena.wait_for(lambda: has_states(filed), 30)
+    async with Client(create_server(data_dir / "webots.db", data_dir)) as client:
+        asked = {"parameters": {"speed": [2.0, 4.0]}, "score": DISTANCE, "for_s": 1, "repeats": 2}
+        answer = await trials(client, **asked, timeout_s=90)
+        fast, slow = rows_of(answer["ranked"])
+        assert (fast["speed"], slow["speed"]) == (4.0, 2.0)
+        assert fast["score"] > 1.8 * slow["score"] > 0.05
+        assert "notes" not in answer
+
+
+class StandsAfterAReset(TunableDriver):
+    """A robot that goes on in its first run only."""
+
+    def run(self) -> None:
+        before_s = 0.0
+        while self.robot.step(STEP_MS) != -1:
+            now_s = self.robot.getTime()
+            self.resets += now_s < before_s
+            before_s = now_s
+            self.bridge.publish({"pose": [0.0 if self.resets else now_s, 0.0, 0.0]})
+            self.bridge.get_command()
+
+
+async def test_trials_of_a_robot_that_only_moved_before_them_say_so_before_they_are_ranked(
+    connect: Connect, file: Path
+) -> None:
+    driving = StandsAfterAReset(file)
+    driving.start()
+    async with connect() as client:
+        await ask(client, "webots_run", for_s=1)
+        answer = await trials(client, parameters={"kp": [1.0, 2.0]}, score="max(pose[0])", for_s=1)
+    driving.stop()
+    assert answer["verdict"] == "all 3 scores are 0: nothing that was tried changed them"
+    (note,) = answer["notes"]
+    assert "in run 1, before the trials, and stood still in all 3" in note
+    assert list(answer).index("notes") < list(answer).index("ranked")
 
 
 async def test_a_cancelled_call_ends_the_trial_that_runs_and_no_other_begins(

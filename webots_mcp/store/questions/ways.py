@@ -5,11 +5,14 @@ from __future__ import annotations
 import sqlite3
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from webots_mcp.store.detection.motion import path_length, position_noise
+from webots_mcp.store.detection.event import EventOptions
+from webots_mcp.store.detection.motion import find_motion, path_length, position_noise
 from webots_mcp.store.reading.deadline import Deadline
-from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.reading.ranges import Segment, TimeRange, whole_run
 from webots_mcp.store.reading.rows import Columns, exceeds, read_columns
 from webots_mcp.store.reading.sampling import MOST_SAMPLES, newest_part, read_sampled
+from webots_mcp.store.reading.subject import Subject
+from webots_mcp.store.signals.catalogue import known_signals
 from webots_mcp.store.signals.registry import Signal
 
 if TYPE_CHECKING:
@@ -57,6 +60,21 @@ def read_way(
     part = newest_part(connection, segment, NOISE_ROWS)
     noise_m = position_noise(read_columns(connection, part, position, deadline), position)
     return Way(columns, position, noise_m, every_s)
+
+
+def way_of_run(
+    connection: sqlite3.Connection, subject: Subject, deadline: Deadline
+) -> PathLength | None:
+    """How far a robot went in a run; None where no position is recorded, or not all was read."""
+    whole = whole_run(connection, subject.run_id)
+    if whole is None:
+        return None
+    asked = TimeRange(subject.robot_id, subject.robot, (whole,), "simulation")
+    position = find_motion(known_signals(connection, asked), EventOptions()).position
+    if position is None:
+        return None
+    way = read_way(connection, whole, position, deadline)
+    return None if way.columns.cut or len(way.columns.times) < 2 else way.length
 
 
 def sampling_interval_s(

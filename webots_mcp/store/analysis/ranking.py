@@ -156,13 +156,13 @@ def _verdict(sets: Sequence[Ranked], chance: float | None, limit: float) -> str:
         return "no trial gave a score"
     if len(sets) == 1:
         return "one parameter set: there is nothing to compare it with"
-    if len(scores) > 1 and min(scores) == max(scores):
-        return f"all {len(scores)} scores are {scores[0]:g}: nothing that was tried changed them"
     if not sets[1].is_whole:
         which = "every other" if sets[0].is_whole else "every"
         failed = ["had failures"] if any(each.failures for each in sets) else []
         pruned = ["was pruned"] if any(each.pruned for each in sets) else []
         return f"{which} parameter set {' or '.join(failed + pruned)}"
+    if min(scores) == max(scores):
+        return f"all {len(scores)} scores are {scores[0]:g}: nothing that was tried changed them"
     if chance is None:
         return "the best and the next were not both repeated: how much theirs differ is not known"
     if chance < limit:

@@ -49,5 +49,12 @@ def test_a_field_is_shown_and_set(database: Path, capsys: pytest.CaptureFixture[
     assert ["customData", "SFString", "a text"] in rows
     assert main(["field", *where, "ROVER.children"]) == 0
     assert 'lidar"]' in capsys.readouterr().out, "all entries"
+    capsys.readouterr()
+    assert main(["field", *where, "ROVER.translation", "[NaN,0,0]"]) != 0
+    assert "give 3 finite numbers, such as [0, 0.5, 0.1]; got '[NaN,0,0]'" in str(
+        capsys.readouterr()
+    )
+    assert main(["field", *where, "ROVER.customData", "NaN"]) == 0
+    assert "to: NaN" in capsys.readouterr().out
     assert main(["field", *where, "ROVER.nothing"]) == 2
     assert "has no field 'nothing'" in capsys.readouterr().err

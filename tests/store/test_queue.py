@@ -86,12 +86,16 @@ def test_a_database_that_stays_locked_is_an_error_and_no_command(recorded: Recor
     assert count(recorded.connection) == 0
 
 
-@pytest.mark.parametrize("params", [{"x": float("nan")}, {"x": object()}])
+@pytest.mark.parametrize(
+    ("params", "said"),
+    [({"x": [float("nan"), 0]}, r"NaN or an infinity \({'x': \[nan, 0\]}\)"),
+     ({"x": object()}, "not plain JSON")],
+)  # fmt: skip
 def test_parameters_that_are_no_json_are_refused(
-    recorded: Recorded, params: dict[str, object]
+    recorded: Recorded, params: dict[str, object], said: str
 ) -> None:
     robot = recorded.robot()
-    with pytest.raises(InvalidInputError, match="not plain JSON"):
+    with pytest.raises(InvalidInputError, match=said):
         CommandQueue(recorded.connection).enqueue(robot.id, "go", params)
 
 

@@ -18,7 +18,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request
 from websockets.sync.server import Server, ServerConnection, serve
 
-Manner = Literal["well", "busy", "cut off"]
+Manner = Literal["well", "busy", "cut off", "in other words"]
 
 _MODES: Final = {"pause": "pause", "real-time": "real-time", "fast": "fast", "step": "pause"}
 
@@ -28,7 +28,8 @@ class WebotsServer:
 
     Args:
         streams: Whether it was started with `--stream`.
-        manner: `busy`: its main thread reads nothing; `cut off`: it hangs up in mid-frame.
+        manner: `busy`: its main thread reads nothing; `cut off`: it hangs up in mid-frame;
+            `in other words`: it obeys and says something that no release is known to say.
         on_order: Called with each word that it obeys.
         announce_bytes: So long a message about the scene comes before each answer.
     """
@@ -140,6 +141,8 @@ class WebotsServer:
             return self.log("stderr", f"ERROR: Streaming server: Unsupported message: {text}")
         self.on_order(text)
         self.mode = _MODES.get(word, self.mode)
+        if self._manner == "in other words":
+            return client.send("state: changed")
         if word in ("pause", "step"):
             client.send("paused by client")
         elif word in _MODES:

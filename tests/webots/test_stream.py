@@ -72,6 +72,15 @@ def test_without_stream_it_is_said_that_webots_hears_but_does_not_obey() -> None
         assert server.mode == "pause"
 
 
+def test_an_answer_that_is_not_known_is_told_and_is_no_sign_of_a_start_without_stream() -> None:
+    with WebotsServer(streams=True, manner="in other words") as server:
+        reply = give_order(at(server), "pause", 5)
+        told = no_obedience(at(server), reply)
+        assert (reply.heard, server.mode) == (None, "pause")
+        assert "answered 'state: changed', which does not tell whether it obeyed" in told
+        assert "--stream" not in told
+
+
 def test_the_words_that_pause_by_accident_are_never_sent() -> None:
     with WebotsServer(streams=True) as server:
         for order in get_args(Order):

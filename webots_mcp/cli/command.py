@@ -179,9 +179,14 @@ def settings_of(texts: Sequence[str], kinds: Mapping[str, str] = _NO_KINDS) -> d
 def value_of(text: str) -> Any:
     """What was typed, as JSON; what is none is a text."""
     try:
-        return json.loads(text)
+        return json.loads(text, parse_constant=_no_constant)
     except (ValueError, RecursionError):
         return text
+
+
+def _no_constant(name: str) -> float:
+    """NaN and the infinities are Python's, and none of JSON."""
+    raise ValueError(name)
 
 
 @contextmanager

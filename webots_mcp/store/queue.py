@@ -210,7 +210,12 @@ def any_unfinished(connection: sqlite3.Connection) -> bool:
 def _encode_params(params: Mapping[str, Any]) -> str:
     try:
         text = json.dumps(dict(params), allow_nan=False, ensure_ascii=False, sort_keys=True)
-    except (TypeError, ValueError) as error:
+    except ValueError as error:
+        raise InvalidInputError(
+            f"params hold NaN or an infinity ({params!r:.200}), which are no numbers of JSON: give "
+            "finite numbers, or null"
+        ) from error
+    except TypeError as error:
         raise InvalidInputError(f"params are not plain JSON: {error}") from error
     if (size := len(text.encode())) > MAX_PARAMS_BYTES:
         raise InvalidInputError(

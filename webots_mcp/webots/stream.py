@@ -40,6 +40,9 @@ _ORDERS: Final[dict[Order, tuple[str, tuple[str, ...]]]] = {
     "reset": ("reset", ("reset finished",)),
     "reload": ("reload", ("delete world", "loading:", "world:", "scene load completed")),
 }
+_SAID_TO_ALL: Final = ("stdout:", "stderr:", "robot")  # also without --stream
+_LONGEST_WORDS: Final = 200
+_LONGEST_OTHER: Final = 60
 RESTARTING: Final = ("reset", "reload")  # may be answered to others, or much later
 
 
@@ -78,10 +81,12 @@ class Reply(NamedTuple):
     Attributes:
         heard: Webots' own words; None where it said nothing.
         is_alive: Whether its main thread answered at all, so that it is not busy.
+        other: What it said instead, which only one that obeys orders does.
     """
 
     heard: str | None
     is_alive: bool
+    other: str | None = None
 
 
 def address_of(instance: str) -> Address | None:
@@ -300,22 +305,30 @@ def _give(
     address: Address, words: str, answers: tuple[str, ...], timeout_s: float, *, late: bool
 ) -> Reply:
     until_s = time.monotonic() + timeout_s
-    is_alive = False
+    is_alive, other = False, None
     with connected(address, timeout_s) as stream:
         stream.send(words)
         stream.ping()
         while (message := stream.receive(until_s)) is not None:
-            if message.text.startswith(answers):
-                return Reply(message.text.partition("\n")[0][:200], is_alive=True)
+            line = message.text.partition("\n")[0][:_LONGEST_WORDS]
+            if line.startswith(answers):
+                return Reply(line, is_alive=True)
+            if not (message.is_pong or line.startswith(_SAID_TO_ALL)):
+                other = other or line[:_LONGEST_OTHER]
             is_alive = is_alive or message.is_pong
             if is_alive and not late:
                 # Words are answered in their order: what comes now is about something else.
                 until_s = min(until_s, time.monotonic() + _CLOSING_S)
-    return Reply(None, is_alive)
+    return Reply(None, is_alive, other)
 
 
 def no_obedience(address: Address, reply: Reply) -> str:
     """Why Webots said nothing to an order, as far as that can be told."""
+    if reply.other is not None:
+        return (
+            f"Webots at {address} answered {reply.other!r}, which does not tell whether it obeyed: "
+            "look at its window, or at what is recorded"
+        )
     if reply.is_alive:
         return (
             f"Webots at {address} hears but does not obey: it was started without --stream (only a "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sqlite3
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -67,3 +68,13 @@ def test_a_way_goes_on_to_where_the_robot_is(rover: sqlite3.Connection) -> None:
     way, end = chart.sources["way", 0].data, chart.sources["end", 0].data
     assert (way["x0"][-1], way["x1"][-1], way["value"][-1]) == (6.0, 6.2, "turn")
     assert (end["x"], end["y"]) == ([6.2], [0.2])
+
+
+def test_a_way_that_was_not_read_to_its_end_is_drawn_without_one(rover: sqlite3.Connection) -> None:
+    plot = compose_trajectory(rover, beginning(rover, 30))[0]
+    (track,) = plot.tracks
+    cut = replace(plot, tracks=[replace(track, path=replace(track.path, is_whole=False))])
+    chart = draw_way(cut)
+    assert not chart.sources["end", 0].data["x"]
+    assert not chart.refresh(plot), "the figure with an end is another one"
+    assert draw_way(plot).sources["end", 0].data["x"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sqlite3
 from itertools import pairwise
@@ -12,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.plotting.conftest import Record, whole
+from webots_mcp.errors import NothingRecordedError
 from webots_mcp.plotting.canvas import MOST_PANELS, Sheet
 from webots_mcp.plotting.curves import Curve
 from webots_mcp.plotting.palette import MERGED, MOST_VALUES, area_styles
@@ -232,6 +234,45 @@ def test_arrows_point_the_way_that_was_taken() -> None:
     found = headings(path, 4)
     assert [heading.degrees for heading in found] == pytest.approx([0, 90, 180, -90])
     assert headings(Path([Place(0, 1, 1)], None, frozenset()), 4) == []
+
+
+def moded(time_s: float) -> dict[str, object]:
+    return {"mode": "rest" if time_s < 60 else "walk", "x": time_s, "y": -time_s}
+
+
+@pytest.mark.parametrize("deadline_s", [0.0, 0.001, 0.002, 0.004, 0.008, 0.016, 0.032, 30.0])
+def test_what_was_not_read_in_time_is_hatched_and_is_no_end(
+    record: Record, deadline_s: float
+) -> None:
+    """Whenever the time is over; only that of the last one is sure not to be."""
+    connection = record(moded, 2000)
+    asked: dict[str, Any] = {"deadline_s": deadline_s, "events": False}
+    with contextlib.suppress(NothingRecordedError):
+        axes, notes = compose_signals(connection, [whole(connection)], ["x"], **asked)
+        from_s = axes.unread[0].start_s if axes.unread else 199.9
+        assert [each.end_s for each in axes.unread] == [199.9] * bool(axes.unread)
+        told = [(each.value, each.start_s) for each in axes.bands.intervals] if axes.bands else []
+        assert told == [("rest", 0.0), ("walk", 60.0)][: len(told)]
+        said = f"not all of run 1 was read from {from_s:g} s on: it took too long"
+        assert (said in notes) == bool(axes.unread)
+        assert not any("without a value" in note for note in notes)
+        assert not axes.unread or deadline_s < 30
+    with contextlib.suppress(NothingRecordedError):
+        way, notes = compose_trajectory(connection, [whole(connection)], **asked)
+        path = way.tracks[0].path
+        last_s = path.places[-1].time_s
+        assert path.is_whole == (last_s == pytest.approx(199.9))
+        assert (f"the way of run 1 is not read after {last_s:g} s" in notes) != path.is_whole
+
+
+@pytest.mark.parametrize("compose", [compose_signals, compose_trajectory])
+def test_where_nothing_was_read_in_time_nobody_says_that_nothing_was_recorded(
+    record: Record, compose: Any
+) -> None:
+    connection = record(moded, 2000)
+    names = [["x"]] if compose is compose_signals else []
+    with pytest.raises(NothingRecordedError, match="read in time"):
+        compose(connection, [whole(connection)], *names, deadline_s=0.0)
 
 
 def test_what_is_too_far_to_tell_a_distance_to_is_no_place(record: Record) -> None:

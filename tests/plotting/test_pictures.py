@@ -10,7 +10,8 @@ import subprocess
 import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import fields
+from dataclasses import fields, replace
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -31,13 +32,14 @@ from webots_mcp.errors import (
 from webots_mcp.plotting import Picture, PlotKind, Sheet, image_format_of, plot, plot_signals
 from webots_mcp.plotting.canvas import draw
 from webots_mcp.plotting.fonts import fit_fonts
+from webots_mcp.plotting.intervals import Interval
 from webots_mcp.plotting.palette import DASHES, LINES
 from webots_mcp.plotting.signal_axes import paint_signals
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import paint_trajectory
 from webots_mcp.server.parameters import RunIds
-from webots_mcp.store.reading.ranges import Scope
+from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 
 Ask = dict[str, Any]
@@ -386,3 +388,25 @@ def test_the_name_of_a_file_tells_its_format() -> None:
     assert image_format_of(Path("a/b.svg")) == "svg"
     with pytest.raises(InvalidInputError, match=r"end it in \.png or \.svg"):
         image_format_of(Path("plot.jpg"))
+
+
+def test_a_picture_of_what_was_not_read_whole_says_so_and_marks_no_end(
+    rover: sqlite3.Connection,
+) -> None:
+    ranges = [find_range(rover, Scope(run_id=1))]
+    svg = Sheet(image_format="svg")
+    signals, _ = compose_signals(rover, ranges, ["pose.0"])
+    way, _ = compose_trajectory(rover, ranges)
+    (track,) = way.tracks
+    cut = replace(way, tracks=[replace(track, path=replace(track.path, is_whole=False))])
+    for all_of_it, part, paint, says in (
+        (signals, replace(signals, unread=[Interval("", 60, 120)]), paint_signals, True),
+        (way, cut, paint_trajectory, False),
+    ):
+        shown, shown_cut = (
+            words(Picture(draw(svg, partial(paint, plot=plot))[0], "image/svg+xml", "", ()))
+            for plot in (all_of_it, part)
+        )
+        assert ("not all was read" in shown_cut) == says
+        assert "not all was read" not in shown
+        assert ("end" in shown, "end" in shown_cut) == ((False, False) if says else (True, False))

@@ -187,7 +187,7 @@ class _Drawing:
         fig.yaxis.major_label_overrides = dict(zip(rows, named, strict=True))
         fig.yaxis.major_tick_line_color = None
         fig.yaxis.axis_line_color = None
-        fig.vstrip("start_s", "end_s", source=self._sources[_GAPS], **_GAP)
+        self._hatch(fig)
         return fig
 
     def _figure(self, height: int, **options: Any) -> Any:
@@ -206,9 +206,14 @@ class _Drawing:
         if self._plot.bands:
             source = self._sources["ground", self._plot.bands.name, 0]
             fig.vstrip("start_s", "end_s", source=source, name="ground", **_GROUND)
-        fig.vstrip("start_s", "end_s", source=self._sources[_GAPS], **_GAP)
+        self._hatch(fig)
         line = {"line_color": FAINT, "line_dash": "dotted", "line_alpha": 0.6}
         fig.vspan("start_s", source=self._sources[_MOMENTS], **line)
+
+    def _hatch(self, fig: Any) -> None:
+        """Where nothing was recorded, and where not all was read."""
+        fig.vstrip("start_s", "end_s", source=self._sources[_GAPS], **_GAP)
+        fig.vstrip("start_s", "end_s", source=self._sources[_UNREAD], **(_GAP | _NOT_ALL))
 
     def _ground_legend(self, fig: Any, bands: Lane) -> Any:
         (ground,) = fig.select({"name": "ground"})
@@ -270,6 +275,7 @@ class _Drawing:
 
 
 _GAPS: Final[Key] = ("gaps", "", 0)
+_UNREAD: Final[Key] = ("unread", "", 0)
 _MOMENTS: Final[Key] = ("moments", "", 0)
 _WHEN: Final = (("from", "@start_s{0.000} s"), ("to", "@end_s{0.000} s"))
 _GROUND: Final[dict[str, Any]] = {
@@ -280,6 +286,13 @@ _GAP: Final[dict[str, Any]] = {
     "fill_color": "white", "line_width": 0, "hatch_pattern": "/", "hatch_color": "#AAAAAA",
     "hatch_weight": 0.5, "level": "underlay",
 }  # fmt: skip
+
+
+_NOT_ALL: Final[dict[str, Any]] = {
+    "hatch_pattern": "x",
+    "hatch_color": LINES[1],
+    "hatch_alpha": 0.5,
+}
 
 
 def _panel_px(plot: SignalAxes, height_px: int | None) -> int:
@@ -309,7 +322,9 @@ def data_of(plot: SignalAxes) -> dict[Key, dict[str, Any]]:
     """All that the figures show, by what it is."""
     styles = _styles_of(plot)
     events = [interval for lane in plot.events for interval in lane.intervals]
-    found: dict[Key, dict[str, Any]] = {_GAPS: _columns(plot.gaps), _MOMENTS: _columns(events)}
+    found: dict[Key, dict[str, Any]] = {
+        _GAPS: _columns(plot.gaps), _UNREAD: _columns(plot.unread), _MOMENTS: _columns(events),
+    }  # fmt: skip
     for curve in (curve for panel in plot.panels for curve in panel.curves):
         found["curve", curve.name, curve.run_id] = _points(curve.points)
         found["band", curve.name, curve.run_id] = _outline(curve.points)

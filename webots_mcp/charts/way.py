@@ -137,7 +137,8 @@ def data_of(plot: TrajectoryAxes) -> dict[Key, dict[str, Any]]:
         first, last = track.path.places[0], track.path.places[-1]
         found["way", index] = _steps(track, LINES[index % len(LINES)])
         found["start", index] = {"x": [first.x], "y": [first.y]}
-        found["end", index] = {"x": [last.x], "y": [last.y]}
+        end = [last] if track.path.is_whole else []
+        found["end", index] = {"x": [each.x for each in end], "y": [each.y for each in end]}
         found["headings", index] = _headings(track.path)
         for mark in track.marks:
             if mark.intervals:
@@ -148,7 +149,8 @@ def data_of(plot: TrajectoryAxes) -> dict[Key, dict[str, Any]]:
 def _legend_of(plot: TrajectoryAxes) -> Any:
     """What the legend tells, which stays as it is as long as the figure."""
     marks = [[(mark.name, len(mark.intervals)) for mark in track.marks] for track in plot.tracks]
-    return marks, [track.name for track in plot.tracks], plot.mode, plot.x_label, plot.y_label
+    tracks = [(track.name, track.path.is_whole) for track in plot.tracks]
+    return marks, tracks, plot.mode, plot.x_label, plot.y_label
 
 
 def _obstacles(fig: Any, obstacles: Sequence[Obstacle]) -> None:
@@ -196,7 +198,7 @@ def _track(
         "x", "y", angle="angle", source=sources["headings", index], marker="triangle", size=10,
         color=INK if alone else colour, line_color="white",
     )  # fmt: skip
-    items += _ends(fig, index, colour, sources)
+    items += _ends(fig, index, colour, sources, is_whole=track.path.is_whole)
     return [*items, *_marks(fig, track, index, sources, alone=alone)]
 
 
@@ -250,7 +252,7 @@ def _marked(mark: Lane, path: Path) -> dict[str, Any]:
 
 
 def _ends(
-    fig: Any, index: int, colour: str, sources: dict[Key, ColumnDataSource]
+    fig: Any, index: int, colour: str, sources: dict[Key, ColumnDataSource], *, is_whole: bool
 ) -> list[LegendItem]:
     start = fig.scatter(
         "x", "y", source=sources["start", index], size=11, fill_color="white", line_color=INK,
@@ -260,7 +262,7 @@ def _ends(
         "x", "y", source=sources["end", index], marker="square", size=11, color=colour,
         line_color="white",
     )  # fmt: skip
-    told = [] if index else [("start", start), ("end", end)]
+    told = [] if index else [("start", start), ("end", end)][: 1 + is_whole]
     return [LegendItem(label=name, renderers=[renderer]) for name, renderer in told]
 
 

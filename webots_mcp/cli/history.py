@@ -31,8 +31,9 @@ if TYPE_CHECKING:
     from webots_mcp.plotting import Picture
     from webots_mcp.store.detection.event import EventOptions
     from webots_mcp.store.detection.verdict import Verdicts
-    from webots_mcp.store.questions.series import RunHistory
+    from webots_mcp.store.questions.series import ChangeColumns, RunHistory
     from webots_mcp.store.questions.trends import RunTrends, StateTrend
+    from webots_mcp.store.reading.changes import Point
 
 
 def _id_or_signal(text: str) -> int | str:
@@ -304,13 +305,14 @@ def _print_history(run: RunHistory) -> None:
     if run.numbers:
         print_table(columns, list(zip(*series, strict=True)))
     changes = [
-        [states.name, point.sim_time_s, "null" if point.value is None else point.value]
+        [states.name, _since(states, point), "null" if point.value is None else point.value]
         for states in run.changes
         for point in states.points
     ]
     if changes:
         print_table(("signal", "since_s", "value"), changes)
     print_notes([f"no row from {gap.start_s:.3f} to {gap.end_s:.3f} s" for gap in run.gaps[:10]])
+    print_notes(_unread(run.cut_at_s))
 
 
 def _print_trends(run: RunTrends) -> None:
@@ -328,6 +330,20 @@ def _print_trends(run: RunTrends) -> None:
         print_table(("signal", "changes", "last", "since_s", "seconds in each value"), states)
     left = run.total - len(run.numbers)
     print_notes([f"{left} more signals that changed less: -n shows them"] if left else [])
+    print_notes(_unread(run.cut_at_s))
+
+
+def _since(states: ChangeColumns, point: Point) -> float | str:
+    first = states.since_before and states.total == len(states.points)
+    is_open = first and point is states.points[0]
+    return f"before {point.sim_time_s:.3f}" if is_open else point.sim_time_s
+
+
+def _unread(cut_at_s: float | None) -> list[str]:
+    """From where on the answer is not of all rows."""
+    if cut_at_s is None:
+        return []
+    return [f"not all was read from {cut_at_s:.3f} s on, the time was over: ask for less time"]
 
 
 def _times(state: StateTrend) -> str:

@@ -114,6 +114,14 @@ class Drawing:
     notes: tuple[str, ...]
     took_s: float
 
+    @property
+    def is_cut(self) -> bool:
+        """Whether there was no time to read all of it."""
+        ways = self.way.tracks if self.way else ()
+        return bool(self.signals and self.signals.unread) or any(
+            not track.path.is_whole for track in ways
+        )
+
 
 def look(recording: Recording, choice: Choice) -> Look:
     """The robot and the run that are chosen, and how they are.

@@ -222,6 +222,9 @@ class Tab:
         drawing, key = self._drawing, shown.key
         if drawing is None or key is None:
             return
+        if drawing.is_cut:  # what is new would stand behind what was not read
+            self._has_grown = True
+            return
         read = partial(rows_after, self._recording, key.run_id, drawing.read, self._until_s)
         columns = await to_thread.run_sync(read)
         if not columns.times:

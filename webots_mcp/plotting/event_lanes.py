@@ -77,11 +77,15 @@ def _within(interval: Interval, part: Part) -> Interval:
     return Interval(interval.value, start_s, min(interval.end_s, max(part.end_s, start_s)))
 
 
-def stuck_mark(connection: sqlite3.Connection, part: Part, position: tuple[str, str]) -> Lane:
-    """When the robot was stuck."""
+def stuck_mark(
+    connection: sqlite3.Connection, part: Part, position: tuple[str, str], deadline_s: float
+) -> tuple[Lane, list[str]]:
+    """When the robot was stuck, and where that was not looked for."""
     options = EventOptions(kinds=("stuck",), signals=position, position=position)
     found = find_events(
-        connection, part.range, options, limit=MOST_EVENTS, around=(), group=False, exact=False
-    )
+        connection, part.range, options, limit=MOST_EVENTS, around=(), group=False, exact=False,
+        deadline_s=deadline_s,
+    )  # fmt: skip
     intervals = [_within(Interval("stuck", e.start_s, e.end_s), part) for e in found.events]
-    return Lane(f"stuck over {options.stuck_s:g} s", intervals, ())
+    lane = Lane(f"stuck over {options.stuck_s:g} s", intervals, ())
+    return lane, _not_looked_for(found.verdicts)

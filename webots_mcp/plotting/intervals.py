@@ -48,8 +48,9 @@ class Lane:
 def lane_of(columns: ChangeColumns, run: RunHistory, end_s: float) -> Lane:
     """A text or boolean signal as intervals; values beyond the sixteenth share a name.
 
-    Where nothing was recorded there is no interval: nobody knows the value.
+    Where nothing was recorded or read there is no interval: nobody knows the value.
     """
+    end_s = end_s if columns.cut_at_s is None else min(columns.cut_at_s, end_s)
     values = list(columns.time_by_value_s)
     known = values if len(values) <= MOST_VALUES else values[: MOST_VALUES - 1]
     intervals = [

@@ -9,10 +9,12 @@ from typing import Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.plotting.canvas import short
+from webots_mcp.plotting.intervals import Interval
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.parameters import differing, parameters_of
 from webots_mcp.store.questions.series import MOST_POINTS, History, RunHistory, query_history
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange, recorded_bounds
 from webots_mcp.store.runs import fetch_run
 from webots_mcp.store.signals.catalogue import one_signal, signals_of
@@ -45,8 +47,17 @@ class Part:
 
     @property
     def has_rows(self) -> bool:
-        """Whether anything was recorded."""
-        return self.run.rows != 0 and self.start_s <= self.end_s
+        """Whether anything was recorded; where there was no time to read it, something may be."""
+        is_empty = self.run.rows == 0 and self.run.cut_at_s is None
+        return not is_empty and self.start_s <= self.end_s
+
+    @property
+    def unread(self) -> Interval | None:
+        """The stretch of which not all was read; None where all was."""
+        cut_s = self.run.cut_at_s
+        if cut_s is None:
+            return None
+        return Interval("", min(max(cut_s, self.start_s), self.end_s), self.end_s)
 
     @property
     def robot(self) -> str:
@@ -64,6 +75,7 @@ def parts_of(
     ranges: Sequence[TimeRange],
     names: Sequence[str],
     points: int = MOST_POINTS,
+    deadline_s: float = QUESTION_DEADLINE_S,
 ) -> list[Part]:
     """Read the signals of each run in the ranges; several runs begin at 0 each.
 
@@ -72,6 +84,7 @@ def parts_of(
         ranges: Those of the picture.
         names: Signals, with `*`.
         points: The most buckets of a run; the buckets of all runs have one length.
+        deadline_s: After it nothing more is read of a range, and the part says from where on.
 
     Raises:
         UnknownSignalError: A name meets nothing.
@@ -85,7 +98,8 @@ def parts_of(
             "name them by their ids"
         )
     parts: list[Part] = []
-    for each, history in zip(ranges, _histories(connection, ranges, names, points), strict=True):
+    histories = _histories(connection, ranges, names, points, deadline_s)
+    for each, history in zip(ranges, histories, strict=True):
         for segment, run in zip(each.segments, history.runs, strict=True):
             alone = replace(each, segments=(segment,))
             parts.append(_part(connection, alone, run, count > 1))
@@ -109,7 +123,11 @@ def _named_by_parameters(connection: sqlite3.Connection, parts: list[Part]) -> l
 
 
 def _histories(
-    connection: sqlite3.Connection, ranges: Sequence[TimeRange], names: Sequence[str], points: int
+    connection: sqlite3.Connection,
+    ranges: Sequence[TimeRange],
+    names: Sequence[str],
+    points: int,
+    deadline_s: float,
 ) -> list[History]:
     """The same data must look the same: the longest run decides how long a bucket is."""
     least_step_s = 0.0
@@ -117,7 +135,7 @@ def _histories(
         histories = [
             query_history(
                 connection, each, names, max_points=points, max_changes=MOST_CHANGES,
-                least_step_s=least_step_s,
+                least_step_s=least_step_s, deadline_s=deadline_s,
             )
             for each in ranges
         ]  # fmt: skip
@@ -153,14 +171,24 @@ def _seconds(time_s: float) -> str:
 
 
 def range_notes(parts: Sequence[Part]) -> list[str]:
-    """Where a range reaches outside the recording, and of what only the newest is drawn."""
+    """Where a range reaches outside the recording, and what of it is not drawn."""
     notes = [note for part in parts for note in part.notes]
+    notes += [f"{unread}: it took too long" for unread in unread_parts(parts)]
     return notes + [
         f"of {columns.total} changes of {columns.name} in {part.name} only the newest "
         f"{len(columns.points)} are shown"
         for part in parts
         for columns in part.run.changes
         if columns.total > len(columns.points)
+    ]
+
+
+def unread_parts(parts: Sequence[Part]) -> list[str]:
+    """From where on not all of each run was read, of those of which not all was."""
+    return [
+        f"not all of {part.name} was read from {_seconds(unread.start_s)} s on"
+        for part in parts
+        if (unread := part.unread) is not None
     ]
 
 

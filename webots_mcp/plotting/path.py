@@ -6,7 +6,7 @@ import math
 import sqlite3
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate, pairwise
 from typing import Final, NamedTuple, TypeGuard
 
@@ -37,11 +37,13 @@ class Path:
     Attributes:
         step_s: Simulated time between the places where not every row was read; else None.
         breaks: Indexes of the places before which nothing was recorded, or to which it leapt.
+        is_whole: Whether it was read up to its end: the last place of one that was not is none.
     """
 
     places: Sequence[Place]
     step_s: float | None
     breaks: frozenset[int]
+    is_whole: bool = True
 
     def pieces(self) -> Iterator[Sequence[Place]]:
         """The parts between the breaks."""
@@ -64,15 +66,21 @@ class Path:
         return self.places[max(0, start - 1) : end + 1]
 
 
-def read_path(connection: sqlite3.Connection, part: Part, x: Signal, y: Signal) -> Path:
+def read_path(
+    connection: sqlite3.Connection, part: Part, x: Signal, y: Signal, deadline_s: float
+) -> Path:
     """The places of one run: of every row, or of the part's buckets if the rows are many."""
     (segment,) = part.range.segments
+    cut_s = part.run.cut_at_s
     if exceeds(connection, segment):
         run = part.run
         by_name = {columns.name: columns.last for columns in run.numbers}
-        return _path(run.sim_time_s, by_name[x.name], by_name[y.name], run.step_s)
-    columns = read_columns(connection, segment, [x, y], Deadline())
-    return _path(columns.times, columns.values[x.name], columns.values[y.name], None)
+        path = _path(run.sim_time_s, by_name[x.name], by_name[y.name], run.step_s)
+    else:
+        columns = read_columns(connection, segment, [x, y], Deadline(deadline_s))
+        path = _path(columns.times, columns.values[x.name], columns.values[y.name], None)
+        cut_s = columns.cut_at_s
+    return replace(path, is_whole=cut_s is None)
 
 
 def _path(

@@ -15,7 +15,13 @@ from webots_mcp.plotting.palette import DASHES, FAINT, INK, LINES, Area, area_st
 from webots_mcp.plotting.panels import Panel
 
 _LETTER_PX: Final = 6
-_GAP_HATCH: Final = "////"
+_GAP: Final[dict[str, Any]] = {"facecolor": "none", "edgecolor": "#AAAAAA", "hatch": "////"}
+_UNREAD: Final[dict[str, Any]] = {
+    "facecolor": "none",
+    "edgecolor": LINES[1],
+    "hatch": "xx",
+    "alpha": 0.5,
+}
 _DOT_HATCH: Final = "..."
 _FLAGS: Final = {"true": Area(INK, dotted=False), "false": Area("#F0F0F0", dotted=False)}
 _BAND_ALPHA: Final = 0.35
@@ -32,6 +38,7 @@ class SignalAxes:
         lanes: Text and boolean signals below.
         events: One lane per kind of event.
         gaps: Where nothing was recorded.
+        unread: Where not all was read.
     """
 
     title: str
@@ -43,6 +50,7 @@ class SignalAxes:
     lanes: Sequence[Lane]
     events: Sequence[Lane]
     gaps: Sequence[Interval]
+    unread: Sequence[Interval] = ()
 
 
 def paint_signals(figure: Any, plot: SignalAxes) -> None:
@@ -117,13 +125,14 @@ def _shade(axes: Any, plot: SignalAxes) -> None:
         for value in plot.bands.values:
             intervals = [interval for interval in plot.bands.intervals if interval.value == value]
             _bars(axes, intervals, **_fill(styles[value]), alpha=_BAND_ALPHA, zorder=0.5)
-    _hatch(axes, plot.gaps, zorder=0.6)
+    _hatch(axes, plot, zorder=0.6)
 
 
-def _hatch(axes: Any, gaps: Sequence[Interval], zorder: float) -> None:
-    """Whatever stands there in the last row's name, nothing was recorded."""
-    _bars(axes, gaps, color="white", zorder=zorder)
-    _bars(axes, gaps, facecolor="none", edgecolor="#AAAAAA", hatch=_GAP_HATCH, zorder=zorder)
+def _hatch(axes: Any, plot: SignalAxes, zorder: float) -> None:
+    """Whatever stands there in the last row's name, nothing was recorded, or read."""
+    for stretches, style in ((plot.gaps, _GAP), (plot.unread, _UNREAD)):
+        _bars(axes, stretches, color="white", zorder=zorder)
+        _bars(axes, stretches, **style, zorder=zorder)
 
 
 def _bars(axes: Any, intervals: Sequence[Interval], **style: Any) -> None:
@@ -145,7 +154,7 @@ def _paint_lanes(axes: Any, plot: SignalAxes) -> None:
             _paint_states(axes, row, lane, styles)
         else:
             _paint_events(axes, row, lane)
-    _hatch(axes, plot.gaps, zorder=2)
+    _hatch(axes, plot, zorder=2)
     axes.set_ylim(len(lanes), 0)
     axes.set_yticks([row + 0.5 for row in range(len(lanes))], [short(lane.name) for lane in lanes])
     axes.tick_params(axis="y", length=0)
@@ -211,8 +220,10 @@ def _entries(axes: Any, plot: SignalAxes) -> list[Entry]:
         pen: dict[str, Any] = {"color": LINES[index % len(LINES)], "linewidth": 1.5}
         entries.append((Line2D([], [], linestyle=DASHES[index % len(DASHES)], **pen), name))
     if plot.gaps:
-        hatched = Patch(facecolor="none", edgecolor="#999999", hatch=_GAP_HATCH, linewidth=0)
-        entries.append((hatched, "nothing recorded"))
+        darker: dict[str, Any] = _GAP | {"edgecolor": "#999999"}
+        entries.append((Patch(**darker, linewidth=0), "nothing recorded"))
+    if plot.unread:
+        entries.append((Patch(**_UNREAD, linewidth=0), "not all was read"))
     styles = _lane_styles(plot)
     if plot.bands is not None and plot.panels:
         entries.append((Patch(visible=False), f"{short(plot.bands.name)}:"))

@@ -21,8 +21,10 @@ from webots_mcp.plotting.parts import (
     parts_of,
     range_notes,
     title_of,
+    unread_parts,
 )
 from webots_mcp.plotting.signal_axes import SignalAxes, paint_signals
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
 
 
@@ -73,14 +75,18 @@ def compose_signals(
     bands: str | None = None,
     events: bool = True,
     room: Room | None = None,
+    deadline_s: float = QUESTION_DEADLINE_S,
 ) -> tuple[SignalAxes, tuple[str, ...]]:
     """What `plot_signals` paints, and its notes; arguments and errors as there.
 
-    `room` is how much it may be; None for that of a PNG of 900 x 500 pixels.
+    `room` is how much it may be; None for that of a PNG of 900 x 500 pixels. `deadline_s` is for
+    what is read of a range; what is not read in it is hatched, and a note says so.
     """
     room = room or Sheet().room
     mode = mode_signal(known_signals(connection, ranges), bands)
-    parts = parts_of(connection, ranges, [*names, *([mode] if mode else [])], room.points)
+    parts = parts_of(
+        connection, ranges, [*names, *([mode] if mode else [])], room.points, deadline_s
+    )
     overlaid = len(parts) > 1
     curves = [curve for part in parts for curve in _curves(part)]
     panels, left_out = (by_signal if overlaid else by_scale)(curves, room.panels)
@@ -103,6 +109,7 @@ def compose_signals(
         lanes=below,
         events=marked,
         gaps=() if overlaid else _gaps(parts[0]),
+        unread=() if overlaid else _unread(parts[0]),
     )
     notes = [*_notes(parts, curves), *merged_notes([*below, *([behind] if behind else [])])]
     if left_out:
@@ -133,6 +140,10 @@ def _gaps(part: Part) -> list[Interval]:
     return [Interval("", gap.start_s, gap.end_s).moved(part.origin_s) for gap in part.run.gaps]
 
 
+def _unread(part: Part) -> list[Interval]:
+    return [] if part.unread is None else [part.unread.moved(part.origin_s)]
+
+
 def _height_of_rows(rows: int, sheet: Sheet) -> int:
     """Rows of intervals alone need no more."""
     return min(sheet.height_px, max(LEAST_HEIGHT_PX, 130 + 50 * rows))
@@ -156,7 +167,8 @@ def _caption(plot: SignalAxes) -> str:
     shown = [name for panel in plot.panels for name in panel.names]
     below = [lane.name for lane in plot.lanes]
     behind = f" over {plot.bands.name}" if plot.bands else ""
-    return f"{plot.title}: {', '.join([*shown, *below])}{behind}"
+    unread = f", from {plot.unread[0].start_s:g} s on not all was read" if plot.unread else ""
+    return f"{plot.title}: {', '.join([*shown, *below])}{behind}{unread}"
 
 
 def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
@@ -166,12 +178,9 @@ def _notes(parts: Sequence[Part], curves: Sequence[Curve]) -> list[str]:
         left = [c for c in part.run.numbers if (part.run.run_id, c.name) not in drawn]
         if too_large := [columns.name for columns in left if columns.whole.present]:
             notes.append(f"beyond 1e100 in {part.name}: {listed(too_large)}")
-        if silent := [columns.name for columns in left if not columns.whole.present]:
+        silent = [columns.name for columns in left if not columns.whole.present]
+        if silent and part.unread is None:
             notes.append(f"without a value in {part.name}: {listed(silent)}")
-        if part.run.cut_at_s is not None:
-            notes.append(
-                f"{part.name} is drawn up to {part.run.cut_at_s:g} s only: it took too long"
-            )
         notes += [
             f"{columns.name} in {part.name} was {_counted(columns.odd)}: not drawn"
             for columns in part.run.numbers
@@ -191,6 +200,8 @@ def _left_out(names: Sequence[str], room: Room) -> str:
 
 def _nothing(parts: Sequence[Part]) -> str:
     notes = "; ".join(note for part in parts for note in part.notes)
+    if unread := unread_parts(parts):
+        return f"nothing to draw was read in time ({'; '.join(unread)}): ask for less time"
     return f"nothing to draw: none of the signals has a value in {title_of(parts)}" + (
         f" ({notes})" if notes else ""
     )

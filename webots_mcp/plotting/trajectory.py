@@ -25,6 +25,7 @@ from webots_mcp.plotting.path import read_path
 from webots_mcp.plotting.trajectory_axes import Track, TrajectoryAxes, paint_trajectory
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
+from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
 from webots_mcp.store.reading.ranges import TimeRange
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.registry import Signal
@@ -60,7 +61,7 @@ def plot_trajectory(
     sheet = sheet or Sheet()
     plot, notes = compose_trajectory(connection, ranges, position, bands=bands, events=events)
     data, font_notes = draw(sheet, partial(paint_trajectory, plot=plot))
-    caption = f"{plot.title}: {plot.y_label} over {plot.x_label}"
+    caption = "; ".join([f"{plot.title}: {plot.y_label} over {plot.x_label}", *_cut(plot.tracks)])
     return Picture(data, media_type(sheet), caption, (*notes, *font_notes))
 
 
@@ -71,27 +72,39 @@ def compose_trajectory(
     *,
     bands: str | None = None,
     events: bool = True,
+    deadline_s: float = QUESTION_DEADLINE_S,
 ) -> tuple[TrajectoryAxes, tuple[str, ...]]:
-    """What `plot_trajectory` paints, and its notes; arguments and errors as there."""
+    """What `plot_trajectory` paints, and its notes; arguments and errors as there.
+
+    `deadline_s` is for each thing that is read; where a way was cut by it, it has no end.
+    """
     known = known_signals(connection, ranges)
     x, y = _position(known, position)
     mode = mode_signal(known, bands)
     flags = _flags(known) if events else []
     names = [x.name, y.name, *([mode] if mode else []), *flags]
-    parts = parts_of(connection, ranges, names)
+    parts = parts_of(connection, ranges, names, deadline_s=deadline_s)
     tracks: list[Track] = []
+    unlooked: list[str] = []
     for part in parts:
         modes = _lane(part, mode) if len(parts) == 1 else None
         marks = [_flagged(part, flag) for flag in flags]
         if events:
-            marks.insert(0, stuck_mark(connection, part, (x.name, y.name)))
-        tracks.append(Track(part.name, read_path(connection, part, x, y), modes, marks))
+            stuck, notes = stuck_mark(connection, part, (x.name, y.name), deadline_s)
+            marks.insert(0, stuck)
+            unlooked += notes
+        path = read_path(connection, part, x, y, deadline_s)
+        tracks.append(Track(part.name, path, modes, marks))
     if not any(track.path.places for track in tracks):
+        if not all(track.path.is_whole for track in tracks):
+            raise NothingRecordedError(
+                f"no place was read in time in {title_of(parts)}: ask for less time"
+            )
         raise NothingRecordedError(f"{x.name} and {y.name} have no values in {title_of(parts)}")
     metres = None if position else "m"
     labels = (_label(x, metres), _label(y, metres))
     axes = TrajectoryAxes(title_of(parts), *labels, tracks, mode)
-    return axes, _notes(parts, tracks)
+    return axes, tuple(dict.fromkeys((*_notes(parts, tracks), *unlooked)))
 
 
 def _position(known: Known, named: tuple[str, str] | None) -> tuple[Signal, Signal]:
@@ -145,4 +158,13 @@ def _notes(parts: Sequence[Part], tracks: Sequence[Track]) -> tuple[str, ...]:
         for track in tracks
         if track.path.step_s is not None
     ]
-    return tuple(dict.fromkeys(notes))
+    return (*notes, *_cut(tracks))
+
+
+def _cut(tracks: Sequence[Track]) -> list[str]:
+    """Up to when a way was read that goes on."""
+    return [
+        f"the way of {track.name} is not read after {track.path.places[-1].time_s:g} s"
+        for track in tracks
+        if track.path.places and not track.path.is_whole
+    ]

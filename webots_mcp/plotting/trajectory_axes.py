@@ -74,7 +74,8 @@ def paint_trajectory(figure: Any, plot: TrajectoryAxes) -> None:
         if track.path.places:
             entries += _paint_track(figure, axes, track, index, plot)
     _frame(figure, axes, [place for track in plot.tracks for place in track.path.places])
-    paint_legend(figure, [*_end_entries(), *entries])
+    ends = [each.path.is_whole for each in plot.tracks if each.path.places]
+    paint_legend(figure, [*_end_entries()[: 1 + any(ends)], *entries])
 
 
 def _frame(figure: Any, axes: Any, places: Sequence[Place]) -> None:
@@ -202,7 +203,8 @@ def _paint_headings(axes: Any, path: Path, colour: str) -> None:
 def _paint_ends(axes: Any, path: Path, colour: str) -> None:
     first, last = path.places[0], path.places[-1]
     axes.plot([first.x], [first.y], color=colour, zorder=5, **_START)
-    axes.plot([last.x], [last.y], color=colour, zorder=5, **_END)
+    if path.is_whole:
+        axes.plot([last.x], [last.y], color=colour, zorder=5, **_END)
 
 
 def _end_entries() -> list[Entry]:

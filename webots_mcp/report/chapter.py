@@ -202,8 +202,18 @@ def chapter_of(
         log=room.fit("log", _log(connection, run_id), newest=True),
         numbers=told_trends.total,
         changed_most=[each.name for each in told_trends.numbers if each.shape != "constant"],
-        notes=tuple(dict.fromkeys((*found.notes, *course.notes, *why_not))),
+        notes=tuple(
+            dict.fromkeys((*found.notes, *course.notes, *_unread(told_trends), *why_not))
+        ),
     )  # fmt: skip
+
+
+def _unread(course: RunTrends) -> list[str]:
+    """That what is told of modes and trends is not told of all rows."""
+    if course.cut_at_s is None:
+        return []
+    since = time_at(course.cut_at_s)
+    return [f"modes and trends are those of what was read in time: not all was from {since} s on"]
 
 
 def _first_words(info: RunInfo) -> str:

@@ -60,7 +60,14 @@ ALLOWED["server"] = STDLIB | {
 }  # fmt: skip
 ALLOWED["page"] = ALLOWED["server"] | ALLOWED["charts"] | {"page"}
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
-ALLOWED["pytest_plugin"] = {"contract", "standin", "testing", "MCPBridge", "MemoryDatabase"}
+ALLOWED["pytest_plugin"] = {
+    "connection",
+    "contract",
+    "standin",
+    "testing",
+    "MCPBridge",
+    "MemoryDatabase",
+}
 
 
 def imports(file: Path) -> Iterator[str]:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ import pytest
 
 if TYPE_CHECKING:
     from webots_mcp import MCPBridge, MemoryDatabase
+    from webots_mcp.contract import Database
     from webots_mcp.standin import InProcessSupervisor
     from webots_mcp.testing import Recording, RobotFactory, SimulationFactory
 
@@ -30,8 +32,26 @@ def webots_parameters(
     marker = request.node.get_closest_marker("webots_parameters")
     values: dict[str, Any] = dict(marker.kwargs) if marker else {}
     if marker:
+        if marker.args:
+            raise pytest.UsageError("webots_parameters takes names: webots_parameters(kp=3.0)")
         monkeypatch.setenv(PARAMETERS_VARIABLE, json.dumps(values))
     return values
+
+
+def _require_declared(values: dict[str, Any], databases: Iterable[Database]) -> None:
+    """Fail a test whose marker names what no controller has declared."""
+    from webots_mcp.connection import connect
+
+    declared = set[str]()
+    for database in databases:
+        with closing(connect(database, "reader")) as connection:
+            declared |= {name for (name,) in connection.execute("SELECT name FROM parameter")}
+    named = (name for name, value in values.items() if not isinstance(value, dict))  # a robot's own
+    lacking = [name for name in named if name not in declared]
+    if lacking:
+        pytest.fail(
+            f"webots_parameters: no controller declared {', '.join(lacking)}", pytrace=False
+        )
 
 
 @pytest.fixture
@@ -75,13 +95,17 @@ def webots_robot(webots_robot_factory: RobotFactory) -> InProcessSupervisor:
 
 @pytest.fixture
 def webots_bridge(
-    webots_robot: InProcessSupervisor, webots_database: MemoryDatabase
+    webots_robot: InProcessSupervisor,
+    webots_database: MemoryDatabase,
+    webots_parameters: dict[str, Any],
 ) -> Iterator[MCPBridge]:
     """A bridge that records each `publish` of `webots_robot` into `webots_database`."""
     from webots_mcp import MCPBridge
 
     with MCPBridge(webots_robot, throttle_interval=1, database=webots_database) as bridge:
         yield bridge
+    if webots_parameters:
+        _require_declared(webots_parameters, [webots_database])
 
 
 @pytest.fixture
@@ -112,6 +136,8 @@ def webots_simulation(
     factory = SimulationFactory(tmp_path, request.config.rootpath, tell)
     yield factory
     factory.close()
+    if webots_parameters and (databases := factory.databases):
+        _require_declared(webots_parameters, databases)
 
 
 def pytest_configure(config: pytest.Config) -> None:

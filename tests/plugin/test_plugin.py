@@ -85,6 +85,42 @@ while True:
 """
 
 
+def test_a_marker_that_no_parameter_takes_fails_its_test(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        import pytest
+
+        @pytest.mark.webots_parameters(kpp=3.0)
+        def test_bridge(webots_bridge):
+            webots_bridge.publish({"n": webots_bridge.parameter("kp", 2.0).value})
+
+        @pytest.mark.webots_parameters(kpp=3.0)
+        def test_simulation(webots_simulation):
+            webots_simulation(controllers={"rover": "steps.py"}).run_for(0.1)
+
+        @pytest.mark.webots_parameters({"kp": 3.0})
+        def test_written_otherwise(webots_bridge):
+            pass
+        """
+    )
+    pytester.makepyfile(
+        steps="""
+        from controller import Supervisor
+        from webots_mcp import MCPBridge
+
+        robot = Supervisor()
+        bridge = MCPBridge(robot)
+        while robot.step(16) != -1:
+            bridge.publish({"n": 1})
+        """
+    )
+    result = pytester.runpytest_inprocess()
+    result.assert_outcomes(passed=2, errors=3)
+    said = result.stdout.str()
+    assert said.count("webots_parameters: no controller declared kpp") >= 2
+    assert "webots_parameters takes names: webots_parameters(kp=3.0)" in said
+
+
 def test_a_controller_that_hangs_is_named_and_the_recordings_file_too(
     pytester: pytest.Pytester,
 ) -> None:

@@ -93,6 +93,12 @@ class SimulationFactory:
         self._on_start = on_start
         self._started: list[RecordedSimulation] = []
 
+    @property
+    def databases(self) -> list[Path]:
+        """Those in which the simulations have recorded."""
+        asked = (each.recording.database for each in self._started)
+        return [each for each in asked if isinstance(each, Path) and each.is_file()]
+
     def __call__(
         self,
         world: str | Path = DEFAULT_WORLD,

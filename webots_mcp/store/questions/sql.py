@@ -239,6 +239,10 @@ def _explain(connection: sqlite3.Connection, statement: str, error: Exception) -
         return "only one statement is allowed"
     if "not authorized" in text or "prohibited" in text or "readonly" in text:
         return f"only reading is allowed ({text}): no writing, no ATTACH, no PRAGMA"
+    if "number of bindings" in text:
+        return (
+            "?, :name, @name and $name stand for values that nobody gives: write them in the SELECT"
+        )
     if missing := _MISSING.search(text):
         return f"{text}; {_near(connection, statement, *missing.groups())}"
     return f"SQLite says: {text}"

@@ -168,7 +168,7 @@ def events(arguments: argparse.Namespace) -> None:
     ]  # fmt: skip
     print_table(("run", "start_s", "duration_s", "kind", "name", "details"), rows)
     left_out = [
-        f"left out: {each.count} of kind {kind} from {each.first_s:.3f} to {each.last_s:.3f} s"
+        f"left out: {each.count} of kind {kind} {each.span}"
         for kind, each in found.left_out.items()
     ]
     left_out += [f"--after '{found.cursor}' shows them, -n more at once"] if found.cursor else []

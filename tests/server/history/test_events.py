@@ -143,6 +143,25 @@ async def test_of_each_kind_it_is_told_whether_it_was_found_is_absent_or_was_not
     }
 
 
+async def test_what_is_left_out_of_several_runs_is_named_by_run_because_each_has_its_own_time(
+    recorded: Recorded, connect: Connect
+) -> None:
+    robot = recorded.robot()
+    for run in (1, 2):
+        if run == 2:
+            robot.end_run("reset")
+            robot.run_id = robot.begin_run("reset")
+        for step in range(1, 5):
+            robot.state(3.0 * step / run, {"n": step})
+            robot.log(3.0 * step / run, f"it slips {step}", "warning")
+    async with connect(read_only=True) as client:
+        asked: dict[str, Any] = {"kinds": ["log"], "since": 0, "group": False}
+        both = await ask(client, "webots_find_events", limit=1, **asked)
+        one = await ask(client, "webots_find_events", kinds=["log"], group=False, limit=1)
+    assert both["not_shown"] == {"log": "7 from 3.0 s of run 1 to 4.5 s of run 2"}
+    assert one["not_shown"] == {"log": "3 from 1.5 to 4.5 s"}
+
+
 async def test_what_find_events_does_not_show_is_named_by_time_and_a_cursor_shows_it(
     story: Path,
 ) -> None:

@@ -214,7 +214,7 @@ def test_what_happens_all_the_time_crowds_nothing_out_and_is_named_by_time(
     assert told.count(("log", "warning")) == 3 and told.count(("run", None)) == 1
     changes = events.left_out["change"]
     assert changes.count == events.totals["change"] - 2
-    assert (changes.first_s, changes.last_s) == pytest.approx((1.0, 98.0), abs=0.01)
+    assert (changes.first.start_s, changes.last.start_s) == pytest.approx((1.0, 98.0), abs=0.01)
 
 
 def test_pictures_are_told_only_where_they_are_asked_for(empty: sqlite3.Connection) -> None:

@@ -171,10 +171,7 @@ def verdicts_of(verdicts: Verdicts) -> KindVerdicts:
 
 def not_shown_of(told: Events) -> dict[str, str] | None:
     """How many of each kind are not shown, and from when to when they are."""
-    return {
-        kind: f"{each.count} from {seconds(each.first_s)} to {seconds(each.last_s)} s"
-        for kind, each in told.left_out.items()
-    } or None
+    return {kind: f"{each.count} {each.span}" for kind, each in told.left_out.items()} or None
 
 
 def events_table(events: Sequence[Event], view: View) -> Table | None:

@@ -39,11 +39,21 @@ _ROW_AT: Final = (
 
 @dataclass(frozen=True)
 class LeftOut:
-    """Events of one kind that were found and left out: how many, and when they began."""
+    """Events of one kind that were found and left out: how many, and the first and the last."""
 
     count: int
-    first_s: float
-    last_s: float
+    first: Event
+    last: Event
+
+    @property
+    def span(self) -> str:
+        """From when to when they began; each run has a time of its own."""
+        first_s, last_s = round(self.first.start_s, 3), round(self.last.start_s, 3)
+        if self.first.run_id == self.last.run_id:
+            return f"from {first_s} to {last_s} s"
+        return (
+            f"from {first_s} s of run {self.first.run_id} to {last_s} s of run {self.last.run_id}"
+        )
 
 
 @dataclass(frozen=True)
@@ -304,7 +314,7 @@ def _left_out(events: Sequence[Event]) -> dict[str, LeftOut]:
     for event in events:
         by_kind.setdefault(event.kind, []).append(event)
     return {
-        kind: LeftOut(sum(e.count for e in each), each[0].start_s, each[-1].start_s)
+        kind: LeftOut(sum(e.count for e in each), each[0], each[-1])
         for kind, each in by_kind.items()
     }
 

@@ -221,14 +221,18 @@ class _Progress:
 
 
 def _show(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) -> None:
+    from webots_mcp.store.questions.score import unseen
     from webots_mcp.store.trials import ranking_of, trials_of
 
     with recording.reader() as connection:
         found = trials_of(connection, set_id)
+        notes = unseen(connection, (each.run_id for each in found if each.score is not None))
     ranking = ranking_of(found, plan.best)
     runs = {each.number: each.run_id for each in found}
     if as_json:
-        print(json.dumps({"trial_set_id": set_id, **_as_json(ranking), "runs": runs}))
+        print(
+            json.dumps({"trial_set_id": set_id, **_as_json(ranking), "runs": runs, "notes": notes})
+        )
         return
     print_table(
         ("rank", "parameters", "mean", "least", "greatest", "scores", "pruned", "failed", "why"),
@@ -236,7 +240,7 @@ def _show(recording: Recording, set_id: int, plan: WorldPlan, *, as_json: bool) 
     )
     ids = [each.run_id for each in found if each.run_id is not None]
     where = f"runs {min(ids)} to {max(ids)}" if ids else "no run was recorded"
-    print_notes([ranking.verdict, f"trial set {set_id}, {where}; score: {plan.score}"])
+    print_notes([ranking.verdict, f"trial set {set_id}, {where}; score: {plan.score}", *notes])
 
 
 def _row(number: int, ranked: Any) -> list[Any]:

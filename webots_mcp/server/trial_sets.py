@@ -26,7 +26,7 @@ from webots_mcp.server.target import find_target
 from webots_mcp.server.tuning import settable
 from webots_mcp.store.analysis.ranking import Ranked, Ranking
 from webots_mcp.store.parameters import Declared, declared_for
-from webots_mcp.store.questions.score import require_kinds
+from webots_mcp.store.questions.score import require_kinds, unseen
 from webots_mcp.store.questions.ways import way_of_run
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.snapshot import in_one_snapshot
@@ -264,6 +264,7 @@ def _told(connection: sqlite3.Connection, found: TrialSet) -> dict[str, Any]:
                 *_standing(connection, found, trials),
                 *_left_out(left_out),
                 *_gone(connection, trials),
+                *unseen(connection, (each.run_id for each in trials if each.score is not None)),
             ]
         ),
         "hint": hint,

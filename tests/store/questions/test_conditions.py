@@ -113,8 +113,9 @@ def test_of_several_runs_all_rows_are_counted_and_the_same_is_said_once(
     found = ask(rover, "target > 1e6", since=0.0, until=2e9)
 
     assert found.verdicts.absent["condition"] == "it held in none of 2050 rows"
-    (note,) = (note for note in found.notes if "row" in note)
-    assert note.startswith("run 1, 2, 3: ")
+    dropped, others = (note for note in found.notes if "row" in note)
+    assert dropped.startswith("run 1: ") and "some were dropped" in dropped
+    assert others.startswith("run 2, 3: ")
 
 
 def test_a_misspelt_signal_is_told_from_how_many(rover: sqlite3.Connection) -> None:
@@ -135,6 +136,18 @@ def test_the_answer_says_whether_the_rows_are_all_that_was_published(
     (note,) = ask(counting.connection, "n > 0").notes
 
     assert said in note
+
+
+def test_where_rows_were_dropped_it_is_not_said_that_nothing_was_missed(
+    counting: Recorder,
+) -> None:
+    counting.publish(0.0, {"n": 1})
+    counting.connection.execute("UPDATE session SET throttle_interval = 1")
+    counting.insert("event", **counting.at(0.0), kind="dropped")
+
+    (note,) = ask(counting.connection, "n > 0").notes
+
+    assert note == "run 1: rows were dropped, so what they held is not seen"
 
 
 def test_a_wrong_question_is_refused_with_what_would_do(rover: sqlite3.Connection) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 
 import pytest
 
 from tests.recordings.rover import start_run
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
-from webots_mcp.store.questions.score import score_run
+from webots_mcp.store.questions.score import score_run, unseen
 
 
 @pytest.mark.parametrize(
@@ -74,6 +75,38 @@ def test_a_run_without_rows_and_one_with_purged_rows_have_no_score(
     found = score_run(empty, run_id, "last(x)")
     assert found.value is None
     assert "7 rows of run 1 were purged" in str(found.why)
+
+
+def test_what_scores_do_not_see_of_their_runs_is_told_once_for_runs_that_are_alike(
+    empty: sqlite3.Connection,
+) -> None:
+    recorder = start_run(empty)
+    recorder.publish(0.0, {"x": 1})
+    whole = recorder.run_id
+    empty.execute("UPDATE session SET throttle_interval = 1")
+    assert unseen(empty, [whole, None]) == []
+
+    robot_id = recorder.robot("second")
+    throttled = recorder.session(robot_id, "b")
+    empty.execute("UPDATE session SET throttle_interval = 10 WHERE id = ?", (throttled,))
+    for peak in (None, None, 9):
+        recorder.run(throttled, robot_id)
+        recorder.publish(0.0, {"x": 1})
+        if peak is not None:
+            recorder.insert(
+                "kept_stretch", run_id=recorder.run_id, uuid="k", wall_time_s=0.0,
+                start_sim_time_s=0.0, end_sim_time_s=1.0, reason="hit",
+            )  # fmt: skip
+            recorder.insert("kept_state", **recorder.at(0.5), data=json.dumps({"x": peak}))
+    recorder.insert("event", **{**recorder.at(0.0), "run_id": whole}, kind="dropped")
+
+    assert score_run(empty, recorder.run_id, "max(x)").value == 1
+    between = "one publish() call in 10 is a row, so what held between two rows is not seen"
+    assert unseen(empty, [1, 2, 3, 4]) == [
+        "scores of run 1: rows were dropped, so what they held is not seen",
+        f"scores of run 2, 3: {between}",
+        f"scores of run 4: {between}; what only kept stretches have is in no score",
+    ]
 
 
 @pytest.mark.parametrize(

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.conditions.score import Facts, Score, Scored, parse_score
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.naming import nearest_first
+from webots_mcp.naming import listed, nearest_first
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.registry import kind_names
 from webots_mcp.store.questions.events import collect
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.held import unrecorded
+from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment, TimeRange, whole_run
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject
@@ -94,6 +97,21 @@ def score_run(
         duration_s = end_s - began_s
         segment = segment.through(end_s)
     return _scored(connection, score, subject, segment, duration_s, Deadline(deadline_s))
+
+
+def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> list[str]:
+    """What was published and is not in scores of these runs, in a sentence for runs that are alike.
+
+    Rows that only a kept stretch has are in none, so that runs are judged by equally many.
+    """
+    alike: dict[str, list[str]] = {}
+    for run_id in filter(None, run_ids):
+        kept = len(kept_parts(connection, run_id, -math.inf, math.inf))
+        told = [unrecorded(connection, run_id)]
+        told += ["what only kept stretches have is in no score"] if kept else []
+        if said := "; ".join(filter(None, told)):
+            alike.setdefault(said, []).append(str(run_id))
+    return [f"scores of run {listed(runs)}: {said}" for said, runs in alike.items()]
 
 
 def _scored(

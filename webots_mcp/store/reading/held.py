@@ -28,8 +28,9 @@ _SOME_BEFORE: Final = (  # what was there last, for `changed` and `rate`
     "SELECT min(sim_time_s) FROM (SELECT sim_time_s FROM state WHERE run_id = ? "
     "AND sim_time_s < ? ORDER BY sim_time_s DESC LIMIT 20)"
 )
-_INTERVAL: Final = (
-    "SELECT s.throttle_interval FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?"
+_RECORDED: Final = (
+    "SELECT s.throttle_interval, EXISTS (SELECT 1 FROM event WHERE run_id = r.id "
+    "AND kind = 'dropped') FROM run r JOIN session s ON s.id = r.session_id WHERE r.id = ?"
 )
 
 Row = tuple[float, Any]
@@ -135,8 +136,14 @@ def stretches_in(rows: Iterable[Row], condition: Condition, from_s: float) -> It
 
 def recorded_share(connection: sqlite3.Connection, run_id: int) -> str:
     """How many of the published states a run's rows are, in a sentence."""
-    (interval,) = connection.execute(_INTERVAL, (run_id,)).fetchone()
+    return unrecorded(connection, run_id) or "each publish() call is a row, so nothing was missed"
+
+
+def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
+    """What of the published states is not in a run's rows; None where all of them are."""
+    interval, dropped = connection.execute(_RECORDED, (run_id,)).fetchone()
     if interval == 1:
-        return "each publish() call is a row, so nothing was missed"
+        return "rows were dropped, so what they held is not seen" if dropped else None
     share = f"one publish() call in {interval} is a row" if interval else "rows may be fewer"
+    share += " and some were dropped" if dropped else ""
     return f"{share}, so what held between two rows is not seen"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,16 @@ pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
 
 from bokeh.document import Document
 
+from tests.recordings.long import build
 from tests.recordings.rover import start_run
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.page.summing import Summing
 from webots_mcp.page.tab import Tab
 from webots_mcp.schema import create_schema
 from webots_mcp.store.recording import Recording
+from webots_mcp.store.rollup.rolling import watermark
+from webots_mcp.store.summing_up import LEAST_ROWS
 
 
 def record(folder: Path, robot: str, state: dict[str, Any]) -> None:
@@ -68,3 +73,23 @@ def test_what_no_bridge_writes_is_said_on_the_page_and_logged_once(
     assert "rows that it did not write" in go_on(tab)
     assert "rows that it did not write" in go_on(tab)
     assert len([each for each in caplog.records if each.exc_info]) == 1
+
+
+def test_what_no_server_rolls_up_is_rolled_up_beside_the_page(tmp_path: Path) -> None:
+    build(tmp_path / DATABASE_NAME, 2 * LEAST_ROWS, rolled=False)
+    recording = Recording(tmp_path / DATABASE_NAME, tmp_path, read_only=True)
+    summing = Summing(recording)
+    summing.start()
+    while not summing.rounds:
+        assert summing.is_alive()
+        threading.Event().wait(0.01)
+    summing.stop()
+    assert summing.says == ""
+    with recording.reader() as connection:
+        assert watermark(connection) == 2 * LEAST_ROWS
+
+
+def test_of_a_page_without_a_recording_nothing_is_rolled_up(tmp_path: Path) -> None:
+    summing = Summing(Recording(tmp_path / DATABASE_NAME, tmp_path, read_only=True))
+    summing.look()
+    assert (summing.rounds, summing.says) == (0, "")

@@ -40,6 +40,7 @@ from webots_mcp.page.looking import (
 )
 from webots_mcp.page.pacing import Beat
 from webots_mcp.page.style import CARD, LOG, NOTES, PICTURE, SCROLLING, STATUS, page_sheet, sheet
+from webots_mcp.page.summing import Summing
 from webots_mcp.page.words import (
     log_markup,
     notes_markup,
@@ -66,10 +67,10 @@ _FIGURES_PX: Final = _HEIGHT_PX - 280  # of it for the signals
 _EMPTY: Final = "Nothing to draw yet: the figures appear with the first rows of a run."
 
 
-def open_tab(recording: Recording, read_only: bool, document: Document) -> None:
+def open_tab(recording: Recording, read_only: bool, summing: Summing, document: Document) -> None:
     """Make a document show a recording."""
     document.title = "webots-mcp"
-    tab = Tab(recording, document, read_only=read_only)
+    tab = Tab(recording, document, read_only=read_only, summing=summing)
     document.add_root(tab.layout)
     go_on: Any = tab.go_on
     document.add_periodic_callback(go_on, _PERIOD_MS)
@@ -82,12 +83,22 @@ class Tab:
         recording: What is shown.
         document: Where it is shown.
         read_only: Without buttons, and without inputs for parameters.
+        summing: What rolls up beside it, if anything does.
     """
 
-    def __init__(self, recording: Recording, document: Document, *, read_only: bool) -> None:
+    def __init__(
+        self,
+        recording: Recording,
+        document: Document,
+        *,
+        read_only: bool,
+        summing: Summing | None = None,
+    ) -> None:
         self._recording = recording
         self._steered = replace(recording, read_only=False)
         self._document = document
+        self._summing = summing or Summing(recording)
+        self._rounds = 0  # of its, when the figures were drawn
         self._read_only = read_only
         self._choice = Choice(window_s=60.0)
         self._shown: Look | None = None
@@ -156,7 +167,9 @@ class Tab:
         if shown is None or shown.key is None:
             return
         wanted = (shown.key, self._choice)
+        self._look_at_cut()
         if wanted != self._drawn or (self._has_grown and time.monotonic() >= self._next_drawing_s):
+            self._rounds = self._summing.rounds
             drawing = await to_thread.run_sync(gather, self._recording, shown, self._choice)
             is_other, self._drawn = wanted != self._drawn, wanted
             self._show(drawing, is_other=is_other)
@@ -164,6 +177,17 @@ class Tab:
             await self._grow(shown)
         else:  # runs over each other have clocks of their own
             self._has_grown = (shown.header["sim_time_s"] or 0.0) > self._until_s
+
+    def _look_at_cut(self) -> None:
+        """What could not be read in time is read again, at once where it was rolled up since."""
+        drawing = self._drawing
+        if drawing is None or not drawing.is_cut:
+            return
+        self._has_grown = True
+        if self._rounds != self._summing.rounds:
+            self._next_drawing_s = 0.0
+        said = [self._summing.says] if self._summing.says else []
+        _say(self._notes, notes_markup([*said, *drawing.notes]))
 
     def _show(self, drawing: Drawing, *, is_other: bool) -> None:
         self._drawing, self._has_grown = drawing, False
@@ -223,7 +247,6 @@ class Tab:
         if drawing is None or key is None:
             return
         if drawing.is_cut:  # what is new would stand behind what was not read
-            self._has_grown = True
             return
         read = partial(rows_after, self._recording, key.run_id, drawing.read, self._until_s)
         columns = await to_thread.run_sync(read)

@@ -54,7 +54,9 @@ class NumberSeries(BaseModel):
 class ChangeSeries(BaseModel):
     """A text or boolean signal: its values, each with the time from which on it had it."""
 
-    since_s: list[float | None]
+    since_s: list[float | None] = Field(
+        description="First null: it began earlier; there was no time to find when."
+    )
     value: list[str | bool | None]
     total: int | None = Field(default=None, description="How many changes, if not all are shown.")
     time_by_value_s: dict[str, float]

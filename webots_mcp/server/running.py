@@ -291,7 +291,9 @@ def _in_between(view: View, command: Command, asked: TimeRange) -> dict[str, Any
     shown_events, events = fitting_events(of_others, _SHOWN_EVENTS, _EVENTS_BUDGET, view)
     return {
         "movement": movement(view, asked),
-        "trends": trend_tables(told, _SHOWN_SIGNALS, _TRENDS_BUDGET) if told.rows else None,
+        "trends": trend_tables(told, _SHOWN_SIGNALS, _TRENDS_BUDGET)
+        if told.rows or told.cut_at_s is not None
+        else None,
         "events": events,
         "not_shown": not_shown_of(shown_events),
     }

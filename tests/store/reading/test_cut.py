@@ -10,10 +10,15 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.extent import Detection
+from webots_mcp.store.detection.registry import asked_kinds
+from webots_mcp.store.detection.verdict import Ledger, Verdicts
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
+from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, Segment, find_range, whole_run
 from webots_mcp.store.reading.rollups import read_pieces
 from webots_mcp.store.rollup.rolling import roll
@@ -145,3 +150,52 @@ def test_who_had_no_time_at_all_says_so_of_text_as_of_numbers(
         assert (history.rows, trend.rows) == (0, 0)
         assert trend.silent == (), "nobody has looked"
         assert not any(each.points or each.time_by_value_s for each in history.changes)
+
+
+def test_a_page_without_a_row_for_which_the_time_was_over_is_no_last_page(
+    unsummed: sqlite3.Connection,
+) -> None:
+    page = query_rows(unsummed, find_range(unsummed, Scope()), ["*"], limit=1000, deadline_s=0.0)
+    assert (page.ids, page.cursor, page.cut) == ([], None, True)
+
+
+def test_a_kind_is_absent_only_where_all_of_it_was_looked_at(unsummed: sqlite3.Connection) -> None:
+    whole = _verdicts(unsummed, ENOUGH)
+    assert (whole.found["change"], whole.far) == (3, ["gap"])
+    told = [_verdicts(unsummed, looks) for looks in SOME]
+    assert not any("change" in {*each.far, *each.came_near} for each in told)
+    cut = [each for each in told if "change" in each.reasons]
+    assert any("change" in each.found for each in cut), "some of them were read"
+    assert all("the time was over" in each.not_searched["change"] for each in cut)
+
+
+def test_the_newest_change_goes_on_only_where_it_was_looked_at_to_the_end(
+    unsummed: sqlite3.Connection,
+) -> None:
+    for looks in SOME:
+        ledger, options = Ledger(), EventOptions(kinds=("change",), signals=("mode",))
+        found = find_range(unsummed, Scope(start_s=400.0, end_s=600.0))
+        (event,) = _look(unsummed, found.segments[0], options, ledger, looks)[-1:] or [None]
+        if event is not None and event.end_s != 1500.0:
+            assert not event.ongoing
+            assert "the time was over" in ledger.verdicts(asked_kinds(options), []).gaps["change"]
+
+
+def _verdicts(connection: sqlite3.Connection, looks: int) -> Verdicts:
+    ledger, options = Ledger(), EventOptions(kinds=("gap", "change"))
+    (segment,) = find_range(connection, Scope()).segments
+    events = _look(connection, segment, options, ledger, looks)
+    return ledger.verdicts(asked_kinds(options), events)
+
+
+def _look(
+    connection: sqlite3.Connection,
+    segment: Segment,
+    options: EventOptions,
+    ledger: Ledger,
+    looks: int,
+) -> list[Event]:
+    known = known_signals(connection, find_range(connection, Scope()))
+    kinds = asked_kinds(options)
+    detection = Detection(connection, known, kinds, options, after(looks), ledger)
+    return detection.events_touching(segment)

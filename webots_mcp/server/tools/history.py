@@ -215,13 +215,15 @@ def _page(
         "raw": _row_columns(page, rows, view),
         "cursor": cursor,
         "notes": notes_of(page.notes),
-        "hint": f"{rows} rows: go on with cursor" if cursor else _no_rows(rows, after_id),
+        "hint": f"{rows} rows: go on with cursor" if cursor else _no_rows(page, rows, after_id),
     }
 
 
-def _no_rows(rows: int, after_id: int) -> str | None:
+def _no_rows(page: Page, rows: int, after_id: int) -> str | None:
     if rows:
         return None
+    if page.cut:
+        return "the time was over before any row was read: ask for a shorter range"
     return "no rows after that cursor" if after_id else "no row in that range"
 
 

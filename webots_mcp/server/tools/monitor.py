@@ -132,7 +132,7 @@ def _found(view: View, wall_start_s: float) -> dict[str, Any]:
         "notes": notes_of(
             tuple(dict.fromkeys((*window.rows.notes, *found.notes, *_of_earlier(told))))
         ),
-        "hint": _hint(rows, bool(shown.left_out), wall_start_s, view),
+        "hint": _hint(recorded, bool(shown.left_out), wall_start_s, view),
     }
 
 
@@ -156,8 +156,8 @@ def _in_window(event: Event, window: Window, wall_start_s: float) -> bool:
     return event.wall_time_s >= wall_start_s or lasted
 
 
-def _hint(rows: int, left_out: bool, wall_start_s: float, view: View) -> str | None:
-    if rows == 0:
+def _hint(recorded: bool, left_out: bool, wall_start_s: float, view: View) -> str | None:
+    if not recorded:
         return _why_nothing(view)
     if not left_out:
         return None

@@ -162,7 +162,8 @@ def _run_trends(
         for signal, trend, has_value in zip(numbers, found, has_values, strict=True)
         if trend is None and (has_value or numbers_cut_s is None)
     ]
-    cuts_s = [each for each in (numbers_cut_s, states_cut_s) if each is not None]
+    kept_cut_s = None if kept is None else kept.cut_at_s
+    cuts_s = [e for e in (numbers_cut_s, kept_cut_s, states_cut_s) if e is not None]
     return RunTrends(
         run_id=segment.run_id,
         start_s=segment.start_s,

@@ -7,7 +7,7 @@ import sqlite3
 from bisect import bisect_right
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import count, groupby, pairwise
 from typing import Final, Literal
 
@@ -75,7 +75,9 @@ def tabulate(
         columns = read_columns(connection, segment, signals, deadline)
         table = _from_rows(columns, signals, max_points, least_step_s)
     if table.starts and not segment.full_rate:
-        _take_in_kept(connection, segment, signals, deadline, table)
+        cut_at_s = _take_in_kept(connection, segment, signals, deadline, table)
+        cuts_s = [each for each in (table.cut_at_s, cut_at_s) if each is not None]
+        table = replace(table, cut_at_s=min(cuts_s, default=None))
     return table
 
 
@@ -85,14 +87,15 @@ def _take_in_kept(
     signals: Sequence[Signal],
     deadline: Deadline,
     table: Table,
-) -> None:
+) -> float | None:
     """Put the extremes of what only kept stretches have into its buckets.
 
-    A row that is a bucket of its own reaches up to the next one.
+    A row that is a bucket of its own reaches up to the next one. Gives where the deadline stopped
+    the reading, if it did.
     """
     columns = kept_columns(connection, segment, signals, deadline)
     if columns is None:
-        return
+        return None
     places = [max(0, bisect_right(table.starts, time_s + 1e-9) - 1) for time_s in columns.times]
     start = 0
     for place, group in groupby(places):
@@ -103,6 +106,7 @@ def _take_in_kept(
             if cells := table.cells.get(signal.name):
                 cells[place] = with_extremes(cells[place], beside)
         start = end
+    return columns.cut_at_s
 
 
 def _from_rows(

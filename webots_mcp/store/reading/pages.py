@@ -29,7 +29,9 @@ class Page:
     Attributes:
         values: Per signal one value per row; None where the row has none.
         odd: Per signal, how often each value that JSON cannot hold.
-        cursor: Give it as `after_id` for the next page; None after the last row.
+        cursor: Give it as `after_id` for the next page; None after the last row, or where the time
+            was over before any was read.
+        cut: The time was over: there may be more rows even where none is here.
     """
 
     robot: str
@@ -41,6 +43,7 @@ class Page:
     odd: dict[str, dict[str, int]]
     cursor: int | None
     notes: tuple[str, ...]
+    cut: bool = False
 
 
 @in_one_snapshot
@@ -120,4 +123,5 @@ def _page(
         {name: dict(counts) for name, counts in odd.items()},
         ids[:limit][-1] if more else None,
         time_range.notes,
+        cut,
     )

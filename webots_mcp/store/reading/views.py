@@ -354,7 +354,7 @@ class LongView:
         pieces = self._pieces if shared else self._pieces_of([signal])
         read = functools.partial(self._rows_of, signal)
         spans = joined(spans_in_pieces(self._segment, signal, pieces, condition, read))
-        if self._deadline.passed:
+        if self._deadline.passed or pieces.cut_at_s is not None:
             self._cut()
         return spans
 

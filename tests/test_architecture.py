@@ -19,8 +19,9 @@ ALLOWED = {
     "errors": set[str](),
     "bundled": set[str](),
     "forked": set[str](),
-    "connection": {"contract", "errors", "forked"},
-    "schema": {"connection", "contract", "errors"},
+    "origin": {"errors"},
+    "connection": {"contract", "errors", "forked", "origin"},
+    "schema": {"connection", "contract", "errors", "origin"},
     "liveness": set[str](),
     "notice": set[str](),
     "naming": {"units"},
@@ -35,7 +36,16 @@ ALLOWED = {
     "webots": {"connection", "contract", "errors", "liveness", "webots"},
 }
 ALLOWED["setup"] = {"contract", "errors", "setup", "webots", "__version__"}
-ENTRIES = {"bundled", "conditions", "maintenance", "naming", "parameter", "settlement", "units"}
+ENTRIES = {
+    "bundled",
+    "conditions",
+    "maintenance",
+    "naming",
+    "origin",
+    "parameter",
+    "settlement",
+    "units",
+}
 STDLIB = {
     *ENTRIES,
     *ALLOWED["maintenance"],

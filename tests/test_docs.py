@@ -13,7 +13,7 @@ import webots_mcp
 from webots_mcp import MCPBridge, MemoryDatabase, testing
 from webots_mcp.cli import COMMANDS
 from webots_mcp.contract import BUILT_IN_ACTIONS
-from webots_mcp.schema import SCHEMA_FILE
+from webots_mcp.origin import SCHEMA_FILE
 from webots_mcp.server import create_server
 
 CHECKOUT = Path(__file__).parents[1]

@@ -9,13 +9,15 @@ import os
 import sqlite3
 import time
 from collections.abc import Callable, Generator, Iterable
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from functools import cache
 from pathlib import Path
-from typing import Final, Literal, TypeVar
+from typing import Any, Final, Literal, TypeVar
 
 from webots_mcp.contract import (
     APPLICATION_ID,
     PRIVATE_FILE,
+    SCHEMA_VERSION,
     Database,
     MemoryDatabase,
     make_folder,
@@ -27,6 +29,7 @@ from webots_mcp.errors import (
     NoDatabaseError,
 )
 from webots_mcp.forked import is_inherited
+from webots_mcp.origin import require_shipped
 
 Role = Literal["loop", "writer", "reader"]
 Result = TypeVar("Result")
@@ -34,6 +37,8 @@ Result = TypeVar("Result")
 OLDEST_SQLITE: Final = (3, 38, 0)  # RETURNING, ->>, shared databases in memory
 OPENING_TIMEOUT_MS: Final = 5000
 _UNINTERRUPTED_MS: Final = 100
+LONGEST_READ_S: Final = 60.0  # of a statement of a reader
+_STEPS_PER_LOOK: Final = 1_000_000  # of SQLite's virtual machine: some 20 ms
 LONGEST_WRITE_S: Final = 0.001  # of maintenance: a robot that wants to write waits so long
 CHECKPOINT_TIMEOUT_MS: Final = 100  # longer, and a checkpoint makes writers wait for its readers
 _UNWRITABLE: Final = ("readonly database", "unable to open database file")
@@ -45,11 +50,6 @@ _ABOUT_A_VALUE: Final = (
     "user-defined function",
 )  # fmt: skip
 
-# One statement, so one moment: another starter may be making the tables right now.
-_STAMPS: Final = (
-    "SELECT (SELECT application_id FROM pragma_application_id), "
-    "(SELECT user_version FROM pragma_user_version), (SELECT count(*) FROM sqlite_master)"
-)
 # All that a statement may raise because of the database.
 FAILURES: Final = (sqlite3.Error, sqlite3.Warning, UnicodeDecodeError, SystemError)
 
@@ -58,11 +58,36 @@ FAILURES: Final = (sqlite3.Error, sqlite3.Warning, UnicodeDecodeError, SystemErr
 _PRAGMAS: Final[dict[Role, tuple[str, ...]]] = {
     "loop": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
     "writer": ("synchronous=NORMAL", "wal_autocheckpoint=0", "foreign_keys=ON"),
-    "reader": ("query_only=ON", "user_version"),  # asked for, it makes SQLite open the file
+    "reader": ("query_only=ON",),
 }
 
 
-class FrozenConnection(sqlite3.Connection):
+class ReadingConnection(sqlite3.Connection):
+    """Each statement is interrupted after a minute: what others wrote may take for ever to read."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._until_s = [0.0]  # apart from the connection, which the handler must not keep alive
+        keep_deadline(self)
+
+    def execute(self, *statement: Any) -> sqlite3.Cursor:
+        """As of any connection, with a deadline of its own."""
+        self._until_s[0] = time.monotonic() + LONGEST_READ_S
+        return super().execute(*statement)
+
+    def is_late(self) -> Callable[[], bool]:
+        """Tells whether the statement that was begun last has had its time."""
+        until_s = self._until_s
+        return lambda: time.monotonic() > until_s[0]
+
+
+def keep_deadline(connection: sqlite3.Connection) -> None:
+    """Give a connection back the deadline of its own, if it has one, after another's."""
+    is_late = connection.is_late() if isinstance(connection, ReadingConnection) else None
+    connection.set_progress_handler(is_late, _STEPS_PER_LOOK)
+
+
+class FrozenConnection(ReadingConnection):
     """To a file in a place that cannot be written, read as it lies on the disk.
 
     Reading a database in WAL mode needs two files beside it. Where they cannot be made and are
@@ -87,7 +112,8 @@ def connect(
         NoDatabaseError: The file is missing and `create` is false.
         DatabaseError: The folder cannot be made, the file cannot be opened, its log cannot be
             read where nothing can be written, or SQLite is too old.
-        ForeignDatabaseError: With `create`, the file belongs to another application.
+        ForeignDatabaseError: The file belongs to another application, or holds under our names,
+            or on our tables, what we did not make.
         ForkedProcessError: The process that this one was forked from has the file open.
         sqlite3.Error: The file is no database, or is locked for longer than 5 s.
     """
@@ -95,21 +121,47 @@ def connect(
     address = database.uri if isinstance(database, MemoryDatabase) else _file_uri(database, create)
     timeout_s = OPENING_TIMEOUT_MS / 1000 if patient else 0
     try:
-        connection = _open(address, timeout_s, sqlite3.Connection)
+        kind = ReadingConnection if role == "reader" else sqlite3.Connection
+        connection = _open(address, timeout_s, kind)
     except sqlite3.OperationalError as error:
         raise DatabaseError(f"{database} cannot be opened: {error}; check the folder") from error
     try:
         if create:
             schema_version(connection)  # first: another application's file stays as it is
             _make_wal(connection)
-        for pragma in _PRAGMAS[role]:
-            connection.execute(f"PRAGMA {pragma}").fetchall()
+        _prepare(connection, role)
     except Exception as error:
         connection.close()
         if role == "reader" and isinstance(database, Path) and is_unwritable(error):
             return _open_frozen(database)
         raise
     return connection
+
+
+def _prepare(connection: sqlite3.Connection, role: Role) -> None:
+    """Set what the role needs, and look whether all is ours; another version's is only migrated."""
+    for pragma in _PRAGMAS[role]:
+        connection.execute(f"PRAGMA {pragma}")
+    if _can_distrust():
+        connection.execute("PRAGMA trusted_schema=OFF")
+    if schema_version(connection) == SCHEMA_VERSION:
+        require_shipped(connection)
+
+
+@cache
+def _can_distrust() -> bool:
+    """Whether views may be kept from functions with side effects, and ours work nevertheless.
+
+    SQLite 3.40 counts those of JSON, which our views call, among them.
+    """
+    with closing(sqlite3.connect(":memory:")) as probe:
+        probe.execute("PRAGMA trusted_schema=OFF")
+        probe.execute("CREATE VIEW ours AS SELECT json_valid('1')")
+        try:
+            probe.execute("SELECT * FROM ours")
+        except sqlite3.OperationalError:
+            return False
+    return True
 
 
 def _require_usable(database: Database) -> None:
@@ -146,7 +198,13 @@ def _open_frozen(file: Path) -> sqlite3.Connection:
             "only be read where SQLite can make a file beside it: copy both to a folder of your "
             "own and give --database that copy"
         )
-    return _open(f"{file.absolute().as_uri()}?mode=ro&immutable=1", 0, FrozenConnection)
+    connection = _open(f"{file.absolute().as_uri()}?mode=ro&immutable=1", 0, FrozenConnection)
+    try:
+        _prepare(connection, "reader")
+    except BaseException:
+        connection.close()
+        raise
+    return connection
 
 
 def never_wait(connection: sqlite3.Connection) -> None:
@@ -420,11 +478,14 @@ def schema_version(connection: sqlite3.Connection) -> int:
         ForeignDatabaseError: The file holds tables of another application.
         sqlite3.DatabaseError: The file is no database, or is damaged.
     """
-    application_id, version, tables = connection.execute(_STAMPS).fetchone()
+    # In this order: another starter may be making the tables now, in one transaction. By PRAGMAs:
+    # in the place of SQLite's own `pragma_user_version` a view of that name would be read.
+    (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    (application_id,) = connection.execute("PRAGMA application_id").fetchone()
     if application_id == APPLICATION_ID:
-        return int(version)
+        return int(connection.execute("PRAGMA user_version").fetchone()[0])
     if tables:
-        (file,) = connection.execute("SELECT file FROM pragma_database_list").fetchone()
+        _, _, file = connection.execute("PRAGMA database_list").fetchone()
         raise ForeignDatabaseError(
             f"the SQLite database {file} belongs to another application (application_id "
             f"{application_id}, expected {APPLICATION_ID}); choose another file"

@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import sqlite3
 import time
-from pathlib import Path
 from typing import Final
 
 from webots_mcp.connection import schema_version, transaction
 from webots_mcp.contract import SCHEMA_VERSION, new_uuid
 from webots_mcp.errors import SchemaTooNewError, SchemaTooOldError
-
-SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
+from webots_mcp.origin import shipped_statements
 
 _NEW_RECORDING: Final = "INSERT INTO recording (uuid, created_wall_time_s) VALUES (?, ?)"
 
@@ -48,11 +46,6 @@ def create_schema(connection: sqlite3.Connection) -> None:
     """
     with transaction(connection):
         if schema_version(connection) == 0:
-            for statement in _statements():
+            for statement in shipped_statements():
                 connection.execute(statement)
             connection.execute(_NEW_RECORDING, (new_uuid(), time.time()))
-
-
-def _statements() -> list[str]:
-    """The statements of `schema.sql`; each ends with a semicolon at the end of a line."""
-    return [part for part in SCHEMA_FILE.read_text("utf-8").split(";\n") if part.strip()]

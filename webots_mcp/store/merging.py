@@ -20,6 +20,7 @@ from webots_mcp.adoption import adopt
 from webots_mcp.connection import transaction
 from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.origin import require_shipped
 from webots_mcp.settlement import settle
 from webots_mcp.store.images import PICTURES, inside
 from webots_mcp.store.recording import Recording
@@ -159,6 +160,7 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
     ]
     if versions[0] != versions[1]:
         raise InvalidInputError(f"{source} has another schema: run 'webots-mcp migrate' on it")
+    require_shipped(connection, schema="source")
     recording, nameless = connection.execute(_UNFIT, {"run": run_id}).fetchone()
     subject = f"{source}" if run_id is None else f"run {run_id}"
     if recording:

@@ -15,7 +15,8 @@ from sqlalchemy.pool import StaticPool
 
 from webots_mcp.bundled import bundled
 from webots_mcp.connection import connect
-from webots_mcp.contract import Database, MemoryDatabase
+from webots_mcp.contract import SCHEMA_VERSION, Database, MemoryDatabase
+from webots_mcp.origin import require_shipped
 from webots_mcp.schema import schema_version
 
 _STAMPS: Final = ("application_id", "user_version")
@@ -32,11 +33,14 @@ def upgrade(database: Database, revision: str = "head") -> tuple[int, int]:
         The schema version before and after.
 
     Raises:
-        ForeignDatabaseError: The file belongs to another application.
+        ForeignDatabaseError: The file belongs to another application, or holds what that version
+            has not made.
         DatabaseError: The file cannot be opened.
     """
     with _alembic(database) as (config, connection):
         before = schema_version(connection)
+        if 0 < before < SCHEMA_VERSION:
+            require_shipped(connection, _statements(f"{before:04}"))
         command.upgrade(config, revision)
         return before, schema_version(connection)
 
@@ -75,13 +79,13 @@ def _begin_immediate(connection: sqlalchemy.Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE")
 
 
-def _dump_schema() -> str:
-    """The text of `schema.sql`: what the migrations make of an empty database.
+def _statements(revision: str = "head") -> list[str]:
+    """What the migrations make of an empty database; at the end, that of `schema.sql`.
 
-    Regenerate it with `python -m webots_mcp.store.migrate > webots_mcp/schema.sql`.
+    Regenerate that with `python -m webots_mcp.store.migrate > webots_mcp/schema.sql`.
     """
     with _alembic(MemoryDatabase()) as (config, connection):
-        command.upgrade(config, "head")
+        command.upgrade(config, revision)
         pragmas = [f"PRAGMA {name} = {_pragma(connection, name)}" for name in _STAMPS]
         rows = connection.execute(
             "SELECT sql FROM sqlite_master WHERE sql IS NOT NULL AND name NOT LIKE 'sqlite_%' "
@@ -89,8 +93,7 @@ def _dump_schema() -> str:
         )
         revision = connection.execute("SELECT version_num FROM alembic_version").fetchone()[0]
         stamp = f"INSERT INTO alembic_version (version_num) VALUES ('{revision}')"
-        statements = [*pragmas, *(str(sql).rstrip() for (sql,) in rows), stamp]
-    return "".join(f"{statement};\n" for statement in statements)
+        return [*pragmas, *(str(sql).rstrip() for (sql,) in rows), stamp]
 
 
 def _pragma(connection: sqlite3.Connection, name: str) -> int:
@@ -98,4 +101,4 @@ def _pragma(connection: sqlite3.Connection, name: str) -> int:
 
 
 if __name__ == "__main__":
-    print(_dump_schema(), end="")  # noqa: T201
+    print("".join(f"{each};\n" for each in _statements()), end="")  # noqa: T201

@@ -15,6 +15,7 @@ from webots_mcp import settlement
 from webots_mcp.adoption import adopt
 from webots_mcp.connection import (
     FAILURES,
+    LONGEST_READ_S,
     FrozenConnection,
     Role,
     connect,
@@ -309,6 +310,11 @@ def _explain(error: Exception, database: Database) -> str:
         )
     if is_about_a_value(error):
         return f"the database at {name} holds a value that cannot be read: {text}"
+    if "interrupted" in text:
+        return (
+            f"reading the database at {name} was ended: one statement took longer than "
+            f"{LONGEST_READ_S:g} s; ask for less, by run and time"
+        )
     if _NO_DATABASE in text:
         moved = isinstance(database, Path) and database.name == DATABASE_NAME
         aside = "; a bridge that finds it there moves it aside and begins a new one"

@@ -16,6 +16,7 @@ from contextvars import ContextVar
 from typing import Any, Final, cast
 
 from webots_mcp.connection import is_about_a_value, is_damage
+from webots_mcp.origin import shipped_statements
 
 MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
 MAX_SIM_TIME_S: Final = 1e10
@@ -52,7 +53,6 @@ _UNSTORABLE: Final = (
     TypeError, OverflowError, ValueError, RecursionError, sqlite3.DataError, sqlite3.IntegrityError,
 )  # fmt: skip
 # Where several tables are read as one, a view of `main` would go on to read the tables themselves.
-_VIEWS: Final = "SELECT sql FROM main.sqlite_master WHERE type = 'view'"
 _COLUMNS: Final = 'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)'
 
 
@@ -121,8 +121,9 @@ def shadow_if_asked(connection: sqlite3.Connection) -> None:
 def _shadow(connection: sqlite3.Connection, unsound: Unsound) -> None:
     connection.execute("PRAGMA query_only=OFF")  # a view of this connection alone
     _show_sound(connection, unsound)
-    for (sql,) in connection.execute(_VIEWS).fetchall():
-        connection.execute(sql.replace("CREATE VIEW", "CREATE TEMP VIEW", 1))
+    for sql in shipped_statements():
+        if sql.startswith("CREATE VIEW"):
+            connection.execute(sql.replace("CREATE VIEW", "CREATE TEMP VIEW", 1))
     connection.execute("PRAGMA query_only=ON")
 
 

@@ -13,7 +13,7 @@ from webots_mcp.connection import Role, connect
 from webots_mcp.contract import LOG_LEVELS, Database
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
-from webots_mcp.schema import schema_version
+from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.detection.event import Event as FoundEvent
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.events import Event, newest_events
@@ -227,6 +227,7 @@ class Recording:
                 "no bridge has opened this database yet: make an MCPBridge on it, or let the "
                 "simulation run first"
             )
+        require_current(connection)
         return connection
 
     def _roll_up(self) -> None:

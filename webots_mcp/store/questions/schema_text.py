@@ -6,6 +6,8 @@ import re
 import sqlite3
 from typing import Final
 
+from webots_mcp.origin import shipped_objects
+
 _OBJECTS: Final = (
     "SELECT name, type, sql FROM sqlite_master WHERE type IN ('table', 'view') "
     "AND name NOT LIKE 'sqlite_%' AND name <> 'alembic_version' ORDER BY type, rowid"
@@ -44,10 +46,11 @@ _RULES: Final = (
 
 
 def columns_by_table(connection: sqlite3.Connection) -> dict[str, list[str]]:
-    """The columns of each table and view."""
+    """The columns of each table and view of ours; those of a person are not looked into."""
     return {
         name: [column for (column,) in connection.execute(_COLUMNS, (name,))]
         for name, _, _ in connection.execute(_OBJECTS).fetchall()
+        if name in shipped_objects()
     }
 
 
@@ -62,7 +65,7 @@ def describe_schema(connection: sqlite3.Connection) -> str:
     listed: dict[frozenset[str], str] = {}
     told = set[tuple[str, str]]()
     for name, kind, sql in connection.execute(_OBJECTS).fetchall():
-        if name in _BOOKKEEPING:
+        if name in _BOOKKEEPING or name not in columns:
             continue
         same = frozenset(columns[name]).difference(_BOOKKEEPING_COLUMNS)
         names.setdefault(same, []).append(f"{kind} {name}")

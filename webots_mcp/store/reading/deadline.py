@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Generator
 from typing import Final
 
+from webots_mcp.connection import keep_deadline
+
 QUESTION_DEADLINE_S: Final = 2.0
 _STEPS_PER_LOOK: Final = 20_000  # of SQLite's virtual machine: about 0.5 ms
 
@@ -56,4 +58,4 @@ class Deadline:
         try:
             yield
         finally:
-            connection.set_progress_handler(None, 0)
+            keep_deadline(connection)

@@ -1,0 +1,119 @@
+"""Whether what is in a database is what we ship: a file of foreign origin may hold anything.
+
+A view under the name of a table of ours, or a trigger on one, would run its author's SQL in every
+process that opens the file, and a recursion in it need never end. So what has a name of ours must
+be what we ship under it, and nothing that runs may hang on it. What a person has added beside is
+left alone.
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
+
+from __future__ import annotations
+
+import re
+import sqlite3
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.errors import ForeignDatabaseError
+
+SCHEMA_FILE: Final = Path(__file__).with_name("schema.sql")
+
+_MADE: Final = re.compile(r'CREATE (?:UNIQUE )?(?:TABLE|VIEW|INDEX|TRIGGER) "?(\w+)', re.IGNORECASE)
+_TOKENS: Final = re.compile(
+    r"('(?:[^']|'')*'|\"[^\"]*\"|`[^`]*`|\[[^\]]*\]|\w+|/\*.*?\*/|--[^\n]*|[^\s\w])", re.DOTALL
+)
+_OF_COLUMNS: Final = re.compile(
+    r'CREATE (UNIQUE )?INDEX "?\w+"? ON "?\w+"? ?\("?\w+"?( (ASC|DESC))?'
+    r'(, ?"?\w+"?( (ASC|DESC))?)*\)',
+    re.IGNORECASE,
+)
+_OBJECTS: Final = (
+    "SELECT type, CAST(name AS TEXT), CAST(tbl_name AS TEXT), CAST(sql AS TEXT) "
+    "FROM {}.sqlite_master WHERE sql IS NOT NULL"
+)
+# SQLite's own, which our questions use: a table or view of that name would be read in their place.
+_OF_SQLITE: Final = re.compile(r"pragma_|json_(each|tree)$|sqlite_")
+_OF_SQLITE_MADE: Final = "CREATE TABLE sqlite_"  # for AUTOINCREMENT, and by ANALYZE
+
+
+@cache
+def shipped_statements() -> tuple[str, ...]:
+    """The statements of `schema.sql`; each ends with a semicolon at the end of a line."""
+    return tuple(each for each in SCHEMA_FILE.read_text("utf-8").split(";\n") if each.strip())
+
+
+@cache
+def shipped_objects() -> dict[str, str]:
+    """By their names, the statements that make tables, views and indexes."""
+    return _by_name(shipped_statements())
+
+
+def _by_name(statements: Iterable[str]) -> dict[str, str]:
+    made = ((_MADE.match(each), each.rstrip()) for each in statements)
+    return {match[1].lower(): each for match, each in made if match}
+
+
+def require_shipped(
+    connection: sqlite3.Connection,
+    statements: Iterable[str] | None = None,
+    *,
+    schema: str = "main",
+) -> None:
+    """Raise where a table, view or index of ours is not what we ship, or something runs on one.
+
+    Args:
+        connection: Nothing but PRAGMAs was asked of that database yet.
+        statements: Those that make what we ship, in another version; None for this one.
+        schema: The name that the database was attached under.
+
+    Raises:
+        ForeignDatabaseError: The text names what it is, and what to do.
+    """
+    shipped = shipped_objects() if statements is None else _by_name(statements)
+    texts = set(shipped.values())
+    found = connection.execute(_OBJECTS.format(schema)).fetchall()
+    others = [row for row in found if row[3].rstrip() not in texts]
+    if not others:  # as a rule
+        return
+    referring = {name.lower() for kind, name, _, sql in others if kind == "table" and _refers(sql)}
+    for kind, name, table, sql in others:
+        if (why := _why_refused(kind, name, table, sql, shipped, referring)) is not None:
+            files = connection.execute("PRAGMA database_list").fetchall()
+            (file,) = (path for _, each, path in files if each == schema)
+            raise ForeignDatabaseError(
+                f"the {kind} {name[:60]!r} in {file or 'the database'} {why}, and webots-mcp "
+                "has not made it, so nothing of the file is used: if it is your own, remove it "
+                f"(sqlite3 FILE 'DROP {kind.upper()} ...'), else do not trust the file"
+            )
+
+
+def _why_refused(
+    kind: str, name: str, table: str, sql: str, shipped: dict[str, str], referring: set[str]
+) -> str | None:
+    """What an object does that nobody may; None where it is harmless, or ours in other spelling."""
+    if (ours := shipped.get(name.lower())) is not None:
+        return None if _spelled(sql) == _spelled(ours) else "stands where another is in recordings"
+    if _OF_SQLITE.match(name.lower()) and not sql.startswith(_OF_SQLITE_MADE):
+        return "has a name of SQLite's own"
+    if kind == "trigger" and (table.lower() in shipped or table.lower() in referring):
+        return f"runs when {table[:60]!r} is written to"
+    if kind == "index" and table.lower() in shipped and not _OF_COLUMNS.fullmatch(sql.strip()):
+        return f"computes when {table[:60]!r} is written to"
+    return None
+
+
+def _refers(sql: str) -> bool:
+    """Whether a table may have foreign keys, by which a deleted row of ours deletes rows there."""
+    return "references" in sql.lower()
+
+
+def _spelled(sql: str) -> list[str]:
+    """The words of a statement: versions of SQLite and ours differ in spaces and comments."""
+    return [
+        each if each.startswith("'") else each.strip('"').lower()
+        for each in _TOKENS.findall(sql)
+        if not each.startswith(("/*", "--"))
+    ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -18,10 +19,12 @@ from webots_mcp.connection import connect
 from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.pool.parquet import asking
 from webots_mcp.pool.parquet.reading import ParquetPool
+from webots_mcp.pool.parquet.storage import Storage
 from webots_mcp.pool.tables import table
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.runs import list_runs
+from webots_mcp.store.questions.sql_process import FOLDER
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.ranges import Scope, find_range
 
@@ -156,8 +159,8 @@ def test_the_rows_of_some_runs_come_back_in_the_order_of_the_key(bridge_recordin
 def test_an_object_store_is_asked_as_a_folder_is(bridge_recording: Path) -> None:
     url = bucket.empty()
     ship(bridge_recording, url)
-    with ParquetPool(url) as pool:
-        found = pool.select("SELECT run_id, count(*) AS n FROM state GROUP BY 1", 10)
+    # In this process, which alone has this store.
+    found = asking.select(Storage(url), "SELECT run_id, count(*) AS n FROM state GROUP BY 1", 10)
     counted = len(rows_of(bridge_recording, table("state")))
     assert found.columns == ("run_id", "n")
     assert sum(int(str(row[1])) for row in found.rows) == counted
@@ -216,6 +219,28 @@ def test_a_question_that_takes_too_long_is_ended(
     monkeypatch.setattr(asking, "DEADLINE_S", 0.05)
     with pytest.raises(InvalidInputError, match=r"no answer within 0.05 s: narrow it"):
         pool.select("SELECT sum(a.range * b.range) FROM range(1000000) a, range(1000000) b", 1)
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "SELECT levenshtein(repeat('ab', 200000), repeat('ba', 200000))",
+        "SELECT count(*) FROM (SELECT DISTINCT range FROM range(3000000000))",
+    ],
+)
+def test_what_no_deadline_of_the_engine_ends_is_ended_and_writes_nothing(
+    pool: ParquetPool, monkeypatch: pytest.MonkeyPatch, sql: str
+) -> None:
+    monkeypatch.setattr(asking, "DEADLINE_S", 2.0)
+    with pytest.raises(InvalidInputError, match=r"no answer within 2 s|Out of Memory"):
+        pool.select(sql, 1)
+    assert not (FOLDER / ".tmp").exists()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="no such limit there")
+def test_a_statement_has_so_much_memory_and_no_more(pool: ParquetPool) -> None:
+    with pytest.raises(InvalidInputError, match=r"(?i)memory"):
+        pool.select("SELECT sum(length(repeat('x' || range, 700000000))) FROM range(20)", 1)
 
 
 def test_a_folder_without_a_pool_is_told(tmp_path: Path) -> None:

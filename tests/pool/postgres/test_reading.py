@@ -140,6 +140,10 @@ def test_one_select_is_answered_up_to_its_limit(pool: PostgresPool) -> None:
     assert found.truncated == "only the first 2 rows; narrow the question, or count and aggregate"
     found = pool.select("SELECT 1.5 AS number, NULL, true -- and so on", 9)
     assert (found.columns[:2], found.rows) == (("number", "?column?"), ((1.5, None, True),))
+    assert pool.select("SELECT 1; -- and so on\n /* or */", 9).rows == ((1,),)
+    assert pool.select("SELECT '; -- no end'", 9).rows == (("; -- no end",),)
+    numbers = pool.select("SELECT 1e400::numeric, '-inf'::numeric, 0.1::numeric", 9)
+    assert numbers.rows == (("1.0000000000000000e+400", "-inf", 0.1),)
     ((uuid,),) = pool.select("SELECT recording_uuid FROM robot", 1).rows
     assert isinstance(uuid, str)
 
@@ -154,6 +158,7 @@ def test_one_select_is_answered_up_to_its_limit(pool: PostgresPool) -> None:
         ("SELECT make_partition('state', 2031, 1)", "read-only"),
         ("SELECT nothing FROM run", 'column "nothing" does not exist'),
         ("SELECT 1 / 0", "division by zero"),
+        ("SELECT $1", r"a parameter such as \$1 has no value here"),
         ("", "syntax error"),
     ],
 )

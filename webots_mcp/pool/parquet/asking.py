@@ -1,16 +1,17 @@
 """One SELECT over a pool of Parquet files, by DuckDB.
 
 Each table is a view of its name, with `recording_uuid` before its columns. What keeps a statement
-harmless: it is one SELECT, DuckDB may open files below the root of the pool only, and it has a
-deadline, a limit of memory, and the limits of `query_sql` on what it answers.
+harmless: it is one SELECT, DuckDB may open files below the root of the pool only and write none,
+and it has the limits of `query_sql` on what it answers. It runs in a process of its own with a
+limit of memory, which is ended at the deadline: one call of a function may take any time and room.
 """
 
 from __future__ import annotations
 
 import re
-import threading
-from collections.abc import Generator
-from contextlib import closing, contextmanager
+import subprocess
+import sys
+from contextlib import closing, suppress
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
@@ -19,10 +20,13 @@ from webots_mcp.pool.parquet.layout import files_of
 from webots_mcp.pool.parquet.packages import package
 from webots_mcp.pool.parquet.storage import Storage
 from webots_mcp.pool.tables import Table, tables
-from webots_mcp.store.questions.sql import Result, require_max_rows
+from webots_mcp.store.questions.sql import MAX_BYTES, Result, require_max_rows
+from webots_mcp.store.questions.sql_process import FOLDER, Statement, decode, main
 
 DEADLINE_S: Final = 60.0
 _MEMORY: Final = "2GB"
+_MOST_BYTES: Final = 4_000_000_000  # of the process: DuckDB counts not all that it takes
+_LINE: Final = (sys.executable, "-m", __name__)
 _NUMBERS: Final = (
     "BOOLEAN", "TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
     "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE",
@@ -30,27 +34,35 @@ _NUMBERS: Final = (
 _TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
 
 
-def select(storage: Storage, sql: str, max_rows: int) -> Result:
-    """The first rows of one SELECT.
+def ask(url: str, sql: str, max_rows: int) -> Result:
+    """The first rows of one SELECT over the pool.
 
     Raises:
-        InvalidInputError: It is no single SELECT, is wrong, or takes too long.
+        InvalidInputError: It is no single SELECT, is wrong, or takes too long or too much memory.
         PoolError: DuckDB is not installed.
     """
     require_max_rows(max_rows)
+    package("duckdb")
+    asked = Statement(url, sql, max_rows, MAX_BYTES, DEADLINE_S)
+    ended = subprocess.run(
+        _LINE, input=asked.encoded(), stdout=subprocess.PIPE, cwd=FOLDER, check=False
+    )
+    return decode(
+        ended.stdout, ended.returncode, asked, f"no answer within {DEADLINE_S:g} s: narrow it by "
+        "recording_uuid and by day"
+    )  # fmt: skip
+
+
+def select(storage: Storage, sql: str, max_rows: int) -> Result:
+    """As `ask`, in this process, without a deadline."""
     duckdb = package("duckdb")
     with closing(duckdb.connect()) as connection:
         _prepare(connection, storage, sql)
         try:
             _require_select(duckdb, connection, sql)
-            with _deadline(connection):
-                answer = connection.sql(sql)
-                rows = _bounded(answer).limit(max_rows + 1).fetchall()
-                return answered(map(str, answer.columns), rows, max_rows)
-        except duckdb.InterruptException as error:
-            raise InvalidInputError(
-                f"no answer within {DEADLINE_S:g} s: narrow it by recording_uuid and by day"
-            ) from error
+            answer = connection.sql(sql)
+            rows = _bounded(answer).limit(max_rows + 1).fetchall()
+            return answered(map(str, answer.columns), rows, max_rows)
         except duckdb.Error as error:
             raise InvalidInputError(f"DuckDB says: {error}") from error
 
@@ -64,6 +76,7 @@ def _prepare(connection: Any, storage: Storage, sql: str) -> None:
         paths = storage.find(files_of(table)) if is_named else []
         connection.execute(_view(table, [storage.url_of(path) for path in paths]))
     connection.execute(f"SET memory_limit = '{_MEMORY}'")
+    connection.execute("SET temp_directory = ''")  # nothing is spilled to the disk
     connection.execute("SET TimeZone = 'UTC'")
     connection.execute(f"SET allowed_directories = [{_quoted(storage.url_of('') + '/')}]")
     connection.execute("SET enable_external_access = false")
@@ -120,12 +133,13 @@ def _require_select(duckdb: Any, connection: Any, sql: str) -> None:
         )
 
 
-@contextmanager
-def _deadline(connection: Any) -> Generator[None]:
-    timer = threading.Timer(DEADLINE_S, connection.interrupt)
-    timer.daemon = True
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
+def _ask(asked: Statement) -> Result:
+    with suppress(ImportError, ValueError, OSError):  # no such limits, or narrower ones
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, _MOST_BYTES))
+    return select(Storage(asked.database), asked.sql, asked.max_rows)
+
+
+if __name__ == "__main__":
+    main(_ask)

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import PoolUnavailableError
 from webots_mcp.pool.batch import Batch, Row, batches
-from webots_mcp.pool.parquet.asking import select
+from webots_mcp.pool.parquet.asking import ask
 from webots_mcp.pool.parquet.layout import files_of, folder_of, picture_file, uuid_in
 from webots_mcp.pool.parquet.packages import package
 from webots_mcp.pool.parquet.progress import read_progress, require_pool
@@ -37,6 +37,7 @@ class ParquetPool:
     def __init__(self, url: str) -> None:
         package("pyarrow")
         self._storage = Storage(url)
+        self._url = self._storage.root if self._storage.is_local else url
         self.address = self._storage.address
 
     def __enter__(self) -> ParquetPool:
@@ -114,10 +115,10 @@ class ParquetPool:
         """The first rows of one SELECT of DuckDB.
 
         Raises:
-            InvalidInputError: It is no single SELECT, is wrong, or takes too long.
+            InvalidInputError: As `ask`.
             PoolError: DuckDB is not installed.
         """
-        return select(self._storage, sql, max_rows)
+        return ask(self._url, sql, max_rows)
 
     def _in_order(
         self, table: Table, pieces: Iterable[_Piece], where: Mapping[str, Collection[int]]

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import itertools
+import re
+import sys
 import time
 from collections.abc import Collection, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from decimal import Decimal
 from typing import Any, Final, TypeVar, cast
 
 import psycopg
-from psycopg.types.numeric import FloatLoader
+from psycopg.abc import Buffer
+from psycopg.adapt import Loader
 
 from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.pool.asking import Kind, answered, bounded
@@ -59,7 +63,20 @@ FROM pg_class WHERE oid = %(name)s::regclass
 _KINDS: Final[dict[int, Kind]] = {
     **dict.fromkeys((16, 20, 21, 23, 26, 700, 701, 1700), "number"), 17: "bytes",
 }  # fmt: skip
-_ASKED_WRONG: Final = ("22", "25006", "42", "57014", "0A")  # SQLSTATEs that a question has
+_PARAMETER: Final = "08P01"  # one SQLSTATE of what the client did wrong: it gave no values
+_ASKED_WRONG: Final = ("22", "25006", "42", "57014", "0A", _PARAMETER)  # that a question has
+# With comments behind it, in which nothing may be taken for the end of a text.
+_END: Final = re.compile(r";(?:\s|;|--[^\n'\"$]*(?:\n|\Z)|/\*[^'\"$*]*\*/)*\Z")
+
+
+class _NumericLoader(Loader):
+    """As a number; one that is larger than any float as its text, with 17 digits."""
+
+    def load(self, data: Buffer) -> float | str:
+        number = Decimal(bytes(data).decode())
+        if number.is_finite() and abs(number) > sys.float_info.max:
+            return f"{number:.16e}"
+        return float(number)
 
 
 _Cursor = TypeVar("_Cursor", bound="psycopg.Cursor[Any] | psycopg.ServerCursor[Any]")
@@ -156,7 +173,7 @@ class PostgresPool:
             InvalidInputError: It is no SELECT, is wrong, or takes longer than a minute.
         """
         require_max_rows(max_rows)
-        asked = sql.strip().rstrip(";").replace("%", "%%")
+        asked = _END.sub("", sql.strip()).replace("%", "%%")
         until_s = time.monotonic() + SELECT_S
         # Large objects may be made in a transaction that only reads: none of it stays.
         undone = self._connection.transaction(force_rollback=True)
@@ -165,7 +182,7 @@ class PostgresPool:
             with self._limited(self._connection.cursor(next(self._names)), until_s) as cursor:
                 columns = cursor.execute(asked.encode(), ()).description or ()
             with self._limited(self._connection.cursor(), until_s) as cursor:
-                cursor.adapters.register_loader("numeric", FloatLoader)
+                cursor.adapters.register_loader("numeric", _NumericLoader)
                 query = _bounded(asked, [each.type_code for each in columns], max_rows + 1)
                 rows = cursor.execute(query.encode(), ()).fetchall()
         return answered([each.name for each in columns], rows, max_rows)
@@ -204,6 +221,8 @@ def _clear_question() -> Generator[None]:
         if not (error.sqlstate or "").startswith(_ASKED_WRONG):
             raise
         said = one_line(error.diag.message_primary or str(error))
+        if error.sqlstate == _PARAMETER:
+            said = "a parameter such as $1 has no value here"
         hint = f"; {one_line(error.diag.message_hint)}" if error.diag.message_hint else ""
         raise InvalidInputError(
             f"PostgreSQL does not answer this: {said}{hint}. Ask one SELECT, which ends within "

@@ -38,7 +38,7 @@ _REFUSED_FUNCTIONS: Final = frozenset(
 # Their first use on a connection defines them, which an authorizer would see as writing.
 _LOAD_JSON_TABLES: Final = "SELECT 1 FROM json_each('[]'), json_tree('[]')"
 _BEGINS: Final = re.compile(r"(?:\s|--[^\n]*\n|/\*.*?\*/)*(\w*)", re.DOTALL)
-_TOO_LARGE: Final = "it needs too much memory: read shorter values, or fewer at a time"
+TOO_LARGE: Final = "it needs too much memory: read shorter values, or fewer at a time"
 _LONGEST_ERROR: Final = 300
 _MISSING: Final = re.compile(r"no such (column|table): (\S+)")
 
@@ -99,7 +99,7 @@ def query_sql(
             why = fetch_rows(cursor, rows, max_rows, budget)
             cursor.close()
     except MemoryError as error:
-        raise InvalidInputError(_TOO_LARGE) from error
+        raise InvalidInputError(TOO_LARGE) from error
     except (sqlite3.Error, sqlite3.Warning, ValueError) as error:  # ValueError: a NUL, on 3.10
         if not (deadline.passed and "interrupted" in str(error)):
             raise InvalidInputError(_explain(connection, statement, error)) from error

@@ -1,8 +1,8 @@
-"""One SQL statement in a process of its own, which its deadline ends whatever SQLite is doing.
+"""One SQL statement in a process of its own, which its deadline ends whatever the engine is doing.
 
 SQLite looks at its deadline between the steps of its virtual machine, and one call of `replace` on
-long texts is one step of half a minute. A process can be ended inside it, and takes its memory
-along. It gets one request as JSON on stdin and gives one answer as JSON on stdout.
+long texts is one step of half a minute; DuckDB is no quicker. A process can be ended inside it, and
+takes its memory along. It gets one request as JSON on stdin and gives one answer as JSON on stdout.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import sqlite3
 import sys
 import tempfile
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -24,7 +24,7 @@ import webots_mcp
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, Database
 from webots_mcp.errors import InvalidInputError, WebotsMCPError
-from webots_mcp.store.questions.sql import Cell, Result, query_sql, too_slow
+from webots_mcp.store.questions.sql import TOO_LARGE, Cell, Result, query_sql, too_slow
 
 LINE: Final = (sys.executable, "-m", __name__)
 # Modules are looked for here first, so that no file of the user's folder is taken for one.
@@ -37,7 +37,7 @@ _GRACE_S: Final = 0.3  # SQLite's own deadline comes first: it keeps the rows th
 
 @dataclass(frozen=True)
 class Statement:
-    """What is asked; see `query_sql`."""
+    """What is asked; see `query_sql`. The database is a file, or the URL of a pool."""
 
     database: str
     sql: str
@@ -50,15 +50,23 @@ class Statement:
         return json.dumps(asdict(self)).encode()
 
 
-def decode(answer: bytes, exit_code: int, asked: Statement) -> Result:
+def decode(answer: bytes, exit_code: int, asked: Statement, slow: str | None = None) -> Result:
     """What the process answered; one that ended itself before it could answer took too long.
+
+    Args:
+        answer: What it wrote to stdout.
+        exit_code: Its own.
+        asked: What it was asked.
+        slow: What to do about a statement that takes too long, where it is not asked of SQLite.
 
     Raises:
         InvalidInputError: As `query_sql`.
         WebotsMCPError: The process ended for another reason, not because of the statement.
     """
     if exit_code == _TIMED_OUT:
-        raise InvalidInputError(too_slow(asked.deadline_s))
+        raise InvalidInputError(slow or too_slow(asked.deadline_s))
+    if exit_code < 0:
+        raise InvalidInputError(f"signal {-exit_code} ended the statement; perhaps {TOO_LARGE}")
     if exit_code != 0:
         raise WebotsMCPError(
             f"the process that runs the statement ended without an answer (exit code {exit_code}); "
@@ -85,28 +93,29 @@ def as_file(database: Database) -> Generator[Path]:
         yield file
 
 
-def main() -> None:
+def main(ask: Callable[[Statement], Result]) -> None:
     """Answer the request on stdin."""
     asked = Statement(**json.load(sys.stdin))
     end = threading.Timer(asked.deadline_s + _GRACE_S, os._exit, [_TIMED_OUT])
     end.daemon = True
     end.start()
-    sys.stdout.write(json.dumps(_answer(asked)))
-
-
-def _answer(asked: Statement) -> dict[str, object]:
     try:
-        with closing(connect(Path(asked.database), "reader")) as connection:
-            connection.execute(f"PRAGMA hard_heap_limit={_MAX_HEAP_BYTES}")
-            return asdict(
-                query_sql(
-                    connection, asked.sql, max_rows=asked.max_rows, max_bytes=asked.max_bytes,
-                    deadline_s=asked.deadline_s,
-                )
-            )  # fmt: skip
+        answer = asdict(ask(asked))
     except (WebotsMCPError, sqlite3.Error) as error:
-        return {"error": str(error)}
+        answer = {"error": str(error)}
+    except MemoryError:
+        answer = {"error": TOO_LARGE}
+    sys.stdout.write(json.dumps(answer))
+
+
+def _ask(asked: Statement) -> Result:
+    with closing(connect(Path(asked.database), "reader")) as connection:
+        connection.execute(f"PRAGMA hard_heap_limit={_MAX_HEAP_BYTES}")
+        return query_sql(
+            connection, asked.sql, max_rows=asked.max_rows, max_bytes=asked.max_bytes,
+            deadline_s=asked.deadline_s,
+        )  # fmt: skip
 
 
 if __name__ == "__main__":
-    main()
+    main(_ask)

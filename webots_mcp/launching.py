@@ -3,14 +3,24 @@
 from __future__ import annotations
 
 import re
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.contract import WORLD_ENDING, find_project, full_path, require_world_of
+from webots_mcp.connection import transaction
+from webots_mcp.console.lines import said
+from webots_mcp.contract import (
+    WORLD_ENDING,
+    find_project,
+    full_path,
+    host_name,
+    require_world_of,
+)
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.setup.project import controllers_in, has_bridge
 from webots_mcp.store.beginnings import Beginning, beginnings, newest_session
+from webots_mcp.store.console import ConsoleRows
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.command_line import Start
 from webots_mcp.webots.launched import LaunchedWebots, Show
@@ -81,6 +91,7 @@ class Launch:
         self.start = start
         self.world = start.world
         self._recording = recording
+        self._began_s = time.time()
         self.webots = LaunchedWebots(start, environment, show)
         try:
             recording.create()  # it has a console to record before any controller begins
@@ -99,6 +110,18 @@ class Launch:
         reasons = [*self._of_webots(), *self._of_controllers()]
         return "; ".join(reasons) or "no controller has recorded yet"
 
+    def record_last_words(self) -> None:
+        """Record what a Webots has said that ended before its console was followed.
+
+        Raises:
+            DatabaseError: It cannot be recorded.
+        """
+        port = self.webots.address.port if self.webots.address else self.start.port
+        rows = ConsoleRows(f"{host_name()}:{port}", self._began_s)
+        with self._recording.writer() as connection, transaction(connection):
+            if not rows.is_recorded(connection):
+                rows.write(connection, [said(line) for line in self.webots.lines])
+
     def _begun(self) -> list[Beginning]:
         asked = Address("127.0.0.1", self.start.port)
         address, pids = self.webots.address or asked, self.webots.pids
@@ -106,7 +129,7 @@ class Launch:
         return [each for each in found if each.pid in pids or address_of(each.instance) == address]
 
     def _of_webots(self) -> list[str]:
-        said = [line.text for line in self.webots.lines if _is_of_trouble(line)]
+        told = [line.text for line in self.webots.lines if _is_of_trouble(line)]
         reasons = list[str]()
         if self.webots.is_over:
             reasons.append(f"Webots ended with exit code {self.webots.exit_code}")
@@ -114,8 +137,8 @@ class Launch:
             reasons.append(f"Webots does not listen at port {self.start.port} yet: it is starting")
         elif self.start.mode == "pause":
             reasons.append("it begins paused: controllers are started when it is played")
-        if said:
-            reasons.append(f"its console said: {' | '.join(said[-_SHOWN_LINES:])}")
+        if told:
+            reasons.append(f"its console said: {' | '.join(told[-_SHOWN_LINES:])}")
         return reasons
 
     def _of_controllers(self) -> list[str]:

@@ -152,6 +152,10 @@ def test_webots_that_ends_at_its_start_is_told_with_what_it_said(
     _, said = process.communicate(timeout=60)
     assert process.returncode == 1
     assert "webots-mcp: Webots ended with exit code 1; its console said: " in said
+    asking = [sys.executable, "-m", "webots_mcp", "logs", "--data-dir"]
+    asking += [str(world.parent.parent / "mcp_data")]
+    told = subprocess.run(asking, capture_output=True, text=True, check=False).stdout
+    assert told.count("a world begins with") == 1
 
 
 def test_without_a_free_port_webots_says_so_and_ends(

@@ -97,6 +97,7 @@ def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _R
         time.sleep(_LOOK_EVERY_S)
     webots.wait_for_last_words()
     if first is None and _told(launched) is None:
+        launched.record_last_words()
         _say(launched.silence())
     return code
 

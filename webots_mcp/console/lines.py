@@ -57,7 +57,7 @@ class ConsoleLines:
         if self._is_old or len(newest) < len(lines):
             yield _about(f"({told}: when they were printed is not known)")
         for line in newest:
-            yield _said(line)._replace(is_old=True)
+            yield said(line)._replace(is_old=True)
 
     def idle(self) -> Iterator[Said]:
         """What is to be said although nothing came."""
@@ -73,7 +73,7 @@ class ConsoleLines:
         if self._lines_in_second > MOST_LINES_PER_S:
             self._left_out += 1
         else:
-            yield _said(line)
+            yield said(line)
 
     def _tell_left_out(self) -> Iterator[Said]:
         if self._left_out:
@@ -82,7 +82,8 @@ class ConsoleLines:
             self._left_out = 0
 
 
-def _said(line: ConsoleLine) -> Said:
+def said(line: ConsoleLine) -> Said:
+    """A line as a row, now: who said it, and how grave it is."""
     # What a terminal shows of a line that was written over, as by a progress bar.
     text = line.text.rstrip("\r").rpartition("\r")[2].replace("\0", "�")
     level, source = _judged(line.stream, text)

@@ -56,6 +56,9 @@ _COLUMNS: Final = "wall_time_s, level, source, message, logger"
 _ADD: Final = f"INSERT INTO log (run_id, sim_time_s, {_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?)"
 _WAIT: Final = f"INSERT INTO console_line (instance, {_COLUMNS}) VALUES (?, ?, ?, ?, ?, ?)"
 _WAITING: Final = f"SELECT id, {_COLUMNS} FROM console_line WHERE instance = ? ORDER BY id"
+_IS_FOLLOWED: Final = (
+    "SELECT EXISTS (SELECT 1 FROM console_line WHERE instance = ? AND wall_time_s >= ?)"
+)
 _FORGET: Final = "DELETE FROM console_line WHERE id = ?"
 _FORGET_OLDEST: Final = (
     "DELETE FROM console_line WHERE instance = :instance AND id <= (SELECT id FROM console_line "
@@ -112,6 +115,12 @@ class ConsoleRows:
         """Forget what waits for runs that will not come."""
         past = (self._instance, self._started_s - _EARLY_S, time.time() - _KEPT_WAITING_S)
         connection.execute(_FORGET_PAST, past)
+
+    def is_recorded(self, connection: sqlite3.Connection) -> bool:
+        """Whether lines of this Webots wait for a run: then somebody follows its console."""
+        return bool(
+            connection.execute(_IS_FOLLOWED, (self._instance, self._started_s)).fetchone()[0]
+        )
 
     def write(self, connection: sqlite3.Connection, lines: Sequence[Said]) -> None:
         """Write lines that no bridge has recorded, and those that have waited until now.

@@ -108,6 +108,7 @@ async def _wait(launched: Launch, ctx: Context[Any], until_s: float) -> Beginnin
             return first
         if is_over:
             await to_thread.run_sync(launched.webots.end)
+            await to_thread.run_sync(launched.record_last_words)
             raise CommandRefusedError(await to_thread.run_sync(launched.silence))
         lines = launched.webots.lines
         said = cut_text(lines[-1].text, _LONGEST_LINE) if lines else "Webots starts"

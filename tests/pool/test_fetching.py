@@ -24,7 +24,8 @@ from tests.store.export.test_export import publish
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.errors import InvalidInputError, PoolError
+from webots_mcp.pool import fetching
 from webots_mcp.pool.key_order import in_order
 from webots_mcp.pool.target import open_pool, open_target
 from webots_mcp.standin import InProcessSupervisor
@@ -329,6 +330,19 @@ def test_what_goes_on_or_is_not_wholly_shipped_is_fetched_when_it_is(
     with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
         pool.execute("INSERT OR IGNORE INTO state SELECT * FROM state_later")
     assert list(lab.fetch(run_uuid=uuid).runs) == [uuid]
+
+
+def test_far_more_states_than_a_run_had_are_not_taken(
+    lab: Lab, runs: Recorded, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab.ship(runs.folder / DATABASE_NAME, full=True)
+    with closing(sqlite3.connect(tmp_path / "pool")) as pool, pool:
+        pool.execute("UPDATE run SET rows = 1")
+    before = lab.everything()
+    monkeypatch.setattr(fetching, "_UNCOUNTED_ROWS", 0)
+    with pytest.raises(PoolError, match="states of runs that had"):
+        lab.fetch(robot="rover")
+    assert lab.everything() == before
 
 
 @IN_EACH_POOL

@@ -22,6 +22,7 @@ from typing import Final
 
 from webots_mcp.connection import transaction
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.errors import PoolError
 from webots_mcp.liveness import process_alive
 from webots_mcp.pool.batch import Batch
 from webots_mcp.pool.catalogue import Meant
@@ -35,6 +36,7 @@ from webots_mcp.store.merging import merge
 _FOLDER: Final = ".fetch-"
 _MOST_RUNS: Final = 100  # that are written into one small recording,
 _MOST_ROWS: Final = 200_000  # unless one of them has more rows by itself
+_UNCOUNTED_ROWS: Final = 10_000
 _OF_RUN: Final = (
     "rollup", "coarse_rollup", "change", "kept_stretch", "kept_state", "log", "event",
     "parameter_value", "image",
@@ -184,7 +186,7 @@ class _Fetcher:
                 copy.context(ids)
                 for name in _OF_RUN:
                     copy.rows(name, "run_id", ids)
-                copy.rows("state", "run_id", ids, told)
+                copy.rows("state", "run_id", ids, _up_to(runs, told))
                 copy.pictures(folder)
                 self._settle(small, {run.run_id: run.uuid for run in runs})
             merge(self._connection, self._data_dir, folder / DATABASE_NAME)
@@ -323,6 +325,24 @@ class _Copy:
             for row in batch.rows
         ]
         return Batch(batch.table, rows)
+
+
+def _up_to(runs: Sequence[PooledRun], told: Callable[[int], None]) -> Callable[[int], None]:
+    """Tells how many states are copied, and stops where they are far more than the runs had.
+
+    A run whose process was killed has a few more than the last heartbeat counted.
+    """
+    counted = sum(run.rows for run in runs)
+
+    def tell(copied: int) -> None:
+        if copied > 2 * counted + _UNCOUNTED_ROWS:
+            raise PoolError(
+                f"the pool has more than {copied:,} states of runs that had {counted:,} "
+                f"({runs[0].uuid}, ...): somebody else has written there; nothing of them is taken"
+            )
+        told(copied)
+
+    return tell
 
 
 @contextmanager

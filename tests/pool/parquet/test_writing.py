@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ from tests.pool.parquet.rows import (
 )
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.pool.batch import Batch, Row
+from webots_mcp.pool.parquet import rows as arrow_rows
 from webots_mcp.pool.parquet.reading import ParquetPool
 from webots_mcp.pool.parquet.writing import PART_BYTES, ParquetTarget
 from webots_mcp.pool.tables import SQLValue, table, tables
@@ -357,6 +359,28 @@ def test_what_is_damaged_is_named_and_nothing_is_written_over_it(tmp_path: Path,
         write_all(str(tmp_path), STEPS)
     assert file.read_bytes() == b"PAR1 and no more"
     with pytest.raises(PoolError, match=r"_progress .*cannot be read|is damaged"):
+        pooled(str(tmp_path), UUID, "log")
+
+
+def test_of_a_file_that_unpacks_to_far_more_only_what_was_shipped_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(arrow_rows, "_MOST_BYTES", 20_000_000)
+    with shipping(tmp_path) as shipment:
+        shipment.write([logs(1, 2)], {})
+    (file,) = tmp_path.glob(f"recording={UUID}/table=log/*/*.parquet")
+    own: Any = parquet.ParquetFile(file).read()
+    (more,) = logs(3, message="x" * 10_000).rows
+    one = arrow_rows.as_arrow(table("log"), [more], Counter())
+    whole: Any = import_module("pyarrow").concat_tables([own, *[one] * 100_000])
+    parquet.write_table(whole, file, use_dictionary=True)
+    assert file.stat().st_size < 1_000_000 < 1_000_000_000 < whole.nbytes
+    assert ids(pooled(str(tmp_path), UUID, "log")) == [1, 2]
+    progress = tmp_path / f"recording={UUID}" / "_progress"
+    told = json.loads(progress.read_text())
+    told["parts"]["log"]["number"] = 2  # as if that part were over: all its rows would count
+    progress.write_text(json.dumps(told))
+    with pytest.raises(PoolError, match="unpacks to more than 20,000,000 bytes"):
         pooled(str(tmp_path), UUID, "log")
 
 

@@ -139,7 +139,7 @@ class ParquetPool:
         if content is None:
             raise PoolUnavailableError(f"{piece.path} is gone from {self.address}: ask again")
         if table.is_appended:  # those of a kept stretch may stand before older ones
-            held = decoded(table, content, piece.path).slice(0, piece.counted)
+            held = decoded(table, content, piece.path, piece.counted)
             found = iter([held.sort_by("id")])
         else:
             found = pieces_of(table, content, piece.path)

@@ -20,6 +20,7 @@ from webots_mcp.units import unit_in
 _APPENDED_GROUP_ROWS: Final = 20_000
 _CHANGING_GROUP_ROWS: Final = 4_000  # those of many files are read side by side
 _ROWS_AT_ONCE: Final = 1000
+_MOST_BYTES: Final = 1_000_000_000  # in memory, of a file that is read as a whole
 _FINE: Final[dict[type, frozenset[type]]] = {
     int: frozenset({int, type(None)}),
     float: frozenset({int, float, type(None)}),
@@ -128,15 +129,26 @@ def encoded(table: Table, arrow_table: Any) -> bytes:
     return sink.getvalue()
 
 
-def decoded(table: Table, content: bytes, path: str) -> Any:
-    """The rows of a file; columns that an older version had not are null.
+def decoded(table: Table, content: bytes, path: str, count: int | None = None) -> Any:
+    """The first rows of a file, or all; columns that an older version had not are null.
 
     Raises:
-        PoolError: The file is none, or is damaged.
+        PoolError: The file is none, is damaged, or holds more than a shipper writes into one.
     """
-    arrow, parquet = package("pyarrow"), package("pyarrow.parquet")
-    with _whole(path):
-        return conformed(table, parquet.read_table(arrow.BufferReader(content)))
+    held = schema_of(table).empty_table()
+    pieces, size = [held], 0
+    for piece in pieces_of(table, content, path) if count != 0 else ():
+        pieces.append(piece)
+        size += piece.nbytes
+        if size > _MOST_BYTES:
+            raise PoolError(
+                f"{path} unpacks to more than {_MOST_BYTES:,} bytes, which no file that was "
+                "shipped does: restore or remove it"
+            )
+        if count is not None and sum(each.num_rows for each in pieces) >= count:
+            break
+    held = package("pyarrow").concat_tables(pieces)
+    return held if count is None else held.slice(0, count)
 
 
 def footer_of(file: Any, path: str) -> Any:

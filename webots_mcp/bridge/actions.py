@@ -1,7 +1,8 @@
 """The built-in actions: for each in `contract.BUILT_IN_ACTIONS` the function of its name.
 
-Each is a generator: it yields until its outcome is known (once a round of the user's loop, or of
-the pause), returns the command's result, or raises the command's error.
+Each gives a generator: it yields until its outcome is known (once a round of the user's loop, or of
+the pause), returns the command's result, or raises the command's error. What is refused before
+there is one interrupts no other.
 """
 
 from __future__ import annotations
@@ -113,11 +114,14 @@ def step(context: Context, command: Command) -> Progress:
     A loop that does not ask for commands in every round makes more; those made are told. A world
     that does not wait for the robot goes on in real time meanwhile, so that it can be stopped.
     """
+    return _step(context, command, _whole_number(command.params, "steps", 1, MAX_STEPS))
+
+
+def _step(context: Context, command: Command, steps: int) -> Progress:
     clock, watch = context.clock, context.watch
-    steps = _whole_number(command.params, "steps", 1, MAX_STEPS)
     from_s, from_step = clock.sim_time_s, clock.steps_seen
     mode = None if context.simulation.waits_for_robot else "real_time"
-    context.pause.end(command, mode, stepping=True)
+    context.pause.lend_mode(command, mode, stepping=True)
     watch.stepping = command.id
     try:
         while (made := clock.steps_seen - from_step) < steps and not context.pause.active:
@@ -156,14 +160,14 @@ def reset(context: Context, command: Command) -> Progress:
     """Ask for the reset; done when simulation time went back, which takes a physics step."""
     was_paused = context.pause.active
     context.queue.issue(command)
-    yield from _reset(context, command)
+    context.pause.end(command)  # first: a paused simulation makes no physics step
+    yield from _reset(context)
     why = "a reset takes a step, which ended the pause" if was_paused else "a reset keeps the mode"
     return {"run_id": context.clock.run.id, **_mode(context), "why": f"{why}; time goes on"}
 
 
-def _reset(context: Context, command: Command) -> Generator[None]:
+def _reset(context: Context) -> Generator[None]:
     clock, run = context.clock, context.clock.run
-    context.pause.end(command)  # first: a paused simulation makes no physics step
     clock.await_reset()
     context.simulation.robot.simulationReset()
     deadline_s = time.monotonic() + _RESET_TIMEOUT_S
@@ -198,7 +202,10 @@ def reload(context: Context, command: Command) -> Progress:
 @_built_in
 def load_world(context: Context, command: Command) -> Progress:
     """Ask for another world of the project; this process ends, as all controllers do."""
-    world = _world_of_project(context, command.params.get("world"))
+    return _load(context, command, _world_of_project(context, command.params.get("world")))
+
+
+def _load(context: Context, command: Command, world: Path) -> Progress:
     context.pause.end(command)  # first: a paused simulation makes no physics step
     context.simulation.robot.worldLoad(str(world))
     return (yield from _until_ended("worldLoad"))
@@ -222,6 +229,10 @@ def _world_of_project(context: Context, world: object) -> Path:
 def quit(context: Context, command: Command) -> Progress:  # noqa: A001  (the action's name)
     """Ask Webots to end; this process ends with it."""
     status = _whole_number(command.params, "status", 0, _HIGHEST_STATUS, default=0)
+    return _quit(context, command, status)
+
+
+def _quit(context: Context, command: Command, status: int) -> Progress:
     context.pause.end(command)
     context.simulation.robot.simulationQuit(status)
     return (yield from _until_ended("simulationQuit"))
@@ -331,9 +342,9 @@ def _run_until(context: Context, command: Command, goal: Goal) -> Progress:
     watch.begin(command.id, goal, finish)
     pause.ask_before_steps(watch.before_step)
     try:
-        pause.end(command, goal.pace)
+        pause.lend_mode(command, goal.pace)
         if goal.reset:
-            yield from _reset(context, command)
+            yield from _reset(context)
         while not watch.over():
             if pause.active:
                 cause = ", ".join(f"{name} {value}" for name, value in pause.cause.items())
@@ -369,12 +380,12 @@ def _setter(command: Command) -> Setter:
 
 def _finish_of(context: Context, command: Command, then: Then) -> Callable[[], None]:
     """What to do at the step that ends a run."""
-    pause, simulation = context.pause, context.simulation
-    was_paused, mode_before = pause.active, pause.running_mode
+    pause = context.pause
+    was_paused = pause.active
 
     def finish() -> None:
         if then == "go_on" or (then == "as_before" and not was_paused):
-            simulation.set_mode(mode_before)
+            pause.give_mode_back()
         else:
             pause.begin(command_id=command.id)
 

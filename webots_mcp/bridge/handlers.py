@@ -82,13 +82,14 @@ class Handlers:
 
     def _refuse(self, action: str) -> None:
         """Say once that the function is never called; a controller may register it in its loop."""
+        if action in self._refused:
+            return
+        self._refused.add(action)
         why = (
             f"action {action!r} is built in, and the bridge runs its own: the function registered "
             f"for it is never called; choose another name, such as {'my_' + action!r}"
         )
-        if action not in self._refused:
-            self._refused.add(action)
-            self._journal.log("warning", "bridge", why)
+        self._journal.log("warning", "bridge", why)
         self._recorder.errors.failed(f"register_command({action!r})", ValueError(why))
 
     def _unknown(self, action: str) -> str:

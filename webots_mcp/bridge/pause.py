@@ -61,7 +61,7 @@ class Pause:
         self._heartbeat = heartbeat
         self._stepped = stepped
         self._begins = begins
-        self._mode_before = "real_time"
+        self._mode_before: str | None = None  # a pause, a run's pace or steps; None where none is
         self._user_code_depth = 0  # a handler may ask for commands itself
         self._awaiting_step = False
         self._ask_before_steps: Callable[[], object] | None = None
@@ -72,8 +72,8 @@ class Pause:
 
     @property
     def running_mode(self) -> str:
-        """The simulation mode now, or the one before the pause."""
-        return self._mode_before if self.active else self._simulation.mode_name
+        """The simulation mode now; or before the pause, a run's own pace or steps."""
+        return self._mode_before or self._simulation.mode_name
 
     def begin(self, **cause: object) -> None:
         """Pause the simulation and keep the loop from here on.
@@ -85,18 +85,30 @@ class Pause:
             return
         self.cause = cause
         self._begins()
-        self._activate(self._simulation.mode_name)
+        self._activate(self.running_mode)
         self._simulation.set_mode("pause")
         self._journal.event("pause", cause)
         self._heartbeat.change_loop(PAUSED, self._mode_before)
 
     def end(self, command: Command, mode: str | None = None, *, stepping: bool = False) -> None:
         """Let the loop go on, in `mode` or in the one that it ran in before."""
-        self._simulation.set_mode(mode or _running(self.running_mode))
-        if self.active:
-            self._deactivate()
+        before, was_active = self.running_mode, self.active
+        self._simulation.set_mode(mode or _running(before))
+        self._deactivate()
+        if was_active:
             self._journal.event("resume", {"command_id": command.id})
         self._heartbeat.change_loop(STEPPING if stepping else None)
+
+    def lend_mode(self, command: Command, mode: str | None, *, stepping: bool = False) -> None:
+        """Let the loop go on for a while, as `end` does: the mode to go back to stays."""
+        before = self.running_mode
+        self.end(command, mode, stepping=stepping)
+        self._mode_before = before
+
+    def give_mode_back(self) -> None:
+        """That while is over: the loop goes on in the mode before it."""
+        self._simulation.set_mode(self.running_mode)
+        self._mode_before = None
 
     def take_over(self, mode_before: str) -> None:
         """Go on with the pause of a bridge whose process is gone, if the simulation still stands.
@@ -113,8 +125,10 @@ class Pause:
 
     def close(self) -> None:
         """Nobody will serve commands any more: where it is paused, time goes on."""
-        if self.active and not self._simulation.over:
-            self._simulation.set_mode(_running(self._mode_before))
+        if self._mode_before is None or self._simulation.over:
+            return
+        self._simulation.set_mode(_running(self._mode_before))
+        if self.active:
             self._end_by("the bridge, which was closed")
 
     def pump(self) -> None:
@@ -173,6 +187,7 @@ class Pause:
 
     def _deactivate(self) -> None:
         self.active = False
+        self._mode_before = None
         self._guard_steps()
 
     def _guard_steps(self) -> None:
@@ -212,7 +227,7 @@ class Pause:
     def _leave_for(self, step: Step) -> int:
         """Leave the pause for just this step."""
         if step.begins:
-            self._simulation.set_mode(_running(self._mode_before))
+            self._simulation.set_mode(_running(self.running_mode))
         try:
             answer = step.make()
         except BaseException:

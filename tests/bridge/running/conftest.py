@@ -65,8 +65,8 @@ def rounds(
     return Rounds(robot, sparse, recording, request.param)
 
 
-def let_go_when_paused(rounds: Rounds) -> list[float]:
-    """The times at which the simulation is paused; a `resume` is sent at that moment."""
+def let_go_when_paused(rounds: Rounds, by: str = "resume") -> list[float]:
+    """The times at which the simulation is paused; what lets it go is sent at that moment."""
     times: list[float] = []
     robot = rounds.robot
     set_mode = robot.simulationSetMode
@@ -75,7 +75,7 @@ def let_go_when_paused(rounds: Rounds) -> list[float]:
         set_mode(mode)
         if mode == robot.SIMULATION_MODE_PAUSE:
             times.append(robot.getTime())
-            rounds.recording.send("resume")
+            rounds.recording.send(by)
 
     vars(robot)["simulationSetMode"] = noticed
     return times

@@ -9,6 +9,8 @@ from tests.bridge.running.conftest import STEP_S, Rounds, let_go_when_paused
 from webots_mcp import MCPBridge
 from webots_mcp.standin import InProcessSupervisor
 
+MODES = ("real_time", "fast")
+
 
 def test_it_pauses_at_the_very_step_at_which_the_condition_holds(
     rounds: Rounds, recording: Recording
@@ -152,6 +154,37 @@ def test_what_was_paused_goes_on_at_the_pace_that_it_had_before(
     sent = recording.send("run", until="n >= 10", pace="fast", then="go_on")
     rounds.drive(12)
     assert recording.fate(sent)[1]["mode"] == "real_time"
+
+
+@pytest.mark.parametrize("ended_by", ["its goal", "a breakpoint", "pause", "reset", "close"])
+@pytest.mark.parametrize("mode_before", ["real_time", "fast"])
+def test_the_pace_of_a_run_ends_with_it_however_it_ends(
+    rounds: Rounds, recording: Recording, ended_by: str, mode_before: str
+) -> None:
+    robot = rounds.robot
+    modes = {name: getattr(robot, f"SIMULATION_MODE_{name.upper()}") for name in MODES}
+    robot.simulationSetMode(modes[mode_before])
+    (pace,) = set(MODES) - {mode_before}
+    if ended_by == "a breakpoint":
+        rounds.bridge.breakpoint("n == 8")
+    recording.send("run", until="n >= 20" if ended_by == "its goal" else "n > 1000", pace=pace)
+    rounds.drive(7)
+    assert robot.simulationGetMode() == modes[pace]
+    if ended_by == "close":
+        rounds.bridge.close()
+        assert robot.simulationGetMode() == modes[mode_before]
+        return
+    if ended_by in ("pause", "reset"):
+        recording.send(ended_by)
+    if ended_by != "reset":
+        let_go_when_paused(rounds, by="reset")
+    rounds.drive(20)
+    assert recording.rows("SELECT count(*) FROM run") == [2]
+    assert robot.simulationGetMode() == modes[mode_before]
+    resumed = recording.send("resume")
+    rounds.drive(2)
+    _, result, _ = recording.fate(resumed)
+    assert ("it ran fast before" in result["why"]) is (mode_before == "fast")
 
 
 def test_as_before_pauses_what_was_paused(rounds: Rounds, recording: Recording) -> None:

@@ -115,6 +115,17 @@ def test_two_at_once_are_refused_and_the_first_goes_on(
     assert recording.rows("SELECT count(*) FROM run") == [1]
 
 
+@pytest.mark.parametrize("refused", ["step", "load_world", "quit"])
+def test_a_command_that_is_refused_interrupts_nothing(
+    rounds: Rounds, recording: Recording, refused: str
+) -> None:
+    sent = recording.send("run", until="n == 20", then="go_on")
+    other = recording.send(refused, steps=0, world="/nowhere.wbt", status=-1)
+    rounds.drive(22)
+    assert recording.fate(other)[0] == "failed"
+    assert recording.fate(sent)[1]["ended"] == "condition held"
+
+
 @pytest.mark.parametrize(
     ("params", "told"),
     [

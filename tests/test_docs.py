@@ -11,16 +11,24 @@ import pytest
 
 import webots_mcp
 from webots_mcp import MCPBridge, MemoryDatabase, testing
+from webots_mcp.bridge.backlog import MAX_WAITING_BYTES, MAX_WAITING_ROWS
+from webots_mcp.bridge.devices import MOST_OBJECTS, SECTORS
+from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
 from webots_mcp.cli import COMMANDS
-from webots_mcp.contract import BUILT_IN_ACTIONS
+from webots_mcp.connection import OLDEST_SQLITE
+from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.origin import SCHEMA_FILE
 from webots_mcp.server import create_server
+from webots_mcp.server.budget import LARGE_BUDGET
+from webots_mcp.server.parameters import MAX_WAIT_S
 
 CHECKOUT = Path(__file__).parents[1]
 DOCS = CHECKOUT / "docs"
 INSTALLED = Path(webots_mcp.__file__).parents[1]
 PAGES = sorted([CHECKOUT / "README.md", CHECKOUT / "CHANGELOG.md", CHECKOUT / "CONTRIBUTING.md",
                 *DOCS.glob("*.md"), *CHECKOUT.glob("examples/*/README.md")])  # fmt: skip
+
+WORDS = {2.0: "two", 8: "eight"}
 
 
 def page(name: str) -> str:
@@ -51,6 +59,30 @@ def test_the_page_of_the_bridge_names_every_method() -> None:
 def test_the_page_of_the_bridge_names_every_action_that_is_built_in_and_no_other() -> None:
     (listed,) = re.findall(r"actions that are built in [^:]*:([^.]*)\.", page("bridge.md"))
     assert re.findall(r"`(\w+)`", listed) == list(BUILT_IN_ACTIONS)
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("bridge.md", f"up to {MAX_WAITING_ROWS:,} rows or {MAX_WAITING_BYTES / 1e6:g} MB"),
+        ("bridge.md", f"({MOST_LINES_PER_S} a second of each; what is above is counted)"),
+        ("bridge.md", f"No call waits longer than {MAX_WAIT_S} s"),
+        ("bridge.md", f"the nearest distance of {WORDS[SECTORS]} sectors"),
+        ("bridge.md", f"how many and the nearest {WORDS[MOST_OBJECTS]}"),
+        ("bridge.md", f"keeps the last seconds, and {WORDS[KEEP_AFTER_S]} more"),
+        ("limits.md", f"No tool waits longer than {MAX_WAIT_S} s"),
+        ("limits.md", f"up to {LARGE_BUDGET:,} characters"),
+        ("limits.md", f"SQLite {OLDEST_SQLITE[0]}.{OLDEST_SQLITE[1]} or newer is needed"),
+    ],
+)
+def test_a_limit_has_the_figure_that_its_page_says(name: str, said: str) -> None:
+    assert said in " ".join(page(name).split())
+
+
+def test_the_page_of_the_bridge_shows_its_defaults() -> None:
+    parameters = inspect.signature(MCPBridge).parameters.values()
+    plain = [each.replace(annotation=inspect.Parameter.empty) for each in parameters]
+    assert f"`MCPBridge{inspect.Signature(plain)}`" in page("bridge.md")
 
 
 def test_the_page_of_the_interface_names_all_that_may_be_imported() -> None:

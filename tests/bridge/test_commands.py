@@ -271,7 +271,10 @@ def test_a_handlers_docstring_never_stops_the_registration(
 
 
 def test_a_function_for_what_is_built_in_is_never_called_which_is_said_once_and_stops_no_loop(
-    robot: InProcessSupervisor, database: MemoryDatabase, recording: Recording
+    robot: InProcessSupervisor,
+    database: MemoryDatabase,
+    recording: Recording,
+    capfd: pytest.CaptureFixture[str],
 ) -> None:
     calls: list[str] = []
     with MCPBridge(robot, database=database) as bridge:
@@ -284,7 +287,13 @@ def test_a_function_for_what_is_built_in_is_never_called_which_is_said_once_and_
     assert (robot.simulationGetMode(), calls) == (robot.SIMULATION_MODE_FAST, [])
     (said,) = recording.rows("SELECT message FROM log WHERE level = 'warning'")
     assert said.startswith("action 'fast' is built in") and "'my_fast'" in said
+    assert capfd.readouterr().err.count("is built in") == 1
     assert recording.rows("SELECT actions FROM session") == ["{}"]
+
+
+def test_in_strict_mode_a_function_for_what_is_built_in_is_refused(bridge: MCPBridge) -> None:
+    with pytest.raises(ValueError, match="'pause' is built in"):
+        bridge.register_command("pause", lambda _: None)
 
 
 def test_a_function_for_reset_state_is_run_in_place_of_the_callbacks_which_is_said_once(

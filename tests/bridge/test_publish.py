@@ -46,6 +46,32 @@ def test_every_nth_call_is_recorded_and_force_records_now(
     assert [state["number"] for state in recording.states()] == [5, 10, 99]
 
 
+def test_the_environment_decides_how_many_calls_are_recorded(
+    robot: InProcessSupervisor, recording: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WEBOTS_MCP_THROTTLE_INTERVAL", "1")
+    with MCPBridge(robot, throttle_interval=100, database=recording.database) as bridge:
+        for number in range(3):
+            bridge.publish({"number": number})
+    assert [state["number"] for state in recording.states()] == [0, 1, 2]
+
+
+def test_whatever_is_recorded_has_its_times_and_its_run(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    camera = robot.getDevice("camera")
+    camera.enable(STEP_MS)
+    for mode in ("cruise", "turn"):
+        robot.step(STEP_MS)
+        bridge.publish({"mode": mode})
+    bridge.log("text")
+    assert bridge.save_camera_frame(camera)
+    of_now = (pytest.approx(0.032), 1, bridge.run_id)
+    for table in ("state", "event", "log", "image"):
+        times = f"SELECT sim_time_s, wall_time_s > 1.7e9, run_id FROM {table}"
+        assert recording.rows(f"{times} ORDER BY id DESC LIMIT 1") == [of_now], table
+
+
 def test_extras_that_are_no_dict_do_not_stop_the_loop(
     robot: InProcessSupervisor, database: MemoryDatabase, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -286,6 +286,20 @@ def test_a_wrong_database_or_interval_is_refused(robot: InProcessSupervisor) -> 
         MCPBridge(robot, throttle_interval=0, database=":memory:")
 
 
+def test_a_database_may_be_in_memory_and_the_stats_tell_what_it_has_taken(
+    robot: InProcessSupervisor,
+) -> None:
+    with MCPBridge(robot, throttle_interval=1, database=":memory:") as bridge:
+        before = bridge.stats()
+        bridge.publish({"x": 1})
+        stats = bridge.stats()
+        assert Recording(bridge.database).states() == [{"x": 1}]
+    assert (stats.rows_written, stats.rows_waiting) == (before.rows_written + 1, 0)
+    assert 0 < stats.publish_mean_us <= stats.publish_max_us
+    assert isinstance(bridge.database, MemoryDatabase)
+    bridge.database.close()
+
+
 def test_a_plain_robot_records_as_well(database: MemoryDatabase, recording: Recording) -> None:
     with MCPBridge(InProcessRobot("rover"), throttle_interval=1, database=database) as bridge:
         bridge.publish({"x": 1})

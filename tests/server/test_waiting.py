@@ -92,6 +92,19 @@ async def test_no_call_waits_longer_than_clients_do(
         assert "90" in await fail(client, tool, **arguments, timeout_s=101)
 
 
+async def test_no_tool_may_be_asked_to_wait_for_longer(connect: Connect) -> None:
+    async with connect() as client:
+        tools = (await client.list_tools()).tools
+    waits = {
+        f"{tool.name} {name}": options.get("maximum")
+        for tool in tools
+        for name, options in tool.input_schema["properties"].items()
+        if name in ("timeout_s", "duration_s")
+    }
+    assert len(waits) > 10
+    assert {name: longest for name, longest in waits.items() if longest != 90} == {}
+
+
 async def test_a_command_whose_asker_went_away_says_that_it_goes_on(
     connect: Connect, recorded: Recorded, file: Path
 ) -> None:

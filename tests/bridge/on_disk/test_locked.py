@@ -26,6 +26,20 @@ from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
 
+def test_a_row_is_there_for_others_when_publish_returns_and_no_disk_is_waited_for(
+    bridge: MCPBridge, filed: Recording
+) -> None:
+    connection = bridge._session.context.recorder.session.connection  # pyright: ignore[reportPrivateUsage]
+    assert connection is not None
+    modes = [
+        connection.execute(f"PRAGMA {name}").fetchone() for name in ("journal_mode", "synchronous")
+    ]
+    assert modes == [("wal",), (1,)]  # NORMAL: a commit is in the log, and the disk has it later
+    for n in range(3):
+        bridge.publish({"n": n})
+        assert numbers(filed) == list(range(n + 1))
+
+
 def test_rows_that_meet_a_lock_wait_and_are_written_in_order(
     bridge: MCPBridge, file: Path, filed: Recording
 ) -> None:

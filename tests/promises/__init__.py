@@ -1,0 +1,1 @@
+"""What the pages promise, and what shows each promise: `promises.toml`, beside this file."""

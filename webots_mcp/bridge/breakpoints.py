@@ -11,6 +11,7 @@ from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.keeping import Keeper
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
+from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.run import Run
 from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.text import cut, describe, storable
@@ -43,6 +44,7 @@ class Breakpoint:
 
     Attributes:
         id: None where the database could not take it yet.
+        of_code: The controller's own code has set it.
         hits: How often it began to hold in this run.
         holding: It held in the state before.
         asked_since_s: The simulation time of the first state that it was asked of in this run.
@@ -56,8 +58,11 @@ class Breakpoint:
         evaluator: Evaluator,
         action: str,
         after_hits: int,
+        *,
+        of_code: bool,
     ) -> None:
         self.id = id
+        self.of_code = of_code
         self.condition = condition
         self.evaluator = evaluator
         self.action = action
@@ -66,6 +71,11 @@ class Breakpoint:
         self.holding = False
         self.asked_since_s: float | None = None
         self.unseen = frozenset(condition.signals)
+
+    @property
+    def asks(self) -> tuple[str, str, int]:
+        """Its condition, action and hits, by which it is the same in another database."""
+        return self.condition.text, self.action, self.after_hits
 
     def begin_run(self) -> None:
         """It is armed again."""
@@ -102,8 +112,10 @@ class Breakpoints:
         self._keeper = keeper
         self.run: Run | None = None  # in which the stored ones were read; None while that is owed
         self._begun = clock.run
+        self._registration: Registration | None = None  # in the database that was read last
         self._off: dict[int, str] = {}
         self.armed: list[Breakpoint] = []
+        recorder.session.standing.append(self._owe)
 
     # -- setting -------------------------------------------------------------------------------
 
@@ -130,12 +142,37 @@ class Breakpoints:
         rows = self._recorder.fetch(_ARMED, ids)
         if rows is None:
             return False
-        known = {each.id: each for each in self.armed}
-        unstored = [each for each in self.armed if each.id is None]
-        stored = [known.get(row[0]) or self._read(*row) for row in rows]
-        self.armed = [*unstored, *filter(None, stored)]
+        if registration is not self._registration:
+            self._registration = registration
+            self._move([each for row in rows if (each := self._read(*row)) is not None])
+        else:
+            known = {each.id: each for each in self.armed}
+            unstored = [each for each in self.armed if each.id is None]
+            stored = [known.get(row[0]) or self._read(*row) for row in rows]
+            self.armed = [*unstored, *filter(None, stored)]
         self.run = run
         return True
+
+    def _owe(self) -> tuple[()]:
+        """The next state reads the database that is begun now."""
+        self.run = None
+        return ()
+
+    def _move(self, stored: list[Breakpoint]) -> None:
+        """Into another database: those of the code go along, others stay behind with a word."""
+        for each in self.armed:
+            same = next((other for other in stored if other.asks == each.asks), None)
+            if same is not None:
+                each.id = same.id
+                stored[stored.index(same)] = each
+            elif each.of_code:
+                each.id = self._store(*each.asks)
+                stored.append(each)
+            else:
+                why = "it was set in a database that is gone; set it again"
+                text = f"breakpoint {each.id} ({each.condition.text}) is off: {why}"
+                self._journal.log("warning", "bridge", text)
+        self.armed = stored
 
     def _read(self, number: int, text: bytes, action: bytes, after_hits: int) -> Breakpoint | None:
         from webots_mcp.conditions import parse_condition
@@ -145,7 +182,8 @@ class Breakpoints:
         except InvalidConditionError as error:
             self._disable(number, str(error))
             return None
-        return _armed(number, condition, action.decode("utf-8", "replace"), int(after_hits))
+        asked = (condition, action.decode("utf-8", "replace"), int(after_hits))
+        return _armed(number, *asked, of_code=False)
 
     def set(self, text: str, action: str, after_hits: int) -> int | None:
         """Arm one of the controller's code, for as long as its session lasts.
@@ -162,12 +200,12 @@ class Breakpoints:
         condition = parse_condition(text)
         _require_action(action, after_hits)
         for each in self.armed:
-            if (each.condition, each.action, each.after_hits) == (condition, action, after_hits):
+            if each.asks == (condition.text, action, after_hits):
                 return each.id
         if len(self.armed) >= MAX_BREAKPOINTS:
             raise InvalidInputError(f"{MAX_BREAKPOINTS} breakpoints are armed already: remove one")
         number = self._store(condition.text, action, after_hits)
-        self.armed.append(_armed(number, condition, action, after_hits))
+        self.armed.append(_armed(number, condition, action, after_hits, of_code=True))
         return number
 
     def _store(self, text: str, action: str, after_hits: int) -> int | None:
@@ -279,8 +317,11 @@ _CANNOT_PAUSE: Final = (
 )
 
 
-def _armed(number: int | None, condition: Condition, action: str, after_hits: int) -> Breakpoint:
-    return Breakpoint(number, condition, condition.evaluator(plain), action, after_hits)
+def _armed(
+    number: int | None, condition: Condition, action: str, after_hits: int, *, of_code: bool
+) -> Breakpoint:
+    evaluator = condition.evaluator(plain)
+    return Breakpoint(number, condition, evaluator, action, after_hits, of_code=of_code)
 
 
 def _require_action(action: str, after_hits: object) -> None:

@@ -126,7 +126,7 @@ class Parameters:
         self._wanted: dict[str, Value] = {}
         self._from_reset: dict[str, tuple[Value, Setter]] = {}
         self._changes = 0
-        recorder.session.standing = self._standing
+        recorder.session.standing.append(self._standing)
 
     def declare(self, declaration: Declaration) -> Parameter[Any]:
         """The parameter of that name, made or brought up to what is declared now.

@@ -120,7 +120,8 @@ class Recovery:
         self._backlog.rename_run(before, run.uuid)
         moment = (self._clock.newest_s(run), time.time())
         self._backlog.keep(Row("event", run, (*moment, "storage", None, json.dumps({"why": why}))))
-        for kind, of_run, values in self._session.standing():
+        standing = [each for tell in self._session.standing for each in tell()]
+        for kind, of_run, values in standing:
             self._backlog.keep(Row(kind, run if of_run else None, values))
         self._counts.drop_unconfirmed(why)
         self._errors.warn("storage", f"{why}; recording goes on in a new database")

@@ -40,8 +40,8 @@ class SessionConnection:
     Attributes:
         run: The run that is being recorded.
         actions: Docstrings of the registered custom actions, by name.
-        standing: Gives what else a database has to be told that does not know the session: the
-            kind, whether it belongs to the run, and the values.
+        standing: Each gives what else a database has to be told that does not know the session:
+            the kind, whether it belongs to the run, and the values.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class SessionConnection:
         self.uuid = new_uuid()
         self.run = run
         self.actions: dict[str, str] = {}
-        self.standing: Callable[[], Iterable[tuple[Kind, bool, Values]]] = tuple
+        self.standing: list[Callable[[], Iterable[tuple[Kind, bool, Values]]]] = []
         self.connection: sqlite3.Connection | None = None
         self.registration: Registration | None = None
         self._identity = identity

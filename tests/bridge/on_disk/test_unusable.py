@@ -7,6 +7,7 @@ import sqlite3
 import stat
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,34 @@ def test_a_deleted_database_is_made_again_and_told(
     assert numbers(filed) == [1]
     assert filed.rows("SELECT count(*) FROM event WHERE kind = 'storage'") == [1]
     assert "deleted or replaced" in capfd.readouterr().err
+
+
+@pytest.mark.usefixtures("retry_at_once")
+@pytest.mark.skipif(sys.platform == "win32", reason="an open file cannot be deleted there")
+def test_breakpoints_of_the_code_stay_armed_in_a_new_database_and_others_are_told_to_be_off(
+    robot: InProcessSupervisor, bridge: MCPBridge, file: Path, filed: Recording
+) -> None:
+    bridge.breakpoint("n == 1", "log")
+    with closing(connect(file, "writer")) as connection:
+        connection.execute(
+            "INSERT INTO breakpoint (robot_id, condition, action, created_wall_time_s) "
+            "SELECT id, 'n == 1 or n > 9', 'log', 0 FROM robot"
+        )
+    bridge._session.context.breakpoints.load()  # pyright: ignore[reportPrivateUsage]
+    for part in file.parent.glob(f"{DATABASE_NAME}*"):
+        part.unlink()
+    heartbeat_now(bridge)
+    for reset in (False, True):
+        if reset:
+            robot.simulationReset()
+        for n in range(3):
+            robot.step(STEP_MS)
+            bridge.publish({"n": n})
+            catch_up(bridge)
+    assert filed.rows("SELECT condition, hits FROM breakpoint") == [("n == 1", 2)]
+    assert filed.rows("SELECT name FROM event WHERE kind = 'breakpoint'") == ["n == 1"] * 2
+    (said,) = filed.rows("SELECT message FROM log WHERE level = 'warning'")
+    assert "(n == 1 or n > 9) is off" in said
 
 
 @pytest.mark.usefixtures("retry_at_once")

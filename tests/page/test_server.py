@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import http.client
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from http.client import HTTPMessage
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import pytest
 
 from tests.page.conftest import Server
 from webots_mcp.cli import main
+from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.page.server import MOST_TABS
 
 UPGRADE = {
@@ -109,3 +112,12 @@ def test_a_port_that_is_taken_is_said(
 
 def test_ctrl_c_ends_it_in_a_sentence(serve: Callable[..., Server], tmp_path: Path) -> None:
     assert serve(tmp_path).stop() == "webots-mcp: ended by SIGTERM\n"
+
+
+def test_a_recording_that_is_refused_is_not_served(
+    serve: Callable[..., Server], tmp_path: Path
+) -> None:
+    with closing(sqlite3.connect(tmp_path / DATABASE_NAME)) as other, other:
+        other.execute("CREATE TABLE tune (name TEXT)")
+    with pytest.raises(AssertionError, match="belongs to another application"):
+        serve(tmp_path)

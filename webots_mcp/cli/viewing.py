@@ -30,8 +30,10 @@ def view(arguments: argparse.Namespace) -> None:
     do not notice.
     """
     import webbrowser
+    from contextlib import suppress
 
     from webots_mcp.contract import resolve_database
+    from webots_mcp.errors import NoDatabaseError
     from webots_mcp.report.figures import require_view
 
     require_view("the live page")
@@ -42,6 +44,8 @@ def view(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"--port {arguments.port}: the last port is {_LAST_PORT}")
     where = resolve_database(arguments.database, arguments.data_dir)
     recording = Recording(*where, read_only=True, asker="page")
+    with suppress(NoDatabaseError), recording.reader():  # one that is refused will not be shown
+        pass
     server = create_page_server(recording, arguments.port, read_only=arguments.read_only)
 
     def ready(url: str) -> None:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from contextlib import closing
 
 from mcp.server import MCPServer
+from mcp.server.mcpserver.exceptions import ResourceError
 
 from webots_mcp.connection import connect
 from webots_mcp.contract import MemoryDatabase
-from webots_mcp.errors import NoDatabaseError
+from webots_mcp.errors import NoDatabaseError, WebotsMCPError
 from webots_mcp.schema import create_schema
 from webots_mcp.store.questions.schema_text import describe_schema
 from webots_mcp.store.recording import Recording
@@ -29,6 +30,8 @@ def add_resources(mcp: MCPServer, recording: Recording) -> None:
                 return describe_schema(connection)
         except NoDatabaseError:
             return _schema_to_come()
+        except WebotsMCPError as error:  # of any other a client is not told what it says
+            raise ResourceError(str(error)) from error
 
 
 def _schema_to_come() -> str:

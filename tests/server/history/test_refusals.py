@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
+from mcp import MCPError
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import ask, text_of
@@ -30,6 +33,14 @@ async def test_the_schema_is_told_before_anything_was_recorded(tmp_path: Path) -
         (content,) = (await client.read_resource("webots://schema")).contents
     assert "table state:" in getattr(content, "text", "")
     assert list(tmp_path.iterdir()) == []
+
+
+async def test_the_schema_of_a_refused_recording_is_refused_by_name(tmp_path: Path) -> None:
+    with closing(sqlite3.connect(tmp_path / "webots.db")) as other, other:
+        other.execute("CREATE TABLE tune (name TEXT)")
+    async with client_on(tmp_path / "webots.db") as client:
+        with pytest.raises(MCPError, match="belongs to another application"):
+            await client.read_resource("webots://schema")
 
 
 @pytest.mark.parametrize(

@@ -266,7 +266,8 @@ class Watch:
         """Whether the run has begun in which it is watched."""
         if watched.run is None and self._clock.run is not watched.former:
             watched.run = self._clock.run
-            watched.since_s = (0.0, time.monotonic())
+            if watched.reached is None:  # else it was ended before the reset came
+                watched.since_s = (0.0, time.monotonic())
         return watched.run is not None
 
     def _finish(self, watched: _Watched) -> None:

@@ -101,6 +101,21 @@ def test_a_cancelled_one_ends_as_it_was_told_to_end(rounds: Rounds, recording: R
     assert len(paused) == 1
 
 
+def test_one_that_is_cancelled_before_its_reset_came_has_advanced_nothing(
+    rounds: Rounds, recording: Recording
+) -> None:
+    rounds.drive(10)
+    before_s = rounds.robot.getTime()
+    sent = recording.send("run", for_s=1, reset=True, then="go_on")
+    eager(rounds.bridge)
+    recording.send("cancel_run", command_id=sent)
+    eager(rounds.bridge)
+    rounds.drive(3)
+    _, result, error = recording.fate(sent)
+    assert (error, result["ended"], result["advanced_s"]) == (None, "interrupted", 0.0)
+    assert result["from_s"] == result["sim_time_s"] == pytest.approx(before_s)
+
+
 def test_two_at_once_are_refused_and_the_first_goes_on(
     rounds: Rounds, recording: Recording
 ) -> None:

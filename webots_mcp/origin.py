@@ -30,6 +30,7 @@ _OF_COLUMNS: Final = re.compile(
     r'(, ?"?\w+"?( (ASC|DESC))?)*\)',
     re.IGNORECASE,
 )
+_INDEX: Final = re.compile(r"CREATE (UNIQUE )?INDEX")
 _OBJECTS: Final = (
     "SELECT type, CAST(name AS TEXT), CAST(tbl_name AS TEXT), CAST(sql AS TEXT) "
     "FROM {}.sqlite_master WHERE sql IS NOT NULL"
@@ -64,6 +65,8 @@ def require_shipped(
 ) -> None:
     """Raise where a table, view or index of ours is not what we ship, or something runs on one.
 
+    A table or view that is missing is as wrong; an index is not.
+
     Args:
         connection: Nothing but PRAGMAs was asked of that database yet.
         statements: Those that make what we ship, in another version; None for this one.
@@ -75,19 +78,29 @@ def require_shipped(
     shipped = shipped_objects() if statements is None else _by_name(statements)
     texts = set(shipped.values())
     found = connection.execute(_OBJECTS.format(schema)).fetchall()
+    names = {name.lower() for _, name, _, _ in found}
+    for name, sql in shipped.items():
+        if name not in names and not _INDEX.match(sql):  # without one, all is slower, and true
+            raise ForeignDatabaseError(
+                f"{_file(connection, schema)} has no {name!r}, which webots-mcp makes in each "
+                "recording: use a copy from before it was removed"
+            )
     others = [row for row in found if row[3].rstrip() not in texts]
     if not others:  # as a rule
         return
     referring = {name.lower() for kind, name, _, sql in others if kind == "table" and _refers(sql)}
     for kind, name, table, sql in others:
         if (why := _why_refused(kind, name, table, sql, shipped, referring)) is not None:
-            files = connection.execute("PRAGMA database_list").fetchall()
-            (file,) = (path for _, each, path in files if each == schema)
             raise ForeignDatabaseError(
-                f"the {kind} {name[:60]!r} in {file or 'the database'} {why}, and webots-mcp "
+                f"the {kind} {name[:60]!r} in {_file(connection, schema)} {why}, and webots-mcp "
                 "has not made it, so nothing of the file is used: if it is your own, remove it "
                 f"(sqlite3 FILE 'DROP {kind.upper()} ...'), else do not trust the file"
             )
+
+
+def _file(connection: sqlite3.Connection, schema: str) -> str:
+    files = connection.execute("PRAGMA database_list").fetchall()
+    return next((path for _, each, path in files if each == schema and path), "the database")
 
 
 def _why_refused(

@@ -95,6 +95,15 @@ def test_what_would_run_in_our_processes_is_refused_by_name(
     assert "remove it (sqlite3 FILE 'DROP " in said
 
 
+@pytest.mark.parametrize("role", ["reader", "writer", "loop"])
+def test_what_was_removed_is_named_before_a_question_fails_over_it(file: Path, role: Role) -> None:
+    change(file, "DROP INDEX ix_session_robot_id_id")
+    connect(file, role).close()  # slower, and as true
+    change(file, "DROP TABLE log")
+    with pytest.raises(ForeignDatabaseError, match=r"webots\.db has no 'log'"):
+        connect(file, role)
+
+
 @pytest.mark.parametrize(
     "asked",
     [

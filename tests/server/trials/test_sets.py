@@ -321,6 +321,6 @@ async def test_five_speeds_of_the_rover_three_times_each(
         rows = rows_of(answer["ranked"])
         assert [row["speed"] for row in rows] == [5.0, 4.0, 3.0, 2.0, 1.0]
         assert all(len(row["runs"]) == 3 for row in rows)
-        assert "repeat each 5 times" in answer["verdict"]
+        assert "repeat each 4 times" in answer["verdict"]
         assert simulation.mode is Mode.PAUSE
         assert await value_of(client, "speed") == 1.0

@@ -85,9 +85,8 @@ def rank(outcomes: Sequence[Outcome], best: Best = "highest") -> Ranking:
     """Rank the parameter sets of finished trials."""
     sets = sorted(_grouped(outcomes), key=lambda each: _place(each, best))
     chance = _chance(sets)
-    limit = MOST_CHANCE / max(1, len(sets) - 1)
-    better = True if chance is not None and chance < limit else None
-    return Ranking(sets, _noise(sets), better, chance, _verdict(sets, chance, limit))
+    better = True if chance is not None and chance < MOST_CHANCE else None
+    return Ranking(sets, _noise(sets), better, chance, _verdict(sets, chance))
 
 
 def _grouped(outcomes: Sequence[Outcome]) -> list[Ranked]:
@@ -125,9 +124,12 @@ def _noise(sets: Sequence[Ranked]) -> Noise:
 def _chance(sets: Sequence[Ranked]) -> float | None:
     """Of the best and the next; where one is not whole, they are not compared by their scores.
 
+    That they are the best of many makes a false claim no likelier: of more sets that are alike, the
+    first two lie nearer to each other.
+
     How much like trials differ has to be known of each of the two, from its own repeats (B. L.
-    Welch, The generalization of "Student's" problem, Biometrika 34, 1947). Repeats that are all
-    equal may be so by chance: of two outcomes that are as likely, half of the pairs are.
+    Welch, The generalization of "Student's" problem, Biometrika 34, 1947). However close those are
+    to each other, they may be so by chance, as where half of all trials fall over and score less.
     """
     if len(sets) < 2 or not sets[1].is_whole:
         return None
@@ -138,19 +140,23 @@ def _chance(sets: Sequence[Ranked]) -> float | None:
     apart = abs(statistics.fmean(first) - statistics.fmean(other))
     if math.isclose(apart, 0, abs_tol=1e-9 * max(map(abs, (*first, *other)))):
         return 1.0
+    parted = _chance_of_parting(len(first) + len(other))
     errors = [statistics.variance(each) / len(each) for each in groups]
     if not any(errors):
-        return _chance_of_equal_repeats(len(first) + len(other))
+        return parted
     parts = sum(e**2 / (len(g) - 1) for e, g in zip(errors, groups, strict=True))
-    return chance_beyond(apart, sum(errors), max(1, int(sum(errors) ** 2 / parts)))
+    return max(parted, chance_beyond(apart, sum(errors), sum(errors) ** 2 / parts))
 
 
-def _chance_of_equal_repeats(trials: int) -> float:
-    """How often chance makes all of the one set equal, and all of the other."""
+def _chance_of_parting(trials: int) -> float:
+    """How often, of two outcomes that are as likely, the one set has all of one and the other not.
+
+    More trials of one set than of the other make it no likelier.
+    """
     return 0.5 ** (trials - 1)
 
 
-def _verdict(sets: Sequence[Ranked], chance: float | None, limit: float) -> str:
+def _verdict(sets: Sequence[Ranked], chance: float | None) -> str:
     scores = [score for each in sets for score in each.scores]
     if not scores:
         return "no trial gave a score"
@@ -165,12 +171,13 @@ def _verdict(sets: Sequence[Ranked], chance: float | None, limit: float) -> str:
         return f"all {len(scores)} scores are {scores[0]:g}: nothing that was tried changed them"
     if chance is None:
         return "the best and the next were not both repeated: how much theirs differ is not known"
-    if chance < limit:
+    if chance < MOST_CHANCE:
         return "the best beats the next by more than repeats differ"
-    if all(min(each.scores) == max(each.scores) for each in sets[:2]) and chance < 1:
-        wanted = next(n for n in range(2, 100) if _chance_of_equal_repeats(2 * n) < limit)
+    trials = sum(len(each.scores) for each in sets[:2])
+    if chance == _chance_of_parting(trials):
+        wanted = next(n for n in range(2, 100) if _chance_of_parting(2 * n) < MOST_CHANCE)
         return (
-            "repeats of the best and of the next agree, which so few may by chance: repeat each "
-            f"{wanted} times"
+            "the best and the next lie clearly apart, which so few repeats may by chance: repeat "
+            f"each {wanted} times"
         )
     return "the best and the next are not farther apart than repeats may be: repeat more"

@@ -5,14 +5,14 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Sequence
-from functools import cache
+from functools import lru_cache
 from typing import Final, NamedTuple, TypeAlias
 
 MOST_CHANCE: Final = 0.002  # that any of the figures compared at once differs among like runs
 MATTERS_SD: Final = 1.0  # a difference that matters, in standard deviations between like runs
 MOST_REPEATED: Final = 10  # runs of each group: who asks for more of them has no answer
 _OUTSIDE: Final = 0.1  # how often an interval does not hold the difference
-_MOST_SPLIT: Final = 0.05  # 4 runs of each: the least that tell normal figures from two clusters
+_LEAST_RUNS: Final = 4  # of each group, that tell how much they differ, and no two clusters
 _DUST: Final = 1e-9  # of the largest figure: what differs by less differs by rounding
 
 
@@ -57,10 +57,13 @@ class _Apart(NamedTuple):
 
     Attributes:
         by: The other mean less the first.
-        deviation: The standard deviation between like runs, pooled over both groups (Student, The
-            probable error of a mean, Biometrika 6, 1908); 0 where they agree but for rounding.
-        error: The standard error of `by`.
-        freedom: The degrees of freedom of `deviation`.
+        deviation: The standard deviation between like runs, pooled over both groups; 0 where they
+            agree but for rounding.
+        error: The standard error of `by`, from `deviation` or, in groups of unequal size, from that
+            of each by itself if that is more: so a few runs of a code that scatters are not judged
+            by the many of one that does not (B. L. Welch, The generalization of "Student's"
+            problem, Biometrika 34, 1947). A single run is taken to scatter as the other group does.
+        freedom: The degrees of freedom of `error`.
         split: How often runs that fall into two clusters by chance alone, whatever their figures,
             would be parted as these groups are: two of all ways to choose the runs of one group
             (R. A. Fisher, The Design of Experiments, 1935, section 21).
@@ -69,30 +72,36 @@ class _Apart(NamedTuple):
     by: float
     deviation: float
     error: float
-    freedom: int
+    freedom: float
     split: float
 
 
 def _apart(first: Sequence[float], other: Sequence[float]) -> _Apart | None:
     """None for one run each: then nothing tells how much like runs differ."""
-    freedom = len(first) + len(other) - 2
-    if freedom < 1 or not first or not other:
+    groups, free = (first, other), len(first) + len(other) - 2
+    if free < 1 or not first or not other:
         return None
-    means = [math.fsum(group) / len(group) for group in (first, other)]
-    groups = zip(means, (first, other), strict=True)
-    squares = math.fsum((each - mean) ** 2 for mean, group in groups for each in group)
+    means = [math.fsum(group) / len(group) for group in groups]
+    pairs = zip(means, groups, strict=True)
+    squares = [math.fsum((each - mean) ** 2 for each in group) for mean, group in pairs]
     dust = _DUST * max(map(abs, (*first, *other)))
-    by, deviation = means[1] - means[0], math.sqrt(squares / freedom)
+    by, deviation = means[1] - means[0], math.sqrt(sum(squares) / free)
     by, deviation = (0.0 if abs(each) <= dust else each for each in (by, deviation))
+    split = 2 / math.comb(free + 2, len(first))
     error = deviation * math.sqrt(1 / len(first) + 1 / len(other))
-    return _Apart(by, deviation, error, freedom, 2 / math.comb(freedom + 2, len(first)))
+    if not deviation or len(first) == len(other) or min(map(len, groups)) < 2:
+        return _Apart(by, deviation, error, free, split)
+    errors = [of / (len(group) - 1) / len(group) for of, group in zip(squares, groups, strict=True)]
+    parts = sum(of**2 / (len(group) - 1) for of, group in zip(errors, groups, strict=True))
+    error = max(error, math.sqrt(sum(errors)))
+    return _Apart(by, deviation, error, sum(errors) ** 2 / parts, split)
 
 
 def chance_of(first: Sequence[float], other: Sequence[float]) -> float | None:
     """How often two groups of like runs would lie as far apart as these: Student's t test.
 
-    Two-sided, with the pooled variance. 0 where like runs agree to the last digit and the groups do
-    not. None for one run each: then nothing tells how much like runs differ.
+    Two-sided. 0 where like runs agree to the last digit and the groups do not. None for one run
+    each: then nothing tells how much like runs differ.
     """
     apart = _apart(first, other)
     if apart is None:
@@ -100,7 +109,7 @@ def chance_of(first: Sequence[float], other: Sequence[float]) -> float | None:
     return chance_beyond(abs(apart.by), apart.error**2, apart.freedom) if apart.by else 1.0
 
 
-def chance_beyond(apart: float, variance: float, freedom: int) -> float:
+def chance_beyond(apart: float, variance: float, freedom: float) -> float:
     """How often chance alone makes a difference this large, of a known variance: Student's t.
 
     Args:
@@ -221,7 +230,8 @@ def _differs(
     apart, found = _apart(first, other), chance(first, other)
     if apart is None or found is None:
         return None
-    is_repeated = apart.split < (_MOST_SPLIT if apart.deviation else MOST_CHANCE)
+    is_repeated = min(len(first), len(other)) >= _LEAST_RUNS
+    is_repeated &= bool(apart.deviation) or apart.split < MOST_CHANCE
     if found < limit and is_repeated:
         return True
     if not apart.deviation:
@@ -235,11 +245,17 @@ def _so_many(figures: Sequence[float], runs: int) -> list[float]:
     return [figures[index % len(figures)] for index in range(max(runs, len(figures)))]
 
 
-def _student_tail(t: float, freedom: int) -> float:
-    """The chance of a greater |t|, for a whole number of degrees of freedom.
+def _student_tail(t: float, freedom: float) -> float:
+    """The chance of a greater |t|, for 1 degree of freedom or more.
 
-    M. Abramowitz, I. A. Stegun, Handbook of Mathematical Functions (1964), 26.7.3 and 26.7.4.
+    M. Abramowitz, I. A. Stegun, Handbook of Mathematical Functions (1964), 26.7.3 and 26.7.4;
+    between two whole numbers of degrees, for which those are, its logarithm is almost straight.
     """
+    part = freedom % 1 if freedom > 1 else 0.0  # rounding leaves a little less
+    if part:
+        few, more = (_student_tail(t, freedom - part + each) for each in (0, 1))
+        return few ** (1 - part) * more**part
+    freedom = max(1, int(freedom))
     angle = math.atan(t / math.sqrt(freedom))
     sine, square = math.sin(angle), math.cos(angle) ** 2
     odd = freedom % 2
@@ -252,8 +268,8 @@ def _student_tail(t: float, freedom: int) -> float:
     return max(0.0, 1 - inside)
 
 
-@cache
-def _student_quantile(freedom: int) -> float:
+@lru_cache(1000)
+def _student_quantile(freedom: float) -> float:
     """The |t| that chance exceeds in one case of ten."""
     low, high = 0.0, 10.0  # of one degree of freedom it is 6.3
     while high - low > 1e-9:

@@ -482,10 +482,16 @@ def schema_version(connection: sqlite3.Connection) -> int:
     # in the place of SQLite's own `pragma_user_version` a view of that name would be read.
     (tables,) = connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
     (application_id,) = connection.execute("PRAGMA application_id").fetchone()
+    _, _, file = connection.execute("PRAGMA database_list").fetchone()
     if application_id == APPLICATION_ID:
-        return int(connection.execute("PRAGMA user_version").fetchone()[0])
+        version = int(connection.execute("PRAGMA user_version").fetchone()[0])
+        if version < 0 or (version == 0 and tables):  # migrating would run what is there unseen
+            raise ForeignDatabaseError(
+                f"{file or 'the database'} has tables of schema {version}, which no version of "
+                "webots-mcp makes; choose another file"
+            )
+        return version
     if tables:
-        _, _, file = connection.execute("PRAGMA database_list").fetchone()
         raise ForeignDatabaseError(
             f"the SQLite database {file} belongs to another application (application_id "
             f"{application_id}, expected {APPLICATION_ID}); choose another file"

@@ -176,6 +176,15 @@ def test_nothing_of_an_older_version_is_run_to_bring_it_forward(tmp_path: Path) 
         assert other.execute("PRAGMA user_version").fetchone() == (3,)
 
 
+@pytest.mark.parametrize("version", [-5, 0])
+def test_nothing_is_run_to_migrate_a_version_that_was_never_made(file: Path, version: int) -> None:
+    change(file, *HOSTILE["view 'robot'"], "UPDATE alembic_version SET version_num = '0003'")
+    change(file, f"PRAGMA user_version = {version}")
+    for ask in (lambda: upgrade(file), lambda: connect(file, "loop", create=True)):
+        with pytest.raises(ForeignDatabaseError, match=f"tables of schema {version}, which no"):
+            ask()
+
+
 def spaced(sql: str) -> str:
     return sql.replace(", \n\t", ",").replace("CREATE TABLE lease", 'CREATE  TABLE "lease"')
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.bridge.conftest import Recording, eager
+from tests.bridge.conftest import Recording, eager, heartbeat_now
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import control
 from webots_mcp.connection import connect
@@ -36,6 +36,8 @@ def test_a_session_that_was_judged_dead_leaves_commands_to_its_living_successor(
     bridge.register_command("dance", ran.append)
     write(recording, "UPDATE session SET ended_wall_time_s = 1, end_reason = 'crashed'")
     write(recording, SUCCESSOR)
+    heartbeat_now(bridge)
+    assert recording.rows("SELECT end_reason FROM session ORDER BY id") == ["crashed", None]
     sent = recording.send("dance")
     eager(bridge)
     assert (ran, recording.fate(sent)[0]) == ([], "pending")
@@ -43,6 +45,20 @@ def test_a_session_that_was_judged_dead_leaves_commands_to_its_living_successor(
     write(recording, "UPDATE session SET ended_wall_time_s = 2 WHERE pid = 4242")
     eager(bridge)
     assert (len(ran), recording.fate(sent)[0]) == (1, "done")
+    bridge.close()
+
+
+def test_a_command_that_was_judged_lost_stays_lost(
+    robot: InProcessSupervisor, recording: Recording, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bridge = MCPBridge(robot, database=recording.database)
+    bridge.register_command(
+        "dance", lambda _: write(recording, "UPDATE command SET status = 'lost'")
+    )
+    sent = recording.send("dance")
+    eager(bridge)
+    assert recording.fate(sent)[0] == "lost"
+    assert "was judged lost before it was done" in capsys.readouterr().err
     bridge.close()
 
 

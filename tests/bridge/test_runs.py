@@ -32,6 +32,17 @@ def test_a_reset_by_the_controller_begins_a_new_run_and_ends_the_old_one(
     assert recording.rows("SELECT count(*) FROM state GROUP BY run_id") == [10, 3]
 
 
+def test_what_the_first_state_of_a_run_holds_is_no_change_from_the_run_before(
+    robot: InProcessSupervisor, bridge: MCPBridge, recording: Recording
+) -> None:
+    for mode in ("cruise", "turn"):
+        for _ in range(2):
+            robot.step(STEP_MS)
+            bridge.publish({"mode": mode})
+        robot.simulationReset()
+    assert recording.rows("SELECT count(*) FROM event WHERE kind = 'change'") == [0]
+
+
 @pytest.mark.parametrize("attached", [False, True])
 def test_like_runs_are_recorded_at_like_times_whenever_the_reset_came(
     robot: InProcessSupervisor, recording: Recording, attached: bool

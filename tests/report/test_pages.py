@@ -19,7 +19,7 @@ from tests.recordings.rows import Recorded
 from tests.report.conftest import Shown
 from webots_mcp.errors import InvalidInputError, UnknownRunError, UnknownSignalError
 from webots_mcp.report import Report, make_report
-from webots_mcp.report.words import number
+from webots_mcp.report.words import cut, length, number
 from webots_mcp.store.questions.compare import compare_runs
 
 EVIL = "</script><script>window.harmed = true</script><img src=x onerror=alert(1)>"
@@ -33,6 +33,13 @@ def test_it_tells_what_ran_as_it_was_recorded(page: Shown, recording: sqlite3.Co
     assert "Run 2 of rover" in page.text
     assert sha256 is None or sha256 in page.text
     assert versions in page.text
+
+
+def test_durations_and_cut_texts_are_told_in_words() -> None:
+    told = [length(duration_s) for duration_s in (119.5, 120.0, 7199.0, 7500.0)]
+    assert told == ["120 s", "2 min 0 s", "119 min 59 s", "2 h 5 min"]
+    assert cut("abcde", 5) == "abcde"
+    assert cut("abcdef", 5) == "abcde … (6 characters)"
 
 
 def test_it_tells_events_with_the_seconds_around_them(page: Shown) -> None:

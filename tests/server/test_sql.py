@@ -157,7 +157,7 @@ async def test_a_trick_is_refused_with_a_reason_and_changes_nothing(
                     tasks.start_soon(play, trick)
         assert (await ask(client, "webots_query_sql", sql="SELECT 1"))["result"]["rows"] == [[1]]
     for trick, answer in answers.items():
-        said = text_of(answer).removeprefix("Error executing tool webots_query_sql").strip()
+        said = text_of(answer).removeprefix("Error executing tool webots_query_sql").strip(": ")
         assert said and len(said) < 8000, trick
         assert answer.is_error or trick in TOO_MUCH, (trick, said)
     assert recording.read_bytes() == before

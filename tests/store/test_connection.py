@@ -127,6 +127,16 @@ def test_a_file_that_is_no_database_is_damage_and_not_busy(tmp_path: Path) -> No
     assert not is_busy(refused.value)
 
 
+def test_a_reader_writes_nothing(tmp_path: Path) -> None:
+    file = tmp_path / "webots.db"
+    with closing(connect(file, "writer", create=True)) as connection:
+        create_schema(connection)
+    with closing(connect(file, "reader")) as reader:
+        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+            reader.execute(LEASE, ("a",))
+        assert reader.execute(COUNT).fetchone() == (0,)
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="modes of POSIX")
 def test_what_is_made_is_its_owners_alone_and_what_was_there_keeps_its_mode(tmp_path: Path) -> None:
     file = tmp_path / "project" / "mcp_data" / "webots.db"

@@ -102,7 +102,9 @@ def test_parameters_that_are_no_json_are_refused(
 def test_parameters_beyond_the_limit_are_refused(recorded: Recorded) -> None:
     robot = recorded.robot()
     with pytest.raises(InvalidInputError, match="at most 65536"):
-        CommandQueue(recorded.connection).enqueue(robot.id, "go", {"x": "y" * MAX_PARAMS_BYTES})
+        CommandQueue(recorded.connection).enqueue(
+            robot.id, "go", {"x": "ü" * (MAX_PARAMS_BYTES // 2)}
+        )
 
 
 def test_a_cancelled_command_is_never_claimed(recorded: Recorded) -> None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from pathlib import Path
 
+import pytest
+
 from tests.recordings.rows import Recorded, RecordedRobot, insert
 from webots_mcp.adoption import adopt
+from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S
 from webots_mcp.entries import FORMAT
+from webots_mcp.liveness import process_identity
 from webots_mcp.settlement import settle
 
 STATUS = "SELECT status FROM command"
@@ -23,18 +28,20 @@ def claimed(robot: RecordedRobot) -> None:
     })  # fmt: skip
 
 
+def leave_waiting(database: Path, entry: list[object]) -> None:
+    """As the session of the UUID `u` does that the database could not take a row of."""
+    lines = [{"webots_mcp_waiting": FORMAT, "robot": {}, "session": {"uuid": "u"}}, entry]
+    file = Path(f"{database}-waiting-u.jsonl")
+    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
 def test_a_command_is_not_lost_while_its_result_waits_beside_the_database(
     recorded: Recorded,
 ) -> None:
     assert isinstance(recorded.database, Path)
     claimed(recorded.robot(uuid="u", pid=NOBODY))
     done = {"now": 1.0, "sim_time": 1.0, "command": 1, "status": "done", "result": "7"}
-    lines = [
-        {"webots_mcp_waiting": FORMAT, "robot": {}, "session": {"uuid": "u"}},
-        [1, "command finished", None, done | {"error": None}],
-    ]
-    file = Path(f"{recorded.database}-waiting-u.jsonl")
-    file.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    leave_waiting(recorded.database, [1, "command finished", None, done | {"error": None}])
     settle(recorded.connection, time.time())
     assert recorded.connection.execute(STATUS).fetchone() == ("claimed",)
     adopt(recorded.connection, recorded.database)
@@ -46,6 +53,36 @@ def test_a_command_of_a_dead_process_is_lost_where_nothing_waits(recorded: Recor
     claimed(recorded.robot(uuid="u", pid=NOBODY))
     settle(recorded.connection, time.time())
     assert recorded.connection.execute(STATUS).fetchone() == ("lost",)
+
+
+def test_a_reload_is_lost_where_no_session_has_confirmed_it_for_a_minute(
+    recorded: Recorded,
+) -> None:
+    claimed(recorded.robot(uuid="u", pid=NOBODY))
+    now_s = time.time()
+    sql = "UPDATE command SET action = 'reload', issued_wall_time_s = ?"
+    recorded.connection.execute(sql, (now_s,))
+    for after_s, status in ((1, "claimed"), (ISSUED_TIME_TO_LIVE_S + 1, "lost")):
+        settle(recorded.connection, now_s + after_s)
+        assert recorded.connection.execute(STATUS).fetchone() == (status,)
+
+
+def test_rows_that_are_adopted_after_a_crash_are_counted(recorded: Recorded) -> None:
+    assert isinstance(recorded.database, Path)
+    robot = recorded.robot(uuid="u", pid=NOBODY)
+    robot.state(1.0, {"n": 1})
+    settle(recorded.connection, time.time())
+    recorded.connection.execute("UPDATE run SET uuid = 'r'")
+    leave_waiting(recorded.database, [1, "state", "r", [2.0, time.time(), "{}", None]])
+    assert adopt(recorded.connection, recorded.database) == 1
+    assert recorded.connection.execute("SELECT rows FROM run").fetchone() == (2,)
+
+
+@pytest.mark.skipif(process_identity(os.getpid()) is None, reason="needs the system's word")
+def test_a_living_process_that_got_the_pid_of_a_dead_one_is_not_it(recorded: Recorded) -> None:
+    recorded.robot(pid=os.getpid(), process="another start of the machine 7")
+    settle(recorded.connection, time.time())
+    assert recorded.connection.execute("SELECT end_reason FROM session").fetchone() == ("crashed",)
 
 
 def test_rows_of_a_crashed_run_are_counted_by_no_statement_that_writes(recorded: Recorded) -> None:

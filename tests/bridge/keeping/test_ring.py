@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.bridge.conftest import STEP_MS, Recording
@@ -105,6 +105,7 @@ def test_what_the_controller_changes_after_its_call_does_not_change_what_is_kept
 
 
 @given(rows=rows, most_bytes=st.integers(0, 20_000), last_s=st.floats(0.1, 10))
+@example(rows=[(1.0, "a"), (1.0, "b")], most_bytes=20_000, last_s=1.0)
 def test_a_ring_never_takes_more_memory_or_time_than_it_may_and_holds_the_newest(
     rows: list[tuple[float, str | bytes]], most_bytes: int, last_s: float
 ) -> None:

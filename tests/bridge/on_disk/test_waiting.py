@@ -24,6 +24,7 @@ from tests.bridge.conftest import (
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
 from webots_mcp.bridge.row_writer import RowWriter
+from webots_mcp.entries import Entry, WaitingFile
 from webots_mcp.standin import InProcessSupervisor
 
 
@@ -110,6 +111,24 @@ def test_where_the_file_takes_nothing_rows_wait_in_memory_and_are_counted(
     catch_up(bridge)
     assert numbers(filed) == [0, 1]
     assert bridge.stats().rows_dropped == 0
+
+
+@POSIX
+def test_a_row_of_which_the_disk_took_a_part_is_not_in_the_file(tmp_path: Path) -> None:
+    import resource
+
+    file = WaitingFile(tmp_path / "waiting", lambda: {})
+    file.append([Entry(1, "log", None, ("whole",))])
+    size = file.path.stat().st_size
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size + 5, limits[1]))
+    try:
+        with pytest.raises(OSError, match="the disk is full"):
+            file.append([Entry(2, "log", None, ("cut",))])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert file.path.stat().st_size == size
+    file.close(remove=True)
 
 
 def test_rows_that_began_to_wait_in_memory_go_to_the_file_once_it_takes_them(

@@ -165,20 +165,21 @@ def test_values_that_wait_for_the_reset_come_with_it_and_stay(
     robot.simulationReset()
     drive(2)
     assert (kp.value, ki.value) == (5.0, 1.0)
+    ask(recording, bridge, values={"ki": 2.0})
     robot.simulationReset()
     drive(2)
-    assert (kp.value, ki.value) == (5.0, 1.0)
+    assert (kp.value, ki.value) == (5.0, 2.0)
     assert recording.rows("SELECT next_value FROM parameter ORDER BY id") == [None, None]
     assert recording.rows(VALUES)[2:] == [
         (2, "kp", "5.0", 0, "trial", 2),
         (2, "ki", "1.0", 0, "trial", 2),
+        (2, "ki", "2.0", 0, "command", 3),
         (3, "kp", "5.0", 0, "trial", 2),
-        (3, "ki", "1.0", 0, "trial", 2),
+        (3, "ki", "2.0", 0, "command", 3),
     ]
-    assert (
-        recording.rows("SELECT sim_time_s FROM parameter_value WHERE run_id = 2")
-        == [pytest.approx(0.016)] * 2
-    )
+    assert recording.rows(
+        "SELECT sim_time_s FROM parameter_value WHERE run_id = 2 ORDER BY id"
+    ) == [pytest.approx(time_s) for time_s in (0.016, 0.016, 0.032)]
 
 
 def test_a_reset_finds_the_new_values_when_its_callbacks_run(

@@ -79,6 +79,16 @@ def test_a_lidar_that_dies_is_silent_once(empty: sqlite3.Connection, tier: str) 
     assert (event.start_s, event.end_s) == (60.0, pytest.approx(119.9))
 
 
+def test_a_silence_that_is_exactly_as_long_as_asked_for_is_told(
+    empty: sqlite3.Connection, tier: str
+) -> None:
+    record(empty, lambda t: {"front": None if 20 <= t <= 20.5 else range_m(t), "x": t})
+    options = EventOptions(kinds=("silent",), silent_s=0.5)
+    for scope in (Scope(), Scope(start_s=20.5, end_s=40.0)):  # its end is the range's first row
+        found = find_events(empty, find_range(empty, scope), options)
+        assert told(found) == [("front", 20.0, 20.5)]
+
+
 def test_an_array_that_crosses_16_items_is_not_silent(empty: sqlite3.Connection, tier: str) -> None:
     record(empty, lambda t: {"hits": [range_m(t)] * (14 if t % 40 < 20 else 20)})
     assert told(ask(empty, "silent")) == []

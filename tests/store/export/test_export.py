@@ -222,6 +222,12 @@ def test_columns_come_in_the_order_in_which_they_first_appear(recorder: Recorder
     assert header == ",".join([*HEAD, "z", "a.y", "a.b", "new"])
 
 
+def test_a_column_has_the_kind_of_its_first_value_that_is_there(recorder: Recorder) -> None:
+    for number, x in enumerate((None, 1.5, 2)):
+        recorder.publish(float(number), {"x": x})
+    assert parquet(recorder.connection).to_pydict()["x"] == [None, 1.5, 2.0]
+
+
 def test_cells_that_a_spreadsheet_would_run_are_made_harmless_on_request(
     recorder: Recorder,
 ) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import itertools
 import sqlite3
+import sys
 from collections.abc import Iterator
+from functools import partial
 
 import pytest
 
@@ -14,7 +16,7 @@ from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.detection.verdict import Ledger, Verdicts
-from webots_mcp.store.questions.series import query_history
+from webots_mcp.store.questions.series import RunHistory, query_history
 from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.changes import change_points
 from webots_mcp.store.reading.deadline import Deadline
@@ -150,6 +152,26 @@ def test_who_had_no_time_at_all_says_so_of_text_as_of_numbers(
         assert (history.rows, trend.rows) == (0, 0)
         assert trend.silent == (), "nobody has looked"
         assert not any(each.points or each.time_by_value_s for each in history.changes)
+
+
+def test_no_mode_is_told_behind_the_end_of_the_numbers_beside_it(
+    unsummed: sqlite3.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = find_range(unsummed, Scope())
+    ends_s = set[float]()
+    for looks in SOME[::4]:
+        for question in (query_history, trends):
+            with monkeypatch.context() as patch:
+                counted = partial(Deadline, clock=itertools.count().__next__)
+                patch.setattr(sys.modules[question.__module__], "Deadline", counted)
+                (run,) = question(unsummed, whole, ["mode", "x"], deadline_s=looks).runs
+            end_s = run.cut_at_s
+            if end_s is None:
+                continue
+            ends_s.add(end_s)
+            states = run.changes if isinstance(run, RunHistory) else run.states
+            assert all(sum(each.time_by_value_s.values()) <= end_s + 1e-6 for each in states)
+    assert len(ends_s) > 2
 
 
 def test_a_page_without_a_row_for_which_the_time_was_over_is_no_last_page(

@@ -181,6 +181,7 @@ def _run_history(
     for_states = deadline.part(STATES_SHARE) if numbers else deadline
     changes = change_points(connection, segment, states, for_states)
     table = tabulate(connection, segment, numbers, max_points, deadline, least_step_s)
+    changes = changes.cut(table.cut_at_s)
     cuts_s = [each for each in (table.cut_at_s, changes.unread_from_s) if each is not None]
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
     return RunHistory(

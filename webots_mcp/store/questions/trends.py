@@ -15,7 +15,7 @@ from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_number
 from webots_mcp.store.analysis.swings import SHORTEST_PERIOD_ROWS
 from webots_mcp.store.questions.series import STATES_SHARE
 from webots_mcp.store.questions.trend import Trend, judge
-from webots_mcp.store.reading.changes import change_points
+from webots_mcp.store.reading.changes import Changes, change_points
 from webots_mcp.store.reading.coverage import purged_until_s
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
 from webots_mcp.store.reading.ranges import Segment, TimeRange, recorded_bounds
@@ -135,7 +135,7 @@ def _run_trends(
     states = [signal for signal in signals if signal not in numbers]
     found: list[Trend | None]
     for_states = deadline.part(STATES_SHARE) if numbers else deadline
-    told, states_cut_s = _state_trends(connection, segment, states, for_states)
+    changes = change_points(connection, segment, states, for_states)
     purged_s = purged_until_s(connection, segment.run_id, segment.start_s)
     rows_left = purged_s is None or purged_s < segment.end_s
     if exceeds(connection, segment):
@@ -163,7 +163,8 @@ def _run_trends(
         if trend is None and (has_value or numbers_cut_s is None)
     ]
     kept_cut_s = None if kept is None else kept.cut_at_s
-    cuts_s = [e for e in (numbers_cut_s, kept_cut_s, states_cut_s) if e is not None]
+    changes = changes.cut(numbers_cut_s)
+    cuts_s = [e for e in (numbers_cut_s, kept_cut_s, changes.unread_from_s) if e is not None]
     return RunTrends(
         run_id=segment.run_id,
         start_s=segment.start_s,
@@ -171,7 +172,7 @@ def _run_trends(
         resolution_s=resolution_s,
         rows=rows,
         numbers=tuple(held[:limit]),
-        states=told,
+        states=_state_trends(connection, changes, states),
         silent=tuple(silent),
         total=len(held),
         cut_at_s=min(cuts_s, default=None),
@@ -219,16 +220,10 @@ def _trend_of_pieces(
 
 
 def _state_trends(
-    connection: sqlite3.Connection,
-    segment: Segment,
-    states: Sequence[Signal],
-    deadline: Deadline,
-) -> tuple[tuple[StateTrend, ...], float | None]:
-    """Text, flags and numbers that name a mode, those that changed most often first.
-
-    And from where on they were not read; None where they all were.
-    """
-    found = change_points(connection, segment, states, deadline)
+    connection: sqlite3.Connection, found: Changes, states: Sequence[Signal]
+) -> tuple[StateTrend, ...]:
+    """Text, flags and numbers that name a mode, those that changed most often first."""
+    segment = found.segment
     bounds = recorded_bounds(connection, segment.run_id) or (segment.start_s, segment.end_s)
     end_s = min(segment.end_s, bounds[1])
     told = [
@@ -244,4 +239,4 @@ def _state_trends(
         if (points := found.points[signal.name])
         for is_open in [len(points) == 1 and signal.name in found.since_before]
     ]
-    return tuple(sorted(told, key=lambda state: -state.changes)), found.unread_from_s
+    return tuple(sorted(told, key=lambda state: -state.changes))

@@ -75,6 +75,13 @@ class Changes:
         """How far before `end_s` the values are known."""
         return end_s if self.unread_from_s is None else min(end_s, self.unread_from_s)
 
+    def cut(self, unread_from_s: float | None) -> Changes:
+        """Those of them that were read up to there, for an answer that ends there."""
+        if unread_from_s is None or self.read_to_s(unread_from_s) < unread_from_s:
+            return self
+        points = {name: _until(each, unread_from_s) for name, each in self.points.items()}
+        return replace(self, points=points, unread_from_s=unread_from_s)
+
     def longest_values(self, name: str, end_s: float) -> dict[str, float]:
         """Seconds in each value up to `end_s`, of what was read; see `longest_values`."""
         return longest_values(self.points[name], self.segment.start_s, self.read_to_s(end_s))

@@ -107,6 +107,7 @@ def test_what_scores_do_not_see_of_their_runs_is_told_once_for_runs_that_are_ali
         f"scores of run 2, 3: {between}",
         f"scores of run 4: {between}; what only kept stretches have is in no score",
     ]
+    assert unseen(empty, [2, 3]) == [f"scores: {between}"]
 
 
 @pytest.mark.parametrize(

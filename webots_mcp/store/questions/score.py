@@ -105,13 +105,17 @@ def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> lis
     Rows that only a kept stretch has are in none, so that runs are judged by equally many.
     """
     alike: dict[str, list[str]] = {}
-    for run_id in filter(None, run_ids):
+    scored = list(filter(None, run_ids))
+    for run_id in scored:
         kept = len(kept_parts(connection, run_id, -math.inf, math.inf))
         told = [unrecorded(connection, run_id)]
         told += ["what only kept stretches have is in no score"] if kept else []
         if said := "; ".join(filter(None, told)):
             alike.setdefault(said, []).append(str(run_id))
-    return [f"scores of run {listed(runs)}: {said}" for said, runs in alike.items()]
+    return [
+        f"scores: {said}" if len(runs) == len(scored) else f"scores of run {listed(runs)}: {said}"
+        for said, runs in alike.items()
+    ]
 
 
 def _scored(

@@ -329,7 +329,7 @@ def _standing(
     runs = [each.run_id for each in trials if each.is_over and each.run_id is not None]
     if found.robot_id is None or not runs:
         return []
-    robot, deadline = robot_name(connection, found.robot_id), Deadline(_STANDING_DEADLINE_S)
+    robot, deadline = f"robot {found.robot_id}", Deadline(_STANDING_DEADLINE_S)
     stood = 0
     for run_id in runs:
         way = way_of_run(connection, Subject(found.robot_id, robot, run_id), deadline)

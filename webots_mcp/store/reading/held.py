@@ -141,7 +141,8 @@ def recorded_share(connection: sqlite3.Connection, run_id: int) -> str:
 
 def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
     """What of the published states is not in a run's rows; None where all of them are."""
-    interval, dropped = connection.execute(_RECORDED, (run_id,)).fetchone()
+    row = connection.execute(_RECORDED, (run_id,)).fetchone()
+    interval, dropped = row or (None, False)  # of a robot that cannot be read nothing is known
     if interval == 1:
         return "rows were dropped, so what they held is not seen" if dropped else None
     share = f"one publish() call in {interval} is a row" if interval else "rows may be fewer"

@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.plotting.conftest import Record, whole
+from tests.recordings.rover import WALL_START_S
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.plotting.canvas import MOST_PANELS, Sheet
 from webots_mcp.plotting.curves import Curve
@@ -281,3 +282,14 @@ def test_what_is_too_far_to_tell_a_distance_to_is_no_place(record: Record) -> No
     (track,) = axes.tracks
     assert len(track.path.places) == 90
     assert len(headings(track.path, 5)) == 5
+
+
+def test_events_beyond_those_that_are_drawn_are_counted(record: Record) -> None:
+    connection = record(lambda t: {"n": t})
+    connection.executemany(
+        "INSERT INTO log (run_id, sim_time_s, wall_time_s, level, source, message) "
+        "VALUES (1, ?, ?, 'warning', 'controller', 'hot')",
+        [(i * 0.01, WALL_START_S + i * 0.005) for i in range(510)],
+    )
+    _, notes = compose_signals(connection, [whole(connection)], ["n"])
+    assert "10 events of kind log up to 0.090 s are not drawn" in notes

@@ -41,7 +41,9 @@ def event_lanes(
     notes += _not_looked_for(found.verdicts)
     if found.left_out:
         kind, rest = max(found.left_out.items(), key=lambda item: item[1].count)
-        notes.append(f"{rest.count} events of kind {kind} up to {rest.last_s:.3f} s are not drawn")
+        notes.append(
+            f"{rest.count} events of kind {kind} up to {rest.last.start_s:.3f} s are not drawn"
+        )
     if left_out := kinds[most:]:
         notes.append(f"events left out: {', '.join(left_out)}")
     return lanes, notes

@@ -36,7 +36,7 @@ from webots_mcp.connection import together
 from webots_mcp.contract import Database
 from webots_mcp.entries import Kind, Values, WaitingFile, waiting_path
 
-_LOCK_PATIENCE_S: Final = 0.02  # with another thread of this process that catches up just now
+_LOCK_PATIENCE_S: Final = 0.001  # with another thread of this process that catches up just now
 
 Result = TypeVar("Result")
 

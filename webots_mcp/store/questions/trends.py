@@ -156,7 +156,8 @@ def _run_trends(
         found = [_trend_of_rows(signal, read, kept) for signal in numbers]
         has_values = [not np.isnan(read.values[signal.name]).all() for signal in numbers]
         rows, resolution_s, numbers_cut_s = len(read.times), None, read.cut_at_s
-    held = sorted((trend for trend in found if trend), key=lambda trend: -trend.change)
+    # Sums differ in their last digits from one processor to the next, and the order must not.
+    held = sorted((trend for trend in found if trend), key=lambda trend: -round(trend.change, 9))
     silent = [
         f"{signal.name} ({TOO_LARGE})" if has_value else signal.name
         for signal, trend, has_value in zip(numbers, found, has_values, strict=True)

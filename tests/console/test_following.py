@@ -58,7 +58,7 @@ def messages(recorded: Recorded, source: str | None = None) -> list[str]:
 
 
 def until(condition: Callable[[], bool]) -> None:
-    last_s = time.monotonic() + 15
+    last_s = time.monotonic() + 90  # on a slow machine who waits for a lease looks seldom
     while not condition():
         assert time.monotonic() < last_s, "it did not come about"
         time.sleep(0.02)

@@ -17,7 +17,7 @@ from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
 from webots_mcp.cli import COMMANDS
 from webots_mcp.connection import OLDEST_SQLITE
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
-from webots_mcp.origin import SCHEMA_FILE
+from webots_mcp.schema import SCHEMA_FILE
 from webots_mcp.server import create_server
 from webots_mcp.server.budget import LARGE_BUDGET
 from webots_mcp.server.parameters import MAX_WAIT_S

@@ -10,7 +10,7 @@ import pytest
 from docs import reference
 from webots_mcp import MemoryDatabase
 from webots_mcp.cli import COMMANDS
-from webots_mcp.origin import SCHEMA_FILE
+from webots_mcp.schema import SCHEMA_FILE
 from webots_mcp.server import create_server
 
 

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO, Final, NamedTuple
 
-from webots_mcp.connection import together
 from webots_mcp.entries import (
     STATEMENTS,
     Entry,
@@ -26,8 +25,8 @@ from webots_mcp.entries import (
     read_header,
     waiting_paths,
 )
-from webots_mcp.errors import SessionGoneError
-from webots_mcp.notice import warn
+from webots_mcp.errors import SessionGoneError, warn
+from webots_mcp.transactions import in_transaction
 
 _PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
 
@@ -126,7 +125,7 @@ def take_in(connection: sqlite3.Connection, session_id: int, piece: Sequence[Ent
         connection.execute(_SET_ADOPTED, (taken.number, session_id))
         return taken
 
-    return together(connection, act)
+    return in_transaction(connection, act)
 
 
 def _write(connection: sqlite3.Connection, session_id: int, entry: Entry) -> str | None:
@@ -223,7 +222,7 @@ def _session(connection: sqlite3.Connection, header: dict[str, Any]) -> int:
         )
         return enter_session(connection, robot_id, header["session"])
 
-    return together(connection, act)
+    return in_transaction(connection, act)
 
 
 def enter_robot(connection: sqlite3.Connection, robot: dict[str, Any], now_s: float) -> int:

@@ -54,6 +54,8 @@ _LEVEL_ALIASES: Final[dict[str, LogLevel]] = {
 PAUSED: Final = "paused"  # what a command does to the loop, as the column session.hold tells it
 STEPPING: Final = "stepping"
 
+_PACKAGE: Final = Path(__file__).parent
+
 
 class BuiltInAction(NamedTuple):
     """What has to be known of an action that every bridge has, before it is run.
@@ -240,6 +242,18 @@ def full_path(path: str | os.PathLike[str]) -> Path:
         return Path(path).expanduser().resolve()
     except (RuntimeError, ValueError) as error:
         raise OSError(f"{str(path)!r} cannot be followed: {error}; give the full path") from error
+
+
+def bundled(name: str) -> Path:
+    """The folder `name` (migrations, examples): in the package in a wheel, beside it in a checkout.
+
+    Raises:
+        FileNotFoundError: It is in neither place; the installation is broken.
+    """
+    for folder in (_PACKAGE / name, _PACKAGE.parent / name):
+        if folder.is_dir():
+            return folder
+    raise FileNotFoundError(f"{name}/ is missing: install webots-mcp again")
 
 
 class DataFolder(NamedTuple):

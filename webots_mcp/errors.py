@@ -31,7 +31,15 @@ of its own.
             └── ControllerEndedError
 
 Each message names the value that was wrong and the next step to take.
+
+What keeps nobody from going on is no error: `warn` says it in a line on stderr.
+
+Standard library only, because the bridge imports it inside a robot's controller.
 """
+
+from __future__ import annotations
+
+import sys
 
 
 class WebotsMCPError(Exception):
@@ -136,3 +144,16 @@ class InterruptedCommandError(CommandRefusedError):
 
 class ControllerEndedError(InterruptedCommandError):
     """The controller, or its bridge, ended while a command was under way."""
+
+
+def warn(text: str) -> None:
+    """Write a line for whoever runs the controller or the server.
+
+    A stderr that is full, closed or (under pythonw) not there costs the line, nothing else.
+    """
+    if sys.stderr is None:  # pyright: ignore[reportUnnecessaryComparison]
+        return
+    try:
+        print(f"webots-mcp: {text}", file=sys.stderr, flush=True)  # noqa: T201
+    except (OSError, ValueError):
+        return

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.connection import transaction
 from webots_mcp.console.lines import said
 from webots_mcp.contract import (
     WORLD_ENDING,
@@ -22,6 +21,7 @@ from webots_mcp.setup.project import controllers_in, has_bridge
 from webots_mcp.store.beginnings import Beginning, beginnings, newest_session
 from webots_mcp.store.console import ConsoleRows
 from webots_mcp.store.recording import Recording
+from webots_mcp.transactions import transaction
 from webots_mcp.webots.command_line import Start
 from webots_mcp.webots.launched import LaunchedWebots, Show
 from webots_mcp.webots.stream import Address, ConsoleLine, address_of

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from tests import unprivileged
-from webots_mcp.bundled import bundled
+from webots_mcp.contract import bundled
 
 CONTROLLER = "from controller import Robot\n\nrobot = Robot()\nwhile robot.step(32) != -1: pass\n"
 WRITTEN = [".mcp.json", ".cursor/mcp.json", ".vscode/mcp.json", "mcp_data/.gitignore"]

@@ -15,7 +15,7 @@ from webots_mcp.cli import main
 from webots_mcp.connection import Role, connect, keep_deadline
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import DatabaseError, ForeignDatabaseError
-from webots_mcp.origin import shipped_objects
+from webots_mcp.schema import shipped_objects
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.merging import merge
 from webots_mcp.store.migrate import downgrade, upgrade

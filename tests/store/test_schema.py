@@ -20,7 +20,7 @@ from sqlalchemy.dialects import postgresql
 from sqlalchemy.schema import CreateIndex, CreateTable
 from sqlmodel import SQLModel
 
-from webots_mcp.bundled import bundled
+from webots_mcp.contract import bundled
 from webots_mcp.store import models
 from webots_mcp.store.migrate import upgrade
 

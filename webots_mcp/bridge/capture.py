@@ -21,7 +21,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final
 
 from webots_mcp.bridge.printed_lines import PrintedLines
-from webots_mcp.notice import warn
+from webots_mcp.errors import warn
 
 _DESCRIPTORS: Final = {"stdout": 1, "stderr": 2}
 _PIPE_BYTES: Final = 1 << 20

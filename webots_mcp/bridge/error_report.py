@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from webots_mcp.bridge.text import describe
-from webots_mcp.errors import DatabaseError
-from webots_mcp.notice import warn
+from webots_mcp.errors import DatabaseError, warn
 
 _MOST_CHARACTERS = 2000
 

@@ -32,9 +32,9 @@ from webots_mcp.bridge.row_counts import RowCounts
 from webots_mcp.bridge.row_writer import RowWriter
 from webots_mcp.bridge.run import Run
 from webots_mcp.bridge.session_connection import SessionConnection, patiently
-from webots_mcp.connection import together
 from webots_mcp.contract import Database
 from webots_mcp.entries import Kind, Values, WaitingFile, waiting_path
+from webots_mcp.transactions import in_transaction
 
 _LOCK_PATIENCE_S: Final = 0.001  # with another thread of this process that catches up just now
 
@@ -151,7 +151,9 @@ class Recorder:
         status = RecordingStatus(self.rows_waiting, self.counts.dropped, self.errors.last_error)
         ids = (registration.session_id, run)
         patiently(
-            lambda: together(connection, lambda: write_heartbeat(connection, loop, status, *ids))
+            lambda: in_transaction(
+                connection, lambda: write_heartbeat(connection, loop, status, *ids)
+            )
         )
 
     def update_actions(self) -> None:

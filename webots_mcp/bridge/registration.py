@@ -11,9 +11,9 @@ from typing import Any, Final, NamedTuple
 from webots_mcp import settlement
 from webots_mcp.adoption import enter_robot, enter_session
 from webots_mcp.bridge.identity import Identity
-from webots_mcp.connection import transaction
 from webots_mcp.contract import PAUSED, REMOTE_SILENCE_S
 from webots_mcp.liveness import process_alive
+from webots_mcp.transactions import transaction
 
 _OPEN_SESSIONS: Final = (
     "SELECT s.id, s.pid, s.process, s.host, s.last_seen_wall_time_s FROM session s "

@@ -13,8 +13,8 @@ from webots_mcp.bridge.recovery import Recovery
 from webots_mcp.bridge.row_counts import RowCounts
 from webots_mcp.bridge.run import Run
 from webots_mcp.bridge.session_connection import SessionConnection, patiently
-from webots_mcp.connection import roll_back, together
 from webots_mcp.entries import STATEMENTS, Kind, Values, bind
+from webots_mcp.transactions import in_transaction, roll_back
 
 _CATCH_UP_S: Final = 0.002  # a loop that catches up must not stall over it
 
@@ -64,7 +64,7 @@ class RowWriter:
         bound = [bind(run.id, registration.session_id, values) for values in rows]
         try:
             patiently(
-                lambda: together(
+                lambda: in_transaction(
                     connection, lambda: connection.executemany(STATEMENTS[kind], bound)
                 )
             )

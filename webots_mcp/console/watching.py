@@ -7,7 +7,7 @@ from typing import Final
 
 from webots_mcp.belonging import webots_of
 from webots_mcp.console.following import ConsoleFollower
-from webots_mcp.notice import warn
+from webots_mcp.errors import warn
 from webots_mcp.store.recording import Recording
 
 _FIRST_LOOK_S: Final = 1.0  # a server that has just started has answers to give

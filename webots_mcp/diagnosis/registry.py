@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.connection import is_damage, text_of
 from webots_mcp.contract import PROJECT_DATA_FOLDER, full_path
 from webots_mcp.diagnosis import (
     clients,
@@ -21,6 +20,7 @@ from webots_mcp.diagnosis import (
 from webots_mcp.diagnosis.finding import Check, Checked, Finding, Subject
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.store.recording import Recording
+from webots_mcp.transactions import is_damage, text_of
 
 CHECKS: Final = (
     Check("Python", machine.python),

@@ -20,7 +20,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.connection import transaction
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.errors import PoolError
 from webots_mcp.liveness import process_alive
@@ -32,6 +31,7 @@ from webots_mcp.pool.target import Pool, PooledRun, is_whole
 from webots_mcp.store.bundle import small_recording
 from webots_mcp.store.images import PICTURES
 from webots_mcp.store.merging import merge
+from webots_mcp.transactions import transaction
 
 _FOLDER: Final = ".fetch-"
 _MOST_RUNS: Final = 100  # that are written into one small recording,

@@ -11,7 +11,7 @@ from controller.robot import Robot
 from controller.supervisor import Supervisor
 from controller.wire import Message
 
-from webots_mcp.bundled import bundled
+from webots_mcp.contract import bundled
 from webots_mcp.standin.answers import answer, description, step_over
 from webots_mcp.standin.errors import (
     ControllerEndedError,

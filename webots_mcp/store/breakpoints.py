@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import Final
 
 from webots_mcp.conditions import Condition
-from webots_mcp.connection import transaction
 from webots_mcp.contract import MAX_BREAKPOINTS, BreakpointAction
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.transactions import transaction
 
 # Those of a controller's own code end with its session.
 _OF_ROBOT: Final = (

@@ -17,10 +17,10 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final
 
-from webots_mcp.connection import transaction
 from webots_mcp.contract import host_name
 from webots_mcp.errors import DatabaseError, LeaseLostError
 from webots_mcp.store.recording import Recording
+from webots_mcp.transactions import transaction
 
 LEASE_S: Final = 30.0
 _RENEW_EVERY_S: Final = 3.0

@@ -13,11 +13,9 @@ from alembic.config import Config
 from sqlalchemy import event
 from sqlalchemy.pool import StaticPool
 
-from webots_mcp.bundled import bundled
 from webots_mcp.connection import connect
-from webots_mcp.contract import SCHEMA_VERSION, Database, MemoryDatabase
-from webots_mcp.origin import require_shipped
-from webots_mcp.schema import schema_version
+from webots_mcp.contract import SCHEMA_VERSION, Database, MemoryDatabase, bundled
+from webots_mcp.schema import require_shipped, schema_version
 
 _STAMPS: Final = ("application_id", "user_version")
 

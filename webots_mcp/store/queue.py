@@ -14,10 +14,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, TypeVar
 
-from webots_mcp.connection import is_busy
 from webots_mcp.contract import COMMAND_TIME_TO_LIVE_S, FINAL_STATUSES
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.rows import columns_of
+from webots_mcp.transactions import is_busy
 
 MAX_PARAMS_BYTES: Final = 65_536
 # A writer connection waits 5 s for the lock by itself; then the statement is sent again.

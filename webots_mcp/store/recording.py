@@ -13,18 +13,7 @@ from typing import Any, Final
 
 from webots_mcp import settlement
 from webots_mcp.adoption import adopt
-from webots_mcp.connection import (
-    FAILURES,
-    LONGEST_READ_S,
-    FrozenConnection,
-    Role,
-    connect,
-    is_about_a_value,
-    is_busy,
-    is_damage,
-    is_unwritable,
-    text_of,
-)
+from webots_mcp.connection import LONGEST_READ_S, FrozenConnection, Role, connect
 from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
 from webots_mcp.entries import waiting_paths
 from webots_mcp.errors import (
@@ -44,6 +33,14 @@ from webots_mcp.store.sessions import Session
 from webots_mcp.store.sound import shadow_if_asked
 from webots_mcp.store.states import State, newest_state
 from webots_mcp.store.status import Status, judge, stopped_for
+from webots_mcp.transactions import (
+    FAILURES,
+    is_about_a_value,
+    is_busy,
+    is_damage,
+    is_unwritable,
+    text_of,
+)
 
 GETTING_STARTED: Final = (
     "Add two lines to a controller: 'from webots_mcp import MCPBridge' and, where it has made its "

@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Final, cast
 
-from webots_mcp.connection import is_about_a_value, is_damage
-from webots_mcp.origin import shipped_statements
+from webots_mcp.schema import shipped_statements
+from webots_mcp.transactions import is_about_a_value, is_damage
 
 MAX_DEPTH: Final = 100  # of JSON: the bridge records 20 levels
 MAX_SIM_TIME_S: Final = 1e10

@@ -10,13 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from webots_mcp.connection import transaction
 from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.liveness import process_alive, process_identity
 from webots_mcp.store.analysis.ranking import Best, Outcome, Ranking, rank
 from webots_mcp.store.leases import Lease, give_back, holder_of, take
 from webots_mcp.store.rows import columns_of
+from webots_mcp.transactions import transaction
 
 _NEW_SET: Final = (
     "INSERT INTO trial_set (uuid, plan, created_wall_time_s, robot_id) VALUES (?, ?, ?, ?) "

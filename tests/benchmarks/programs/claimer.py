@@ -12,7 +12,8 @@ from pathlib import Path
 
 from tests.benchmarks.processes import say
 from webots_mcp.bridge.commands import CLAIM, PEEK
-from webots_mcp.connection import connect, never_wait
+from webots_mcp.connection import connect
+from webots_mcp.transactions import never_wait
 
 
 def main(database: Path) -> None:

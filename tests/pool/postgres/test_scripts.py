@@ -18,7 +18,7 @@ from tests.memory import memory_connection
 from tests.pool.postgres.shipped import assert_equal, ship
 from tests.postgres import Server
 from tests.recordings.rover import record_rover
-from webots_mcp.bundled import bundled
+from webots_mcp.contract import bundled
 from webots_mcp.pool.postgres.views import VIEWS
 from webots_mcp.pool.tables import tables
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from tests.memory import memory_connection
 from tests.recordings.rover import Recorder, record_rover, start_run
-from webots_mcp.connection import connect, never_wait
+from webots_mcp.connection import connect
 from webots_mcp.naming import flatten
 from webots_mcp.schema import create_schema
 from webots_mcp.store.analysis.summary import Summary, merge, summarise
@@ -28,6 +28,7 @@ from webots_mcp.store.rollup.buckets import BUCKET_S
 from webots_mcp.store.rollup.rolling import forget, roll, watermark
 from webots_mcp.store.rollup.tables import Addition, held, store
 from webots_mcp.store.signals.catalogue import list_signals
+from webots_mcp.transactions import never_wait
 
 Rows = list[tuple[float, dict[str, Any]]]
 finite = st.floats(-1e9, 1e9, allow_nan=False) | st.integers(-1000, 1000)

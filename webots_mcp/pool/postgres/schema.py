@@ -25,8 +25,7 @@ from sqlalchemy.dialects import postgresql
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.pool import StaticPool
 
-from webots_mcp.bundled import bundled
-from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.contract import SCHEMA_VERSION, bundled
 from webots_mcp.errors import PoolError
 from webots_mcp.pool.postgres.connecting import Connection, clear_errors, connect
 from webots_mcp.pool.postgres.views import VIEWS, make_views

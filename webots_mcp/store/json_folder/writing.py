@@ -14,7 +14,6 @@ from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.connection import transaction
 from webots_mcp.contract import (
     CAMERA_FOLDER,
     PRIVATE_FILE,
@@ -34,6 +33,7 @@ from webots_mcp.store.json_folder.reading import (
     is_there,
     read_folder,
 )
+from webots_mcp.transactions import transaction
 
 Progress = Callable[[int, int], object]
 

@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.connection import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.parameter import Value
 from webots_mcp.settlement import gone_sessions
@@ -17,6 +16,7 @@ from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameter
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.runs import fetch_run
+from webots_mcp.transactions import transaction
 
 MOST_RUNS: Final = 200
 MAX_LABEL: Final = 100

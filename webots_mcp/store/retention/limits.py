@@ -13,11 +13,11 @@ from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.connection import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import process_alive
 from webots_mcp.store.retention.notation import NO_LIMIT, limit_text, option_of
 from webots_mcp.store.retention.policy import DEFAULT, Limit, Retention
+from webots_mcp.transactions import transaction
 
 Asked = Mapping[str, "Limit | float | None"]
 """Limits by the names that they have in `Retention`; None is back to the default."""

@@ -8,9 +8,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Final
 
-from webots_mcp.connection import transaction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.runs import fetch_run
+from webots_mcp.transactions import transaction
 
 # A run that a person named, described or marked is not retention's to judge.
 # Trials are labelled by the hundred without anybody's having judged them: their scores stay.

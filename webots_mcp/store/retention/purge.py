@@ -16,7 +16,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.connection import LONGEST_WRITE_S, ShortWrites, Step, is_busy
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import DatabaseError, InvalidInputError, NothingRecordedError
 from webots_mcp.store.images import inside
@@ -25,6 +24,7 @@ from webots_mcp.store.retention.planning import Step as Going
 from webots_mcp.store.retention.policy import DEFAULT, KEPT, Retention
 from webots_mcp.store.retention.usage import TABLES, first_id, rows_of
 from webots_mcp.store.rollup.rolling import roll, watermark
+from webots_mcp.transactions import LONGEST_WRITE_S, ShortWrites, Step, is_busy
 
 BATCH_ROWS: Final = 500
 ROLLED_ROWS: Final = 100

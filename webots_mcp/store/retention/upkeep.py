@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
 
-from webots_mcp.notice import warn
+from webots_mcp.errors import warn
 from webots_mcp.store.retention.limits import in_force
 from webots_mcp.store.retention.planning import Plan, plan
 from webots_mcp.store.retention.policy import Retention

@@ -13,13 +13,13 @@ from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.connection import Step
-from webots_mcp.notice import warn
+from webots_mcp.errors import warn
 from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, COARSE_S, bucket_of
 from webots_mcp.store.rollup.findings import FINDINGS, findings_to_store
 from webots_mcp.store.rollup.tables import RUN_MARK, in_short_steps, run_mark
 from webots_mcp.store.sound import MAX_SIM_TIME_S, is_over_a_value, sound_rows
+from webots_mcp.transactions import Step
 
 _FIGURES: Final = ", ".join(Summary._fields)
 _COLUMNS: Final = f"run_id, bucket, signal_id, {_FIGURES}, {', '.join(FINDINGS)}"

@@ -14,7 +14,7 @@ from bisect import bisect_left
 from collections.abc import Iterator, Sequence
 from typing import Any, Final, NamedTuple
 
-from webots_mcp.notice import warn
+from webots_mcp.errors import warn
 from webots_mcp.store.analysis.summary import Summary, merge
 from webots_mcp.store.reading.rows import cleaned
 from webots_mcp.store.rollup.batch import Batch, BatchColumn

@@ -17,10 +17,10 @@ from collections.abc import Callable, Sequence
 from itertools import groupby
 from typing import Any, Final, NamedTuple, TypeVar
 
-from webots_mcp.connection import LONGEST_WRITE_S, Step, transaction
 from webots_mcp.store.analysis.summary import Summary
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS
 from webots_mcp.store.signals.registry import Count
+from webots_mcp.transactions import LONGEST_WRITE_S, Step, transaction
 
 Item = TypeVar("Item")
 Key = tuple[int, int]  # bucket, signal id

@@ -20,15 +20,13 @@ ALLOWED = {
     "transactions": set[str](),
     "schema": {"contract", "errors", "transactions"},
     "connection": {"contract", "errors", "schema", "transactions"},
-    "liveness": set[str](),
-    "naming": {"units"},
-    "units": set[str](),
-    "conditions": {"conditions", "errors", "naming", "units"},
+    "liveness": {"contract", "waiting_file"},
+    "naming": set[str](),
+    "conditions": {"conditions", "errors", "naming"},
     "parameter": {"errors", "naming"},
-    "settlement": {"contract", "entries", "liveness"},
     "entries": set[str](),
-    "adoption": {"entries", "errors", "transactions"},
-    "maintenance": {"adoption", "connection", "errors", "schema", "transactions"},
+    "waiting_file": {"entries", "errors", "transactions"},
+    "maintenance": {"connection", "errors", "schema", "transactions", "waiting_file"},
     "standin": {"standin", "contract"},
     "webots": {"connection", "contract", "errors", "liveness", "webots"},
 }
@@ -38,14 +36,13 @@ ENTRIES = {
     "maintenance",
     "naming",
     "parameter",
-    "settlement",
-    "units",
+    "liveness",
 }
 STDLIB = {
     *ENTRIES,
     *ALLOWED["maintenance"],
-    *ALLOWED["settlement"],
-    *ALLOWED["adoption"],
+    *ALLOWED["liveness"],
+    *ALLOWED["waiting_file"],
 }
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
@@ -53,15 +50,14 @@ ALLOWED["store"] = STDLIB | {"store"}
 ALLOWED["pool"] = STDLIB | {"store", "pool"}
 ALLOWED["trials"] = STDLIB | {"pool", "store", "trials", "webots", "__version__"}
 ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}
-ALLOWED["launching"] = STDLIB | {"console", "store", "setup", "webots"}
+ALLOWED["launch"] = STDLIB | {"console", "store", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
 ALLOWED["charts"] = ALLOWED["plotting"] | {"charts", "plotting", "standin"}
 ALLOWED["report"] = ALLOWED["charts"] | {"charts", "report", "__version__"}
-ALLOWED["belonging"] = STDLIB | {"store", "webots"}
-ALLOWED["console"] = ALLOWED["belonging"] | {"belonging", "console"}
+ALLOWED["console"] = STDLIB | {"console", "store", "webots"}
 ALLOWED["server"] = STDLIB | {
-    "belonging", "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
-    "launching", "report", "__version__",
+    "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
+    "launch", "report", "__version__",
 }  # fmt: skip
 ALLOWED["page"] = ALLOWED["server"] | ALLOWED["charts"] | {"page"}
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}

@@ -16,8 +16,8 @@ from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.bridge import encoding, recovery
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, Database
-from webots_mcp.entries import waiting_path
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.waiting_file import waiting_path
 
 STEP_MS = 16
 

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import webots_mcp
 from tests.benchmarks.rover import Rover
 from webots_mcp import MCPBridge
-from webots_mcp.adoption import adopt
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
 from webots_mcp.schema import create_schema
+from webots_mcp.waiting_file import adopt
 
 PACKAGE = str(Path(webots_mcp.__file__).parent)
 # What writes; an interrupt anywhere else finds nothing half done.
@@ -28,7 +28,7 @@ WRITING = {
     for name in (
         *("recorder", "row_writer", "recovery", "session_connection", "connection_lock"),
         *("row_counts", "backlog", "journal", "heartbeat", "heartbeat_rows", "run"),
-        *("mcp_bridge", "publisher", "adoption", "entries", "connection"),
+        *("mcp_bridge", "publisher", "waiting_file", "transactions", "connection"),
     )
 }
 Place = tuple[str, int, int]  # file, line, and the instruction in it or -1

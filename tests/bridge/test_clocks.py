@@ -13,8 +13,7 @@ from tests.bridge.conftest import STEP_MS, Recording, eager, heartbeat_now
 from tests.bridge.test_registration import change, start_again
 from webots_mcp import MCPBridge, MemoryDatabase
 from webots_mcp.connection import connect
-from webots_mcp.liveness import process_identity
-from webots_mcp.settlement import settle
+from webots_mcp.liveness import process_identity, reap
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.recording import look
 
@@ -40,7 +39,7 @@ def set_clock(recording: Recording, by_s: float) -> None:
 
 def judge_all(recording: Recording) -> None:
     connection = connect(recording.database, "writer")
-    settle(connection, time.time())
+    reap(connection, time.time())
     connection.close()
 
 

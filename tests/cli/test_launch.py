@@ -16,7 +16,7 @@ import pytest
 
 from tests.trials.test_killed import wait_until
 from tests.webots.conftest import CONTROLLER, free_port, started, webots, write_project
-from webots_mcp.launching import require_world
+from webots_mcp.launch import require_world
 
 __all__ = ["webots"]
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="the program `webots` is a script")

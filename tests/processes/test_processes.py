@@ -12,10 +12,10 @@ import pytest
 
 from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, has_states, last_number
-from webots_mcp.adoption import adopt
 from webots_mcp.connection import connect
+from webots_mcp.liveness import reap
 from webots_mcp.schema import create_schema
-from webots_mcp.settlement import settle
+from webots_mcp.waiting_file import adopt
 
 COUNTING = """
 n = 0
@@ -145,7 +145,7 @@ while robot.step(16) != -1:
     simulation.controller("rover").kill()
     simulation.wait_for(lambda: simulation.controller("rover").exit_code is not None)
     connection = connect(filed.database, "writer")
-    settle(connection, 2e9)
+    reap(connection, 2e9)
     connection.close()
     status, _, error = filed.fate(sent)
     assert (status, error) == (

@@ -10,7 +10,7 @@ from tests.bridge.conftest import Recording
 from tests.processes.conftest import Start, has_states
 from tests.processes.test_control import wait
 from webots_mcp.connection import connect
-from webots_mcp.settlement import settle
+from webots_mcp.liveness import reap
 from webots_mcp.standin import Mode, Simulation
 
 # `front_m` falls and rises with time in the same way in each run, whatever the physics do.
@@ -98,7 +98,7 @@ def test_a_killed_controller_leaves_no_run_behind(start: Start, filed: Recording
     simulation.controller("rover").kill()
     simulation.wait_for(lambda: not simulation.controller("rover").is_running, timeout_s=30)
     connection = connect(filed.database, "writer")
-    settle(connection, 1e10)
+    reap(connection, 1e10)
     connection.close()
     status, _, error = filed.fate(command)
     assert (status, error) == (

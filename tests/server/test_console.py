@@ -22,8 +22,8 @@ from tests.webots.conftest import (
     wait_for_line,
     write_project,
 )
-from webots_mcp.belonging import belongs
 from webots_mcp.console import watching as console_watching
+from webots_mcp.console.ownership import belongs
 from webots_mcp.server import create_server
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.instances import instances

@@ -10,13 +10,12 @@ import pytest
 
 from tests.recordings.rows import Recorded, insert
 from tests.server.malformed import NOT_UTF8, Damage
-from webots_mcp.adoption import adopt
-from webots_mcp.entries import FORMAT
+from webots_mcp.liveness import dead_sessions
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.retention import Limit, Retention, plan
 from webots_mcp.store.retention.purge import prune
 from webots_mcp.store.rollup.rolling import roll
+from webots_mcp.waiting_file import FORMAT, adopt
 
 BLOB = b"\x00\xff\x01"
 ROLLED = (
@@ -110,7 +109,7 @@ def test_a_run_without_a_time_does_not_keep_others_from_being_purged(
 def test_the_process_of_a_session_need_not_be_text(recorded: Recorded) -> None:
     recorded.robot(process="x")
     recorded.connection.execute("UPDATE session SET process = CAST(x'7bff' AS TEXT)")
-    assert gone_sessions(recorded.connection) == [(1, "crashed")]
+    assert dead_sessions(recorded.connection) == [(1, "crashed")]
 
 
 HEADER = {"webots_mcp_waiting": FORMAT, "robot": {}, "session": {"uuid": "u"}}

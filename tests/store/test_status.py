@@ -15,13 +15,13 @@ from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import UNSEEN
-from webots_mcp.entries import waiting_paths
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.queue import CommandQueue
 from webots_mcp.store.recording import look
 from webots_mcp.store.runs import current_run
 from webots_mcp.store.sessions import newest_session
 from webots_mcp.store.status import Status, judge
+from webots_mcp.waiting_file import waiting_paths
 
 NOW = 4_000_000_000.0  # later than this process, whose sessions these are
 

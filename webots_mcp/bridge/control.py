@@ -17,7 +17,7 @@ from webots_mcp.errors import (
     ControllerEndedError,
     InterruptedCommandError,
 )
-from webots_mcp.settlement import EXTERN
+from webots_mcp.liveness import EXTERN
 
 POLL_INTERVAL_S: Final = 0.005
 

@@ -8,12 +8,12 @@ import sqlite3
 import time
 from typing import Any, Final, NamedTuple
 
-from webots_mcp import settlement
-from webots_mcp.adoption import enter_robot, enter_session
+from webots_mcp import liveness
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.contract import PAUSED, REMOTE_SILENCE_S
 from webots_mcp.liveness import process_alive
 from webots_mcp.transactions import transaction
+from webots_mcp.waiting_file import enter_robot, enter_session
 
 _OPEN_SESSIONS: Final = (
     "SELECT s.id, s.pid, s.process, s.host, s.last_seen_wall_time_s FROM session s "
@@ -70,9 +70,9 @@ def register(
     live process already has the name, `#2` (and so on) is appended.
     """
     now_s = time.time()
-    settlement.settle(connection, now_s)  # what takes long, outside of the transaction
+    liveness.reap(connection, now_s)  # what takes long, outside of the transaction
     with transaction(connection):
-        settlement.settle(connection, now_s)
+        liveness.reap(connection, now_s)
         name = _free_name(connection, identity, now_s)
         robot_id = enter_robot(connection, describe_robot(identity, name), now_s)
         reloaded = _is_reload(connection, identity, robot_id, now_s)
@@ -99,7 +99,7 @@ def _free_name(connection: sqlite3.Connection, identity: Identity, now_s: float)
         living = [row for row in sessions if _is_living(row, identity, now_s)]
         if not living:
             for row in sessions:
-                settlement.end_session(connection, row[0], "replaced")
+                liveness.end_session(connection, row[0], "replaced")
             return name
         number += 1
 

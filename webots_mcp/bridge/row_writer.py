@@ -6,7 +6,6 @@ import time
 from collections.abc import Sequence
 from typing import Any, Final
 
-from webots_mcp.adoption import Taken, is_unfit, take_in
 from webots_mcp.bridge.backlog import Backlog, Row
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.recovery import Recovery
@@ -15,6 +14,7 @@ from webots_mcp.bridge.run import Run
 from webots_mcp.bridge.session_connection import SessionConnection, patiently
 from webots_mcp.entries import STATEMENTS, Kind, Values, bind
 from webots_mcp.transactions import in_transaction, roll_back
+from webots_mcp.waiting_file import Taken, is_unfit, take_in
 
 _CATCH_UP_S: Final = 0.002  # a loop that catches up must not stall over it
 

@@ -15,8 +15,7 @@ from webots_mcp.cli.command import argument, command
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from webots_mcp.launching import Launch
-    from webots_mcp.store.beginnings import Beginning
+    from webots_mcp.launch import Launch, SessionStart
     from webots_mcp.store.recording import Recording
     from webots_mcp.webots.stream import ConsoleLine
 
@@ -55,7 +54,7 @@ def launch(arguments: argparse.Namespace) -> int:
         webots-mcp launch worlds/arena.wbt --headless --mode fast
     """
     from webots_mcp.contract import DATA_DIR_VARIABLE
-    from webots_mcp.launching import Launch, require_world
+    from webots_mcp.launch import Launch, require_world
     from webots_mcp.webots.command_line import Start, free_port
 
     world, project = require_world(arguments.world)
@@ -102,7 +101,7 @@ def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _R
     return code
 
 
-def _told(launched: Launch) -> Beginning | None:
+def _told(launched: Launch) -> SessionStart | None:
     """The first controller that records, once there is one."""
     first = launched.first_record()
     if first is not None:

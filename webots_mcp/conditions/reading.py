@@ -19,9 +19,9 @@ from webots_mcp.naming import (
     find_position,
     flatten,
     mean_of,
+    metres_in,
     reduce_array,
 )
-from webots_mcp.units import metres_in
 
 State: TypeAlias = Any  # what a controller publishes: usually a dict, with anything in it
 Read: TypeAlias = Callable[[State], Value]

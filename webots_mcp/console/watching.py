@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 from typing import Final
 
-from webots_mcp.belonging import webots_of
 from webots_mcp.console.following import ConsoleFollower
+from webots_mcp.console.ownership import own_webots
 from webots_mcp.errors import warn
 from webots_mcp.store.recording import Recording
 
@@ -49,7 +49,7 @@ class ConsoleWatch(threading.Thread):
         over = [key for key, follower in self._followers.items() if not follower.is_alive()]
         for key in over:
             del self._followers[key]
-        for instance in webots_of(self._recording):
+        for instance in own_webots(self._recording):
             key = (instance.pid, instance.port)
             if instance.is_listening and key not in self._followers:
                 self._followers[key] = ConsoleFollower(instance, self._recording)

@@ -8,13 +8,13 @@ from typing import Final, NamedTuple
 from webots_mcp.connection import connect, is_there, journal_mode
 from webots_mcp.contract import HEARTBEAT_LATE_S, SCHEMA_VERSION
 from webots_mcp.diagnosis.finding import Finding, Subject, ago, last_seen_s, worst
-from webots_mcp.entries import count_rows, waiting_paths
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.schema import schema_version
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.sessions import Session, fetch_session
 from webots_mcp.store.status import handler_at_work
 from webots_mcp.store.waiting import waiting
+from webots_mcp.waiting_file import count_rows, waiting_paths
 
 _GET_COMMAND: Final = (
     "call bridge.get_command() in every round of the controller's loop, or use "

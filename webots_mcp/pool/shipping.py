@@ -23,6 +23,7 @@ from webots_mcp.errors import (
     PoolBusyError,
     PoolError,
 )
+from webots_mcp.liveness import dead_sessions
 from webots_mcp.pool.batch import Batch
 from webots_mcp.pool.kept import Kept
 from webots_mcp.pool.outbox import WRITE_BYTES, Outbox
@@ -36,7 +37,6 @@ from webots_mcp.pool.report import Report
 from webots_mcp.pool.summaries import Summaries
 from webots_mcp.pool.tables import Table, table, tables
 from webots_mcp.pool.target import Shipment, Target, whole_runs
-from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
 from webots_mcp.store.merging import settled
 from webots_mcp.store.recording import Recording
@@ -177,7 +177,7 @@ class Shipper:
     def _end_what_was_killed(self, connection: sqlite3.Connection) -> None:
         """End runs whose process is gone, at the edge: nobody at the pool could judge that."""
         database = self._order.recording.database
-        if not isinstance(database, Path) or not gone_sessions(connection):
+        if not isinstance(database, Path) or not dead_sessions(connection):
             return
         try:
             settled(database)

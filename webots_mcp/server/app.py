@@ -14,6 +14,7 @@ from mcp.server import MCPServer
 from webots_mcp import __version__
 from webots_mcp.console.watching import ConsoleWatch
 from webots_mcp.contract import Database
+from webots_mcp.liveness import reap_if_dead
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.server.declaring import tools_of
 from webots_mcp.server.launcher import Companions, Launcher
@@ -45,7 +46,6 @@ from webots_mcp.server.tools import (
     world,
 )
 from webots_mcp.server.trial_worker import TrialWorkers
-from webots_mcp.settlement import settle_gone
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention import Asked, Upkeep
 from webots_mcp.store.retention.limits import ask_where_unset
@@ -114,7 +114,7 @@ def _lifespan(
         if unasked:
             ask_where_unset(connection, unasked)
             unasked.clear()
-        settle_gone(connection)
+        reap_if_dead(connection)
         roll(connection, pause_s=_PAUSE_S)
         retain(connection)
 

@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple
 import anyio
 from anyio import to_thread
 
-from webots_mcp.belonging import belongs
+from webots_mcp.console.ownership import belongs
 from webots_mcp.contract import HEARTBEAT_LATE_S, UNMOVED
 from webots_mcp.errors import (
     AmbiguousRobotError,

@@ -12,12 +12,11 @@ import anyio
 from anyio import to_thread
 
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.launching import Launch, begun_since, newest_in
+from webots_mcp.launch import Launch, SessionStart, newest_in, starts_since
 from webots_mcp.server.launcher import Launcher
 from webots_mcp.server.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.routes import Situation, look_around, webots_meant, why_no_word
-from webots_mcp.store.beginnings import Beginning
 from webots_mcp.webots.instances import instance_at
 from webots_mcp.webots.stream import ANSWER_S, Address, address_of, load_world
 
@@ -181,14 +180,14 @@ class WorldRequest(Request):
         answer.waited_s = self._waited_s
         return answer
 
-    def _begun_in(self, situation: Situation, world: Path, before: int) -> Beginning | None:
-        for each in begun_since(self.recording, before):
+    def _begun_in(self, situation: Situation, world: Path, before: int) -> SessionStart | None:
+        for each in starts_since(self.recording, before):
             here = situation.address in (None, address_of(each.instance))
             if here and each.run_id and each.world and Path(each.world).resolve() == world:
                 return each
         return None
 
-    async def _wait(self, look: Callable[[], Beginning | None]) -> Beginning | None:
+    async def _wait(self, look: Callable[[], SessionStart | None]) -> SessionStart | None:
         while True:
             found = await to_thread.run_sync(look)
             if found is not None or self._left_s <= LEAST_S:

@@ -16,16 +16,16 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp.adoption import adopt
 from webots_mcp.contract import make_folder, whole_file
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.liveness import reap
 from webots_mcp.schema import require_shipped
-from webots_mcp.settlement import settle
 from webots_mcp.store.images import PICTURES, inside
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.rollup.taking_in import take_in_summaries
 from webots_mcp.store.trials import fetch_trial_set, is_at_work
 from webots_mcp.transactions import transaction
+from webots_mcp.waiting_file import adopt
 
 _SESSIONS: Final = (
     "SELECT id, uuid, robot_id FROM source.session s WHERE :run IS NULL "
@@ -140,7 +140,7 @@ def settled(database: Path) -> Recording:
     recording = Recording(database, database.parent)
     with recording.writer() as connection:
         adopt(connection, database)
-        settle(connection, time.time())
+        reap(connection, time.time())
     return recording
 
 

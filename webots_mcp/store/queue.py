@@ -203,7 +203,7 @@ def list_commands(
 
 
 def any_unfinished(connection: sqlite3.Connection) -> bool:
-    """Whether `settlement.settle` could have anything to say about commands."""
+    """Whether `liveness.reap` could have anything to say about commands."""
     return bool(connection.execute(_UNFINISHED).fetchone()[0])
 
 

@@ -11,11 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from webots_mcp import settlement
-from webots_mcp.adoption import adopt
+from webots_mcp import liveness
 from webots_mcp.connection import LONGEST_READ_S, FrozenConnection, Role, connect
 from webots_mcp.contract import DATABASE_NAME, Database, MemoryDatabase
-from webots_mcp.entries import waiting_paths
 from webots_mcp.errors import (
     DatabaseError,
     MalformedRowError,
@@ -41,6 +39,7 @@ from webots_mcp.transactions import (
     is_unwritable,
     text_of,
 )
+from webots_mcp.waiting_file import adopt, waiting_paths
 
 GETTING_STARTED: Final = (
     "Add two lines to a controller: 'from webots_mcp import MCPBridge' and, where it has made its "
@@ -166,7 +165,7 @@ class Recording:
             if any_unfinished(connection):
                 if isinstance(self.database, Path):
                     adopt(connection, self.database)  # a command's result may wait there
-                settlement.settle(connection, time.time())
+                liveness.reap(connection, time.time())
 
     def create(self) -> None:
         """Make the database where there is none, with its folder; one that is there is kept.

@@ -14,7 +14,7 @@ from webots_mcp.contract import (
     UNMOVED,
     UNSEEN,
 )
-from webots_mcp.settlement import EXTERN
+from webots_mcp.liveness import EXTERN
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.runs import Run
 from webots_mcp.store.sessions import Session, companions, left_holding

@@ -7,8 +7,9 @@ import sqlite3
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from webots_mcp.entries import Entry, count_rows, next_entries, read_header, waiting_path
+from webots_mcp.entries import Entry
 from webots_mcp.store.sessions import Session
+from webots_mcp.waiting_file import count_rows, next_entries, read_header, waiting_path
 
 
 class FileBacklog(NamedTuple):

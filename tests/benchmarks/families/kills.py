@@ -18,11 +18,10 @@ from tests.benchmarks.processes import environment
 from tests.benchmarks.registry import Bench, benchmark
 from tests.benchmarks.servers import our_server
 from tests.benchmarks.table import Line, Target
-from webots_mcp.adoption import adopt
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.entries import waiting_paths
 from webots_mcp.store.queue import CommandQueue
+from webots_mcp.waiting_file import adopt, waiting_paths
 
 _KILLS = 60
 _LONGEST_LIFE_S = 0.3

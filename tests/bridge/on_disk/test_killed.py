@@ -19,13 +19,12 @@ from tests.bridge.conftest import (
 )
 from tests.bridge.on_disk.conftest import POSIX, adopt_into
 from webots_mcp import MCPBridge
-from webots_mcp.adoption import adopt
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.entries import waiting_paths
+from webots_mcp.liveness import reap
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.settlement import settle
 from webots_mcp.standin import InProcessSupervisor
+from webots_mcp.waiting_file import adopt, waiting_paths
 
 KILLED = """
 import json, os, signal, sys
@@ -193,9 +192,9 @@ def test_a_session_whose_rows_still_wait_is_not_judged_before_they_are_in(
 ) -> None:
     file = kill("bridge.close()\n")
     with closing(connect(file, "writer")) as connection:
-        settle(connection, time.time())
+        reap(connection, time.time())
         assert adopt(connection, file) > 0
-        settle(connection, time.time())
+        reap(connection, time.time())
     recording = Recording(file)
     assert recording.rows("SELECT end_reason FROM session") == ["finished"]
     assert recording.rows("SELECT end_reason FROM run") == ["finished"]

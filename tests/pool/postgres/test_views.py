@@ -19,10 +19,9 @@ from tests.postgres import Server
 from tests.recordings.rover import Recorder, record_rover, start_run
 from tests.store.test_views import CHOICES, MODES, PLACES, POSES
 from webots_mcp.connection import connect
-from webots_mcp.naming import find_mode, find_position, flatten
+from webots_mcp.naming import find_mode, find_position, flatten, metres_in
 from webots_mcp.pool.postgres.views import VIEWS
 from webots_mcp.store.rollup.rolling import roll
-from webots_mcp.units import metres_in
 
 # Whole states, each other than those of `tests/store/test_views.py`.
 STATES: list[dict[str, Any]] = [

@@ -15,7 +15,7 @@ from tests.memory import memory_connection
 from tests.recordings.runs import ROW_S, Recorded, states
 from tests.store.retention.conftest import TABLES
 from webots_mcp.errors import InvalidInputError, UnknownRunError
-from webots_mcp.settlement import end_session
+from webots_mcp.liveness import end_session
 from webots_mcp.store.retention import Limit, Retention, mark_kept, plan
 from webots_mcp.store.retention.purge import purge
 from webots_mcp.store.rollup.rolling import roll

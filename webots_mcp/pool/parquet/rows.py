@@ -12,10 +12,10 @@ from typing import Any, Final
 
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.errors import PoolError
+from webots_mcp.naming import unit_in
 from webots_mcp.pool.batch import Row
 from webots_mcp.pool.parquet.packages import package
 from webots_mcp.pool.tables import SQLValue, Table
-from webots_mcp.units import unit_in
 
 _APPENDED_GROUP_ROWS: Final = 20_000
 _CHANGING_GROUP_ROWS: Final = 4_000  # those of many files are read side by side

@@ -10,8 +10,8 @@ from collections.abc import Iterable
 from typing import Final
 
 from webots_mcp import naming
+from webots_mcp.naming import METRES, metres_in
 from webots_mcp.pool.postgres.connecting import Connection
-from webots_mcp.units import METRES, metres_in
 
 _HUMP: Final = "(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # where a word begins inside one
 

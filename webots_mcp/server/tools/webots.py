@@ -11,7 +11,7 @@ from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.launching import Launch, require_world
+from webots_mcp.launch import Launch, SessionStart, require_world
 from webots_mcp.server.declaring import ACTS, RESTARTS, tool
 from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.launcher import Companions, project_of
@@ -19,7 +19,6 @@ from webots_mcp.server.parameters import RobotName, TimeoutS
 from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.shortening import cut_text
 from webots_mcp.server.worlds import WorldRequest
-from webots_mcp.store.beginnings import Beginning
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.command_line import Mode, Start, free_port
 
@@ -94,7 +93,7 @@ def _request(
     return WorldRequest(recording, dispatcher, robot, timeout_s, _companions(ctx).webots)
 
 
-async def _wait(launched: Launch, ctx: Context[Any], until_s: float) -> Beginning | None:
+async def _wait(launched: Launch, ctx: Context[Any], until_s: float) -> SessionStart | None:
     """Until a controller records; None where the time was over first.
 
     Raises:
@@ -117,7 +116,7 @@ async def _wait(launched: Launch, ctx: Context[Any], until_s: float) -> Beginnin
 
 
 def _answer(
-    recording: Recording, launched: Launch, first: Beginning | None, started_s: float
+    recording: Recording, launched: Launch, first: SessionStart | None, started_s: float
 ) -> CommandAnswer:
     header: dict[str, Any] = {}
     if first is not None:

@@ -6,11 +6,11 @@ import time
 from typing import Any, Final
 
 from webots_mcp.errors import NothingRecordedError
+from webots_mcp.liveness import dead_sessions
 from webots_mcp.server.declaring import READS, tool
 from webots_mcp.server.parameters import RobotName, RunId
 from webots_mcp.server.results import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.server.shortening import cut_text, round_number
-from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.observers import WorldSeen, world_seen
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention.limits import described, unheeded
@@ -148,7 +148,7 @@ def _pace(view: View, run: Run) -> float | None:
 
 def _run(view: View, run: Run) -> dict[str, Any]:
     """What the run is; `rows` is as of its last heartbeat."""
-    end_reason = run.end_reason or dict(gone_sessions(view.connection)).get(run.session_id)
+    end_reason = run.end_reason or dict(dead_sessions(view.connection)).get(run.session_id)
     ended = {"ended_by": end_reason} if end_reason is not None else {}
     return {
         "id": run.id,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Final
 
+from webots_mcp.naming import metres_in
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.analysis.jumps import (
     POSITION_STEPS,
@@ -19,7 +20,6 @@ from webots_mcp.store.detection.motion import in_metres
 from webots_mcp.store.detection.search import Search
 from webots_mcp.store.reading.rows import Numbers
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.units import metres_in
 
 REACH_S: Final = 2.0  # before and after a range: whether a value comes back shows there
 _LEAST_SHARE: Final = 0.7  # of a distance, less than the root of a half

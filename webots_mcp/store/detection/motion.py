@@ -11,14 +11,23 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.naming import FARTHEST_M, find_mode, find_position, is_seen_speed
+from webots_mcp.naming import (
+    FARTHEST_M,
+    METRES,
+    find_mode,
+    find_position,
+    in_snake_case,
+    is_seen_speed,
+    metres_in,
+    unit_in,
+    words_of,
+)
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.reading.rows import Columns
 from webots_mcp.store.signals.catalogue import one_signal
 from webots_mcp.store.signals.flatten import may_be_yaw
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.units import METRES, in_snake_case, metres_in, unit_in, words_of
 
 if TYPE_CHECKING:
     from webots_mcp.store.analysis.track import PathLength, Track

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, TypeAlias, TypeVar
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.naming import FARTHEST_M
+from webots_mcp.naming import FARTHEST_M, metres_in
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import Motion, find_motion
 from webots_mcp.store.events import Event
@@ -24,7 +24,6 @@ from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.rows import columns_of
 from webots_mcp.store.signals.catalogue import known_signals
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.units import metres_in
 
 # What there is to count, in the order in which it is told.
 KINDS: Final = (

@@ -11,8 +11,8 @@ from importlib import import_module
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.liveness import dead_sessions
 from webots_mcp.naming import Value, flatten
-from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.extent import Detection
 from webots_mcp.store.detection.grouping import grouped
@@ -270,7 +270,7 @@ def collect(
 
 def _runs_over(connection: sqlite3.Connection, run_ids: Sequence[int]) -> set[int]:
     """Those in which nothing goes on any more: they have ended, or their process is gone."""
-    gone = dict(gone_sessions(connection))
+    gone = dict(dead_sessions(connection))
     told = [connection.execute(_IS_OPEN, (run_id,)).fetchone() for run_id in set(run_ids)]
     return {run_id for run_id, session_id, is_open in told if not is_open or session_id in gone}
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.liveness import dead_sessions
 from webots_mcp.parameter import Value
-from webots_mcp.settlement import gone_sessions
 from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameters
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
@@ -213,7 +213,7 @@ def pace(duration_s: float, wall_s: float) -> float | None:
 
 
 def _infos(connection: sqlite3.Connection, rows: Sequence[tuple[Any, ...]]) -> list[RunInfo]:
-    gone = dict(gone_sessions(connection))
+    gone = dict(dead_sessions(connection))
     parameters = notable_parameters(connection, [row[0] for row in rows])
     return [_info(connection, row, gone, parameters[row[0]]) for row in rows]
 

@@ -12,13 +12,13 @@ from collections.abc import Iterable, Sequence
 from dataclasses import astuple
 from typing import Final
 
+from webots_mcp.naming import in_snake_case
 from webots_mcp.store.analysis.features import unwrap
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings, joined_swings
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.reading.rows import Columns, Numbers, numbers_of
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, stored_texts
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.units import in_snake_case
 
 LONGEST_PERIOD_S: Final = 5.0
 ACROSS_S: Final = 20.0  # of the stretch beside: longer than six half swings of that period

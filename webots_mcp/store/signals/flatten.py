@@ -7,8 +7,15 @@ import math
 import re
 from typing import Any, Final, Literal, NamedTuple, cast
 
-from webots_mcp.naming import LONGEST_SPREAD_ARRAY, REDUCTIONS, Value, reduce_array
-from webots_mcp.units import angle_unit, in_snake_case, unit_in
+from webots_mcp.naming import (
+    LONGEST_SPREAD_ARRAY,
+    REDUCTIONS,
+    Value,
+    angle_unit,
+    in_snake_case,
+    reduce_array,
+    unit_in,
+)
 
 Kind = Literal["num", "bool", "text", "angle", "null"]
 MAX_TEXT: Final = 200  # characters of a text value that are kept and compared

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import re
+import sqlite3
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from webots_mcp.console.lines import said
 from webots_mcp.contract import (
@@ -18,7 +19,6 @@ from webots_mcp.contract import (
 )
 from webots_mcp.errors import InvalidInputError, NoDatabaseError
 from webots_mcp.setup.project import controllers_in, has_bridge
-from webots_mcp.store.beginnings import Beginning, beginnings, newest_session
 from webots_mcp.store.console import ConsoleRows
 from webots_mcp.store.recording import Recording
 from webots_mcp.transactions import transaction
@@ -31,6 +31,15 @@ _EXTERN: Final = "<extern>"
 _NOBODYS: Final = (_EXTERN, "<none>", "<generic>", "void")
 _NO_NEWS: Final = ("INFO:", "DEBUG:")
 _TROUBLE: Final = re.compile(r"^(WARNING|ERROR):|\b\w*(Error|Exception)\b")
+_NEWEST: Final = "SELECT coalesce(max(id), 0) FROM session"
+_SINCE: Final = (
+    "SELECT robot.name, s.pid, s.instance, "
+    "(SELECT min(id) FROM run WHERE session_id = s.id "
+    "AND EXISTS (SELECT 1 FROM state WHERE run_id = run.id)) AS run_id, "
+    "(SELECT world FROM run WHERE session_id = s.id ORDER BY id LIMIT 1) "
+    "FROM session s JOIN robot ON robot.id = s.robot_id WHERE s.id > ? "
+    "ORDER BY run_id IS NULL, s.id"
+)
 
 
 def require_world(path: str | Path, project: Path | None = None) -> tuple[Path, Path]:
@@ -67,6 +76,24 @@ def _found(path: Path, project: Path | None) -> Path:
     raise InvalidInputError(f"there is no world {places[0]}{beside}")
 
 
+class SessionStart(NamedTuple):
+    """A controller that began to record.
+
+    Attributes:
+        robot: Its robot.
+        pid: Its process.
+        instance: The Webots that it belongs to, as its bridge knows it.
+        run_id: Its first run with a state; None before there is one.
+        world: The world of its first run.
+    """
+
+    robot: str
+    pid: int
+    instance: str
+    run_id: int | None
+    world: str | None
+
+
 class Launch:
     """A Webots that we have started, and what is recorded in it.
 
@@ -101,7 +128,7 @@ class Launch:
             self.webots.end()
             raise
 
-    def first_record(self) -> Beginning | None:
+    def first_record(self) -> SessionStart | None:
         """The first of its controllers that has recorded a state."""
         return next((each for each in self._begun() if each.run_id is not None), None)
 
@@ -122,10 +149,10 @@ class Launch:
             if not rows.is_recorded(connection):
                 rows.write(connection, [said(line) for line in self.webots.lines])
 
-    def _begun(self) -> list[Beginning]:
+    def _begun(self) -> list[SessionStart]:
         asked = Address("127.0.0.1", self.start.port)
         address, pids = self.webots.address or asked, self.webots.pids
-        found = begun_since(self._recording, self._before)
+        found = starts_since(self._recording, self._before)
         return [each for each in found if each.pid in pids or address_of(each.instance) == address]
 
     def _of_webots(self) -> list[str]:
@@ -186,10 +213,21 @@ def newest_in(recording: Recording) -> int:
         return 0
 
 
-def begun_since(recording: Recording, session: int) -> list[Beginning]:
+def starts_since(recording: Recording, session: int) -> list[SessionStart]:
     """The sessions of a recording after that one."""
     try:
         with recording.reader() as connection:
-            return beginnings(connection, session)
+            return session_starts(connection, session)
     except NoDatabaseError:
         return []
+
+
+def newest_session(connection: sqlite3.Connection) -> int:
+    """The id of the newest session; 0 where there is none."""
+    ((newest,),) = connection.execute(_NEWEST)
+    return int(newest)
+
+
+def session_starts(connection: sqlite3.Connection, after: int) -> list[SessionStart]:
+    """The sessions after that one; those that have recorded first."""
+    return [SessionStart(*row) for row in connection.execute(_SINCE, (after,))]

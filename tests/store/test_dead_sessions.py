@@ -10,11 +10,9 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded, RecordedRobot, insert
-from webots_mcp.adoption import adopt
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S
-from webots_mcp.entries import FORMAT
-from webots_mcp.liveness import process_identity
-from webots_mcp.settlement import settle
+from webots_mcp.liveness import process_identity, reap
+from webots_mcp.waiting_file import FORMAT, adopt
 
 STATUS = "SELECT status FROM command"
 NOBODY = 2**31  # no system gives that pid
@@ -42,16 +40,16 @@ def test_a_command_is_not_lost_while_its_result_waits_beside_the_database(
     claimed(recorded.robot(uuid="u", pid=NOBODY))
     done = {"now": 1.0, "sim_time": 1.0, "command": 1, "status": "done", "result": "7"}
     leave_waiting(recorded.database, [1, "command finished", None, done | {"error": None}])
-    settle(recorded.connection, time.time())
+    reap(recorded.connection, time.time())
     assert recorded.connection.execute(STATUS).fetchone() == ("claimed",)
     adopt(recorded.connection, recorded.database)
-    settle(recorded.connection, time.time())
+    reap(recorded.connection, time.time())
     assert recorded.connection.execute(STATUS).fetchone() == ("done",)
 
 
 def test_a_command_of_a_dead_process_is_lost_where_nothing_waits(recorded: Recorded) -> None:
     claimed(recorded.robot(uuid="u", pid=NOBODY))
-    settle(recorded.connection, time.time())
+    reap(recorded.connection, time.time())
     assert recorded.connection.execute(STATUS).fetchone() == ("lost",)
 
 
@@ -63,7 +61,7 @@ def test_a_reload_is_lost_where_no_session_has_confirmed_it_for_a_minute(
     sql = "UPDATE command SET action = 'reload', issued_wall_time_s = ?"
     recorded.connection.execute(sql, (now_s,))
     for after_s, status in ((1, "claimed"), (ISSUED_TIME_TO_LIVE_S + 1, "lost")):
-        settle(recorded.connection, now_s + after_s)
+        reap(recorded.connection, now_s + after_s)
         assert recorded.connection.execute(STATUS).fetchone() == (status,)
 
 
@@ -71,7 +69,7 @@ def test_rows_that_are_adopted_after_a_crash_are_counted(recorded: Recorded) -> 
     assert isinstance(recorded.database, Path)
     robot = recorded.robot(uuid="u", pid=NOBODY)
     robot.state(1.0, {"n": 1})
-    settle(recorded.connection, time.time())
+    reap(recorded.connection, time.time())
     recorded.connection.execute("UPDATE run SET uuid = 'r'")
     leave_waiting(recorded.database, [1, "state", "r", [2.0, time.time(), "{}", None]])
     assert adopt(recorded.connection, recorded.database) == 1
@@ -81,7 +79,7 @@ def test_rows_that_are_adopted_after_a_crash_are_counted(recorded: Recorded) -> 
 @pytest.mark.skipif(process_identity(os.getpid()) is None, reason="needs the system's word")
 def test_a_living_process_that_got_the_pid_of_a_dead_one_is_not_it(recorded: Recorded) -> None:
     recorded.robot(pid=os.getpid(), process="another start of the machine 7")
-    settle(recorded.connection, time.time())
+    reap(recorded.connection, time.time())
     assert recorded.connection.execute("SELECT end_reason FROM session").fetchone() == ("crashed",)
 
 
@@ -92,7 +90,7 @@ def test_rows_of_a_crashed_run_are_counted_by_no_statement_that_writes(recorded:
     recorded.connection.execute("UPDATE run SET rows = 0, purged_rows = 3")
     writes: list[str] = []
     recorded.connection.set_trace_callback(writes.append)
-    settle(recorded.connection, time.time())
+    reap(recorded.connection, time.time())
     recorded.connection.set_trace_callback(None)
     assert recorded.connection.execute("SELECT rows, last_sim_time_s FROM run").fetchone() == (5, 2)
     assert not [sql for sql in writes if sql.startswith("UPDATE") and "FROM state" in sql]

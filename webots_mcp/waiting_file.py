@@ -1,0 +1,440 @@
+"""The file in which writes of a controller wait for the database, and how they come into it.
+
+A row that meets a lock for longer than a control loop may wait is appended, as one line with one
+`write()`, to a file of its session beside the database (`webots.db-waiting-<session uuid>.jsonl`).
+It survives a killed process; whoever opens the database next adopts it: exactly once, in order, in
+short transactions. How far that came stands in `session.adopted_rows`, the number of the last
+entry, which is written in the same transaction as the rows. So nothing hangs on what happens to the
+file afterwards: who finds it again, after a kill or an interrupt at any place, passes over what is
+in already.
+
+The first line says who records. Each further one is an `Entry` as a JSON array: its number, its
+kind, the UUID of its run and its values. A line that was cut off by a kill in the middle of its
+`write()` is no JSON array, and its caller never had an answer.
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sqlite3
+import sys
+import time
+from collections.abc import Callable, Sequence
+from functools import partial
+from io import FileIO
+from pathlib import Path
+from typing import Any, BinaryIO, Final, NamedTuple, cast
+
+from webots_mcp.entries import STATEMENTS, Entry, bind
+from webots_mcp.errors import SessionGoneError, warn
+from webots_mcp.transactions import in_transaction
+
+ENTRIES_AT_ONCE: Final = 100  # read, or written in one transaction
+FORMAT: Final = 1  # of the file; whoever knows another one leaves the file alone
+MAX_FILE_BYTES: Final = 1_000_000_000
+_VERSION: Final = "webots_mcp_waiting"
+_NO_NUMBER: Final = 1 << 63  # SQLite's integers end there
+_LOCKED_BYTE: Final = 1 << 40  # far beyond the end: Windows refuses to read what is locked
+_PIECE_S: Final = 0.001  # how long a transaction may keep other writers out
+
+_SESSION_OF: Final = "SELECT id, adopted_rows FROM session WHERE uuid = ?"
+_ADOPTED: Final = "SELECT adopted_rows FROM session WHERE id = ?"
+_SET_ADOPTED: Final = "UPDATE session SET adopted_rows = ? WHERE id = ?"
+_RUN_OF: Final = "SELECT id FROM run WHERE uuid = ?"
+_RECOUNT: Final = (
+    "SELECT purged_rows + (SELECT count(*) FROM state WHERE run_id = run.id), id FROM run "
+    "WHERE session_id = ? AND ended_wall_time_s IS NOT NULL"
+)
+_SET_ROWS: Final = "UPDATE run SET rows = ? WHERE id = ?"
+_KNOWN_ROBOT: Final = (
+    "INSERT INTO robot (name, kind, devices, first_seen_wall_time_s, last_seen_wall_time_s) "
+    "VALUES (:name, :kind, :devices, :now, :now) ON CONFLICT (name) DO UPDATE SET "
+    "kind = excluded.kind, devices = excluded.devices, last_seen_wall_time_s = :now"
+)
+SESSION_COLUMNS: Final = (
+    "uuid",
+    "pid",
+    "process",
+    "host",
+    "instance",
+    "extern",
+    "controller",
+    "controller_sha256",
+    "git_commit",
+    "versions",
+    "supervisor",
+    "actions",
+    "started_wall_time_s",
+    "last_seen_wall_time_s",
+    "last_seen_monotonic_s",
+    "throttle_interval",
+)
+_NEW_SESSION: Final = (
+    f"INSERT INTO session (robot_id, {', '.join(SESSION_COLUMNS)}) "
+    f"VALUES (:robot_id, :{', :'.join(SESSION_COLUMNS)}) ON CONFLICT (uuid) "
+    "DO UPDATE SET ended_wall_time_s = NULL, end_reason = NULL"
+)
+
+# What refuses a row whatever state the database is in: its own content.
+_UNFIT: Final = (sqlite3.IntegrityError, sqlite3.DataError, UnicodeEncodeError, OverflowError)
+
+# What a file that was damaged, or made by others, raises while it is read.
+_OF_THE_FILE: Final = (
+    OSError, ValueError, TypeError, LookupError, RecursionError, SessionGoneError,
+)  # fmt: skip
+
+_strange: set[Path] = set()
+
+
+def waiting_path(database: Path, session_uuid: str) -> Path:
+    """Where the entries of a session wait."""
+    return Path(f"{database}-waiting-{session_uuid}.jsonl")
+
+
+def waiting_paths(database: Path) -> list[Path]:
+    """The files in which entries for a database wait, of living sessions too."""
+    before, after = f"{database.name}-waiting-", ".jsonl"
+    try:
+        with os.scandir(database.parent) as files:
+            names = [f.name for f in files if f.name.startswith(before) and f.name.endswith(after)]
+    except OSError:
+        return []
+    return [database.with_name(name) for name in sorted(names)]
+
+
+class WaitingFile:
+    """The entries of one session that wait beside its database, written by that session.
+
+    The file is made with the first entry and stays locked while it is open: a file that is not
+    locked belongs to a process that is gone. All calls come from one thread at a time.
+
+    Args:
+        path: See `waiting_path`.
+        describe_session: Who records, as `adopt` enters it into a database that does not know.
+    """
+
+    def __init__(self, path: Path, describe_session: Callable[[], dict[str, Any]]) -> None:
+        self.path = path
+        self._describe_session = describe_session
+        self._header = b""
+        self._file: FileIO | None = None
+        self._is_whole = True  # it ends with a whole line
+
+    def append(self, entries: list[Entry]) -> None:
+        """Add entries with one `write()`, all or none of them.
+
+        Raises:
+            OSError: They could not be written; what was written of them is no whole line.
+        """
+        file = former = self._file
+        if file is None or os.fstat(file.fileno()).st_nlink == 0:
+            file = self._file = self._made()
+            if former is not None:  # somebody deleted it
+                former.close()
+        self._write(file, b"".join(encoded(entry) for entry in entries))
+
+    def read(self, offset: int) -> list[tuple[int, Entry]]:
+        """The next entries from that byte on; see `next_entries`."""
+        if self._file is None:
+            return []
+        with open(self._file.fileno(), "rb", closefd=False) as file:
+            return next_entries(file, max(offset, len(self._header)))
+
+    def empty(self) -> None:
+        """Forget the entries; who records stays."""
+        if self._file is not None:
+            self._file.truncate(len(self._header))
+            self._is_whole = True
+
+    def close(self, *, remove: bool) -> None:
+        """Without `remove` it stays for whoever opens the database next."""
+        file, self._file = self._file, None
+        if file is None:
+            return
+        if remove:
+            file.truncate(len(self._header))  # who finds it before it is gone finds nothing in it
+        file.close()
+        if remove:
+            with contextlib.suppress(OSError):
+                self.path.unlink()
+
+    def _made(self) -> FileIO:
+        """A new file that says who records, with all that a deleted one still holds."""
+        file = open(self.path, "a+b", buffering=0, opener=_open_privately)  # noqa: SIM115
+        try:
+            if not lock(file.fileno()) or os.fstat(file.fileno()).st_nlink == 0:
+                raise OSError(f"{self.path} is locked by another process")
+            file.truncate(0)
+            header = self._header or encoded({_VERSION: FORMAT, **self._describe_session()})
+            self._is_whole = True
+            self._write(file, header + self._content())
+        except BaseException:
+            file.close()
+            raise
+        self._header = header
+        return file
+
+    def _content(self) -> bytes:
+        if self._file is None:
+            return b""
+        with open(self._file.fileno(), "rb", closefd=False) as file:
+            file.seek(len(self._header))
+            return file.read()
+
+    def _write(self, file: FileIO, data: bytes) -> None:
+        data = data if self._is_whole else b"\n" + data
+        size = os.fstat(file.fileno()).st_size
+        if size + len(data) > MAX_FILE_BYTES:
+            raise OSError(f"{self.path} holds {size} bytes already")
+        self._is_whole = False
+        if (written := file.write(data)) != len(data):
+            file.truncate(size)
+            self._is_whole = True
+            raise OSError(f"{self.path} took {written} of {len(data)} bytes: the disk is full")
+        self._is_whole = True
+
+
+_open_privately: Final = partial(os.open, mode=0o600)
+
+
+def next_entries(file: BinaryIO, offset: int) -> list[tuple[int, Entry]]:
+    """Some entries from that byte on, each with the byte that follows; none at the end.
+
+    Lines that were cut off are passed over.
+    """
+    entries: list[tuple[int, Entry]] = []
+    file.seek(offset)
+    for line in file:
+        offset += len(line)
+        if (entry := _decoded(line)) is not None:
+            entries.append((offset, entry))
+            if len(entries) == ENTRIES_AT_ONCE:
+                break
+    return entries
+
+
+def count_rows(path: Path) -> int:
+    """How many rows wait in a file; 0 where there is none."""
+    offset, rows = 0, 0
+    with contextlib.suppress(OSError), path.open("rb") as file:
+        while entries := next_entries(file, offset):
+            offset = entries[-1][0]
+            rows += sum(entry.kind != "run" for _, entry in entries)
+    return rows
+
+
+def read_header(file: BinaryIO) -> dict[str, Any] | None:
+    """Who recorded; None where the first line was cut off.
+
+    Raises:
+        ValueError: Another version wrote the file.
+    """
+    file.seek(0)
+    try:
+        header = json.loads(file.readline())
+    except (ValueError, RecursionError):
+        return None
+    if not isinstance(header, dict):
+        return None
+    header = cast("dict[str, Any]", header)
+    if header.get(_VERSION) != FORMAT:
+        raise ValueError(f"{file.name} was written by another version of webots-mcp")
+    return header
+
+
+def encoded(value: object) -> bytes:
+    """A line; ASCII, so that any text can be written."""
+    return json.dumps(value).encode() + b"\n"
+
+
+def _decoded(line: bytes) -> Entry | None:
+    """None for what is no entry: cut off by a kill, or damaged since."""
+    try:
+        number, kind, run, values = json.loads(line)
+        entry = Entry(number, kind, run, values if isinstance(values, dict) else tuple(values))
+        known = kind in STATEMENTS
+    except (ValueError, TypeError, RecursionError):
+        return None
+    whole = type(number) is int and 0 < number < _NO_NUMBER
+    return entry if known and whole and (run is None or isinstance(run, str)) else None
+
+
+def lock(fd: int) -> bool:
+    """Take the lock of an open file, which ends with this process; False while another has it."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            os.lseek(fd, _LOCKED_BYTE, os.SEEK_SET)
+            msvcrt.locking(fd, msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
+
+
+def is_unfit(error: Exception) -> bool:
+    """Whether the row itself is refused; a session that is gone is the database's fault."""
+    text = str(error)
+    if isinstance(error, (sqlite3.InterfaceError, sqlite3.ProgrammingError)):
+        return "bind" in text  # a value of a type that SQLite does not know
+    return isinstance(error, _UNFIT) and "FOREIGN KEY" not in text
+
+
+class Taken(NamedTuple):
+    """What one transaction took in.
+
+    Attributes:
+        number: Of the last entry that is in.
+        written: The entries of this call; those passed over are not among them.
+        unfit: Why the database will never take an entry, for each such.
+    """
+
+    number: int
+    written: list[Entry]
+    unfit: list[str]
+
+
+def take_in(connection: sqlite3.Connection, session_id: int, piece: Sequence[Entry]) -> Taken:
+    """Write the entries of a session in one transaction, as many as there is time for.
+
+    Raises:
+        sqlite3.Error: Nothing was written.
+        SessionGoneError: Somebody deleted the session.
+    """
+
+    def act() -> Taken:
+        until_s = time.monotonic() + _PIECE_S
+        session = connection.execute(_ADOPTED, (session_id,)).fetchone()
+        if session is None:
+            raise SessionGoneError(f"the session {session_id} was deleted from the database")
+        taken = Taken(session[0], [], [])
+        for entry in piece:
+            if entry.number > taken.number:
+                taken = taken._replace(number=entry.number)
+                why = _write(connection, session_id, entry)
+                taken.unfit.append(why) if why else taken.written.append(entry)
+                if time.monotonic() > until_s:
+                    break
+        connection.execute(_SET_ADOPTED, (taken.number, session_id))
+        return taken
+
+    return in_transaction(connection, act)
+
+
+def _write(connection: sqlite3.Connection, session_id: int, entry: Entry) -> str | None:
+    """Write an entry; or why the database will never take it, which stops no other."""
+    run_id = None
+    try:
+        if entry.run is not None:
+            row = connection.execute(_RUN_OF, (entry.run,)).fetchone()
+            if row is None:
+                return f"its run {entry.run} is not known"
+            run_id = row[0]
+        connection.execute(STATEMENTS[entry.kind], bind(run_id, session_id, entry.values))
+    except Exception as error:
+        if not is_unfit(error):
+            raise
+        return str(error)
+    return None
+
+
+def adopt(connection: sqlite3.Connection, database: Path) -> int:
+    """Take in what sessions left behind whose process is gone; that of the living is theirs.
+
+    Args:
+        connection: A writer in autocommit mode and in no transaction.
+        database: Its file.
+
+    Returns:
+        How many rows and other writes that was. A file that cannot be taken in stays, is said
+        once, and keeps nobody from recording.
+
+    Raises:
+        sqlite3.Error: The database is locked; what is in is in, the rest waits.
+    """
+    return sum(_adopt_file(connection, path) for path in waiting_paths(database))
+
+
+def _adopt_file(connection: sqlite3.Connection, path: Path) -> int:
+    try:
+        with path.open("r+b") as file:
+            if not lock(file.fileno()) or os.fstat(file.fileno()).st_nlink == 0:
+                return 0
+            count = _adopt_open(connection, file)
+            if os.name != "nt":
+                path.unlink()
+        if os.name == "nt":  # where an open file cannot be deleted; who finds it passes it over
+            path.unlink()
+    except FileNotFoundError:  # another took it in meanwhile
+        return 0
+    except Exception as error:
+        if not (isinstance(error, _OF_THE_FILE) or is_unfit(error)):
+            raise
+        _warn_once(path, error)
+        return 0
+    return count
+
+
+def _warn_once(path: Path, error: Exception) -> None:
+    """A file that stays is met again each second."""
+    if path not in _strange:
+        _strange.add(path)
+        speaks = isinstance(error, (OSError, ValueError))
+        why = str(error) if speaks else f"it is damaged ({error!r})"
+        warn(f"what waits in {path} cannot be taken in: {why}")
+
+
+def _adopt_open(connection: sqlite3.Connection, file: BinaryIO) -> int:
+    header = read_header(file)
+    if header is None:
+        return 0
+    session_id = _session(connection, header)
+    offset, count, unfit = file.tell(), 0, list[str]()
+    while piece := next_entries(file, offset):
+        taken = take_in(connection, session_id, [entry for _, entry in piece])
+        offset = max(end for end, entry in piece if entry.number <= taken.number)
+        count += sum(entry.kind != "run" for entry in taken.written)
+        unfit += taken.unfit
+    if count:
+        for counted in connection.execute(_RECOUNT, (session_id,)).fetchall():
+            connection.execute(_SET_ROWS, counted)
+    if unfit:
+        warn(f"{len(unfit)} rows that waited in {file.name} were refused: {unfit[0]}")
+    return count
+
+
+def _session(connection: sqlite3.Connection, header: dict[str, Any]) -> int:
+    """The session's id; it is entered where the database does not know it."""
+    known = connection.execute(_SESSION_OF, (header["session"]["uuid"],)).fetchone()
+    if known is not None:
+        return int(known[0])
+
+    def act() -> int:
+        robot_id = enter_robot(
+            connection, header["robot"], header["session"]["started_wall_time_s"]
+        )
+        return enter_session(connection, robot_id, header["session"])
+
+    return in_transaction(connection, act)
+
+
+def enter_robot(connection: sqlite3.Connection, robot: dict[str, Any], now_s: float) -> int:
+    """The robot's id; its row is made or brought up to date."""
+    connection.execute(_KNOWN_ROBOT, {**robot, "now": now_s})
+    found = connection.execute("SELECT id FROM robot WHERE name = ?", (robot["name"],)).fetchone()
+    return int(found[0])
+
+
+def enter_session(connection: sqlite3.Connection, robot_id: int, session: dict[str, Any]) -> int:
+    """Make a session's row, of columns and their values; one of that UUID is gone on with."""
+    values = dict.fromkeys(SESSION_COLUMNS) | session
+    connection.execute(_NEW_SESSION, {**values, "robot_id": robot_id})
+    return int(connection.execute(_SESSION_OF, (session["uuid"],)).fetchone()[0])

@@ -20,11 +20,12 @@ ALLOWED = {
     "transactions": set[str](),
     "schema": {"contract", "errors", "transactions"},
     "connection": {"contract", "errors", "schema", "transactions"},
-    "liveness": {"contract", "waiting_file"},
+    "liveness": {"contract", "queue", "waiting_file"},
+    "queue": {"contract", "errors", "transactions"},
     "naming": set[str](),
     "conditions": {"conditions", "errors", "naming"},
     "parameter": {"errors", "naming"},
-    "entries": set[str](),
+    "entries": {"queue"},
     "waiting_file": {"entries", "errors", "transactions"},
     "maintenance": {"connection", "errors", "schema", "transactions", "waiting_file"},
     "standin": {"standin", "contract"},
@@ -37,6 +38,7 @@ ENTRIES = {
     "naming",
     "parameter",
     "liveness",
+    "queue",
 }
 STDLIB = {
     *ENTRIES,

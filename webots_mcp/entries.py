@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from typing import Any, Final, Literal, NamedTuple
 
+from webots_mcp import queue
+
 Kind = Literal[
     "run",
     "state",
@@ -96,23 +98,9 @@ STATEMENTS: Final[dict[Kind, str]] = {
         "FROM json_each(:rows)) AS r WHERE parameter.name = r.name AND session_id = :session "
         "AND robot_id = (SELECT robot_id FROM session WHERE id = :session)"
     ),
-    "command issued": (
-        "UPDATE command SET issued_wall_time_s = :now "
-        "WHERE id = :command AND status = 'claimed' AND session_id = :session"
-    ),
-    "command finished": (
-        "UPDATE command SET status = :status, finished_wall_time_s = :now, "
-        "finished_sim_time_s = :sim_time, result = :result, error = :error "
-        "WHERE id = :command AND status = 'claimed' AND session_id = :session"
-    ),
-    # The process that asked for the reload is gone; that this one runs is the proof that it worked.
-    "reload confirmed": (
-        "UPDATE command SET status = 'done', finished_wall_time_s = :now, "
-        "finished_sim_time_s = :sim_time, result = json_object('run_id', :run, 'mode', :mode, "
-        "'why', 'a reload keeps the mode') "
-        "WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND action = 'reload' "
-        "AND status = 'claimed' AND issued_wall_time_s IS NOT NULL"
-    ),
+    "command issued": queue.ISSUE,
+    "command finished": queue.FINISH,
+    "reload confirmed": queue.CONFIRM_RELOAD,
     "breakpoint hit": "UPDATE breakpoint SET hits = hits + 1 WHERE id = ?",
     "breakpoint failed": "UPDATE breakpoint SET enabled = 0, error = ? WHERE id = ?",
     # What a controller's code has set ends with its session.

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, host_name
+from webots_mcp.queue import CLAIMED_BY_ENDED, EXPIRE, LOSE
 from webots_mcp.waiting_file import waiting_path
 
 # A controller may be silent for hours (paused in Webots) and live; so it is not the silence that
@@ -24,15 +25,6 @@ _PIDS: Final = 2**31  # no system gives a process a higher id
 _TOLERANCE_S: Final = 2.0
 _WINDOWS_EPOCH_S: Final = 11_644_473_600  # from 1601 to 1970
 
-EXPIRE: Final = (
-    "UPDATE command SET status = 'expired', finished_wall_time_s = :now, "
-    "error = 'no controller claimed it in time; it will never run' "
-    "WHERE status = 'pending' AND expires_wall_time_s <= :now"
-)
-LOSE: Final = (
-    "UPDATE command SET status = 'lost', finished_wall_time_s = :now, error = :why "
-    "WHERE id = :id AND status = 'claimed'"
-)
 END_SESSION: Final = (
     "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, end_reason = :reason "
     "WHERE id = :id AND ended_wall_time_s IS NULL"
@@ -62,11 +54,6 @@ _OPEN_SESSIONS: Final = (
     "FROM session WHERE ended_wall_time_s IS NULL AND host = ?"
 )
 _FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
-_CLAIMED_BY_ENDED: Final = (
-    "SELECT c.id, c.issued_wall_time_s, s.extern, s.uuid FROM command c "
-    "LEFT JOIN session s ON s.id = c.session_id "
-    "WHERE c.status = 'claimed' AND (s.id IS NULL OR s.ended_wall_time_s IS NOT NULL)"
-)
 
 
 def process_alive(pid: int, process: str | None, last_seen_wall_time_s: float) -> bool:
@@ -188,7 +175,7 @@ def reap(connection: sqlite3.Connection, now_s: float) -> None:
     connection.execute(EXPIRE, {"now": now_s})
     for session_id, reason in dead_sessions(connection):
         end_session(connection, session_id, reason)
-    for command_id, issued_s, extern, uuid in connection.execute(_CLAIMED_BY_ENDED).fetchall():
+    for command_id, issued_s, extern, uuid in connection.execute(CLAIMED_BY_ENDED).fetchall():
         if _may_wait(connection, uuid):
             continue
         if issued_s is None:

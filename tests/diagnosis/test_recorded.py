@@ -15,8 +15,8 @@ import pytest
 from tests.diagnosis.conftest import Look
 from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.contract import SCHEMA_VERSION
+from webots_mcp.queue import CommandQueue
 from webots_mcp.store.migrate import upgrade
-from webots_mcp.store.queue import CommandQueue
 
 KILLED = """
 import os, signal, sys

@@ -256,8 +256,9 @@ def test_controllers_that_start_at_once_on_a_missing_database_all_come_up(
 
 CLAIMER = """
 import sqlite3, sys, time
-from webots_mcp.bridge.commands import CLAIM, PEEK
-from webots_mcp.connection import connect, never_wait
+from webots_mcp.queue import CLAIM, PEEK
+from webots_mcp.connection import connect
+from webots_mcp.transactions import never_wait
 from pathlib import Path
 
 connection = connect(Path(sys.argv[1]), "loop")

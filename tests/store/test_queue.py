@@ -13,11 +13,11 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp import liveness
-from webots_mcp.bridge.commands import CLAIM
 from webots_mcp.connection import connect
 from webots_mcp.contract import Database
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.queue import (
+from webots_mcp.queue import (
+    CLAIM,
     MAX_PARAMS_BYTES,
     CommandQueue,
     any_unfinished,

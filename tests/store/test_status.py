@@ -15,8 +15,8 @@ from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import UNSEEN
+from webots_mcp.queue import CommandQueue
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.store.queue import CommandQueue
 from webots_mcp.store.recording import look
 from webots_mcp.store.runs import current_run
 from webots_mcp.store.sessions import newest_session

@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator
 from pathlib import Path
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.commands import Command, Progress
+from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.goal import Goal, read_goal
 from webots_mcp.bridge.parameters import SETTERS, Setter
@@ -34,7 +34,7 @@ from webots_mcp.errors import (
     InvalidInputError,
 )
 
-Action = Callable[[Context, Command], Progress]
+Action = Callable[[Context, ClaimedCommand], Progress]
 
 _SCREENSHOT_TIMEOUT_S: Final = 10.0
 _RESET_TIMEOUT_S: Final = 10.0
@@ -45,7 +45,7 @@ _HIGHEST_STATUS: Final = 255
 _known: Final[dict[str, Action]] = {}
 
 
-def begin(context: Context, command: Command) -> Progress:
+def begin(context: Context, command: ClaimedCommand) -> Progress:
     """The generator of a built-in action.
 
     Raises:
@@ -78,7 +78,7 @@ def _built_in(action: Action) -> Action:
 
 
 @_built_in
-def pause(context: Context, command: Command) -> Progress:
+def pause(context: Context, command: ClaimedCommand) -> Progress:
     """Pause at once; or after one more round where the state of this one was throttled."""
     if context.throttle.stale and not context.pause.active:
         context.throttle.want()
@@ -88,7 +88,7 @@ def pause(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def resume(context: Context, command: Command) -> Progress:
+def resume(context: Context, command: ClaimedCommand) -> Progress:
     """Go on in real time, whatever the mode was before."""
     before = context.pause.running_mode
     context.pause.end(command, "real_time")
@@ -100,7 +100,7 @@ def resume(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def fast(context: Context, command: Command) -> Progress:
+def fast(context: Context, command: ClaimedCommand) -> Progress:
     """Go on as fast as the computer can."""
     context.pause.end(command, "fast")
     return _mode(context)
@@ -108,7 +108,7 @@ def fast(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def step(context: Context, command: Command) -> Progress:
+def step(context: Context, command: ClaimedCommand) -> Progress:
     """Let the user's loop come round `steps` times, each with its own step, then pause.
 
     A loop that does not ask for commands in every round makes more; those made are told. A world
@@ -117,7 +117,7 @@ def step(context: Context, command: Command) -> Progress:
     return _step(context, command, _whole_number(command.params, "steps", 1, MAX_STEPS))
 
 
-def _step(context: Context, command: Command, steps: int) -> Progress:
+def _step(context: Context, command: ClaimedCommand, steps: int) -> Progress:
     clock, watch = context.clock, context.watch
     from_s, from_step = clock.sim_time_s, clock.steps_seen
     mode = None if context.simulation.waits_for_robot else "real_time"
@@ -141,7 +141,7 @@ def _step(context: Context, command: Command, steps: int) -> Progress:
 
 
 @_built_in
-def run(context: Context, command: Command) -> Progress:
+def run(context: Context, command: ClaimedCommand) -> Progress:
     """Let the loop run until a condition holds or a time is over; then act on `then`."""
     goal = read_goal(command.params)
     context.watch.require_free()
@@ -149,14 +149,14 @@ def run(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def cancel_run(context: Context, command: Command) -> Progress:
+def cancel_run(context: Context, command: ClaimedCommand) -> Progress:
     """End the `run` command of that id, as its `then` says, or the `step`: nobody waits for it."""
     return {"was_under_way": context.watch.cancel(command.params.get("command_id"))}
     yield
 
 
 @_built_in
-def reset(context: Context, command: Command) -> Progress:
+def reset(context: Context, command: ClaimedCommand) -> Progress:
     """Ask for the reset; done when simulation time went back, which takes a physics step."""
     was_paused = context.pause.active
     context.queue.issue(command)
@@ -183,7 +183,7 @@ def _reset(context: Context) -> Generator[None]:
 
 
 @_built_in
-def reload(context: Context, command: Command) -> Progress:
+def reload(context: Context, command: ClaimedCommand) -> Progress:
     """Ask for the reload; this process ends, and the next session confirms the command."""
     context.queue.issue(command)
     context.reloads.requested_by = command
@@ -200,12 +200,12 @@ def reload(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def load_world(context: Context, command: Command) -> Progress:
+def load_world(context: Context, command: ClaimedCommand) -> Progress:
     """Ask for another world of the project; this process ends, as all controllers do."""
     return _load(context, command, _world_of_project(context, command.params.get("world")))
 
 
-def _load(context: Context, command: Command, world: Path) -> Progress:
+def _load(context: Context, command: ClaimedCommand, world: Path) -> Progress:
     context.pause.end(command)  # first: a paused simulation makes no physics step
     context.simulation.robot.worldLoad(str(world))
     return (yield from _until_ended("worldLoad"))
@@ -226,13 +226,13 @@ def _world_of_project(context: Context, world: object) -> Path:
 
 
 @_built_in
-def quit(context: Context, command: Command) -> Progress:  # noqa: A001  (the action's name)
+def quit(context: Context, command: ClaimedCommand) -> Progress:  # noqa: A001  (the action's name)
     """Ask Webots to end; this process ends with it."""
     status = _whole_number(command.params, "status", 0, _HIGHEST_STATUS, default=0)
     return _quit(context, command, status)
 
 
-def _quit(context: Context, command: Command, status: int) -> Progress:
+def _quit(context: Context, command: ClaimedCommand, status: int) -> Progress:
     context.pause.end(command)
     context.simulation.robot.simulationQuit(status)
     return (yield from _until_ended("simulationQuit"))
@@ -253,7 +253,7 @@ def _until_ended(asked: str) -> Progress:
 
 
 @_built_in
-def screenshot(context: Context, command: Command) -> Progress:
+def screenshot(context: Context, command: ClaimedCommand) -> Progress:
     """Ask for the picture; the simulator writes the file some time later, or never."""
     quality = _whole_number(command.params, "quality", 1, 100, default=100)
     path = f"{SCREENSHOT_FOLDER}/command-{command.id:06d}.png"
@@ -264,7 +264,7 @@ def screenshot(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def take_frame(context: Context, command: Command) -> Progress:
+def take_frame(context: Context, command: ClaimedCommand) -> Progress:
     """Take a picture of what a camera, a range finder or a lidar sees now, as it measured last."""
     name = command.params.get("camera") or ""
     device = find_pictured(context.simulation.robot, str(name))
@@ -276,7 +276,7 @@ def take_frame(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def reset_state(context: Context, command: Command) -> Progress:
+def reset_state(context: Context, command: ClaimedCommand) -> Progress:
     """Run what the controller registered with `on_reload`; not asked where it has its own."""
     with context.pause.user_code():
         outcomes = context.reloads.call_back()
@@ -295,7 +295,7 @@ def reset_state(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def set_parameters(context: Context, command: Command) -> Progress:
+def set_parameters(context: Context, command: ClaimedCommand) -> Progress:
     """Set parameters, all or none: `when` "now", or "reset" for the next reset of the world."""
     params, clock, parameters = command.params, context.clock, context.parameters
     values, when = params.get("values"), params.get("when", "now")
@@ -316,7 +316,7 @@ def set_parameters(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def arm_breakpoints(context: Context, command: Command) -> Progress:
+def arm_breakpoints(context: Context, command: ClaimedCommand) -> Progress:
     """Read the breakpoints anew: some were set or removed."""
     while not context.breakpoints.load():
         yield
@@ -324,7 +324,7 @@ def arm_breakpoints(context: Context, command: Command) -> Progress:
 
 
 @_built_in
-def keep(context: Context, command: Command) -> Progress:
+def keep(context: Context, command: ClaimedCommand) -> Progress:
     """Keep the last seconds and those to come at full rate, for a `reason`."""
     reason, sim_time_s = command.params.get("reason"), context.clock.sim_time_s
     if not isinstance(reason, str) or not reason.strip():
@@ -335,7 +335,7 @@ def keep(context: Context, command: Command) -> Progress:
     yield
 
 
-def _run_until(context: Context, command: Command, goal: Goal) -> Progress:
+def _run_until(context: Context, command: ClaimedCommand, goal: Goal) -> Progress:
     """Set what the goal asks for, run until it is reached, and say how far it came."""
     watch, pause, finish = context.watch, context.pause, _finish_of(context, command, goal.then)
     _set_before_run(context, command, goal)
@@ -365,20 +365,20 @@ def _run_until(context: Context, command: Command, goal: Goal) -> Progress:
         watch.end()
 
 
-def _set_before_run(context: Context, command: Command, goal: Goal) -> None:
+def _set_before_run(context: Context, command: ClaimedCommand, goal: Goal) -> None:
     """Set the parameters of a goal, all or none."""
     if goal.parameters:
         parameters, setter = context.parameters, _setter(command)
         (parameters.set_from_reset if goal.reset else parameters.set_now)(goal.parameters, setter)
 
 
-def _setter(command: Command) -> Setter:
+def _setter(command: ClaimedCommand) -> Setter:
     """As whom a command sets parameters: a trial's says so."""
     by = command.params.get("by")
     return Setter(by if by in SETTERS else "command", command.id)
 
 
-def _finish_of(context: Context, command: Command, then: Then) -> Callable[[], None]:
+def _finish_of(context: Context, command: ClaimedCommand, then: Then) -> Callable[[], None]:
     """What to do at the step that ends a run."""
     pause = context.pause
     was_paused = pause.active

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
-from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.commands import ClaimedCommand
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.gate import QUIT, Step
 from webots_mcp.bridge.session import Session
@@ -30,7 +30,7 @@ class Attachment:
     """
 
     def __init__(
-        self, session: Session, serve: Callable[[], Command | None], errors: ErrorReport
+        self, session: Session, serve: Callable[[], ClaimedCommand | None], errors: ErrorReport
     ) -> None:
         self._session = session
         self._serve = serve
@@ -40,7 +40,7 @@ class Attachment:
         self._clock = session.context.clock
         self._calls = self._throttle.calls  # of publish, up to the end of the last step
         self._left_to_controller = False
-        self._unlooked: Command | None = None
+        self._unlooked: ClaimedCommand | None = None
 
     def begin(self) -> None:
         """From now on each step is gone along with."""
@@ -53,7 +53,7 @@ class Attachment:
         self._session.control.handlers.loop_looks = True
         self._pause.go_along(None)
 
-    def take_command(self) -> Command | None:
+    def take_command(self) -> ClaimedCommand | None:
         """The command that was served last, for a loop that asks for it by itself."""
         self._session.control.handlers.loop_looks = True
         command, self._unlooked = self._unlooked, None

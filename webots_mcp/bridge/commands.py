@@ -1,8 +1,6 @@
-"""The controller's end of the command queue: each command runs at most once.
+"""The controller's end of the command queue: what it claims, and the answers that it writes.
 
-`pending` becomes `claimed` in one statement, before anything runs; a result is written only while
-the command is still claimed by this session. So a command whose controller died in the middle is
-never run a second time, and a result is final once.
+The statements and what they guarantee are those of `webots_mcp.queue`.
 """
 
 from __future__ import annotations
@@ -16,39 +14,17 @@ from webots_mcp.bridge.encoding import encode
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.bridge.registration import Registration
 from webots_mcp.bridge.text import storable
+from webots_mcp.queue import CLAIM, CLAIMED_SINCE, PEEK, SUCCESSOR_PID
 
 Progress = Generator[None, None, object]
 """A built-in action under way: it yields until its outcome is known, and returns the result."""
 
 _MOST_NAMED: Final = 10
 
-# An indexed read takes no lock. An UPDATE takes the write lock even where it matches nothing, so
-# it is made only after this said that there is something. The texts come as bytes: one that is no
-# UTF-8 would fail the statement after it claimed the command.
-PEEK: Final = (
-    "SELECT 1 FROM command WHERE robot_id = ? AND status = 'pending' "
-    "AND expires_wall_time_s > ? LIMIT 1"
-)
-CLAIM: Final = (
-    "UPDATE command SET status = 'claimed', session_id = :session, claimed_wall_time_s = :now, "
-    "claimed_sim_time_s = :sim_time WHERE status = 'pending' AND id = (SELECT id FROM command "
-    "WHERE robot_id = :robot AND status = 'pending' AND expires_wall_time_s > :now "
-    "ORDER BY id LIMIT 1) AND NOT EXISTS (SELECT 1 FROM session s WHERE s.robot_id = :robot "
-    "AND s.id > :session AND s.ended_wall_time_s IS NULL) "
-    "RETURNING id, CAST(action AS BLOB), CAST(params AS BLOB), CAST(requested_by AS BLOB)"
-)
-# A session that was judged dead although it lives may have a successor: commands are for that one.
-_SUCCESSOR: Final = (
-    "SELECT pid FROM session WHERE robot_id = ? AND id > ? AND ended_wall_time_s IS NULL LIMIT 1"
-)
-# Commands are claimed in the order of their ids. One row always.
-_CLAIMED_SINCE: Final = (
-    "SELECT (SELECT max(id) FROM command WHERE session_id = ? AND status = 'claimed' AND id > ?)"
-)
 _INTERRUPTED: Final = "the controller was interrupted before it began; it did not run"
 
 
-class Command:
+class ClaimedCommand:
     """A claimed command."""
 
     __slots__ = ("action", "id", "params", "requested_by", "session_id")
@@ -72,7 +48,7 @@ class Command:
         return {**self.params, "id": self.id, "action": self.action, "params": self.params}
 
 
-class CommandQueue:
+class ClaimedCommands:
     """Claims commands for this session and writes their fate."""
 
     def __init__(self, recorder: Recorder) -> None:
@@ -80,7 +56,7 @@ class CommandQueue:
         self._last_begun = 0
         self._claiming = False
 
-    def claim(self, sim_time_s: float) -> Command | None:
+    def claim(self, sim_time_s: float) -> ClaimedCommand | None:
         """The oldest command that waits for this robot, now ours; None costs no lock.
 
         Call `begin` with it. One that an interrupt kept from that fails with the next call.
@@ -103,23 +79,23 @@ class CommandQueue:
             self._look_for_successor(registration)
         return command
 
-    def begin(self, command: Command) -> None:
+    def begin(self, command: ClaimedCommand) -> None:
         """It is in the hands of who runs it: whatever happens now, its fate will be written."""
         self._last_begun = command.id
         self._claiming = False
 
     def _fail_interrupted(self, session_id: int, sim_time_s: float) -> None:
-        found = self._recorder.fetch(_CLAIMED_SINCE, (session_id, self._last_begun))
+        found = self._recorder.fetch(CLAIMED_SINCE, (session_id, self._last_begun))
         if found is None:
             return
         ((command_id,),) = found
         if command_id is not None:
-            self.fail(Command(command_id, "", {}, session_id), _INTERRUPTED, sim_time_s)
+            self.fail(ClaimedCommand(command_id, "", {}, session_id), _INTERRUPTED, sim_time_s)
         self._claiming = False
 
     def _look_for_successor(self, registration: Registration) -> None:
-        ids = (registration.robot_id, registration.session_id)
-        for (pid,) in self._recorder.fetch(_SUCCESSOR, ids) or ():
+        ids = {"robot": registration.robot_id, "session": registration.session_id}
+        for (pid,) in self._recorder.fetch(SUCCESSOR_PID, ids) or ():
             self._recorder.errors.warn(
                 "successor",
                 f"commands for robot {registration.robot_name!r} go to process {pid}, which began "
@@ -131,10 +107,10 @@ class CommandQueue:
         row: tuple[int, bytes, bytes | None, bytes | None],
         session_id: int,
         sim_time_s: float,
-    ) -> Command | None:
+    ) -> ClaimedCommand | None:
         command_id, action, text, asker = row
         by = None if asker is None else asker.decode("utf-8", "replace")
-        command = Command(command_id, action.decode("utf-8", "replace"), {}, session_id, by)
+        command = ClaimedCommand(command_id, action.decode("utf-8", "replace"), {}, session_id, by)
         try:
             params = json.loads(text or b"")
         except (ValueError, RecursionError):  # no JSON, no UTF-8, or nested beyond all sense
@@ -146,7 +122,7 @@ class CommandQueue:
         self.fail(command, f"params must be a JSON object, got {got!r}", sim_time_s)
         return None
 
-    def issue(self, command: Command) -> None:
+    def issue(self, command: ClaimedCommand) -> None:
         """Note that Webots is about to be asked for what may end this process."""
         values = {"now": time.time(), "command": command.id}
         self._recorder.record("command issued", None, values)
@@ -154,19 +130,24 @@ class CommandQueue:
         while not self._recorder.flush() and time.monotonic() < deadline_s:
             time.sleep(0.002)
 
-    def succeed(self, command: Command, result: object, sim_time_s: float) -> str | None:
+    def succeed(self, command: ClaimedCommand, result: object, sim_time_s: float) -> str | None:
         """Write `done` with the result, and what of it had to be replaced, which is returned."""
         encoded = encode(result)
         replaced = _name_replaced(encoded.odd)
         self._finish(command, "done", encoded.text, replaced, sim_time_s)
         return replaced
 
-    def fail(self, command: Command, error: str, sim_time_s: float) -> None:
+    def fail(self, command: ClaimedCommand, error: str, sim_time_s: float) -> None:
         """Write `failed` with the reason."""
         self._finish(command, "failed", None, storable(error), sim_time_s)
 
     def _finish(
-        self, command: Command, status: str, result: str | None, error: str | None, at_s: float
+        self,
+        command: ClaimedCommand,
+        status: str,
+        result: str | None,
+        error: str | None,
+        at_s: float,
     ) -> None:
         times = {"now": time.time(), "sim_time": at_s}
         fate = {"command": command.id, "status": status, "result": result, "error": error}

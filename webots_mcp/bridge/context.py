@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.commands import CommandQueue
+from webots_mcp.bridge.commands import ClaimedCommands
 from webots_mcp.bridge.goal import Watch
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
@@ -32,7 +32,7 @@ class Context(NamedTuple):
     heartbeat: Heartbeat
     throttle: Throttle
     reloads: Reloads
-    queue: CommandQueue
+    queue: ClaimedCommands
     pause: Pause
     parameters: Parameters
     breakpoints: Breakpoints

@@ -6,7 +6,7 @@ import time
 from typing import Final
 
 from webots_mcp.bridge import actions
-from webots_mcp.bridge.commands import Command, Progress
+from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.handlers import Handlers
 from webots_mcp.bridge.pause import PUMP_INTERVAL_S
@@ -34,7 +34,7 @@ class Control:
         self._context = context
         self.handlers = Handlers(context.recorder, context.journal, context.pause)
         self.why_ended = "the controller ended"
-        self._under_way: dict[Command, Progress] = {}
+        self._under_way: dict[ClaimedCommand, Progress] = {}
         self._reported = False
         self._next_poll_s = 0.0
         context.pause.serve = self._serve_pause
@@ -49,7 +49,7 @@ class Control:
             self._under_way.pop(command, None)
             self._succeed(command, {"controller": f"it has ended; {EXTERN}"})
 
-    def serve(self) -> Command | None:
+    def serve(self) -> ClaimedCommand | None:
         """One round: what is under way, one new command, and the pause if there is one.
 
         Returns:
@@ -66,7 +66,7 @@ class Control:
             self._next_poll_s = now + POLL_INTERVAL_S if handled is None else now
         return self._serve_pause() or handled
 
-    def _serve_pause(self) -> Command | None:
+    def _serve_pause(self) -> ClaimedCommand | None:
         """Serve commands for as long as the pause lasts."""
         handled, pause = None, self._context.pause
         while pause.active:
@@ -77,7 +77,7 @@ class Control:
             time.sleep(PUMP_INTERVAL_S if pause.active else 0)
         return handled
 
-    def _serve_one(self) -> Command | None:
+    def _serve_one(self) -> ClaimedCommand | None:
         if self._context.simulation.over:
             return None
         command = self._context.queue.claim(self._context.clock.sim_time_s)
@@ -85,7 +85,7 @@ class Control:
             self._start(command)
         return command
 
-    def _start(self, command: Command) -> None:
+    def _start(self, command: ClaimedCommand) -> None:
         built_in = BUILT_IN_ACTIONS.get(command.action)
         try:
             self._context.queue.begin(command)
@@ -109,14 +109,14 @@ class Control:
             else:
                 self._advance(command)
 
-    def _abandon(self, command: Command) -> None:
+    def _abandon(self, command: ClaimedCommand) -> None:
         """Webots is not asked for anything any more; the successor confirms a reload."""
         if command.action == "reload":
             del self._under_way[command]
         else:
             self._end(command, ControllerEndedError("Webots ended the controller"))
 
-    def _advance(self, command: Command) -> None:
+    def _advance(self, command: ClaimedCommand) -> None:
         """Go on with a built-in action; a callback of the user's in it may come back to here."""
         progress = self._under_way.pop(command, None)
         if progress is None:
@@ -136,7 +136,7 @@ class Control:
         for command in [c for c in self._under_way if c.action in LOOPING]:
             self._end(command, InterruptedCommandError(why))
 
-    def _end(self, command: Command, interruption: InterruptedCommandError) -> None:
+    def _end(self, command: ClaimedCommand, interruption: InterruptedCommandError) -> None:
         """End a built-in action that is under way: it may say how far it came."""
         progress = self._under_way.pop(command)
         try:
@@ -146,12 +146,12 @@ class Control:
         except CommandRefusedError as reason:
             self._fail(command, reason)
 
-    def _succeed(self, command: Command, result: object) -> None:
+    def _succeed(self, command: ClaimedCommand, result: object) -> None:
         context = self._context
         replaced = context.queue.succeed(command, result, context.clock.sim_time_s)
         if replaced is not None:
             text = f"command {command.id} ({command.action}): {replaced}"
             context.journal.log("warning", "bridge", text)
 
-    def _fail(self, command: Command, error: BaseException) -> None:
+    def _fail(self, command: ClaimedCommand, error: BaseException) -> None:
         self._context.queue.fail(command, describe(error), self._context.clock.sim_time_s)

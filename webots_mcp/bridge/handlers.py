@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Final
 
-from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.commands import ClaimedCommand
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.pause import Pause
 from webots_mcp.bridge.recorder import Recorder
@@ -69,7 +69,7 @@ class Handlers:
         """Whether the controller has registered a function for it that is run."""
         return action in self._handlers
 
-    def run(self, command: Command) -> object:
+    def run(self, command: ClaimedCommand) -> object:
         """What the function of the command's action returns; whatever it raises is passed on.
 
         Raises:
@@ -107,7 +107,7 @@ class Handlers:
             "is not known"
         )
 
-    def _call(self, handler: Handler, command: Command) -> object:
+    def _call(self, handler: Handler, command: ClaimedCommand) -> object:
         outer, self.running = self.running, True
         try:
             with self._pause.user_code():

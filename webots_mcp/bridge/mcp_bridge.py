@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 from webots_mcp.bridge import open_bridges
 from webots_mcp.bridge.attachment import Attachment
 from webots_mcp.bridge.capture import Capture
-from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.commands import ClaimedCommand
 from webots_mcp.bridge.encoding import text_of
 from webots_mcp.bridge.error_report import ErrorReport
 from webots_mcp.bridge.handlers import Handler
@@ -524,7 +524,7 @@ class MCPBridge:
 
     # -- inside --------------------------------------------------------------------------------
 
-    def _serve(self) -> Command | None:
+    def _serve(self) -> ClaimedCommand | None:
         command = self._session.serve()
         if self._close_after_answer:
             self.close()

@@ -6,7 +6,7 @@ from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from typing import Final, Protocol
 
-from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.commands import ClaimedCommand
 from webots_mcp.bridge.gate import QUIT, Step
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
@@ -90,7 +90,9 @@ class Pause:
         self._journal.event("pause", cause)
         self._heartbeat.change_loop(PAUSED, self._mode_before)
 
-    def end(self, command: Command, mode: str | None = None, *, stepping: bool = False) -> None:
+    def end(
+        self, command: ClaimedCommand, mode: str | None = None, *, stepping: bool = False
+    ) -> None:
         """Let the loop go on, in `mode` or in the one that it ran in before."""
         before, was_active = self.running_mode, self.active
         self._simulation.set_mode(mode or _running(before))
@@ -99,7 +101,9 @@ class Pause:
             self._journal.event("resume", {"command_id": command.id})
         self._heartbeat.change_loop(STEPPING if stepping else None)
 
-    def lend_mode(self, command: Command, mode: str | None, *, stepping: bool = False) -> None:
+    def lend_mode(
+        self, command: ClaimedCommand, mode: str | None, *, stepping: bool = False
+    ) -> None:
         """Let the loop go on for a while, as `end` does: the mode to go back to stays."""
         before = self.running_mode
         self.end(command, mode, stepping=stepping)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.commands import ClaimedCommand
 
 Callback = Callable[[], object]
 
@@ -22,7 +22,7 @@ class Reloads:
     def __init__(self, failed: Callable[[str, Exception], None]) -> None:
         self._failed = failed
         self._callbacks: list[Callback] = []
-        self.requested_by: Command | None = None
+        self.requested_by: ClaimedCommand | None = None
         self._undetected = False
         self._unfired = False
 

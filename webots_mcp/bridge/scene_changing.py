@@ -14,7 +14,7 @@ from collections.abc import Generator
 from dataclasses import replace
 from typing import Any, Final
 
-from webots_mcp.bridge.commands import Command, Progress
+from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.scene_edits import MOST_EDITS, FieldEdit, Removal
 from webots_mcp.bridge.scene_path import Place, children, find, find_node, label
@@ -41,7 +41,7 @@ _ADDED_BEFORE: Final = "does not bring it back: it was added in this run"
 _SAYS: Final = "Webots' console (webots_get_logs, if it is recorded) says why"
 
 
-def set_field(context: Context, command: Command) -> Progress:
+def set_field(context: Context, command: ClaimedCommand) -> Progress:
     """Set the field, or the entry of one, that a `path` leads to, to a `value`."""
     robot, params = context.simulation.robot, command.params
     place = yield from find(robot, params.get("path"))
@@ -127,7 +127,7 @@ def _until_stepped(context: Context) -> Generator[None, None, bool]:
     return True
 
 
-def _asked_by(command: Command) -> dict[str, Any]:
+def _asked_by(command: ClaimedCommand) -> dict[str, Any]:
     return {"command_id": command.id, "requested_by": command.requested_by}
 
 
@@ -137,7 +137,7 @@ def _told_of_reset(is_remembered: bool) -> dict[str, Any]:
     return {"a_reset": f"leaves it so: {MOST_EDITS} changes are remembered, and no more"}
 
 
-def add_node(context: Context, command: Command) -> Progress:
+def add_node(context: Context, command: ClaimedCommand) -> Progress:
     """Add the node that `vrml` describes to the children of a `path`, or to a field of nodes."""
     robot, params = context.simulation.robot, command.params
     text = _require_one_node(params.get("vrml"))
@@ -226,7 +226,7 @@ def _path_of(robot: Any, node: Any) -> str:
     return definition if is_first else f"#{node.getId()}"
 
 
-def remove_node(context: Context, command: Command) -> Progress:
+def remove_node(context: Context, command: ClaimedCommand) -> Progress:
     """Remove the node that a `path` leads to, with all in it."""
     robot = context.simulation.robot
     place = yield from find_node(robot, command.params.get("path"))

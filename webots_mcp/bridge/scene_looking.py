@@ -10,7 +10,7 @@ from collections.abc import Generator, Iterable
 from fnmatch import fnmatchcase
 from typing import Any, Final, cast
 
-from webots_mcp.bridge.commands import Command, Progress
+from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.scene import DEEPEST, WALKED, SceneNode, find_field, holds_solids, walk
 from webots_mcp.bridge.scene_path import Pace, Place, children, fields_of, find, find_node, label
@@ -29,7 +29,7 @@ _MOST_PATTERNS: Final = 20
 _MOST_NEAR: Final = 10  # types or names that are told where none matches
 
 
-def get_scene(context: Context, command: Command) -> Progress:
+def get_scene(context: Context, command: ClaimedCommand) -> Progress:
     """The nodes of the tree, or below a `path`, that match `types` and `names`."""
     params, robot = command.params, context.simulation.robot
     types, names = _patterns(params, "types"), _patterns(params, "names")
@@ -125,7 +125,7 @@ def _any_match(texts: Iterable[str], patterns: list[str]) -> bool:
     return any(fnmatchcase(text.lower(), each.lower()) for text in texts for each in patterns)
 
 
-def get_field(context: Context, command: Command) -> Progress:
+def get_field(context: Context, command: ClaimedCommand) -> Progress:
     """What a `path` leads to: the value of a field, or a node with all its fields."""
     place = yield from find(context.simulation.robot, command.params.get("path"))
     start = _whole(command.params, "start", 0, 0, 10**9)

@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from webots_mcp.bridge.breakpoints import Breakpoints
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.commands import Command, CommandQueue
+from webots_mcp.bridge.commands import ClaimedCommand, ClaimedCommands
 from webots_mcp.bridge.context import Context
 from webots_mcp.bridge.control import Control
 from webots_mcp.bridge.error_report import ErrorReport
@@ -97,7 +97,7 @@ class Session:
             heartbeat=heartbeat,
             throttle=throttle,
             reloads=reloads,
-            queue=CommandQueue(recorder),
+            queue=ClaimedCommands(recorder),
             pause=pause,
             parameters=parameters,
             breakpoints=Breakpoints(simulation, clock, recorder, journal, pause, keeper),
@@ -133,7 +133,7 @@ class Session:
         if registration.paused_mode is not None:
             self.context.pause.take_over(registration.paused_mode)
 
-    def serve(self) -> Command | None:
+    def serve(self) -> ClaimedCommand | None:
         """One round of the loop: the commands that wait, and the heartbeat."""
         simulation = self.context.simulation
         self.runs.look()

@@ -19,6 +19,7 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.naming import flatten
+from webots_mcp.queue import Command
 from webots_mcp.server.budget import figure, seconds, shown, table
 from webots_mcp.server.shortening import shorten
 from webots_mcp.server.target import find_target
@@ -29,7 +30,6 @@ from webots_mcp.store.detection.event import Event
 from webots_mcp.store.questions.events import search_events
 from webots_mcp.store.questions.runs import pace
 from webots_mcp.store.questions.trends import trends
-from webots_mcp.store.queue import Command
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range, whole_run
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.recording import Recording, View

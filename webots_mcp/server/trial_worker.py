@@ -16,12 +16,12 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
+from webots_mcp.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.server.running import ACTION
 from webots_mcp.server.target import find_target
 from webots_mcp.store.leases import Job
 from webots_mcp.store.parameters import described, parameters_of
 from webots_mcp.store.questions.score import score_run
-from webots_mcp.store.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.trials import (

@@ -21,8 +21,8 @@ from webots_mcp.errors import (
     NothingRecordedError,
     SchemaTooOldError,
 )
+from webots_mcp.queue import any_unfinished
 from webots_mcp.schema import create_schema, require_current, schema_version
-from webots_mcp.store.queue import any_unfinished
 from webots_mcp.store.reading.subject import Subject, choose, require_run
 from webots_mcp.store.retention.limits import Asked
 from webots_mcp.store.robots import Robot

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from webots_mcp.connection import connect
 from webots_mcp.contract import Database
-from webots_mcp.store.queue import Command, fetch_command
+from webots_mcp.queue import Command, fetch_command
 
 _UNFINISHED: Final = {
     "pending": "no get_command() of its controller has come to it yet",

@@ -13,6 +13,7 @@ from webots_mcp.connection import Role, connect
 from webots_mcp.contract import LOG_LEVELS, Database
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
+from webots_mcp.queue import CommandQueue, list_commands
 from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.detection.event import Event as FoundEvent
 from webots_mcp.store.detection.event import EventOptions
@@ -20,7 +21,6 @@ from webots_mcp.store.events import Event, newest_events
 from webots_mcp.store.logs import LogFilter, LogLine, newest_lines
 from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.questions.events import find_events
-from webots_mcp.store.queue import CommandQueue, list_commands
 from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
 from webots_mcp.store.reading.rows import read_columns

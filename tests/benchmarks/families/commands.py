@@ -19,8 +19,8 @@ from tests.benchmarks.servers import our_server
 from tests.benchmarks.table import Line, Target, duration
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
+from webots_mcp.queue import CommandQueue, fetch_command
 from webots_mcp.schema import create_schema
-from webots_mcp.store.queue import CommandQueue, fetch_command
 
 _ROUND_TRIPS = 300
 _LOOK_INTERVAL_S = 0.001

@@ -20,7 +20,7 @@ from tests.benchmarks.servers import our_server
 from tests.benchmarks.table import Line, Target
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.store.queue import CommandQueue
+from webots_mcp.queue import CommandQueue
 from webots_mcp.waiting_file import adopt, waiting_paths
 
 _KILLS = 60

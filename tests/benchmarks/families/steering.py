@@ -17,7 +17,7 @@ from tests.benchmarks.table import Line, duration
 from webots_mcp import MCPBridge
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, MAX_RUN_S
-from webots_mcp.store.queue import CommandQueue
+from webots_mcp.queue import CommandQueue
 
 _BLOCKS: Final = 15
 _ROUNDS: Final = 5_000

@@ -11,8 +11,8 @@ import time
 from pathlib import Path
 
 from tests.benchmarks.processes import say
-from webots_mcp.bridge.commands import CLAIM, PEEK
 from webots_mcp.connection import connect
+from webots_mcp.queue import CLAIM, PEEK
 from webots_mcp.transactions import never_wait
 
 

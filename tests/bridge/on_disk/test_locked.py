@@ -21,7 +21,7 @@ from tests.bridge.conftest import (
 )
 from webots_mcp import MCPBridge
 from webots_mcp.bridge import actions, backlog
-from webots_mcp.bridge.commands import Command
+from webots_mcp.bridge.commands import ClaimedCommand
 from webots_mcp.connection import connect
 from webots_mcp.standin import InProcessSupervisor
 
@@ -136,7 +136,7 @@ def test_arming_is_answered_once_the_breakpoints_could_be_read(
     with write_lock(file) as other:
         _store_breakpoint(other, "n == 2")
         bridge.publish({"n": 0})
-        progress = actions.begin(context, Command(1, "arm_breakpoints", {}, 1))
+        progress = actions.begin(context, ClaimedCommand(1, "arm_breakpoints", {}, 1))
         next(progress)
     catch_up(bridge)
 

@@ -9,13 +9,13 @@ from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
+from webots_mcp.queue import Command, list_commands
 from webots_mcp.server.budget import condensed
 from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.dispatch import Dispatcher, shown_result
 from webots_mcp.server.parameters import Cursor, Id, RobotName, TimeoutS
 from webots_mcp.server.results import CommandAnswer, CommandsAnswer
 from webots_mcp.server.shortening import DETAIL_BUDGET, cut_text, shorten
-from webots_mcp.store.queue import Command, list_commands
 from webots_mcp.store.recording import Recording, View
 
 COMMAND_COLUMNS: Final = (

@@ -1,7 +1,12 @@
-"""The command queue, from the asker's side: put in, look, take back.
+"""The command queue: the rows of `command`, and every statement that changes one.
 
-A command runs at most once: it is claimed by one statement of the bridge, and the guards in the
-statements here (`AND status = 'pending'`, the unique key) hold for any number of processes.
+Who asks puts a command in as `pending`. The controller that it is for makes it `claimed`, in one
+statement and before anything runs, and then `done` or `failed`. What nobody claims in time is
+`expired`, what its asker takes back before that is `cancelled`, and what its claimer's process did
+not live to answer is `lost`. So a command runs at most once, and what became of it is final once:
+each statement names the status that it expects, which holds for any number of processes.
+
+Standard library only, because the bridge imports it inside a robot's controller.
 """
 
 from __future__ import annotations
@@ -9,14 +14,11 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-import uuid
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Any, Final, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
-from webots_mcp.contract import COMMAND_TIME_TO_LIVE_S, FINAL_STATUSES
+from webots_mcp.contract import COMMAND_TIME_TO_LIVE_S, FINAL_STATUSES, new_uuid
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.rows import columns_of
 from webots_mcp.transactions import is_busy
 
 MAX_PARAMS_BYTES: Final = 65_536
@@ -24,8 +26,7 @@ MAX_PARAMS_BYTES: Final = 65_536
 _ATTEMPTS: Final = 3
 
 
-@dataclass(frozen=True)
-class Command:
+class Command(NamedTuple):
     """A request and its fate; `params` and `result` are JSON text. Columns as in `store.models`."""
 
     id: int
@@ -58,20 +59,9 @@ class Command:
             return None
 
 
-_COLUMNS: Final = columns_of(Command)
-_ENQUEUE: Final = (
-    "INSERT INTO command (robot_id, action, params, status, requested_by, idempotency_key, "
-    "created_wall_time_s, expires_wall_time_s) "
-    "VALUES (:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires) "
-    "ON CONFLICT (idempotency_key) DO NOTHING"
-)
+_COLUMNS: Final = ", ".join(Command._fields)
 _BY_KEY: Final = f"SELECT {_COLUMNS} FROM command WHERE idempotency_key = ?"
 _BY_ID: Final = f"SELECT {_COLUMNS} FROM command WHERE id = ?"
-_CANCEL: Final = (
-    "UPDATE command SET status = 'cancelled', finished_wall_time_s = :now, error = :why "
-    "WHERE id = :id AND status = 'pending'"
-)
-_NOTE: Final = "UPDATE command SET error = :note WHERE id = :id AND status = 'claimed'"
 _NEWEST: Final = (
     f"SELECT {_COLUMNS} FROM command WHERE robot_id = :robot_id "
     "AND (:before_id IS NULL OR id < :before_id) AND (:status IS NULL OR status = :status) "
@@ -81,6 +71,77 @@ _NEWEST: Final = (
 _UNFINISHED: Final = (
     "SELECT EXISTS (SELECT 1 FROM command WHERE status = 'pending') "
     "OR EXISTS (SELECT 1 FROM command WHERE status = 'claimed')"
+)
+
+# -- who asks ----------------------------------------------------------------------------------
+
+_ENQUEUE: Final = (
+    "INSERT INTO command (robot_id, action, params, status, requested_by, idempotency_key, "
+    "created_wall_time_s, expires_wall_time_s) "
+    "VALUES (:robot_id, :action, :params, 'pending', :requested_by, :key, :now, :expires) "
+    "ON CONFLICT (idempotency_key) DO NOTHING"
+)
+_CANCEL: Final = (
+    "UPDATE command SET status = 'cancelled', finished_wall_time_s = :now, error = :why "
+    "WHERE id = :id AND status = 'pending'"
+)
+_NOTE: Final = "UPDATE command SET error = :note WHERE id = :id AND status = 'claimed'"
+
+# -- the controller that it is for -------------------------------------------------------------
+
+# An indexed read takes no lock. An UPDATE takes the write lock even where it matches nothing, so
+# it is made only after this said that there is something. The texts come as bytes: one that is no
+# UTF-8 would fail the statement after it claimed the command.
+PEEK: Final = (
+    "SELECT 1 FROM command WHERE robot_id = ? AND status = 'pending' "
+    "AND expires_wall_time_s > ? LIMIT 1"
+)
+# A session that was judged dead although it lives may have a successor: commands are for that one.
+_SUCCESSOR: Final = (
+    "FROM session s WHERE s.robot_id = :robot AND s.id > :session AND s.ended_wall_time_s IS NULL"
+)
+CLAIM: Final = (
+    "UPDATE command SET status = 'claimed', session_id = :session, claimed_wall_time_s = :now, "
+    "claimed_sim_time_s = :sim_time WHERE status = 'pending' AND id = (SELECT id FROM command "
+    "WHERE robot_id = :robot AND status = 'pending' AND expires_wall_time_s > :now "
+    f"ORDER BY id LIMIT 1) AND NOT EXISTS (SELECT 1 {_SUCCESSOR}) "
+    "RETURNING id, CAST(action AS BLOB), CAST(params AS BLOB), CAST(requested_by AS BLOB)"
+)
+SUCCESSOR_PID: Final = f"SELECT s.pid {_SUCCESSOR} LIMIT 1"
+# Commands are claimed in the order of their ids. One row always.
+CLAIMED_SINCE: Final = (
+    "SELECT (SELECT max(id) FROM command WHERE session_id = ? AND status = 'claimed' AND id > ?)"
+)
+_OF_CLAIMER: Final = "WHERE id = :command AND status = 'claimed' AND session_id = :session"
+ISSUE: Final = f"UPDATE command SET issued_wall_time_s = :now {_OF_CLAIMER}"
+FINISH: Final = (
+    "UPDATE command SET status = :status, finished_wall_time_s = :now, "
+    f"finished_sim_time_s = :sim_time, result = :result, error = :error {_OF_CLAIMER}"
+)
+# The process that asked for the reload is gone; that this one runs is the proof that it worked.
+CONFIRM_RELOAD: Final = (
+    "UPDATE command SET status = 'done', finished_wall_time_s = :now, "
+    "finished_sim_time_s = :sim_time, result = json_object('run_id', :run, 'mode', :mode, "
+    "'why', 'a reload keeps the mode') "
+    "WHERE robot_id = (SELECT robot_id FROM run WHERE id = :run) AND action = 'reload' "
+    "AND status = 'claimed' AND issued_wall_time_s IS NOT NULL"
+)
+
+# -- whoever sees that nobody will finish it (`liveness.reap`) --------------------------------
+
+EXPIRE: Final = (
+    "UPDATE command SET status = 'expired', finished_wall_time_s = :now, "
+    "error = 'no controller claimed it in time; it will never run' "
+    "WHERE status = 'pending' AND expires_wall_time_s <= :now"
+)
+CLAIMED_BY_ENDED: Final = (
+    "SELECT c.id, c.issued_wall_time_s, s.extern, s.uuid FROM command c "
+    "LEFT JOIN session s ON s.id = c.session_id "
+    "WHERE c.status = 'claimed' AND (s.id IS NULL OR s.ended_wall_time_s IS NOT NULL)"
+)
+LOSE: Final = (
+    "UPDATE command SET status = 'lost', finished_wall_time_s = :now, error = :why "
+    "WHERE id = :id AND status = 'claimed'"
 )
 
 
@@ -126,7 +187,7 @@ class CommandQueue:
                 belongs to another request.
             sqlite3.OperationalError: The database stayed locked.
         """
-        key = idempotency_key or uuid.uuid4().hex
+        key = idempotency_key or new_uuid()
         now_s = self._clock()
         values = {
             "robot_id": robot_id,

@@ -23,12 +23,14 @@ from webots_mcp.store.recording import Recording
 from webots_mcp.transactions import transaction
 
 LEASE_S: Final = 30.0
+# One that ends later was taken before the clock was set back. It is not one lease from now: the
+# holder may renew after the asker looked at the clock and before its statement reads the row.
+_LATEST_S: Final = 2 * LEASE_S
 _RENEW_EVERY_S: Final = 3.0
-# A lease that ends later than any that is taken now was taken before the clock was set back.
 _TAKE: Final = (
     "INSERT INTO lease (name, holder, until_wall_time_s) VALUES (:name, :holder, :until) "
     "ON CONFLICT (name) DO UPDATE SET holder = :holder, until_wall_time_s = :until "
-    "WHERE :forced OR until_wall_time_s NOT BETWEEN :now AND :until"
+    "WHERE :forced OR until_wall_time_s NOT BETWEEN :now AND :latest"
 )
 _RENEW: Final = "UPDATE lease SET until_wall_time_s = ? WHERE name = ? AND holder = ?"
 _GIVE_BACK: Final = "DELETE FROM lease WHERE name = ? AND holder = ?"
@@ -52,7 +54,7 @@ class Lease:
 def holder_of(connection: sqlite3.Connection, name: str) -> str | None:
     """Who renewed the lease of that job lately; None where nobody did."""
     now_s = time.time()
-    row = connection.execute(_HOLDER, (name, now_s, now_s + LEASE_S)).fetchone()
+    row = connection.execute(_HOLDER, (name, now_s, now_s + _LATEST_S)).fetchone()
     return row and str(row[0])
 
 
@@ -66,7 +68,8 @@ def take(connection: sqlite3.Connection, name: str, *, forced: bool = False) -> 
     """
     now_s = time.time()
     lease = Lease(name, f"{host_name()} {os.getpid()} {os.urandom(4).hex()}")
-    values = {**vars(lease), "now": now_s, "until": now_s + LEASE_S, "forced": forced}
+    times = {"now": now_s, "until": now_s + LEASE_S, "latest": now_s + _LATEST_S}
+    values = {**vars(lease), **times, "forced": forced}
     return lease if connection.execute(_TAKE, values).rowcount else None
 
 

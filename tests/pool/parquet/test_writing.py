@@ -40,6 +40,7 @@ from tests.pool.parquet.rows import (
 from webots_mcp.errors import InvalidInputError, PoolBusyError, PoolError, PoolUnavailableError
 from webots_mcp.pool.batch import Batch, Row
 from webots_mcp.pool.parquet import rows as arrow_rows
+from webots_mcp.pool.parquet.lease import LEASE_S
 from webots_mcp.pool.parquet.reading import ParquetPool
 from webots_mcp.pool.parquet.writing import PART_BYTES, ParquetTarget
 from webots_mcp.pool.tables import SQLValue, table, tables
@@ -287,9 +288,10 @@ def test_a_shipper_of_another_host_is_waited_for_until_its_lease_is_over(tmp_pat
     write_all(str(tmp_path), STEPS[:1])
     lease = tmp_path / f"recording={UUID}" / "_lease"
     other = {"host": "elsewhere", "pid": 1, "process": "x", "token": "x"}
-    lease.write_text(json.dumps(other | {"until_wall_time_s": time.time() + 30}))
-    with pytest.raises(PoolBusyError, match="process 1 on elsewhere ships this recording"):
-        write_all(str(tmp_path), STEPS)
+    for left_s in (30.0, LEASE_S + 20):  # its clock is ahead
+        lease.write_text(json.dumps(other | {"until_wall_time_s": time.time() + left_s}))
+        with pytest.raises(PoolBusyError, match="process 1 on elsewhere ships this recording"):
+            write_all(str(tmp_path), STEPS)
     lease.write_text(json.dumps(other | {"until_wall_time_s": time.time() - 1}))
     write_all(str(tmp_path), STEPS)
     assert not lease.exists()

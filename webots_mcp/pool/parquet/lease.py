@@ -14,6 +14,9 @@ from webots_mcp.liveness import process_identity
 from webots_mcp.pool.parquet.storage import Storage
 
 LEASE_S: Final = 60.0
+# One that ends later was taken before a clock was set back. It is not one lease from now: it may
+# be renewed after this host looked at its clock, and the clock of the other host may be ahead.
+_LATEST_S: Final = 2 * LEASE_S
 _RENEW_AFTER_S: Final = 15.0
 
 
@@ -37,7 +40,7 @@ class _Holder:
         """
         if self.host == host_name() and self.process is not None:
             return process_identity(self.pid) != self.process
-        return not now_s < self.until_wall_time_s <= now_s + LEASE_S
+        return not now_s < self.until_wall_time_s <= now_s + _LATEST_S
 
 
 class Lease:

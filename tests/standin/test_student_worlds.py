@@ -67,6 +67,23 @@ def test_each_type_that_is_left_out_is_warned_of_once() -> None:
     ]
 
 
+def test_a_warning_of_several_nodes_names_the_line_of_the_first(tmp_path: Path) -> None:
+    world = tmp_path / "deep.wbt"
+    world.write_text(
+        "#VRML_SIM R2025a utf8\n"
+        "WorldInfo { }\n"
+        'Robot { name "r" controller "<none>" children [\n'
+        "  Radar { }\n"
+        "] }\n"
+        "Fog { }\n"
+        "Radar { }\n"
+    )
+    assert InProcessSimulation(world).console == [
+        "WARNING: deep.wbt, line 4: the stand-in has no Radar nodes; these 2 are left out.",
+        "WARNING: deep.wbt, line 6: the stand-in has no Fog nodes; this one is left out.",
+    ]
+
+
 def test_loose_boxes_are_pushed_and_fixed_ones_not() -> None:
     text = (WORLDS / "e_puck_r2023b.wbt").read_text(encoding="utf-8")
     assert "supervisor" not in text

@@ -80,9 +80,13 @@ class World:
                 ]
 
     def warnings(self) -> list[str]:
-        """One line for each type of node that was left out, and for what is not followed."""
+        """One line for each type of node that was left out, and for what is not followed.
+
+        A line names the first node of its type in the file; what lies higher in the tree was left
+        out before it.
+        """
         by_type: dict[str, list[Node]] = {}
-        for node in self.left_out:
+        for node in sorted(self.left_out, key=lambda node: node.line):
             by_type.setdefault(node.type_name, []).append(node)
         lines = [
             f"line {nodes[0].line}: the stand-in has no {type_name} nodes; "

@@ -201,6 +201,18 @@ def test_what_changed_most_comes_first(rover: sqlite3.Connection, tier: str) -> 
     assert run.resolution_s == (None if tier == "rows" else 10.0)
 
 
+def test_a_clock_is_never_what_changed_most(empty: sqlite3.Connection, tier: str) -> None:
+    record(
+        empty, rows=2000, interval_s=0.1, time_s=lambda t: t, robotTime=lambda t: t + 1e6,
+        loop_steps=lambda t: round(t * 10), lap_time=lambda t: t % 7,
+        pose_x=lambda t: 0.5 * t, target=lambda _: 3.0,
+    )  # fmt: skip
+    names = [trend.name for trend in ask(empty).numbers]
+    assert set(names[:2]) == {"pose_x", "lap_time"}
+    assert names[2] == "target"
+    assert set(names[3:]) == {"time_s", "robotTime", "loop_steps"}
+
+
 def test_modes_are_counted_with_their_times(rover: sqlite3.Connection, tier: str) -> None:
     mode, bumper = ask(rover, "mode", "sensors.bumper").states
     assert (mode.changes, mode.last, mode.since_s) == (3, "cruise", 95.0)

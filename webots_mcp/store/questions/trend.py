@@ -24,6 +24,7 @@ from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_number
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
 from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.signals.registry import Signal
+from webots_mcp.units import words_of
 
 STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
 TOLD_MISSING_SHARE: Final = 0.001
@@ -31,6 +32,12 @@ SLOW_SHARE: Final = 0.5  # of the variance must be left in means for their cours
 SWINGING_SHARE: Final = 0.6  # of the range: what swung for less did something else as well
 WIDE_SHARE: Final = 0.3  # of the range of values: who swings by less swings about a moving place
 TOLD_BEYOND_ENDS: Final = 0.05  # of the range: extremes nearer to the ends are as good as them
+# Words of a clock or a counter, and how straight its course is, also in means of a tenth of it.
+_CLOCKS: Final = frozenset((
+    "time", "clock", "timestamp", "stamp", "elapsed", "t", "seconds", "step", "steps", "tick",
+    "ticks", "frame", "frames", "iteration", "iterations",
+))  # fmt: skip
+_CLOCK_R2: Final = 0.99
 _DUST: Final = 1e-12  # of a value: what adding leaves of it
 _HALF_TURN_VARIANCE: Final = -2 * math.log(2 / math.pi)  # of angles spread over half a turn
 
@@ -95,6 +102,15 @@ class Trend:
     def is_lacking(self) -> bool:
         """Whether so many rows have no value that it is told."""
         return self.missing > TOLD_MISSING_SHARE * self.summary.rows
+
+    @property
+    def is_clock(self) -> bool:
+        """Whether it rises with simulation time and its name says so: it tells nothing new.
+
+        A straight rise alone is not enough: a robot at constant speed has one too.
+        """
+        is_straight = self.monotonic == "rising" and (self.r2 or 0.0) >= _CLOCK_R2
+        return is_straight and not _CLOCKS.isdisjoint(words_of(self.name.rpartition(".")[2]))
 
 
 def judge(

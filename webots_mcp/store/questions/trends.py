@@ -54,7 +54,7 @@ class RunTrends:
     Attributes:
         resolution_s: None if every row was looked at; else the length of the rollups from which
             shape, slope and swings come (counts, extremes, mean and deviation stay exact).
-        numbers: What changed most comes first; at most `limit` of `total`.
+        numbers: What changed most comes first, clocks come last; at most `limit` of `total`.
         silent: Names that have no value in the range, or none that can be reckoned with.
         rows: Rows that were read, be it as rollups.
         cut_at_s: The deadline passed; from there on something is missing in the answer.
@@ -157,7 +157,10 @@ def _run_trends(
         has_values = [not np.isnan(read.values[signal.name]).all() for signal in numbers]
         rows, resolution_s, numbers_cut_s = len(read.times), None, read.cut_at_s
     # Sums differ in their last digits from one processor to the next, and the order must not.
-    held = sorted((trend for trend in found if trend), key=lambda trend: -round(trend.change, 9))
+    held = sorted(
+        (trend for trend in found if trend),
+        key=lambda trend: (trend.is_clock, -round(trend.change, 9)),
+    )
     silent = [
         f"{signal.name} ({TOO_LARGE})" if has_value else signal.name
         for signal, trend, has_value in zip(numbers, found, has_values, strict=True)

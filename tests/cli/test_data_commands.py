@@ -178,9 +178,9 @@ def test_import_takes_in_another_recording_with_its_trials_once(
         set_id = create_trial_set(connection, '{"score": "duration"}', [{"kp": 1.0}])
         finish_trial(connection, trials_of(connection, set_id)[0], Result(2, 4.5, None))
     new = tmp_path / "new" / "webots.db"
-    for _ in range(2):
+    for told in ("new here: run 1 to 2", "nothing is new: run 1 to 2 was here already"):
         assert main(["import", str(database), "--data-dir", str(new.parent)]) == 0
-        assert capsys.readouterr().out == f"of {database} there are here: run 1 to 2\n"
+        assert capsys.readouterr().out == f"{database}: {told}\n"
         assert query(new, "SELECT status, score, run_id FROM trial") == [("done", 4.5, 2)]
         assert query(new, "SELECT count(*) FROM run") == [(2,)]
     said = complaint(capsys, "import", str(new), "--database", str(new))
@@ -196,10 +196,16 @@ def test_a_bundle_goes_from_one_recording_to_another(
     file, new = tmp_path / "run.zip", tmp_path / "new"
     assert main(["export", "--run", "2", "-o", str(file), "--database", str(database)]) == 0
     assert capsys.readouterr().out == f"{file}: run 2, {file.stat().st_size:,} bytes\n"
-    for _ in range(2):
+    for told in ("new here: run 1", "nothing is new: run 1 was here already"):
         assert main(["import", str(file), "--data-dir", str(new)]) == 0
-        assert capsys.readouterr().out == f"of {file} there are here: run 1\n"
+        assert capsys.readouterr().out == f"{file}: {told}\n"
     assert query(new / "webots.db", "SELECT count(*) FROM state") == [(327,)]
+    assert main(["import", str(database), "--data-dir", str(new)]) == 0
+    assert capsys.readouterr().out == f"{database}: new here: run 2; run 1 was here already\n"
+    with closing(connect(database, "writer")) as connection:
+        create_trial_set(connection, '{"score": "duration"}', [{"kp": 1.0}])
+    assert main(["import", str(database), "--data-dir", str(new)]) == 0
+    assert "no run is new, but sessions without runs, or trials, are" in capsys.readouterr().out
     line = ("export", "--last", "5", "-o", str(file), "--database", str(database))
     assert "a bundle is a whole run" in complaint(capsys, *line)
 

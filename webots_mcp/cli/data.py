@@ -185,8 +185,24 @@ def _import_recording(arguments: argparse.Namespace, source: Path, told: Path) -
     with writing(arguments, create=True) as (recording, connection):
         if isinstance(recording.database, Path) and source.samefile(recording.database):
             raise InvalidInputError(f"{source} is the recording itself: choose another file")
-        runs = merge(connection, recording.data_dir, source)
-    print(f"of {told} there are here: run {id_ranges(list(runs.values())) or 'none'}")
+        (newest,) = connection.execute("SELECT coalesce(max(id), 0) FROM run").fetchone()
+        changes = connection.total_changes
+        runs = list(merge(connection, recording.data_dir, source).values())
+        is_changed = connection.total_changes > changes
+    print(f"{told}: {_taken_in(runs, newest, is_changed=is_changed)}")
+
+
+def _taken_in(runs: list[int], newest_before: int, *, is_changed: bool) -> str:
+    """What an import has brought, of the runs that are in both recordings now."""
+    new = [run_id for run_id in runs if run_id > newest_before]
+    before = [run_id for run_id in runs if run_id <= newest_before]
+    known = f"run {id_ranges(before)} was here already" if before else ""
+    if new:
+        return f"new here: run {id_ranges(new)}" + (f"; {known}" if known else "")
+    if is_changed:
+        beside = f"; {known}" if known else ""
+        return f"no run is new, but sessions without runs, or trials, are{beside}"
+    return f"nothing is new{': ' if known else ', it has no runs'}{known}"
 
 
 @command(

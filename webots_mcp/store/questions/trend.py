@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, Literal
 
+from webots_mcp.naming import words_of
 from webots_mcp.store.analysis.arrays import Array, np
 from webots_mcp.store.analysis.features import (
     Line,
@@ -24,7 +25,6 @@ from webots_mcp.store.analysis.summary import LARGEST, Summary, summarise_number
 from webots_mcp.store.analysis.swings import LEAST_HALF_SWINGS, Swing, find_swings
 from webots_mcp.store.reading.moments import shown_time
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.units import words_of
 
 STRAIGHT_R2: Final = 0.8  # a line that explains less is not how a person would describe it
 TOLD_MISSING_SHARE: Final = 0.001

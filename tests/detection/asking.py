@@ -33,7 +33,7 @@ _KINDS: Final[dict[Measure, tuple[str, ...]]] = {
 # Signals that are never searched, and periods that are not drawn.
 _OTHERS: Final = re.compile(r"not in \d+ of |not with a period of more than 5 s ")
 # By how much a distance may be too short, of some runs or of all.
-_LONGER: Final = re.compile(r"(?:run ([\d, ]+): )?the way may be up to ([\d.]+) (%|m) longer")
+_LONGER: Final = re.compile(r"(?:run ([\d, ]+): )?the path may be up to ([\d.]+) (%|m) longer")
 _OF_ROBOT: Final = frozenset[Measure]({"standstill", "stuck", "leap", "gap"})
 
 

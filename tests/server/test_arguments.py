@@ -48,7 +48,7 @@ HUGE = 2**63
         ("get_logs", {"n" * 10**5: 1}, "no parameter 'nnn"),
         ("get_trends", {"signal": ["x"]}, "no parameter 'signal': there is signals, "),
         ("find_events", {"strt_s": 1}, "no parameter 'strt_s': there is start_s, "),
-        ("find_events", {"for_s": 2.0}, "for_s=2 needs above or below"),
+        ("find_events", {"for_s": 2.0}, "for_s=2 needs a limit: give above or below"),
         ("query_history", {"signals": ["x"], "cursor": 3}, "cursor goes on with rows"),
         ("get_timeline", {"kinds": ["threshold"]}, "a threshold has no place here"),
         ("monitor", {"duration_s": 2, "lookback_s": 9}, "give either duration_s"),
@@ -70,7 +70,11 @@ async def test_the_answer_names_the_parameter_what_it_takes_and_what_came(
 @pytest.mark.parametrize(
     ("tool", "arguments", "told"),
     [
-        ("get_timeline", {"cursor": "x"}, ": 'x' is no cursor: give the `cursor` of the page"),
+        (
+            "get_timeline",
+            {"cursor": "x"},
+            ": 'x' is not a cursor: give the `cursor` of",
+        ),
         ("get_trends", {"since": "n" * 10**5}, "nnn' is no time: give Unix seconds or ISO 8601"),
         ("get_trends", {"signals": ["n" * 10**5]}, "no signal 'nnn"),
     ],

@@ -57,7 +57,7 @@ async def test_a_slow_way_under_noise_is_told_with_how_much_longer_it_may_be(
     async with connect() as client:
         answer = await ask(client, "webots_monitor", lookback_s=60)
     assert answer["movement"]["distance_m"] < 1.0
-    assert "the way may be up to" in answer["movement"]["distance_note"]
+    assert "the path may be up to" in answer["movement"]["distance_note"]
 
 
 async def test_a_lost_position_does_not_count_as_a_way(

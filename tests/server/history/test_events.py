@@ -83,7 +83,7 @@ async def test_a_threshold_holds_for_at_least_so_long(story: Path) -> None:
     both = await tell(story, "webots_find_events", **asked, for_s=2)
     assert [row["start_s"] for row in rows_of(both["events"])] == [39.6, 95.6]
     none = await tell(story, "webots_find_events", **asked, for_s=60)
-    assert "pose.0 was beyond it for" in none["verdicts"]["came_near"]["threshold"]
+    assert "pose.0 was beyond the limit for at most" in none["verdicts"]["came_near"]["threshold"]
     assert "need signals" in await refuse(story, "webots_find_events", above=1)
 
 
@@ -139,7 +139,7 @@ async def test_of_each_kind_it_is_told_whether_it_was_found_is_absent_or_was_not
     assert "still" in answer["verdicts"]["came_near"] or answer["verdicts"]["found"]["still"]
     blind = await tell(story, "webots_find_events", kinds=["silent"], signals=["mode"])
     assert blind["verdicts"] == {
-        "not_searched": {"silent": "no number was published, or none of these names"}
+        "not_searched": {"silent": "no number was published, or none with these names"}
     }
 
 

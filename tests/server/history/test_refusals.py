@@ -57,7 +57,7 @@ async def test_the_schema_of_a_refused_recording_is_refused_by_name(tmp_path: Pa
         ("webots_query_history", {"signals": ["mode"], "max_points": 10**9}, "less than or equal"),
         ("webots_find_events", {"kinds": ["threshold"]}, "above or below"),
         ("webots_find_events", {"kinds": ["explosion"]}, "must be one of 'run', 'gap'"),
-        ("webots_get_timeline", {"cursor": "xyz"}, "no cursor"),
+        ("webots_get_timeline", {"cursor": "xyz"}, "is not a cursor"),
         ("webots_compare_runs", {"run_ids": [1, 1]}, "1 to 10"),
         ("webots_compare_runs", {"run_ids": [1, 99]}, "no run 99"),
         ("webots_plot", {"signals": ["nope"]}, "no signal 'nope'"),
@@ -101,7 +101,7 @@ async def test_a_run_without_a_row_says_so_in_every_tool(tmp_path: Path) -> None
 
 async def test_sql_that_never_ends_is_ended(story: Path) -> None:
     endless = "WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c) SELECT x FROM c"
-    assert "give a recursion an end" in await refuse(
+    assert "end every recursion" in await refuse(
         story, "webots_query_sql", sql=endless.replace("SELECT x FROM c", "SELECT count(*) FROM c")
     )
     answer = await tell(story, "webots_query_sql", sql=endless)

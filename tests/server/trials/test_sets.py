@@ -38,7 +38,7 @@ async def test_a_grid_is_tried_and_ranked_and_the_parameters_are_set_back(
         assert best["range"] == [best["score"]] * 2
         assert answer["ranked"]["in_every_row"]["gait"] == "trot"
         assert answer["best_is_better"] is True
-        assert "beats the next" in answer["verdict"]
+        assert "is ahead of the second best" in answer["verdict"]
         assert await ask(client, "webots_get_trials") == answer | {
             name: pytest.approx(answer[name], abs=5) for name in ("age_s",)
         }
@@ -200,7 +200,7 @@ async def test_trials_of_a_robot_that_only_moved_before_them_say_so_before_they_
         await ask(client, "webots_run", for_s=1)
         answer = await trials(client, parameters={"kp": [1.0, 2.0]}, score="max(pose[0])", for_s=1)
     driving.stop()
-    assert answer["verdict"] == "all 3 scores are 0: nothing that was tried changed them"
+    assert answer["verdict"] == "all 3 scores are 0: no tried value changed the score"
     (note,) = answer["notes"]
     assert "in run 1, before the trials, and stood still in all 3" in note
     assert list(answer).index("notes") < list(answer).index("ranked")
@@ -308,7 +308,7 @@ async def test_of_many_trials_that_fail_the_first_are_told_and_how_many_more(
         while answer["state"] == "under way":
             answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=90)
         assert answer["failed"] == 101, answer
-        assert answer["verdict"] == "no trial gave a score"
+        assert answer["verdict"] == "no trial has a score"
         assert len(json.dumps(answer, separators=(",", ":"))) < 8_000
         shown = len(rows_of(answer["ranked"]))
         if shown < 100:

@@ -108,14 +108,14 @@ def test_a_clear_effect_is_found_in_half_of_all_rankings() -> None:
 def test_scores_that_are_all_equal_are_told_so() -> None:
     ranking = rank(outcomes(k1=[0.0, 0.0], k2=[0.0], k3=[0.0, None]))
     assert ranking.better is None
-    assert ranking.verdict == "all 4 scores are 0: nothing that was tried changed them"
+    assert ranking.verdict == "all 4 scores are 0: no tried value changed the score"
 
 
 def test_without_repeats_nobody_can_tell_whether_the_best_is_better() -> None:
     ranking = rank(outcomes(k1=[1.0], k2=[5.0]))
 
     assert (ranking.better, ranking.chance) == (None, None)
-    assert "not known" in ranking.verdict
+    assert "unknown" in ranking.verdict
 
 
 def test_noise_alone_is_called_better_at_most_once_in_a_hundred_sets() -> None:
@@ -129,5 +129,5 @@ def test_noise_alone_is_called_better_at_most_once_in_a_hundred_sets() -> None:
 
 
 def test_nothing_that_gave_a_score_is_said_so() -> None:
-    assert rank(outcomes(k1=[None])).verdict == "no trial gave a score"
-    assert rank([]).verdict == "no trial gave a score"
+    assert rank(outcomes(k1=[None])).verdict == "no trial has a score"
+    assert rank([]).verdict == "no trial has a score"

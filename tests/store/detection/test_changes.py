@@ -40,7 +40,7 @@ def test_a_text_now_and_then_among_numbers_hides_no_change_of_the_mode(
         ("mixed", 10.0),
         ("mixed", 12.0),
     ]
-    assert "not from number to number of mixed" in found.verdicts.not_searched["change"]
+    assert "not between numbers of mixed" in found.verdicts.not_searched["change"]
 
 
 def test_a_mode_that_is_a_number_as_text_changes(empty: sqlite3.Connection) -> None:

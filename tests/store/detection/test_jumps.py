@@ -179,7 +179,7 @@ def test_which_beam_is_the_shortest_neither_jumps_nor_freezes(
     assert find_events(empty, find_range(empty, Scope()), asked).events == ()
     asked = EventOptions(kinds=("jump", "flat"), signals=("lidar.argmin",))
     found = find_events(empty, find_range(empty, Scope()), asked).verdicts.not_searched
-    assert all("leaps and rests by nature" in found[kind] for kind in ("jump", "flat"))
+    assert all("normally jumps and stays constant" in found[kind] for kind in ("jump", "flat"))
 
 
 def test_what_is_rarer_is_the_disturbance_wherever_it_begins(

@@ -150,7 +150,7 @@ def test_standstills_take_no_time_from_kinds_that_cost_less(long: sqlite3.Connec
     found = detection.events_touching(asked.segments[0])
     long.set_trace_callback(None)
     told = ledger.verdicts(kinds, found).not_searched
-    assert {kind for kind, why in told.items() if "the time was over" in why} == {"still", "stuck"}
+    assert {kind for kind, why in told.items() if "time limit reached" in why} == {"still", "stuck"}
     assert {each.kind for each in found} == {"flat", "jump", "oscillation"}
 
 

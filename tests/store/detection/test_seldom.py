@@ -99,5 +99,5 @@ def test_the_rest_of_a_stretch_that_is_being_read_when_time_ends_is_named(
         known = known_signals(empty, asked)
         Detection(empty, known, kinds, options, deadline, ledger).events_touching(asked.segments[0])
         why = ledger.verdicts(kinds, []).not_searched.get("oscillation", "")
-        cut |= {why} if "s on, the time was over; ask start_s=" in why else set()
+        cut |= {why} if "s on: time limit reached, ask start_s=" in why else set()
     assert cut

@@ -128,7 +128,7 @@ def test_numbers_that_are_too_large_to_be_judged_are_said_to_be_so(
 ) -> None:
     record(empty, lambda t: {"speed": 1e305 * math.sin(t), "left": range_m(t), "x": t})
     answer = ask(empty, kind)
-    assert "not in speed, whose numbers are beyond 1e+100" in answer.verdicts.not_searched[kind]
+    assert "not in speed: numbers beyond 1e+100" in answer.verdicts.not_searched[kind]
 
 
 @pytest.mark.parametrize("items", [8, 40])
@@ -151,7 +151,7 @@ def test_many_silences_are_one_event_but_for_one_that_goes_on(empty: sqlite3.Con
     event, newest = ask(empty, "silent").events
     assert (event.count, newest.count) == (11, 1)
     assert event.details["says"] == (
-        "11 times without a value, the first at 8 s, the last at 108 s, each 1.9 s long"
+        "11 stretches without a value, the first at 8 s, the last at 108 s, each 1.9 s long"
     )
     assert newest.ongoing and newest.start_s == pytest.approx(118.0)
 
@@ -179,9 +179,8 @@ def test_losses_shorter_than_what_counts_are_counted_beside(
     answer = ask(empty, "silent", **bounds)
     assert len(answer.events) == found
     (said,) = answer.notes
-    assert (
-        said == f"run 1: had no value for less than silent_s=1 s and counts not as silent: {note}"
-    )
+    too_short = "without a value for less than silent_s=1 s, so not counted as silent"
+    assert said == f"run 1: {too_short}: {note}"
 
 
 def test_how_long_a_silence_counts_is_the_askers_to_say(empty: sqlite3.Connection) -> None:
@@ -198,7 +197,7 @@ def test_what_comes_now_and_then_is_not_silent_meanwhile_and_the_answer_says_so(
     record(empty, lambda t: {"gps": t if round(t * 10) % 20 == 0 else None})
     answer = ask(empty, "silent")
     assert answer.events == ()
-    assert "gps has a value about every 1.8 s" in answer.notes[0]
+    assert "gps is intermittent (a value about every 1.8 s)" in answer.notes[0]
 
 
 def test_a_sensor_that_is_frozen_for_most_of_the_run_is_flat(
@@ -360,5 +359,5 @@ def test_a_short_freeze_of_a_long_run_does_not_contradict_the_verdict(
     answer = ask(empty, "flat")
     assert told(answer) == [("force", 100.1, 119.9)]
     assert answer.verdicts.gaps == {
-        "flat": "not all of noisy signals for less than 20 s: ask for less time"
+        "flat": "noisy signals: those under 20 s may be missed: ask for less time"
     }

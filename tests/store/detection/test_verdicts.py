@@ -26,7 +26,7 @@ def ask(connection: sqlite3.Connection, rows: int, *kinds: str) -> Verdicts:
 
 def test_what_no_run_so_short_can_hold_was_not_searched(empty: sqlite3.Connection) -> None:
     told = ask(empty, 21, "stuck", "still", "flat", "silent")
-    run = "run 1 is only 2 s long; this kind lasts at least"
+    run = "run 1 lasted only 2 s; this kind needs at least"
     assert told.gaps == {"still, stuck": f"{run} 3 s", "flat": f"{run} 20 s"}
     assert told.far == ["silent"]
 
@@ -37,14 +37,15 @@ def test_what_was_searched_in_some_signals_is_named_once_with_the_others(
     told = ask(empty, 400, "oscillation", "gap")
     (why,) = told.gaps.values()
     assert why.startswith("not in 1 of 4 signals")
-    assert "(temp_c)" in why and why.endswith("; none in what was searched")
+    assert "(temp_c)" in why and why.endswith("; none in the searched part")
     assert (told.far, told.came_near) == (["gap"], {})
 
 
 def test_of_a_short_run_it_is_said_which_swings_do_not_fit_in(empty: sqlite3.Connection) -> None:
     (why,) = ask(empty, 76, "oscillation").gaps.values()
-    assert "run 1 is only 7.5 s long: 6 half swings with a period of more than 2.5 s" in why
-    assert why.endswith("; none in what was searched")
+    too_short = "run 1 lasted only 7.5 s, too short for 6 half periods where a period is over 2.5 s"
+    assert too_short in why
+    assert why.endswith("; none in the searched part")
 
 
 def test_where_no_signal_is_searched_for_swings_nothing_is_absent(

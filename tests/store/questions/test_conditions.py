@@ -81,7 +81,7 @@ def test_where_it_never_held_the_answer_says_how_many_rows_were_looked_at(
 ) -> None:
     found = ask(rover, "pose.0 > 1e6")
 
-    assert found.verdicts.absent["condition"] == "it held in none of 1150 rows"
+    assert found.verdicts.absent["condition"] == "true in none of 1150 rows"
 
 
 @pytest.mark.parametrize(
@@ -103,7 +103,7 @@ def test_what_never_had_a_value_was_not_looked_for(
     assert verdicts.not_searched["condition"].startswith(named)
     assert "had no value in any row" in verdicts.not_searched["condition"]
     assert ask(counting.connection, "n > 9 and missing(blind)").verdicts.absent == {
-        "condition": "it held in none of 50 rows"
+        "condition": "true in none of 50 rows"
     }
 
 
@@ -112,7 +112,7 @@ def test_of_several_runs_all_rows_are_counted_and_the_same_is_said_once(
 ) -> None:
     found = ask(rover, "target > 1e6", since=0.0, until=2e9)
 
-    assert found.verdicts.absent["condition"] == "it held in none of 2050 rows"
+    assert found.verdicts.absent["condition"] == "true in none of 2050 rows"
     dropped, others = (note for note in found.notes if "row" in note)
     assert dropped.startswith("run 1: ") and "some were dropped" in dropped
     assert others.startswith("run 2, 3: ")
@@ -147,7 +147,7 @@ def test_where_rows_were_dropped_it_is_not_said_that_nothing_was_missed(
 
     (note,) = ask(counting.connection, "n > 0").notes
 
-    assert note == "run 1: rows were dropped, so what they held is not seen"
+    assert note == "run 1: rows were dropped, so their values are missing"
 
 
 def test_a_wrong_question_is_refused_with_what_would_do(rover: sqlite3.Connection) -> None:
@@ -169,7 +169,7 @@ def test_what_there_was_no_time_for_is_named_by_time(rover: sqlite3.Connection) 
         deadline_s=0.0,
     )
 
-    assert "the time was over" in found.verdicts.not_searched["condition"]
+    assert "time limit reached" in found.verdicts.not_searched["condition"]
 
 
 @settings(

@@ -125,7 +125,7 @@ def test_bends_that_noise_hides_are_told_as_a_doubt_of_the_distance(
     found = compare_runs(empty, [1, 2, 3])
     why = found.not_known["distance_m, mean_speed_m_s"]
     assert "run 1" not in why
-    for run in ("run 2: the way may be up to ", "run 3: the way may be up to "):
+    for run in ("run 2: the path may be up to ", "run 3: the path may be up to "):
         assert run in why
     assert "noise of about 30 mm hides" in why
 
@@ -175,8 +175,8 @@ def test_what_is_behind_the_compared_stretch_is_said_to_be_left_out(
 ) -> None:
     record(empty, "a", driving)
     record(empty, "b", driving, end_s=20.0)
-    (note,) = (note for note in compare_runs(empty, [1, 2]).notes if "came after" in note)
-    assert "the first 19.9 s of run 1 (39.9 s)" in note
+    (note,) = (note for note in compare_runs(empty, [1, 2]).notes if "the rest of" in note)
+    assert "the first 19.9 s; for the rest of run 1 (39.9 s)" in note
 
 
 @pytest.mark.parametrize(
@@ -223,7 +223,7 @@ def test_of_what_was_not_read_in_time_no_figure_is_told(empty: sqlite3.Connectio
     told = {name for names in found.not_known for name in names.split(", ")}
     unread = {"distance_m", "mean_speed_m_s", "share of each mode", "events per min"}
     assert told == unread | {"means of signals"}
-    assert all(why.startswith("the time was over") for why in found.not_known.values())
+    assert all(why.startswith("time limit reached") for why in found.not_known.values())
 
 
 def test_how_much_runs_differ_is_told_as_an_interval(empty: sqlite3.Connection) -> None:

@@ -101,11 +101,11 @@ def test_what_scores_do_not_see_of_their_runs_is_told_once_for_runs_that_are_ali
     recorder.insert("event", **{**recorder.at(0.0), "run_id": whole}, kind="dropped")
 
     assert score_run(empty, recorder.run_id, "max(x)").value == 1
-    between = "one publish() call in 10 is a row, so what held between two rows is not seen"
+    between = "one publish() call in 10 is a row: what happened in between is not seen"
     assert unseen(empty, [1, 2, 3, 4]) == [
-        "scores of run 1: rows were dropped, so what they held is not seen",
+        "scores of run 1: rows were dropped, so their values are missing",
         f"scores of run 2, 3: {between}",
-        f"scores of run 4: {between}; what only kept stretches have is in no score",
+        f"scores of run 4: {between}; rows that only kept stretches have do not count",
     ]
     assert unseen(empty, [2, 3]) == [f"scores: {between}"]
 

@@ -84,7 +84,7 @@ def test_without_any_evidence_a_standstill_says_that_there_is_none(
 ) -> None:
     assert not publish_stuck(empty, volts=(12.0, 12.1))
     (still,) = ask(empty, "still").events
-    assert "nothing that is published shows" in still.details["not_stuck"]
+    assert "no published signal shows" in still.details["not_stuck"]
 
 
 def test_who_turns_on_the_spot_is_not_stuck(empty: sqlite3.Connection) -> None:
@@ -106,7 +106,7 @@ def test_wheels_against_each_other_are_no_turn_that_was_seen(empty: sqlite3.Conn
         state = {"x": min(step, 150) * 0.02, "y": 0.0, "wheels": wheels, "mode": "go"}
         recorder.publish(step * 0.1, state)
     (still,) = ask(empty, "still").events
-    assert "its wheels ran against each other" in still.details["not_stuck"]
+    assert "its wheels turned in opposite directions" in still.details["not_stuck"]
     assert "it turned in place" not in still.details["not_stuck"]
 
 
@@ -127,7 +127,7 @@ def test_where_nothing_stood_the_answer_says_what_came_nearest(empty: sqlite3.Co
     recorder = start_run(empty)
     for step in range(300):
         recorder.publish(step * 0.1, {"gps": {"x": step * 0.03, "y": 0}})
-    assert "0.9 m in 3 s" in ask(empty, "stuck").verdicts.absent["stuck"]
+    assert "in 3 s: 0.9 m" in ask(empty, "stuck").verdicts.absent["stuck"]
 
 
 def test_a_recording_gap_ends_a_standstill(empty: sqlite3.Connection) -> None:
@@ -170,7 +170,7 @@ def test_a_mode_that_was_not_looked_at_in_time_is_not_said_to_be_one_in_which_it
     part = Part(10.0, 20.0, 100, "go", False, False, (None, 100), None)
     observed = Observed([part], Counts(rows=100))
     evidence = weigh(observed, motion, EventOptions(), moved_in)
-    assert evidence.against == ["whether it moves in mode go was not looked at: the time was over"]
+    assert evidence.against == ["not checked whether it moves in mode go: time limit reached"]
     statements: list[str] = []
     empty.set_trace_callback(statements.append)
     assert weigh(observed, motion, EventOptions(), moved_in) == evidence

@@ -91,12 +91,12 @@ def test_a_swing_faster_than_the_rollups_gets_no_period_of_an_alias(
 
     record(empty, rows=4000, interval_s=0.1, sine=math.sin, yaw=yaw)
     (note,) = trends(empty, find_range(empty, Scope(run_id=1))).notes
-    assert "swings shorter than 80 s were not looked for" in note
+    assert "oscillations with a period under 80 s were not searched for" in note
     for name in ("sine", "yaw"):
         trend = one(empty, name)
         assert (trend.shape, trend.swings, trend.flat_since_s) == ("varying", (), None)
-        assert "varies faster than 10 s: ask for a shorter range" in trend.says
-        assert "varies faster" not in one(empty, name, start_s=100.0, end_s=109.0).says
+        assert "varies within 10 s: ask for a shorter range" in trend.says
+        assert "varies within" not in one(empty, name, start_s=100.0, end_s=109.0).says
 
 
 def test_a_swing_slower_than_the_rollups_is_told_in_both_tiers(
@@ -118,7 +118,7 @@ def test_what_swung_and_rests_is_said_to_have_swung(empty: sqlite3.Connection) -
     record(empty, rows=1000, interval_s=0.1, swing=swing)
     trend = one(empty, "swing")
     assert trend.shape == "resting"
-    says = "swung by 0.3 every 2 s from 70.043 to 81.957 s; flat at 0 since 82 s"
+    says = "oscillated from 70.043 to 81.957 s: amplitude 0.3, period 2 s; flat at 0 since 82 s"
     assert trend.says == says
 
 
@@ -287,7 +287,7 @@ def test_a_staircase_rises_and_does_not_swing(empty: sqlite3.Connection) -> None
     record(empty, rows=600, interval_s=0.1, turned=lambda time_s: 90.0 * (time_s // 8))
     trend = one(empty, "turned")
     assert (trend.shape, trend.swings) == ("rising", ())
-    assert "swing" not in trend.says and "swung" not in trend.says
+    assert "oscillat" not in trend.says
 
 
 def test_a_ripple_on_a_course_is_no_headline(empty: sqlite3.Connection) -> None:
@@ -298,7 +298,7 @@ def test_a_ripple_on_a_course_is_no_headline(empty: sqlite3.Connection) -> None:
     trend = one(empty, "y")
     assert trend.shape == "varying"
     assert trend.says.startswith("between ")
-    assert "also swung by 20" in trend.says
+    assert "also oscillated from" in trend.says and "amplitude 20" in trend.says
 
 
 def test_the_rate_is_that_of_the_two_ends_beside_it(empty: sqlite3.Connection) -> None:

@@ -188,7 +188,7 @@ def test_a_kind_is_absent_only_where_all_of_it_was_looked_at(unsummed: sqlite3.C
     assert not any("change" in {*each.far, *each.came_near} for each in told)
     cut = [each for each in told if "change" in each.reasons]
     assert any("change" in each.found for each in cut), "some of them were read"
-    assert all("the time was over" in each.not_searched["change"] for each in cut)
+    assert all("time limit reached" in each.not_searched["change"] for each in cut)
 
 
 def test_the_newest_change_goes_on_only_where_it_was_looked_at_to_the_end(
@@ -200,7 +200,7 @@ def test_the_newest_change_goes_on_only_where_it_was_looked_at_to_the_end(
         (event,) = _look(unsummed, found.segments[0], options, ledger, looks)[-1:] or [None]
         if event is not None and event.end_s != 1500.0:
             assert not event.ongoing
-            assert "the time was over" in ledger.verdicts(asked_kinds(options), []).gaps["change"]
+            assert "time limit reached" in ledger.verdicts(asked_kinds(options), []).gaps["change"]
 
 
 def _verdicts(connection: sqlite3.Connection, looks: int) -> Verdicts:

@@ -198,7 +198,7 @@ def test_a_range_that_is_wider_than_a_stretch_says_how_to_use_each_call(
     start_s, end_s = stretch(connection)
     wide = find_range(connection, Scope(robot="throttled", start_s=start_s - 5, end_s=end_s))
     inside = find_range(connection, Scope(robot="throttled", start_s=start_s + 1, end_s=end_s - 1))
-    assert any("ask for a part of it alone to use each call" in note for note in wide.notes)
+    assert any("ask for such a stretch alone to use every row" in note for note in wide.notes)
     assert not any("each call" in note for note in inside.notes)
 
 
@@ -315,5 +315,5 @@ def test_a_mean_that_leans_towards_the_hits_of_a_breakpoint_is_told(
     assert mean is not None
     assert (abs(mean - truth) > 0.1 * truth) is leans
     rows = len({n for n in range(2000) if (n + 1) % interval == 0 or n % every == 0})
-    text = f"of {rows} rows of run 1 up to 286 are there because a breakpoint was hit"
+    text = f"up to 286 of {rows} rows of run 1 were recorded because a breakpoint was hit"
     assert [text in note for note in whole.notes] == [True] * leans

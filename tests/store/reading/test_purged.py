@@ -63,7 +63,7 @@ def test_gaps_of_purged_rows_are_told_or_said_to_be_hidden(tmp_path: Path) -> No
             (gap,) = found.events
             assert (gap.start_s, gap.end_s) == (43.0, 61.0)
             hidden = found.verdicts.not_searched["gap"]
-            assert hidden.startswith("rows are missing between 30 and 39.9 s: the rows about them")
+            assert hidden.startswith("rows are missing between 30 and 39.9 s: their exact times")
         assert gap.wall_time_s == pytest.approx(WALL_START_S + 0.5 * 43, abs=0.1)
 
 
@@ -142,7 +142,7 @@ def test_where_rows_were_purged_events_do_not_claim_to_have_looked_at_them(
     told = find_events(rover, find_range(rover, Scope(run_id=1))).verdicts.not_searched
     for kind in ("still", "stuck", "jump", "oscillation"):
         assert "not before 55.000 s, whose rows were purged" in told[kind], kind
-    assert "not those of less than 20 s before 55.000 s" in told["silent"]
+    assert "not those under 20 s before 55.000 s" in told["silent"]
 
 
 def distance(comparison: Comparison) -> list[Spread | None]:
@@ -188,7 +188,7 @@ def test_a_mode_that_is_a_number_changed_when_its_summary_says(
 ) -> None:
     told = events_of(patrol, "change", end_s=300.0)
     assert [(each.name, each.start_s) for each in told.events] == [("task", 83.5)]
-    assert "of task not more than one in 10 s" in told.verdicts.not_searched["change"]
+    assert "of task at most one in 10 s" in told.verdicts.not_searched["change"]
 
 
 def test_where_only_a_bucket_tells_when_a_silence_began_the_answer_says_so(
@@ -204,11 +204,11 @@ def test_of_what_was_purged_no_call_is_advised_that_brings_nothing(
     patrol: sqlite3.Connection, kind: str
 ) -> None:
     verdicts = events_of(patrol, kind, start_s=100.0, end_s=300.0).verdicts
-    assert verdicts.unlooked(kind) == "the rows of that time were purged, and no call brings more"
+    assert verdicts.unlooked(kind) == "the rows of that time were purged for good"
 
 
 def test_trends_of_what_was_purged_advise_no_shorter_range(patrol: sqlite3.Connection) -> None:
     purged = trends(patrol, find_range(patrol, Scope(run_id=1, start_s=20.0, end_s=120.0)))
     (front,) = (each for each in purged.runs[0].numbers if each.name == "front_m")
-    assert "varies faster than 10 s, and its rows were purged" in front.says
+    assert "varies within 10 s, and its rows were purged" in front.says
     assert not any("ask for" in note for note in purged.notes)

@@ -76,7 +76,7 @@ def test_more_seconds_back_than_a_run_has_lasted_name_the_run_before(
     asked = find_range(rover, Scope(run_id=2, last_s=60.0))
     (told,) = asked.notes
     assert asked.segments == find_range(rover, Scope(run_id=2)).segments
-    assert "run 2 (begun by reset) has lasted for 29.9 s only" in told and "run 1" in told
+    assert "run 2 (started by reset) has lasted only 29.9 s" in told and "run 1" in told
     assert "run 1" not in " ".join(find_range(rover, Scope(run_id=2, last_s=29.9)).notes)
 
 

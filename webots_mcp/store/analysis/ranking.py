@@ -159,7 +159,7 @@ def _chance_of_parting(trials: int) -> float:
 def _verdict(sets: Sequence[Ranked], chance: float | None) -> str:
     scores = [score for each in sets for score in each.scores]
     if not scores:
-        return "no trial gave a score"
+        return "no trial has a score"
     if len(sets) == 1:
         return "one parameter set: there is nothing to compare it with"
     if not sets[1].is_whole:
@@ -168,16 +168,16 @@ def _verdict(sets: Sequence[Ranked], chance: float | None) -> str:
         pruned = ["was pruned"] if any(each.pruned for each in sets) else []
         return f"{which} parameter set {' or '.join(failed + pruned)}"
     if min(scores) == max(scores):
-        return f"all {len(scores)} scores are {scores[0]:g}: nothing that was tried changed them"
+        return f"all {len(scores)} scores are {scores[0]:g}: no tried value changed the score"
     if chance is None:
-        return "the best and the next were not both repeated: how much theirs differ is not known"
+        return "the best and second best were not both repeated: their spread is unknown"
     if chance < MOST_CHANCE:
-        return "the best beats the next by more than repeats differ"
+        return "the best is ahead of the second best by more than the spread of repeats"
     trials = sum(len(each.scores) for each in sets[:2])
     if chance == _chance_of_parting(trials):
         wanted = next(n for n in range(2, 100) if _chance_of_parting(2 * n) < MOST_CHANCE)
         return (
-            "the best and the next lie clearly apart, which so few repeats may by chance: repeat "
-            f"each {wanted} times"
+            "the best is clearly ahead of the second best, but with so few repeats that may be "
+            f"chance: repeat each {wanted} times"
         )
-    return "the best and the next are not farther apart than repeats may be: repeat more"
+    return "the best and second best differ by no more than repeats may: repeat more"

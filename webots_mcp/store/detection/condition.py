@@ -30,14 +30,14 @@ def condition_events(search: Search) -> Iterator[Event]:
     held = where_held(search.connection, search.recorded, condition, search.deadline)
     if held.cut and held.reached_s is not None:
         then = f"ask again with start_s={held.reached_s:.3f}"
-        search.not_searched("condition", f"the time was over at {held.reached_s:.3f} s: {then}")
+        search.not_searched("condition", f"time limit reached at {held.reached_s:.3f} s: {then}")
     if search.only is None:
         share = recorded_share(search.connection, search.segment.run_id)
         search.ledger.note_of_run(search.segment.run_id, share)
         _require_values(condition, held)
         search.ledger.rows += held.rows
         search.ledger.came_near(
-            "condition", search.ledger.rows, f"it held in none of {search.ledger.rows} rows"
+            "condition", search.ledger.rows, f"true in none of {search.ledger.rows} rows"
         )
     for stretch in held.stretches:
         times = (stretch.start_s, stretch.end_s)
@@ -57,7 +57,7 @@ def _require_values(condition: Condition, held: Held) -> None:
         return
     names = ", ".join(sorted(held.never_there))
     why = f": {NO_POSITION}" if POSITION in held.never_there else ""
-    raise NotSearchableError(f"{names} had no value in any row, so that it could not hold{why}")
+    raise NotSearchableError(f"{names} had no value in any row, so it could not be true{why}")
 
 
 def _details(values: dict[str, Value]) -> dict[str, Any]:

@@ -134,11 +134,11 @@ def weigh(observed: Observed, motion: Motion, options: EventOptions, moved_in: M
     should_move = [(part.drives or part.mode in modes) and not part.hindered for part in parts]
     against = [*_against_in(counts, motion), *mode_against]
     against += [_turned(motion)] if counts.mostly(counts.turning) else []
-    to_and_fro = f"it went to and fro within {counts.reach_m:.2g} m"
+    to_and_fro = f"it moved back and forth within {counts.reach_m:.2g} m"
     against += [to_and_fro] if counts.mostly(counts.swaying) else []
     if not any(should_move) and not against:
-        modeless = "" if motion.mode else "; a signal that holds a mode can be named: mode=NAME"
-        against = [f"nothing that is published shows that it should have moved{modeless}"]
+        modeless = "" if motion.mode else "; if one of them holds the mode, give mode=NAME"
+        against = [f"no published signal shows that it should have moved{modeless}"]
     rows = sum(part.rows for part, should in zip(parts, should_move, strict=True) if should)
     return Evidence(should_move, [*mode_why, *_shown_in(counts, motion, rows)], against)
 
@@ -147,7 +147,7 @@ def _turned(motion: Motion) -> str:
     """A turn that was seen, or what only the wheels tell: a quadcopter's also run like that."""
     if motion.heading is not None:
         return "it turned in place"
-    return "its wheels ran against each other, as to turn in place; no heading is recorded"
+    return "its wheels turned in opposite directions, as for a turn in place; no heading recorded"
 
 
 def _shown_in(counts: Counts, motion: Motion, rows: int) -> list[str]:
@@ -167,7 +167,7 @@ def _against_in(counts: Counts, motion: Motion) -> list[str]:
     said: list[str] = []
     if motion.commanded and counts.mostly(counts.stopped):
         said.append(f"{motion.commanded.name} {counts.stopped_m_s:.3g}")
-    return [*said, "wheels rest"] if counts.mostly(counts.resting) else said
+    return [*said, "wheels at rest"] if counts.mostly(counts.resting) else said
 
 
 def _by_command(
@@ -222,7 +222,7 @@ def _by_mode(
     reasons = {mode: _moves_in(said, options, moved_in) for mode, said in modes.items()}
     why = list(dict.fromkeys(reason for reason in reasons.values() if reason))
     against = [
-        f"whether it moves in mode {modes[mode]} was not looked at: the time was over"
+        f"not checked whether it moves in mode {modes[mode]}: time limit reached"
         if mode in moved_in.cut
         else f"not seen moving in mode {modes[mode]}"
         for mode, reason in reasons.items()

@@ -53,7 +53,7 @@ class Detection:
         if here.recorded is not None:
             return found + self._with_ends(here, here.recorded)
         for kind in judged:
-            why = f"no row in run {segment.run_id} there"
+            why = f"run {segment.run_id} has no row in that range"
             self.ledger.not_searched(kind.name, why)
         return found
 
@@ -67,7 +67,7 @@ class Detection:
         lost: list[Event] = []
         while cut := [e for e in events if e not in lost and self._is_cut(e, looked_at, search)]:
             if self.deadline.passed:
-                self._note_longer(cut, "the time was over")
+                self._note_longer(cut, "time limit reached")
                 break
             reach_s = FARTHER * max(reach_s, 1.0)
             looked_at = _around(search, segment, reach_s)
@@ -75,12 +75,12 @@ class Detection:
             longer = {id(each): _longer(each, whole) for each in cut}
             lost += [each for each in cut if longer[id(each)] is each]
             events = [longer.get(id(each), each) for each in events]
-        self._note_longer(lost, "it does not show in a longer range")
+        self._note_longer(lost, "it was not found again in a longer range")
         return list({(*_subject(each), each.start_s): each for each in events}.values())
 
     def _note_longer(self, events: Sequence[Event], why: str) -> None:
         for each in events:
-            said = f"{why}: that of {each.start_s:.3f} s may be longer"
+            said = f"the one at {each.start_s:.3f} s may last longer: {why}"
             self.ledger.not_searched(each.kind, said)
 
     def _search(self, segment: Segment, kinds: Sequence[EventKind]) -> Search:
@@ -117,7 +117,7 @@ class Detection:
         if not self.deadline.passed:
             return {kind.name: self._found_of(kind, search) for kind in kinds}
         for kind in kinds:
-            search.not_searched(kind.name, "the time was over: ask for this kind alone")
+            search.not_searched(kind.name, "time limit reached: ask for this kind alone")
         return {kind.name: [] for kind in kinds}
 
     def _found_of(self, kind: EventKind, search: Search) -> list[Event]:
@@ -150,8 +150,8 @@ class Detection:
 
 
 def _too_short(kind: EventKind, search: Search) -> str:
-    run = f"run {search.segment.run_id} is only {search.length_s:.3g} s long"
-    return f"{run}; this kind lasts at least {kind.least_s(search.options):g} s"
+    run = f"run {search.segment.run_id} lasted only {search.length_s:.3g} s"
+    return f"{run}; this kind needs at least {kind.least_s(search.options):g} s"
 
 
 def _around(search: Search, segment: Segment, reach_s: float) -> Segment:

@@ -35,7 +35,7 @@ def flat_events(search: Search) -> Iterator[Event]:
     signals = search.required_quantities()
     search.note_too_large("flat")
     if (shortest_s := search.view.shortest_rest_s) and search.only is None:
-        why = f"not all of noisy signals for less than {shortest_s:g} s: {search.less_time}"
+        why = f"noisy signals: those under {shortest_s:g} s may be missed: {search.less_time}"
         search.not_searched("flat", why)
     resting: dict[str, list[Span]] = {}
     sooner: list[tuple[Resting, Span]] = []
@@ -154,7 +154,7 @@ def _is_lively(search: Search, signal: Signal) -> bool:
 def _alike(events: Sequence[Event], unit: str) -> str:
     said = {event.details.get("says") for event in events}
     what = said.pop() if len(said) == 1 else None
-    return f"times {what}" if what else "times flat"
+    return f"times {what}" if what else "flat stretches"
 
 
 FLAT: Final = EventKind(

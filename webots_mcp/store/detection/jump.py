@@ -48,7 +48,7 @@ def jump_events(search: Search) -> Iterator[Event]:
         }
         jumps = [found[time_s] for time_s in sorted(found)]
         if are_usual(jumps, search.view.summary(signal).present):
-            many = f"not in {signal.name}: {len(jumps)} large steps are how it is"
+            many = f"not in {signal.name}: large steps are normal for it ({len(jumps)} found)"
             search.not_searched("jump", many)
             continue
         yield from (_jump(search, signal, jump) for jump in jumps)
@@ -93,7 +93,7 @@ def _alike(events: Sequence[Event], unit: str) -> str:
     """Dropouts, spikes or steps, and to where."""
     if "distance_m" in events[0].details:
         lengths = [event.details["distance_m"] for event in events]
-        return f"leaps of {min(lengths):.3g} to {max(lengths):.3g} m"
+        return f"position jumps of {min(lengths):.3g} to {max(lengths):.3g} m"
     after = [float(event.details["after"]) for event in events]
     sizes = [abs(event.details["after"] - event.details["before"]) for event in events]
     if events[0].end_s == events[0].start_s:
@@ -106,7 +106,7 @@ def _alike(events: Sequence[Event], unit: str) -> str:
 
 JUMP: Final = EventKind(
     "jump",
-    "leap or dropout",
+    "step, spike or dropout",
     jump_events,
     least_s=lambda options: REACH_S,
     of_numbers=True,

@@ -240,8 +240,8 @@ def doubt_of_length(way: PathLength) -> str | None:
         return None
     noise_mm = float(f"{1000 * way.noise_m:.1g}")
     return (
-        f"the way may be up to {_more(way)} longer: the position's noise of about {noise_mm:g} mm "
-        "hides short ways and narrow bends; more rows per second show them"
+        f"the path may be up to {_more(way)} longer: position noise of about {noise_mm:g} mm hides "
+        "short moves and tight turns; more rows per second show them"
     )
 
 

@@ -24,8 +24,8 @@ def oscillation_events(search: Search) -> Iterator[Event]:
         search.require_rows()
     if left := [each.name for each in search.required_numbers() if each not in signals]:
         why = (
-            f"not in {len(left)} of {len(search.numbers)} signals, whose names are not of what a "
-            f"robot swings with: name them in signals ({listed(left, _MOST_NAMED)})"
+            f"not in {len(left)} of {len(search.numbers)} signals, whose names do not suggest "
+            f"motion: name them in signals ({listed(left, _MOST_NAMED)})"
         )
         if not signals:
             raise NotSearchableError(why)
@@ -48,14 +48,13 @@ def _note_periods(search: Search) -> None:
     if fitting_s < longest_s:
         search.not_searched(
             "oscillation",
-            f"run {search.segment.run_id} is only {search.length_s:.3g} s long: {turns} half "
-            f"swings with a period of more than {fitting_s:.2g} s do not fit in",
+            f"run {search.segment.run_id} lasted only {search.length_s:.3g} s, too short for "
+            f"{turns} half periods where a period is over {fitting_s:.2g} s",
         )
     elif search.view.is_long and search.options.oscillation_period_s is None:
         search.not_searched(
             "oscillation",
-            f"not with a period of more than {longest_s:g} s in so long a range: "
-            f"{search.less_time}",
+            f"not with a period over {longest_s:g} s in so long a range: {search.less_time}",
         )
 
 
@@ -106,6 +105,6 @@ OSCILLATION: Final = EventKind(
     of_numbers=True,
     drawn=3,
     reads_through=_swinging,
-    alike=Alike(lambda events, unit: "stretches of swings"),
+    alike=Alike(lambda events, unit: "oscillations"),
     effort=1,
 )

@@ -117,7 +117,7 @@ class Search:
             NotSearchableError: They were purged.
         """
         if self.is_purged:
-            raise NotSearchableError("the rows of that time were purged, and no call brings more")
+            raise NotSearchableError("the rows of that time were purged for good")
 
     @cached_property
     def motion(self) -> Motion:
@@ -150,7 +150,7 @@ class Search:
             NotSearchableError: There are none.
         """
         if not self.numbers:
-            raise NotSearchableError("no number was published, or none of these names")
+            raise NotSearchableError("no number was published, or none with these names")
         return self.numbers
 
     def required_quantities(self) -> list[Signal]:
@@ -162,7 +162,7 @@ class Search:
         quantities = [signal for signal in self.required_numbers() if not signal.is_index]
         if not quantities:
             raise NotSearchableError(
-                "which item of an array is the least leaps and rests by nature"
+                "the index of an array's smallest item normally jumps and stays constant"
             )
         return quantities
 
@@ -227,7 +227,7 @@ class Search:
     def note_too_large(self, kind: str) -> None:
         """Note which signals have numbers that are too large to be judged."""
         if self.only is None and (names := listed(self._too_large, MOST_NAMED)):
-            self.not_searched(kind, f"not in {names}, whose numbers are beyond {LARGEST:g}")
+            self.not_searched(kind, f"not in {names}: numbers beyond {LARGEST:g}")
 
     @cached_property
     def _too_large(self) -> list[str]:
@@ -245,5 +245,5 @@ class Search:
         if not self.deadline.passed:
             return False
         names = ", ".join(signal.name for signal in left[:3]) + (", ..." if left[3:] else "")
-        self.not_searched(kind, f"the time was over before {len(left)} signals: ask for {names}")
+        self.not_searched(kind, f"time limit reached, {len(left)} signals left: ask for {names}")
         return True

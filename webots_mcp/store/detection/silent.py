@@ -66,7 +66,7 @@ def silent_events(search: Search) -> Iterator[Event]:
     if shorter:
         told = [f"{name} {count} time{'s' * (count > 1)}" for name, count in shorter.most_common()]
         limit = f"for less than silent_s={search.options.silent_s:g} s"
-        note = f"had no value {limit} and counts not as silent: {listed(told, MOST_NAMED)}"
+        note = f"without a value {limit}, so not counted as silent: {listed(told, MOST_NAMED)}"
         search.ledger.note_of_run(search.segment.run_id, note)
 
 
@@ -111,7 +111,7 @@ def _is_shorter(search: Search, signal: Signal, span: Span) -> bool:
 
 
 def _least_silence_s(search: Search, signal: Signal, here: Summary, spans: Sequence[Span]) -> float:
-    """Longer, where a signal comes now and then: it is silent who stays away longer than usual."""
+    """Longer for an intermittent signal: three times its usual interval between values."""
     least_s = search.options.silent_s
     lengths = sorted(span.end_s - span.start_s for span in spans)
     if here.present >= MOSTLY * here.rows or len(lengths) < MANY_SILENCES:
@@ -120,8 +120,8 @@ def _least_silence_s(search: Search, signal: Signal, here: Summary, spans: Seque
     if 3 * usual_s <= least_s:
         return least_s
     search.ledger.notes.append(
-        f"{signal.name} has a value about every {usual_s:.3g} s: it counts as silent from "
-        f"{3 * usual_s:.3g} s on"
+        f"{signal.name} is intermittent (a value about every {usual_s:.3g} s): it counts as silent "
+        f"after {3 * usual_s:.3g} s"
     )
     return 3 * usual_s
 
@@ -134,5 +134,5 @@ SILENT: Final = EventKind(
     least_s=lambda options: options.silent_s,
     of_numbers=True,
     drawn=2,
-    alike=Alike(lambda events, unit: "times without a value", of_arrays=True),
+    alike=Alike(lambda events, unit: "stretches without a value", of_arrays=True),
 )

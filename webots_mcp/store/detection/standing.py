@@ -60,11 +60,11 @@ def find_standings(search: Search) -> Standings:
     notes = search.view.taken_notes()
     if found.seen_s > search.options.stuck_s / NEARLY:
         notes.append(
-            f"none of less than {found.seen_s:.2g} s: the position's noise of {found.noise_m:.2g} "
-            "m hides slow motion"
+            f"none under {found.seen_s:.2g} s: position noise of {found.noise_m:.2g} m hides slow "
+            "motion"
         )
     modes = listed([shown(mode) or "null" for mode in sorted(moved_in.cut, key=str)], MOST_NAMED)
-    unknown = f"the time was over before it was known whether it moves in mode {modes}"
+    unknown = f"time limit reached before it was known whether it moves in mode {modes}"
     not_weighed = [unknown] if moved_in.cut else []
     nearest = None if found.standings else _told_nearest(search, found)
     return Standings(events, notes, not_weighed, nearest)
@@ -83,9 +83,9 @@ def _found(search: Search) -> StretchStandings:
     if in_rows.noise_m is None:
         search.require_rows()
         if search.deadline.passed:
-            raise NotSearchableError("the time was over: ask for this kind alone")
+            raise NotSearchableError("time limit reached: ask for this kind alone")
         names = " and ".join(signal.name for signal in search.motion.position or ())
-        raise NotSearchableError(f"{names} have no value in run {run_id} there")
+        raise NotSearchableError(f"{names} have no value in that range of run {run_id}")
     return in_rows
 
 
@@ -102,7 +102,7 @@ def _found_in_rows(search: Search, outside: range) -> StretchStandings:
     assert position is not None
     columns = search.view.places(motion.evidence, options.stuck_s, outside)
     if missing := [each.name for each in position if each.name not in columns.values]:
-        raise NotSearchableError(f"{missing[0]} is not in every row: ask for less time")
+        raise NotSearchableError(f"not every row has {missing[0]}: ask for less time")
     sampled_s, sample = search.view.sampled_s, search.view.sample(position)
     tracks = tracks_in(columns, position, position_noise(sample, position) if sampled_s else None)
     return standings_of(columns, tracks, motion, options, sample, sampled_s)
@@ -162,7 +162,7 @@ def _told(search: Search, standing: Standing, evidence: Evidence) -> Iterator[Ev
     )
     if not covered or all(kind.name != "stuck" for kind in search.kinds):
         details = _details(search, standing, parts)
-        details["not_stuck"] = "; ".join(evidence.against) or "only for moments should it move"
+        details["not_stuck"] = "; ".join(evidence.against) or "it should have moved only briefly"
         ends = (standing.start_s, standing.end_s)
         if covered or spans:
             details.pop("not_stuck")
@@ -196,7 +196,7 @@ def _details(search: Search, standing: Standing, parts: Sequence[Part]) -> dict[
 def _from_rows(search: Search, rough: Standing) -> list[Standing]:
     """What the rows about a standstill that samples show tell of it."""
     if search.deadline.passed:
-        search.view.notes.append("the time was over: not exactly where they begin and end")
+        search.view.notes.append("time limit reached: begin and end are approximate")
         return [rough]
     start_s, end_s = rough.start_s - MARGIN_S, rough.end_s + MARGIN_S
     if rough.end_s - rough.start_s <= READ_WHOLE_S:
@@ -236,13 +236,13 @@ def _lasted_s(span: Sequence[Part]) -> float:
 
 
 def _told_nearest(search: Search, found: StretchStandings) -> tuple[float, str] | None:
-    """The longest time for which it stood, else where it went least."""
+    """The longest time for which it stood, else its smallest movement."""
     if found.nearest is None:
         return None
     least_s, nearest = search.options.stuck_s, found.nearest
     if not nearest.lasted_s:
-        went = f"went least from {nearest.start_s:.1f} s on: {-nearest.way_m:.2g} m"
-        return 0.0, f"{went} in {least_s:g} s"
-    climbed = ", but climbed or sank" if nearest.lasted_s >= least_s else ""
-    stood = f"stood for {nearest.lasted_s:.2g} s at most, from {nearest.start_s:.1f} s on"
+        moved = f"smallest movement in {least_s:g} s: {-nearest.way_m:.2g} m"
+        return 0.0, f"{moved}, from {nearest.start_s:.1f} s on"
+    climbed = ", but its height changed" if nearest.lasted_s >= least_s else ""
+    stood = f"longest standstill: {nearest.lasted_s:.2g} s, from {nearest.start_s:.1f} s on"
     return nearest.lasted_s / least_s, stood + climbed

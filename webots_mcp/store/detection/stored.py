@@ -115,8 +115,8 @@ def _note_hidden_gaps(search: Search, segment: Segment, interval_s: float | None
     hidden = hidden_gaps(search.connection, segment, until_s, interval_s)
     if hidden:
         where = listed([f"{first_s:.6g} and {last_s:.6g} s" for first_s, last_s in hidden], 2)
-        why = f"rows are missing between {where}: the rows about them were purged, so that no call"
-        search.not_searched("gap", f"{why} tells from when to when")
+        why = f"rows are missing between {where}: their exact times were purged with the rows"
+        search.not_searched("gap", why)
 
 
 def change_events(search: Search) -> Iterator[Event]:
@@ -125,8 +125,8 @@ def change_events(search: Search) -> Iterator[Event]:
     states = [each for each in search.signals if not each.is_number or each.is_choice]
     if not states:
         raise NotSearchableError(
-            "no text, flag or mode was published, or none of these names; of another number ask "
-            "where='changed(NAME)'"
+            "no text, flag or mode was published, or none with these names; for another number "
+            "ask with where='changed(NAME)'"
         )
     _note_purged(search, [each.name for each in states if each.is_number])
     around = Segment(segment.run_id, segment.start_s - AROUND_S, segment.end_s + AROUND_S)
@@ -138,7 +138,7 @@ def change_events(search: Search) -> Iterator[Event]:
         last_s, cut_at_s = _last_ends_s(search, signal, told)
         if cut_at_s is not None:
             last_s = max(cut_at_s, told[-1].sim_time_s)
-            why = f"the time was over: that of {told[-1].sim_time_s:.3f} s may be longer"
+            why = f"the one at {told[-1].sim_time_s:.3f} s may last longer: time limit reached"
             search.not_searched("change", why)
         ends_s = [*(point.sim_time_s for point in told[2:]), last_s]
         changes = [
@@ -147,15 +147,15 @@ def change_events(search: Search) -> Iterator[Event]:
             if segment.start_s <= point.sim_time_s < segment.end_s
         ]
         if len(told) < len(points):
-            why = f"not from number to number of {name}, which measures: ask signals=['{name}']"
-            search.not_searched("change", f"{why} of webots_query_history")
+            why = f"not between numbers of {name}, a measurement: webots_query_history shows them"
+            search.not_searched("change", why)
         yield from _told(search, name, changes)
 
 
 def _note_unread(search: Search, kind: str, from_s: float | None) -> None:
     if from_s is not None and from_s < search.segment.end_s:
         from_s = max(from_s, search.segment.start_s)
-        why = f"not after {from_s:.3f} s, the time was over; ask start_s={from_s:.3f}"
+        why = f"not after {from_s:.3f} s: time limit reached, ask start_s={from_s:.3f}"
         search.not_searched(kind, why)
 
 
@@ -165,7 +165,7 @@ def _note_purged(search: Search, numbers: Sequence[str]) -> None:
     if numbers and until_s is not None:
         before = "" if until_s == math.inf else f" before {until_s:.3f} s"
         names = listed(numbers, MOST_NAMED)
-        why = f"of {names} not more than one in 10 s{before}, whose rows were purged"
+        why = f"of {names} at most one in 10 s{before}, as rows were purged"
         search.not_searched("change", why)
 
 
@@ -377,11 +377,11 @@ LOG: Final = EventKind(
     log_events,
     stored=True,
     drawn=4,
-    alike=Alike(lambda events, unit: "like lines", sort=_line, adds=_first_line),
+    alike=Alike(lambda events, unit: "similar lines", sort=_line, adds=_first_line),
 )
 NOTICED: Final = EventKind(
     "noticed",
-    "by the bridge",
+    "noticed by the bridge",
     noticed_events,
     stored=True,
     drawn=6,

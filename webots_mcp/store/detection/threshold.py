@@ -29,10 +29,10 @@ def thresholds_on(
         InvalidInputError: A limit without a signal, or a duration without a limit.
     """
     if for_s and above is None and below is None:
-        raise InvalidInputError(f"for_s={for_s:g} needs above or below: of what it is the duration")
+        raise InvalidInputError(f"for_s={for_s:g} needs a limit: give above or below")
     limits = [{"above": above}] * (above is not None) + [{"below": below}] * (below is not None)
     if limits and not names:
-        raise InvalidInputError("above and below need signals: name those that are compared")
+        raise InvalidInputError("above and below need signals: name those to compare")
     return tuple(Threshold(name, for_s=for_s, **limit) for name in names for limit in limits)
 
 
@@ -57,10 +57,10 @@ def _beyond(search: Search, signal: Signal, threshold: Threshold) -> Iterator[Ev
         else:
             longest_s = max(longest_s or 0.0, span.end_s - span.start_s)
     if longest_s is not None:
-        what = f"{signal.name} was beyond it for {longest_s:.3g} s at most"
+        what = f"{signal.name} was beyond the limit for at most {longest_s:.3g} s"
         search.came_near("threshold", longest_s / threshold.for_s, what)
     elif (extreme := _extreme(search, signal, threshold)) is not None:
-        search.came_near("threshold", 0.0, f"{signal.name} came to {extreme:.4g}")
+        search.came_near("threshold", 0.0, f"{signal.name} reached {extreme:.4g}")
 
 
 def _extreme(search: Search, signal: Signal, threshold: Threshold) -> float | None:

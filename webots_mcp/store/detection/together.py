@@ -39,5 +39,5 @@ def _lengths(lengths_s: Sequence[float]) -> str:
         return f", each {middle_s:.3g} s long"
     return (
         f", {least_s:.3g} to {most_s:.3g} s long (median {middle_s:.3g} s), "
-        f"{sum(lengths_s):.4g} s in all"
+        f"{sum(lengths_s):.4g} s in total"
     )

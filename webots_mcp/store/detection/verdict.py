@@ -69,7 +69,7 @@ class Verdicts:
 
     def _in_what_was_searched(self, kind: str) -> list[str]:
         near = self.absent.get(kind)
-        return [] if near is None else [f"none in what was searched{near and f' ({near})'}"]
+        return [] if near is None else [f"none in the searched part{near and f' ({near})'}"]
 
     def unlooked(self, kind: str) -> str | None:
         """Why a kind was not looked for anywhere; None if it was, at least in a part."""

@@ -272,17 +272,15 @@ def _notes(groups: Sequence[Group]) -> list[str]:
     runs = [run for group in groups for run in group.runs]
     notes: list[str] = []
     if 1 < len(runs) == len(groups):
-        notes.append(
-            "one run each: whether they differ by more than like runs do is not known; repeat them"
-        )
+        notes.append("one run each: a difference may be normal variation between runs; repeat them")
     robots = list(dict.fromkeys(run.robot for run in runs))
     if len(robots) > 1:
         notes.append(f"these are runs of different robots: {', '.join(robots)}")
     purged = [str(run.run_id) for run in runs if run.purged_rows]
     if purged:
         notes.append(
-            f"rows of run {', '.join(purged)} were purged: events lack them, and the distance is "
-            "not known (null)"
+            f"rows of run {', '.join(purged)} were purged: their events are missing, and the "
+            "distance is unknown (null)"
         )
     return notes
 
@@ -294,8 +292,8 @@ def _cut_notes(durations_s: dict[int, float], compared_s: float) -> list[str]:
         return []
     which = ", ".join(f"{run_id} ({durations_s[run_id]:.4g} s)" for run_id in longer)
     return [
-        f"what came after the first {compared_s:.4g} s of run {which} is in none of these figures: "
-        "webots_find_events(run_id) tells it"
+        f"all figures are about the first {compared_s:.4g} s; for the rest of run {which} ask "
+        "webots_find_events(run_id)"
     ]
 
 

@@ -40,8 +40,8 @@ NO_MODE: Final = (
     "no mode is known: publish one as a text, such as mode, or name the signal of one: mode=NAME"
 )
 OUT_OF_TIME: Final = (
-    "the time was over before all rows were read: compare fewer runs at once, or ask again once a "
-    "server has summed them up"
+    "time limit reached before all rows were read: compare fewer runs at once, or ask again when "
+    "a server has rolled them up"
 )
 _SPEED: Final = "mean_speed_m_s"
 
@@ -263,7 +263,7 @@ def _outcome(
 def sampling_notes(connection: sqlite3.Connection, parts: Sequence[RunPart]) -> list[str]:
     """Says of which runs the distance comes from samples."""
     return [
-        f"the distance of run {part.segment.run_id} is that of a position each {every_s:.2g} s"
+        f"the distance of run {part.segment.run_id} is from one position every {every_s:.2g} s"
         for part in parts
         if (position := part.motion.position)
         if (every_s := sampling_interval_s(connection, part.segment, position))

@@ -84,7 +84,7 @@ def score_run(
     subject = Subject(fetch_run(connection, run_id).robot_id, run.robot, run_id)
     require_kinds(connection, score, run_id)
     if run.purged_rows:
-        why = f"{run.purged_rows} rows of run {run_id} were purged: what is left is not the run"
+        why = f"{run.purged_rows} rows of run {run_id} were purged: the rest is not the whole run"
         return RunScore(run_id, score.text, None, why, run.duration_s, 0)
     if segment is None:
         why = f"run {run_id} has no state row: its controller published nothing"
@@ -109,7 +109,7 @@ def unseen(connection: sqlite3.Connection, run_ids: Iterable[int | None]) -> lis
     for run_id in scored:
         kept = len(kept_parts(connection, run_id, -math.inf, math.inf))
         told = [unrecorded(connection, run_id)]
-        told += ["what only kept stretches have is in no score"] if kept else []
+        told += ["rows that only kept stretches have do not count"] if kept else []
         if said := "; ".join(filter(None, told)):
             alike.setdefault(said, []).append(str(run_id))
     return [
@@ -131,7 +131,7 @@ def _scored(
     counts = {kind: _count(connection, kind, time_range, deadline) for kind in score.kinds}
     found = score.of(rows, Facts(duration_s, counts))
     if rows.cut:
-        found = Scored(None, f"the time was over after {rows.read} rows")
+        found = Scored(None, f"time limit reached after {rows.read} rows")
     return RunScore(segment.run_id, score.text, *found, duration_s, rows.read)
 
 

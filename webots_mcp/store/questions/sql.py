@@ -38,7 +38,7 @@ _REFUSED_FUNCTIONS: Final = frozenset(
 # Their first use on a connection defines them, which an authorizer would see as writing.
 _LOAD_JSON_TABLES: Final = "SELECT 1 FROM json_each('[]'), json_tree('[]')"
 _BEGINS: Final = re.compile(r"(?:\s|--[^\n]*\n|/\*.*?\*/)*(\w*)", re.DOTALL)
-TOO_LARGE: Final = "it needs too much memory: read shorter values, or fewer at a time"
+TOO_LARGE: Final = "it needs too much memory: read fewer or shorter values at a time"
 _LONGEST_ERROR: Final = 300
 _MISSING: Final = re.compile(r"no such (column|table): (\S+)")
 
@@ -229,7 +229,7 @@ def too_slow(deadline_s: float) -> str:
     """What to do about a statement that gave no row in time."""
     return (
         f"no row within {deadline_s:g} s; narrow it by run_id and sim_time_s (there is an index), "
-        "use all_rollup for long ranges, and give a recursion an end"
+        "use all_rollup for long ranges, and end every recursion"
     )
 
 

@@ -81,5 +81,5 @@ def _read_cursor(text: str) -> Place:
         return read_place(json.loads(text))
     except (ValueError, TypeError) as error:
         raise InvalidInputError(
-            f"{text!r} is no cursor: give the `cursor` of the page before, as it was"
+            f"{text!r} is not a cursor: give the `cursor` of the previous page unchanged"
         ) from error

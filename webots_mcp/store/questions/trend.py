@@ -337,10 +337,10 @@ def _remarks(trend: Trend, *, rows_left: bool) -> Iterator[str]:
     summary, unit = trend.summary, f" {trend.unit}" if trend.unit else ""
     yield _course(trend, unit)
     if trend.leaps:
-        yield "changes by more than a quarter turn at once: turns are not counted"
+        yield "changes by more than a quarter turn between rows: turns are not counted"
     elif trend.fast:
         advice = ": ask for a shorter range" if rows_left else ", and its rows were purged"
-        yield f"varies faster than {trend.resolution_s:g} s{advice}"
+        yield f"varies within {trend.resolution_s:g} s{advice}"
     yield from _beyond_ends(trend)
     if trend.swings and not any(_is_wide(each, summary) for each in trend.swings):
         yield f"also {_swinging(trend, unit)}"
@@ -433,9 +433,9 @@ def _swinging(trend: Trend, unit: str) -> str:
     """Of several stretches the longest."""
     swing = max(trend.swings, key=lambda each: each.end_s - each.start_s)
     seen = f" (seen in means of {trend.resolution_s:g} s)" if trend.resolution_s else ""
-    how = f"by {swing.amplitude:.3g}{unit}{{}} every {swing.period_s:.3g} s{seen}"
+    how = f"amplitude {swing.amplitude:.3g}{unit}, period {swing.period_s:.3g} s{seen}"
     if trend.shape == "oscillating":
-        return f"swings {how.format(f' about {trend.mean or 0.0:.4g}')}"
-    others = f", and {len(trend.swings) - 1} times besides" if trend.swings[1:] else ""
+        return f"oscillates about {trend.mean or 0.0:.4g}: {how}"
+    others = f" (longest of {len(trend.swings)})" if trend.swings[1:] else ""
     stretch = f"from {shown_time(swing.start_s):g} to {shown_time(swing.end_s):g} s"
-    return f"swung {how.format('')} {stretch}{others}"
+    return f"oscillated {stretch}{others}: {how}"

@@ -118,8 +118,8 @@ def _unseen_swings(run: RunTrends) -> str:
     shortest_s = SHORTEST_PERIOD_ROWS * (run.resolution_s or 0.0)
     advice = "; ask for less time to see them" if run.rows_left else ""
     return (
-        f"run {run.run_id} is seen in means of {run.resolution_s:g} s: swings shorter than "
-        f"{shortest_s:g} s were not looked for{advice}"
+        f"run {run.run_id} is seen in means of {run.resolution_s:g} s: oscillations with a period "
+        f"under {shortest_s:g} s were not searched for{advice}"
     )
 
 

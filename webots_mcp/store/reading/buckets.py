@@ -158,7 +158,7 @@ def _step(
         fits = step_s >= least_s and (unit_s == 0 or step_s % unit_s == 0)
         if fits and _number(last_s, step_s) - _number(first_s, step_s) < max_points:
             return step_s
-    raise AssertionError("the steps go on for ever")
+    raise AssertionError("the steps never end")
 
 
 def _round_steps(at_least_s: float) -> Iterator[float]:

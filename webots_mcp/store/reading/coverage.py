@@ -95,7 +95,7 @@ def purge_notes(connection: sqlite3.Connection, run_id: int, start_s: float) -> 
     if until_s is None:
         return
     when = "" if until_s == math.inf else f" before {until_s:g} s"
-    left = "of that time only 10 s summaries are left (no single rows, jumps or export)"
+    left = "only 10 s summaries of that time are left (no single rows, jumps or export)"
     yield f"the rows of run {run_id}{when} were purged: {left}"
 
 
@@ -123,6 +123,6 @@ def hit_notes(
     (rows,) = connection.execute(_ROWS, values).fetchone()
     if hits and rows < _LEAST_ROWS_PER_HIT * hits:
         yield (
-            f"of {rows} rows of run {run_id} up to {hits} are there because a breakpoint was hit: "
-            "means and counts of rows lean towards them"
+            f"up to {hits} of {rows} rows of run {run_id} were recorded because a breakpoint was "
+            "hit: means and counts are biased towards them"
         )

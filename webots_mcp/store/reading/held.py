@@ -136,7 +136,7 @@ def stretches_in(rows: Iterable[Row], condition: Condition, from_s: float) -> It
 
 def recorded_share(connection: sqlite3.Connection, run_id: int) -> str:
     """How many of the published states a run's rows are, in a sentence."""
-    return unrecorded(connection, run_id) or "each publish() call is a row, so nothing was missed"
+    return unrecorded(connection, run_id) or "every publish() call is a row, so nothing was missed"
 
 
 def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
@@ -144,7 +144,8 @@ def unrecorded(connection: sqlite3.Connection, run_id: int) -> str | None:
     row = connection.execute(_RECORDED, (run_id,)).fetchone()
     interval, dropped = row or (None, False)  # of a robot that cannot be read nothing is known
     if interval == 1:
-        return "rows were dropped, so what they held is not seen" if dropped else None
-    share = f"one publish() call in {interval} is a row" if interval else "rows may be fewer"
+        return "rows were dropped, so their values are missing" if dropped else None
+    fewer = "rows may be fewer than publish() calls"
+    share = f"one publish() call in {interval} is a row" if interval else fewer
     share += " and some were dropped" if dropped else ""
-    return f"{share}, so what held between two rows is not seen"
+    return f"{share}: what happened in between is not seen"

@@ -284,7 +284,7 @@ def _rate_notes(connection: sqlite3.Connection, segment: Segment) -> list[str]:
     kept = kept_notes(connection, *span)
     if segment.full_rate:
         return kept
-    inside = [f"{each}; ask for a part of it alone to use each call" for each in kept]
+    inside = [f"{each}; ask for such a stretch alone to use every row" for each in kept]
     return [*inside, *hit_notes(connection, *span)]
 
 
@@ -295,8 +295,8 @@ def _too_young(
     if last_s is None or moment_of(last_s) <= age_s:
         return []
     before, began_by = connection.execute(_RUN_BEFORE, (subject.run_id,)).fetchone()
-    young = f"run {subject.run_id} (begun by {began_by}) has lasted for {_told(age_s)} s only"
-    return [young if before is None else f"{young}; what was before it is in run {before}"]
+    young = f"run {subject.run_id} (started by {began_by}) has lasted only {_told(age_s)} s"
+    return [young if before is None else f"{young}; the time before is in run {before}"]
 
 
 def _bound(connection: sqlite3.Connection, subject: Subject, time_s: float) -> float:

@@ -194,7 +194,7 @@ class RowView:
         self._lasting: list[str] = []
         if columns.cut:
             after = f"after {columns.cut_at_s:.3f} s" if columns.times else "at all"
-            self._lasting.append(f"the time was over: not read {after}; ask for less time")
+            self._lasting.append(f"time limit reached: not read {after}; ask for less time")
         self._columns = columns
         length_s = columns.times[-1] - columns.times[0] if columns.times else 0.0
         self.longest_period_s = max(LONGEST_PERIOD_S, 2 * length_s / SLOW_HALF_SWINGS)
@@ -301,7 +301,7 @@ class LongView:
         self.sampled_s = every_s
         if every_s > stay_s / 2:
             advice = less_time(self._connection, self._segment)
-            self.notes.append(f"not those of less than {2 * every_s:.3g} s: {advice}")
+            self.notes.append(f"not those under {2 * every_s:.3g} s: {advice}")
         plain = [signal for signal in signals if signal.is_plain]
         found = Columns(self._segment.run_id, values={signal.name: [] for signal in plain})
         for part in parts:
@@ -310,7 +310,7 @@ class LongView:
             if sampled.cut:
                 reached_s = sampled.times[-1] if sampled.times else part.start_s
                 self.notes.append(
-                    f"the time was over: not after {reached_s:.3f} s; ask start_s={reached_s:.3f}"
+                    f"not after {reached_s:.3f} s: time limit reached, ask start_s={reached_s:.3f}"
                 )
                 return found
         self._add_newest(found, plain, every_s)
@@ -342,7 +342,7 @@ class LongView:
         self._note_late()
         if self._purged_until_s is not None:
             self.notes.append(
-                f"not those of less than {self.shortest_rest_s:g} s before "
+                f"not those under {self.shortest_rest_s:g} s before "
                 f"{self._purged_until_s:.3f} s, whose rows were purged"
             )
         if condition.lasting and signal not in self._resting:
@@ -481,7 +481,7 @@ class LongView:
             if self._deadline.passed:
                 reached_s = left.end_s
                 self.notes.append(
-                    f"not before {reached_s:.3f} s, the time was over; ask end_s={reached_s:.3f}"
+                    f"not before {reached_s:.3f} s: time limit reached, ask end_s={reached_s:.3f}"
                 )
                 return
             yield replace(part, end_s=min(end_of_all_s, part.end_s + ACROSS_S))
@@ -548,7 +548,7 @@ class LongView:
         numbers = read_numbers(self._connection, part, wanted, self._deadline)
         if (reached_s := numbers.cut_at_s) is not None:
             span = f"start_s={reached_s:.3f}, end_s={part.end_s:.3f}"
-            self.notes.append(f"not from {reached_s:.3f} s on, the time was over; ask {span}")
+            self.notes.append(f"not from {reached_s:.3f} s on: time limit reached, ask {span}")
         held = sum(len(each.times) * len(each.values) for each in self._kept.values())
         if reached_s is None and held < MOST_KEPT:
             self._kept[part] = numbers
@@ -607,7 +607,7 @@ class LongView:
             self.notes.append(f"not before {self._purged_until_s:.3f} s, whose rows were purged")
 
     def _cut(self) -> None:
-        self.notes.append("the time was over before all was searched: ask for less time or kinds")
+        self.notes.append("time limit reached before all was searched: ask for less time or kinds")
 
     def _numbers(self, buckets: range, signals: Sequence[Signal]) -> Numbers:
         """The rows of some buckets, and a few before and after them."""

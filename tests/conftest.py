@@ -12,14 +12,16 @@ from typing import Any
 
 import psutil
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from tests.recordings.bridge import record
 from webots_mcp.connection import connect
 
 # The same examples each time, so that a red run was made red by the change that it tests;
-# `pytest --hypothesis-profile=explore` looks for new ones.
-settings.register_profile("repeatable", derandomize=True)
+# `pytest --hypothesis-profile=explore` looks for new ones. No machine is too slow for them.
+settings.register_profile(
+    "repeatable", derandomize=True, deadline=None, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.register_profile("explore", derandomize=False, print_blob=True)
 settings.load_profile("repeatable")
 

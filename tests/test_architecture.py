@@ -59,8 +59,9 @@ ALLOWED["report"] = ALLOWED["charts"] | {"charts", "report", "__version__"}
 ALLOWED["console"] = STDLIB | {"console", "store", "webots"}
 ALLOWED["server"] = STDLIB | {
     "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
-    "launch", "report", "__version__",
+    "launch", "questions", "report", "__version__",
 }  # fmt: skip
+ALLOWED["questions"] = ALLOWED["server"]
 ALLOWED["page"] = ALLOWED["server"] | ALLOWED["charts"] | {"page"}
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
 ALLOWED["pytest_plugin"] = {

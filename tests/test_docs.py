@@ -17,10 +17,10 @@ from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
 from webots_mcp.cli import COMMANDS
 from webots_mcp.connection import OLDEST_SQLITE
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
+from webots_mcp.questions.argument_types import MAX_WAIT_S
+from webots_mcp.questions.budget import LARGE_BUDGET
 from webots_mcp.schema import SCHEMA_FILE
 from webots_mcp.server import create_server
-from webots_mcp.server.budget import LARGE_BUDGET
-from webots_mcp.server.parameters import MAX_WAIT_S
 
 CHECKOUT = Path(__file__).parents[1]
 DOCS = CHECKOUT / "docs"

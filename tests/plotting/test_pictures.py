@@ -38,7 +38,7 @@ from webots_mcp.plotting.signal_axes import paint_signals
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trajectory_axes import paint_trajectory
-from webots_mcp.server.parameters import RunIds
+from webots_mcp.questions.argument_types import RunIds
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
 

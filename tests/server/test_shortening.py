@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from webots_mcp.server.shortening import GLANCE, WHOLE, compact_json, shorten
+from webots_mcp.questions.shortening import GLANCE, WHOLE, compact_json, shorten
 
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),

@@ -23,7 +23,7 @@ from webots_mcp.contract import BREAKPOINT_ACTIONS
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.server.results import BreakpointAnswer
+    from webots_mcp.questions.answers import BreakpointAnswer
 
 
 @command(

@@ -11,7 +11,7 @@ from webots_mcp.cli.steering import require_done, show_progress, writable
 from webots_mcp.cli.tables import print_table, printable, text_of
 
 if TYPE_CHECKING:
-    from webots_mcp.server.results import CommandAnswer
+    from webots_mcp.questions.answers import CommandAnswer
 
 _WHERE: Final = (DATA_DIR, DATABASE, ROBOT, JSON)
 

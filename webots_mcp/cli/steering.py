@@ -27,8 +27,8 @@ from webots_mcp.contract import LOOPING
 from webots_mcp.errors import CommandRefusedError
 
 if TYPE_CHECKING:
-    from webots_mcp.server.history_results import RunAnswer
-    from webots_mcp.server.results import CommandAnswer, Table
+    from webots_mcp.questions.answers import CommandAnswer, Table
+    from webots_mcp.questions.history_answers import RunAnswer
     from webots_mcp.store.recording import Recording
 
 _WHERE: Final = (DATA_DIR, DATABASE, ROBOT, JSON)

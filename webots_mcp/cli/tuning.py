@@ -22,7 +22,7 @@ from webots_mcp.cli.tables import print_table
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.server.results import CommandAnswer
+    from webots_mcp.questions.answers import CommandAnswer
     from webots_mcp.server.tuning import When
     from webots_mcp.store.recording import Recording
 

@@ -12,12 +12,12 @@ import anyio
 from anyio import to_thread
 
 from webots_mcp.contract import HEARTBEAT_LATE_S, LOOPING
+from webots_mcp.questions.answers import CommandAnswer
+from webots_mcp.questions.history_answers import RunAnswer
+from webots_mcp.questions.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
 from webots_mcp.queue import Command, CommandQueue, fetch_command
-from webots_mcp.server.history_results import RunAnswer
-from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.running import ACTION as RUN
 from webots_mcp.server.running import progress_of, told_of_run
-from webots_mcp.server.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
 from webots_mcp.server.target import find_target
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name

@@ -22,8 +22,8 @@ from webots_mcp.errors import (
     NoDatabaseError,
     NothingRecordedError,
 )
+from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.server.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
-from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.target import find_target
 from webots_mcp.store.observers import live_observer
 from webots_mcp.store.recording import Recording, View, look

@@ -19,12 +19,12 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.naming import flatten
+from webots_mcp.questions.budget import figure, seconds, shown, table
+from webots_mcp.questions.find_events import fitting_events, not_shown_of
+from webots_mcp.questions.get_trends import MOST_SIGNALS, trend_tables
+from webots_mcp.questions.shortening import shorten
 from webots_mcp.queue import Command
-from webots_mcp.server.budget import figure, seconds, shown, table
-from webots_mcp.server.shortening import shorten
 from webots_mcp.server.target import find_target
-from webots_mcp.server.tools.events import fitting_events, not_shown_of
-from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
 from webots_mcp.server.watching import movement
 from webots_mcp.store.detection.event import Event
 from webots_mcp.store.questions.events import search_events

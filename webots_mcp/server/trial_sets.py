@@ -11,7 +11,7 @@ from typing import Any, Final
 from webots_mcp.conditions.score import parse_score
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import require_known
-from webots_mcp.server.budget import (
+from webots_mcp.questions.budget import (
     condensed,
     figure,
     figures,
@@ -20,8 +20,8 @@ from webots_mcp.server.budget import (
     notes_of,
     shown,
 )
+from webots_mcp.questions.shortening import cut_text
 from webots_mcp.server.running import ACTION, known_names, require_possible
-from webots_mcp.server.shortening import cut_text
 from webots_mcp.server.target import find_target
 from webots_mcp.server.tuning import settable
 from webots_mcp.store.analysis.ranking import Ranked, Ranking

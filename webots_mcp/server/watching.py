@@ -7,8 +7,8 @@ import sqlite3
 from dataclasses import dataclass, replace
 from typing import Any
 
-from webots_mcp.server.bounds import newest_runs
-from webots_mcp.server.budget import figure, seconds
+from webots_mcp.questions.bounds import newest_runs
+from webots_mcp.questions.budget import figure, seconds
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import (
     doubt_of_length,

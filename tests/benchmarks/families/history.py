@@ -19,7 +19,7 @@ from tests.benchmarks.table import Line, Target, duration
 from tests.recordings.long import CYCLE_S
 from webots_mcp.connection import connect
 from webots_mcp.plotting import plot
-from webots_mcp.server.tools.monitor import look_back
+from webots_mcp.questions.monitor import look_back
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.logs import LogFilter, count_lines, newest_lines
 from webots_mcp.store.questions.events import find_events

@@ -7,16 +7,16 @@ from typing import Final
 
 from webots_mcp.diagnosis.finding import Checked, worst
 from webots_mcp.diagnosis.registry import diagnose, subject_of
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.results import DiagnosisAnswer
-from webots_mcp.server.shortening import cut_text
+from webots_mcp.questions.answers import DiagnosisAnswer
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.shortening import cut_text
 from webots_mcp.store.recording import Recording
 
 _LONGEST_TEXT: Final = 320
 _BUDGET: Final = 5_000  # characters; the checks beyond it are told by name
 
 
-@tool("Diagnose the set-up", READS)
+@question("Diagnose the set-up", READS)
 def webots_diagnose(recording: Recording) -> DiagnosisAnswer:
     """When nothing comes, or time stands still: each link from Webots and controller to here.
 

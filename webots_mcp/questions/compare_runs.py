@@ -10,7 +10,21 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.budget import (
+from webots_mcp.questions.answers import Table
+from webots_mcp.questions.argument_types import (
+    AnyNames,
+    Cursor,
+    Limit,
+    Mode,
+    Position,
+    RobotName,
+    RunId,
+    RunIds,
+    ShownLimit,
+    TrialSetId,
+    Value,
+)
+from webots_mcp.questions.budget import (
     BUDGET,
     LARGE_BUDGET,
     answer_about,
@@ -25,23 +39,9 @@ from webots_mcp.server.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.server.declaring import ACTS, READS, tool
-from webots_mcp.server.history_results import ComparisonAnswer, RunsAnswer
-from webots_mcp.server.parameters import (
-    AnyNames,
-    Cursor,
-    Limit,
-    Mode,
-    Position,
-    RobotName,
-    RunId,
-    RunIds,
-    ShownLimit,
-    TrialSetId,
-    Value,
-)
-from webots_mcp.server.results import Table
-from webots_mcp.server.shortening import DETAIL_BUDGET, WHOLE, shorten
+from webots_mcp.questions.declaring import CHANGES, READS, question
+from webots_mcp.questions.history_answers import ComparisonAnswer, RunsAnswer
+from webots_mcp.questions.shortening import DETAIL_BUDGET, WHOLE, shorten
 from webots_mcp.store.analysis.spread import MATTERS_SD, Spread
 from webots_mcp.store.detection.event import EventOptions, both_of
 from webots_mcp.store.questions.compare import (
@@ -84,7 +84,7 @@ _GOING_ON: Final = "going on"
 _TAKE_AWAY: Final = "-"
 
 
-@tool("List the runs", READS)
+@question("List the runs", READS)
 def webots_list_runs(
     recording: Recording,
     limit: Limit = 20,
@@ -121,7 +121,7 @@ def webots_list_runs(
         )
 
 
-@tool("Compare runs", READS)
+@question("Compare runs", READS)
 def webots_compare_runs(
     recording: Recording,
     run_ids: RunIds = None,
@@ -161,7 +161,7 @@ def _first_run(recording: Recording, set_id: int) -> int:
         return next(iter(scored_runs(connection, set_id).values()))[0]
 
 
-@tool("Annotate a run", ACTS)
+@question("Annotate a run", CHANGES)
 def webots_annotate_run(
     recording: Recording,
     label: Annotated[

@@ -5,17 +5,16 @@ from __future__ import annotations
 from fnmatch import fnmatchcase
 from typing import Annotated, Any, Final
 
-from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.naming import nearest_first
 from webots_mcp.parameter import MOST_PARAMETERS
-from webots_mcp.server.budget import fitting, seconds, without_empty
-from webots_mcp.server.declaring import ACTS, READS, tool
-from webots_mcp.server.parameters import RobotName, RunId, TimeoutS, Value
-from webots_mcp.server.results import CommandAnswer, ParametersAnswer
-from webots_mcp.server.shortening import DETAIL_BUDGET, WHOLE, shorten
+from webots_mcp.questions.answers import CommandAnswer, ParametersAnswer
+from webots_mcp.questions.argument_types import RobotName, RunId, TimeoutS, Value
+from webots_mcp.questions.budget import fitting, seconds, without_empty
+from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
+from webots_mcp.questions.shortening import DETAIL_BUDGET, WHOLE, shorten
 from webots_mcp.server.tuning import SET_WAIT_S, When, set_parameters
 from webots_mcp.store.parameters import COLUMNS, described
 from webots_mcp.store.recording import Recording, View
@@ -32,7 +31,7 @@ Values = Annotated[
 ]
 
 
-@tool("Get the parameters", READS)
+@question("Get the parameters", READS)
 def webots_get_parameters(
     recording: Recording,
     names: Annotated[
@@ -59,11 +58,11 @@ def webots_get_parameters(
         )
 
 
-@tool("Set parameters", ACTS)
+@question("Set parameters", CHANGES)
 async def webots_set_parameters(
     recording: Recording,
     values: Values,
-    ctx: Context[Any],
+    caller: Caller,
     when: Annotated[
         When, Field(description="now, or from the next reset of the world on.")
     ] = "now",
@@ -76,7 +75,7 @@ async def webots_set_parameters(
     keeps the values; a reload begins with those in the code.
     """
     return await set_parameters(
-        recording, ctx.report_progress, values, when=when, robot=robot, timeout_s=timeout_s
+        recording, caller.report, values, when=when, robot=robot, timeout_s=timeout_s
     )
 
 

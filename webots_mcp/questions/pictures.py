@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from mcp.server.mcpserver import Image
-
+from webots_mcp.questions.answers import ShownPicture
 from webots_mcp.store.images import opened
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ _JPEG_QUALITY: Final = 85
 _GAP_PX: Final = 4
 
 
-def load_sheet(files: Sequence[Path]) -> Image:
+def load_sheet(files: Sequence[Path]) -> ShownPicture:
     """Pictures beside each other, from left to right and from top to bottom, as one.
 
     Raises:
@@ -38,7 +37,7 @@ def load_sheet(files: Sequence[Path]) -> Image:
         sheet.paste(part, (number % columns * width, number // columns * height))
     png = io.BytesIO()
     sheet.save(png, "PNG")
-    return Image(data=png.getvalue(), format="png")
+    return ShownPicture(data=png.getvalue(), format="png")
 
 
 def _thumbnail(file: Path, side_px: int) -> Picture:
@@ -48,7 +47,7 @@ def _thumbnail(file: Path, side_px: int) -> Picture:
     return scaled
 
 
-def load_picture(file: Path) -> tuple[Image, str]:
+def load_picture(file: Path) -> tuple[ShownPicture, str]:
     """A picture within 1,000 pixels, and a note where it had to be scaled (else empty).
 
     Raises:
@@ -58,11 +57,11 @@ def load_picture(file: Path) -> tuple[Image, str]:
         picture.load()
         short = max(picture.size) <= LONGEST_SIDE_PX
         if short and picture.format and file.stat().st_size <= MAX_SENT_BYTES:
-            return Image(data=file.read_bytes(), format=picture.format.lower()), ""
+            return ShownPicture(data=file.read_bytes(), format=picture.format.lower()), ""
         scaled = picture.convert("RGB")
         scaled.thumbnail((LONGEST_SIDE_PX, LONGEST_SIDE_PX))
         jpeg = io.BytesIO()
         scaled.save(jpeg, "JPEG", quality=_JPEG_QUALITY)
     (width, height), (true_width, true_height) = scaled.size, picture.size
     note = f"shown at {width} x {height} of {true_width} x {true_height} pixels"
-    return Image(data=jpeg.getvalue(), format="jpeg"), note
+    return ShownPicture(data=jpeg.getvalue(), format="jpeg"), note

@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import Annotated, Any, Final, cast
 
 from anyio import to_thread
-from mcp.server.mcpserver import Context, Image
 from pydantic import Field
 
 from webots_mcp.contract import MAX_RUN_S, Pace, Then
 from webots_mcp.errors import CommandRefusedError, WebotsMCPError
-from webots_mcp.server.budget import seconds
-from webots_mcp.server.declaring import RESTARTS, tool
+from webots_mcp.questions.answers import ShownPicture
+from webots_mcp.questions.argument_types import RobotName, TimeoutS
+from webots_mcp.questions.budget import seconds
+from webots_mcp.questions.declaring import DESTROYS, Caller, question
+from webots_mcp.questions.history_answers import RunAnswer
+from webots_mcp.questions.pictures import load_picture
 from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.history_results import RunAnswer
-from webots_mcp.server.parameters import RobotName, TimeoutS
-from webots_mcp.server.pictures import load_picture
 from webots_mcp.server.running import ACTION, require_possible
 from webots_mcp.store.images import camera_frames, inside
 from webots_mcp.store.recording import Recording
@@ -25,10 +25,10 @@ _PICTURE_WAIT_S: Final = 8.0
 _SAME_S: Final = 0.001  # times are told to the millisecond
 
 
-@tool("Run until", RESTARTS)
+@question("Run until", DESTROYS)
 async def webots_run(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     until: Annotated[
         str | None,
         Field(max_length=500, description="A condition, as of webots_breakpoint."),
@@ -67,7 +67,7 @@ async def webots_run(
         "parameters": parameters,
         "then": then,
     }
-    dispatcher = Dispatcher(recording, ctx.report_progress)
+    dispatcher = Dispatcher(recording, caller.report)
     asked = {name: value for name, value in params.items() if value is not None}
     answer = cast("RunAnswer", await dispatcher.ask(robot, ACTION, timeout_s, asked))
     if picture and answer.outcome == "done":
@@ -113,7 +113,9 @@ def _add_frame(recording: Recording, answer: RunAnswer, why: str) -> None:
     _attach(answer, image, facts | {"no_screenshot": why}, note, "webots_get_camera")
 
 
-def _attach(answer: RunAnswer, image: Image, facts: dict[str, Any], note: str, again: str) -> None:
-    answer.pictures.append(image.to_image_content())
+def _attach(
+    answer: RunAnswer, image: ShownPicture, facts: dict[str, Any], note: str, again: str
+) -> None:
+    answer.pictures.append(image)
     answer.picture = facts | ({"note": note} if note else {})
     answer.picture["see"] = f"beside this answer; if your client drops it, {again}"

@@ -6,18 +6,17 @@ from functools import partial
 from typing import Annotated, Any, Final, cast
 
 from anyio import to_thread
-from mcp.server.mcpserver import Context, Image
 from pydantic import Field
 
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.server.budget import seconds, some
-from webots_mcp.server.declaring import ACTS, READS, tool
+from webots_mcp.questions.answers import CommandAnswer, ShownPicture
+from webots_mcp.questions.argument_types import RobotName, RunId, Seconds, TimeoutS
+from webots_mcp.questions.budget import seconds, some
+from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
+from webots_mcp.questions.pictures import load_picture, load_sheet
+from webots_mcp.questions.shortening import compact_json
 from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.parameters import RobotName, RunId, Seconds, TimeoutS
-from webots_mcp.server.pictures import load_picture, load_sheet
-from webots_mcp.server.results import CommandAnswer
-from webots_mcp.server.shortening import compact_json
 from webots_mcp.store.images import StoredImage, camera_frames, cameras, inside
 from webots_mcp.store.reading.kept import kept_stretches
 from webots_mcp.store.reading.ranges import just_after
@@ -29,10 +28,10 @@ _MOST_FRAMES: Final = 16
 _FAR_S: Final = 1.0  # from the time that was asked for
 
 
-@tool("Get the camera picture", READS)
+@question("Get the camera picture", READS)
 async def webots_get_camera(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     camera: Annotated[str, Field(max_length=200, description="Device; '' is any.")] = "",
     fresh: Annotated[
         bool, Field(description="Taken now, of lidars and range finders too.")
@@ -43,7 +42,7 @@ async def webots_get_camera(
     ] = 1,
     robot: RobotName = None,
     run_id: RunId = None,
-) -> list[str | Image]:
+) -> list[str | ShownPicture]:
     """The newest camera frame, or those kept around a hit, with time and age."""
     if not fresh:
         past = partial(_show_recorded, recording, camera, at_s, frames, robot, run_id)
@@ -53,7 +52,7 @@ async def webots_get_camera(
             "fresh=true has the controller take one frame now: without at_s, frames and run_id, "
             "and not from a server that is --read-only"
         )
-    dispatcher = Dispatcher(recording, ctx.report_progress)
+    dispatcher = Dispatcher(recording, caller.report)
     answer = await dispatcher.ask(robot, "take_frame", _WAIT_S, {"camera": camera})
     return await to_thread.run_sync(_show, recording, answer)
 
@@ -65,7 +64,7 @@ def _show_recorded(
     frames: int,
     robot: str | None,
     run_id: int | None,
-) -> list[str | Image]:
+) -> list[str | ShownPicture]:
     with recording.view(robot, run_id) as view:
         run = view.require_run()
         found = camera_frames(view.connection, run.id, camera or None, at_s=at_s, count=frames)
@@ -97,7 +96,9 @@ def _told_of(view: View, found: list[StoredImage]) -> dict[str, Any]:
     return {"camera": first.device, "kept": "; ".join(reasons)}
 
 
-def _single(recording: Recording, view: View, image: StoredImage) -> tuple[Image, dict[str, Any]]:
+def _single(
+    recording: Recording, view: View, image: StoredImage
+) -> tuple[ShownPicture, dict[str, Any]]:
     picture, note = load_picture(image.file(recording.data_dir))
     return picture, {
         "picture_sim_time_s": seconds(image.sim_time_s),
@@ -109,7 +110,7 @@ def _single(recording: Recording, view: View, image: StoredImage) -> tuple[Image
     }
 
 
-def _sheet(recording: Recording, found: list[StoredImage]) -> tuple[Image, dict[str, Any]]:
+def _sheet(recording: Recording, found: list[StoredImage]) -> tuple[ShownPicture, dict[str, Any]]:
     picture = load_sheet([image.file(recording.data_dir) for image in found])
     return picture, {
         "pictures_sim_time_s": [seconds(image.sim_time_s) for image in found],
@@ -117,24 +118,24 @@ def _sheet(recording: Recording, found: list[StoredImage]) -> tuple[Image, dict[
     }
 
 
-@tool("Take a screenshot", ACTS)
+@question("Take a screenshot", CHANGES)
 async def webots_take_screenshot(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     quality: Annotated[int, Field(ge=1, le=100, description="Of the simulator's file.")] = 90,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
-) -> list[str | Image]:
+) -> list[str | ShownPicture]:
     """The simulation's main view, now, within 1,000 pixels; needs a Supervisor.
 
     The caption names the original file.
     """
-    dispatcher = Dispatcher(recording, ctx.report_progress)
+    dispatcher = Dispatcher(recording, caller.report)
     answer = await dispatcher.ask(robot, "screenshot", timeout_s, {"quality": quality})
     return await to_thread.run_sync(_show, recording, answer)
 
 
-def _show(recording: Recording, answer: CommandAnswer) -> list[str | Image]:
+def _show(recording: Recording, answer: CommandAnswer) -> list[str | ShownPicture]:
     said = answer.model_dump(mode="json", exclude_none=True)
     path = cast("dict[str, Any]", answer.result or {}).get("path")
     if answer.outcome != "done" or path is None:

@@ -7,18 +7,18 @@ from typing import Annotated, Any, Final, cast
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.server.budget import some
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.parameters import RobotName, RunId
-from webots_mcp.server.results import FullStateAnswer, SensorsAnswer, StateAnswer, Table
-from webots_mcp.server.sensing import sensor_part, unnamed_devices
-from webots_mcp.server.shortening import (
+from webots_mcp.questions.answers import FullStateAnswer, SensorsAnswer, StateAnswer, Table
+from webots_mcp.questions.argument_types import RobotName, RunId
+from webots_mcp.questions.budget import some
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.shortening import (
     DETAIL_BUDGET,
     FULL_BUDGET,
     WHOLE,
     cut_text,
     shorten,
 )
+from webots_mcp.server.sensing import sensor_part, unnamed_devices
 from webots_mcp.store.events import newest_events
 from webots_mcp.store.reading.kept import newest_kept
 from webots_mcp.store.recording import Recording, View
@@ -45,7 +45,7 @@ Offset = Annotated[int, Field(ge=0, description="First item or character at the 
 PageSize = Annotated[int, Field(ge=1, le=2000, description="So many of them.")]
 
 
-@tool("Get the robot's state", READS)
+@question("Get the robot's state", READS)
 def webots_get_robot_state(
     recording: Recording, robot: RobotName = None, run_id: RunId = None
 ) -> StateAnswer:
@@ -67,7 +67,7 @@ def webots_get_robot_state(
         )
 
 
-@tool("Get the sensors", READS)
+@question("Get the sensors", READS)
 def webots_get_sensors(
     recording: Recording, robot: RobotName = None, run_id: RunId = None
 ) -> SensorsAnswer:
@@ -93,7 +93,7 @@ def webots_get_sensors(
         )
 
 
-@tool("Get the full state", READS)
+@question("Get the full state", READS)
 def webots_get_full_state(
     recording: Recording,
     path: PagePath = "",

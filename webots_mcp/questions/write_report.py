@@ -8,17 +8,17 @@ from typing import Annotated, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.questions.argument_types import AnyNames, RobotName, RunIds
+from webots_mcp.questions.budget import notes_of
+from webots_mcp.questions.declaring import CHANGES, question
+from webots_mcp.questions.history_answers import ReportAnswer
 from webots_mcp.report import file_name, make_report, require_free, write_report
-from webots_mcp.server.budget import notes_of
-from webots_mcp.server.declaring import ACTS, tool
-from webots_mcp.server.history_results import ReportAnswer
-from webots_mcp.server.parameters import AnyNames, RobotName, RunIds
 from webots_mcp.store.recording import Recording
 
 FOLDER: Final = "reports"  # in the data folder
 
 
-@tool("Write a report", ACTS)
+@question("Write a report", CHANGES)
 def webots_report(
     recording: Recording,
     run_ids: RunIds = None,

@@ -7,15 +7,14 @@ from typing import Annotated, Any, Final, cast
 
 import anyio
 from anyio import to_thread
-from mcp.server.mcpserver import Context
 from pydantic import BeforeValidator, Field, WithJsonSchema
 
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.questions.argument_types import RobotName, TimeoutS, TrialSetId
+from webots_mcp.questions.declaring import DESTROYS, READS, Caller, question
+from webots_mcp.questions.history_answers import TrialsAnswer
 from webots_mcp.server import trial_sets
-from webots_mcp.server.declaring import READS, RESTARTS, tool
-from webots_mcp.server.history_results import TrialsAnswer
-from webots_mcp.server.parameters import RobotName, TimeoutS, TrialSetId
 from webots_mcp.server.trial_worker import TrialWorkers
 from webots_mcp.store.analysis.ranking import Best
 from webots_mcp.store.recording import Recording
@@ -57,10 +56,10 @@ Tried = Annotated[
 ]
 
 
-@tool("Run trials", RESTARTS)
+@question("Run trials", DESTROYS)
 async def webots_run_trials(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     parameters: Annotated[
         Tried, Field(description='Sets, [{"kp": 1.0}], or a grid, {"kp": [1.0, 2.0]}.')
     ] = None,
@@ -98,7 +97,7 @@ async def webots_run_trials(
     given = parameters is not None or score is not None
     if (trial_set is None) != given:
         raise InvalidInputError("give parameters and score for a new set, or trial_set, not both")
-    workers: TrialWorkers = ctx.request_context.lifespan_context.trials
+    workers: TrialWorkers = caller.companions.trials
     if trial_set is None:
         if parameters is None or score is None:
             raise InvalidInputError("give both: parameters to try, and a score to rank them by")
@@ -113,7 +112,7 @@ async def webots_run_trials(
         number = trial_set
         await to_thread.run_sync(_take_up, recording, workers, number, scheduler, cancel)
     try:
-        await _wait(recording, ctx, number, timeout_s)
+        await _wait(recording, caller, number, timeout_s)
     except anyio.get_cancelled_exc_class():
         with anyio.CancelScope(shield=True):
             await to_thread.run_sync(_end, recording, workers, number)
@@ -121,7 +120,7 @@ async def webots_run_trials(
     return TrialsAnswer(**await to_thread.run_sync(trial_sets.told_of_set, recording, number))
 
 
-@tool("Get trials", READS)
+@question("Get trials", READS)
 def webots_get_trials(recording: Recording, trial_set: TrialSetId = None) -> TrialsAnswer:
     """How far trials are, also those from a shell; the parameters, ranked by score."""
     return TrialsAnswer(**trial_sets.told_of_set(recording, trial_set))
@@ -193,7 +192,7 @@ def _end(recording: Recording, workers: TrialWorkers, set_id: int) -> None:
     workers.end(set_id)
 
 
-async def _wait(recording: Recording, ctx: Context[Any], set_id: int, timeout_s: float) -> None:
+async def _wait(recording: Recording, caller: Caller, set_id: int, timeout_s: float) -> None:
     """Until nobody works on the set any more, or the time is over."""
     until_s, report_s = time.monotonic() + timeout_s, time.monotonic() + _REPORT_EVERY_S
     with recording.reader() as connection:
@@ -202,5 +201,5 @@ async def _wait(recording: Recording, ctx: Context[Any], set_id: int, timeout_s:
                 return
             if time.monotonic() >= report_s:
                 report_s += _REPORT_EVERY_S
-                await ctx.report_progress(*progress_of(connection, set_id))
+                await caller.report(*progress_of(connection, set_id))
             await anyio.sleep(_LOOK_EVERY_S)

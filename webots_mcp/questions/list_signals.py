@@ -6,7 +6,8 @@ from typing import Annotated, Any, Final
 
 from pydantic import Field
 
-from webots_mcp.server.budget import (
+from webots_mcp.questions.argument_types import Cursor, Limit, RobotName, RunId
+from webots_mcp.questions.budget import (
     answer_about,
     figure,
     fitting,
@@ -16,16 +17,15 @@ from webots_mcp.server.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.history_results import SignalsAnswer
-from webots_mcp.server.parameters import Cursor, Limit, RobotName, RunId
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.history_answers import SignalsAnswer
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.signals.catalogue import SignalInfo, list_signals
 
 SIGNAL_COLUMNS: Final = ("signal", "kind", "unit", "last", "min", "max", "missing")
 
 
-@tool("List the signals", READS)
+@question("List the signals", READS)
 def webots_list_signals(
     recording: Recording,
     pattern: Annotated[

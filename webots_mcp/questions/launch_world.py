@@ -7,17 +7,16 @@ from typing import Annotated, Any, Final
 
 import anyio
 from anyio import to_thread
-from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.launch import Launch, SessionStart, require_world
-from webots_mcp.server.declaring import ACTS, RESTARTS, tool
+from webots_mcp.questions.answers import CommandAnswer
+from webots_mcp.questions.argument_types import RobotName, TimeoutS
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, question
+from webots_mcp.questions.shortening import cut_text
 from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.launcher import Companions, project_of
-from webots_mcp.server.parameters import RobotName, TimeoutS
-from webots_mcp.server.results import CommandAnswer
-from webots_mcp.server.shortening import cut_text
+from webots_mcp.server.launcher import project_of
 from webots_mcp.server.worlds import WorldRequest
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.command_line import Mode, Start, free_port
@@ -30,11 +29,11 @@ _LONGEST_LINE: Final = 200
 World = Annotated[str, Field(max_length=1000, description="A .wbt file of the project.")]
 
 
-@tool("Launch Webots on a world", ACTS)
+@question("Launch Webots on a world", CHANGES)
 async def webots_launch_world(
     recording: Recording,
     world: World,
-    ctx: Context[Any],
+    caller: Caller,
     mode: Annotated[Mode | None, Field(description="To begin with; else as it prefers.")] = None,
     headless: Annotated[bool, Field(description="Without its window and 3D view.")] = False,
     stream: Annotated[
@@ -46,22 +45,22 @@ async def webots_launch_world(
 
     It ends with this server, or by webots_quit. One at a time.
     """
-    launcher = _companions(ctx).webots
+    launcher = caller.companions.webots
     project = await to_thread.run_sync(project_of, recording)
     file, _ = await to_thread.run_sync(require_world, world, project)
     port = await to_thread.run_sync(free_port)
     start = Start(file, mode, headless, stream, port)
     started_s = time.monotonic()
     launched = await to_thread.run_sync(launcher.begin, start)
-    first = await _wait(launched, ctx, started_s + timeout_s)
+    first = await _wait(launched, caller, started_s + timeout_s)
     return await to_thread.run_sync(_answer, recording, launched, first, started_s)
 
 
-@tool("Load another world", RESTARTS)
+@question("Load another world", DESTROYS)
 async def webots_load_world(
     recording: Recording,
     world: World,
-    ctx: Context[Any],
+    caller: Caller,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
@@ -71,29 +70,25 @@ async def webots_load_world(
     """
     project = await to_thread.run_sync(project_of, recording)
     file, _ = await to_thread.run_sync(require_world, world, project)
-    return await _request(recording, ctx, robot, timeout_s).load(file)
+    return await _request(recording, caller, robot, timeout_s).load(file)
 
 
-@tool("Quit Webots", RESTARTS)
+@question("Quit Webots", DESTROYS)
 async def webots_quit(
-    recording: Recording, ctx: Context[Any], robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
+    recording: Recording, caller: Caller, robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
 ) -> CommandAnswer:
     """End Webots: the one of webots_launch_world; another only by a robot that is a Supervisor."""
-    return await _request(recording, ctx, robot, timeout_s).quit()
-
-
-def _companions(ctx: Context[Any]) -> Companions:
-    return ctx.request_context.lifespan_context
+    return await _request(recording, caller, robot, timeout_s).quit()
 
 
 def _request(
-    recording: Recording, ctx: Context[Any], robot: str | None, timeout_s: float
+    recording: Recording, caller: Caller, robot: str | None, timeout_s: float
 ) -> WorldRequest:
-    dispatcher = Dispatcher(recording, ctx.report_progress)
-    return WorldRequest(recording, dispatcher, robot, timeout_s, _companions(ctx).webots)
+    dispatcher = Dispatcher(recording, caller.report)
+    return WorldRequest(recording, dispatcher, robot, timeout_s, caller.companions.webots)
 
 
-async def _wait(launched: Launch, ctx: Context[Any], until_s: float) -> SessionStart | None:
+async def _wait(launched: Launch, caller: Caller, until_s: float) -> SessionStart | None:
     """Until a controller records; None where the time was over first.
 
     Raises:
@@ -111,7 +106,7 @@ async def _wait(launched: Launch, ctx: Context[Any], until_s: float) -> SessionS
             raise CommandRefusedError(await to_thread.run_sync(launched.silence))
         lines = launched.webots.lines
         said = cut_text(lines[-1].text, _LONGEST_LINE) if lines else "Webots starts"
-        await ctx.report_progress(time.monotonic() - begun_s, until_s - begun_s, said)
+        await caller.report(time.monotonic() - begun_s, until_s - begun_s, said)
         await anyio.sleep(_LOOK_EVERY_S)
 
 

@@ -11,10 +11,10 @@ from pydantic import Field
 from webots_mcp.console.ownership import console_state
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.parameters import Cursor, EndS, LastS, RobotName, RunId, StartS
-from webots_mcp.server.results import LogsAnswer, Table
-from webots_mcp.server.shortening import cut_text
+from webots_mcp.questions.answers import LogsAnswer, Table
+from webots_mcp.questions.argument_types import Cursor, EndS, LastS, RobotName, RunId, StartS
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.shortening import cut_text
 from webots_mcp.store.logs import (
     COUNT_LIMIT,
     OF_CONSOLE,
@@ -38,7 +38,7 @@ _NO_RUN_YET: Final = (
 )
 
 
-@tool("Get log lines", READS)
+@question("Get log lines", READS)
 def webots_get_logs(
     recording: Recording,
     lines: Annotated[int, Field(ge=1, le=1000, description="The most lines.")] = 50,

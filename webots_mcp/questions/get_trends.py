@@ -5,8 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any, Final
 
-from webots_mcp.server.bounds import range_in
-from webots_mcp.server.budget import (
+from webots_mcp.questions.argument_types import (
+    AnyNames,
+    ShownLimit,
+)
+from webots_mcp.questions.bounds import range_in
+from webots_mcp.questions.budget import (
     BUDGET,
     LARGE_BUDGET,
     answer_about,
@@ -19,13 +23,9 @@ from webots_mcp.server.budget import (
     some,
     table,
 )
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.history_results import RunTrendTables, TrendsAnswer
-from webots_mcp.server.parameters import (
-    AnyNames,
-    ShownLimit,
-)
-from webots_mcp.server.shortening import compact_json, cut_text
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.history_answers import RunTrendTables, TrendsAnswer
+from webots_mcp.questions.shortening import compact_json, cut_text
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange
@@ -42,7 +42,7 @@ _SHOWN_VALUES: Final = 6
 _SHOWN_CONSTANTS: Final = 20
 
 
-@tool("Get the trends", READS)
+@question("Get the trends", READS)
 def webots_get_trends(
     recording: Recording,
     scope: Scope,

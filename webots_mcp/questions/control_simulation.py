@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from anyio import to_thread
-from mcp.server.mcpserver import Context
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.contract import MAX_STEPS
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
-from webots_mcp.server.declaring import ACTS, RESTARTS, tool
+from webots_mcp.questions.answers import CommandAnswer
+from webots_mcp.questions.argument_types import MAX_WAIT_S, RobotName, TimeoutS
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, question
 from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.parameters import MAX_WAIT_S, RobotName, TimeoutS
-from webots_mcp.server.results import CommandAnswer
 from webots_mcp.server.routes import Attempt
 from webots_mcp.server.target import find_target
 from webots_mcp.store.recording import Recording, look
@@ -30,11 +29,11 @@ _WAIT_S: Final = 10.0
 _RELOAD_WAIT_S: Final = 30.0
 
 
-@tool("Control the simulation", RESTARTS)
+@question("Control the simulation", DESTROYS)
 async def webots_simulation_control(
     recording: Recording,
     command: Annotated[Order, Field(description="reset and reload begin a new run at time 0.")],
-    ctx: Context[Any],
+    caller: Caller,
     steps: Annotated[
         Annotated[int, Field(ge=1, le=MAX_STEPS)] | None,
         Field(description="For step, by default 1: rounds of the controller's loop, then paused."),
@@ -66,46 +65,46 @@ async def webots_simulation_control(
     waiting_s = timeout_s or await to_thread.run_sync(
         _usual_wait_s, recording, command, steps, robot
     )
-    dispatcher = Dispatcher(recording, ctx.report_progress)
+    dispatcher = Dispatcher(recording, caller.report)
     attempt = Attempt(recording, dispatcher, robot, waiting_s, command, params, force, port)
     return await attempt.steer()
 
 
-@tool("Reload the world", RESTARTS)
+@question("Reload the world", DESTROYS)
 async def webots_world_reload(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     force: SkipJsonSchema[Force] = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _RELOAD_WAIT_S,
 ) -> CommandAnswer:
     """Load world and code anew: webots_simulation_control("reload") by another name."""
-    dispatcher = Dispatcher(recording, ctx.report_progress)
+    dispatcher = Dispatcher(recording, caller.report)
     return await Attempt(recording, dispatcher, robot, timeout_s, "reload", {}, force).steer()
 
 
-@tool("Reset the world", RESTARTS)
+@question("Reset the world", DESTROYS)
 async def webots_world_reset(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     force: Force = False,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Back to time 0: webots_simulation_control("reset"), and with force for a stuck controller."""
-    dispatcher = Dispatcher(recording, ctx.report_progress)
+    dispatcher = Dispatcher(recording, caller.report)
     return await Attempt(recording, dispatcher, robot, timeout_s, "reset", {}, force).steer()
 
 
-@tool("Reset the controller's state", ACTS)
+@question("Reset the controller's state", CHANGES)
 async def webots_reset_controller_state(
-    recording: Recording, ctx: Context[Any], robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
+    recording: Recording, caller: Caller, robot: RobotName = None, timeout_s: TimeoutS = _WAIT_S
 ) -> CommandAnswer:
     """Put the controller's own variables back; world and time go on as they are.
 
     Runs its own action reset_state, else the callbacks that it registered with bridge.on_reload().
     """
-    return await Dispatcher(recording, ctx.report_progress).ask(robot, "reset_state", timeout_s)
+    return await Dispatcher(recording, caller.report).ask(robot, "reset_state", timeout_s)
 
 
 def _usual_wait_s(recording: Recording, command: Order, steps: int, robot: str | None) -> float:

@@ -12,12 +12,12 @@ from anyio.lowlevel import RunVar
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.budget import LONGEST_NAME, header_of_only
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.history_results import SqlAnswer
-from webots_mcp.server.parameters import ShownLimit
-from webots_mcp.server.results import Table
-from webots_mcp.server.shortening import cut_text
+from webots_mcp.questions.answers import Table
+from webots_mcp.questions.argument_types import ShownLimit
+from webots_mcp.questions.budget import LONGEST_NAME, header_of_only
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.history_answers import SqlAnswer
+from webots_mcp.questions.shortening import cut_text
 from webots_mcp.store.questions.sql import Cell, Result, require_select
 from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, as_file, decode
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
@@ -33,7 +33,7 @@ _PROCESS_TIMEOUT_S: Final = 20.0  # its own deadline counts from when it has sta
 _turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once")
 
 
-@tool("Query by SQL", READS)
+@question("Query by SQL", READS)
 async def webots_query_sql(
     recording: Recording,
     sql: Annotated[str, Field(min_length=1, max_length=10_000, description="One SELECT.")],

@@ -10,17 +10,16 @@ from typing import Annotated, Any, Final
 
 import anyio
 from anyio import to_thread
-from mcp.server.mcpserver import Context
 from pydantic import Field
 from pydantic.json_schema import SkipJsonSchema
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.budget import BUDGET, answer_about, notes_of
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.history_results import MonitorAnswer
-from webots_mcp.server.parameters import MAX_WAIT_S, RobotName
-from webots_mcp.server.tools.events import fitting_events, not_shown_of, verdicts_of
-from webots_mcp.server.tools.trends import MOST_SIGNALS, trend_tables
+from webots_mcp.questions.argument_types import MAX_WAIT_S, RobotName
+from webots_mcp.questions.budget import BUDGET, answer_about, notes_of
+from webots_mcp.questions.declaring import READS, Caller, question
+from webots_mcp.questions.find_events import fitting_events, not_shown_of, verdicts_of
+from webots_mcp.questions.get_trends import MOST_SIGNALS, trend_tables
+from webots_mcp.questions.history_answers import MonitorAnswer
 from webots_mcp.server.watching import Window, movement, window_from
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.registry import asked_kinds
@@ -39,10 +38,10 @@ _ROWLESS: Final = EventOptions(kinds=("run", "command", "log", "noticed"))  # wi
 _WatchS = Annotated[float, Field(ge=1, le=MAX_WAIT_S)] | None
 
 
-@tool("Watch the robot", READS)
+@question("Watch the robot", READS)
 async def webots_monitor(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     duration_s: Annotated[
         _WatchS, Field(description="How long to watch, wall seconds; by default 10.")
     ] = None,
@@ -74,7 +73,7 @@ async def webots_monitor(
     for second in range(1, math.ceil(duration_s) + 1) if is_live else ():
         await anyio.sleep(min(_REPORT_INTERVAL_S, duration_s - second + 1))
         doing = await to_thread.run_sync(_doing, recording, name)
-        await ctx.report_progress(min(second, duration_s), duration_s, doing)
+        await caller.report(min(second, duration_s), duration_s, doing)
     return await to_thread.run_sync(_watched, recording, name, started_s)
 
 

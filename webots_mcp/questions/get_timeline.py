@@ -5,17 +5,17 @@ from __future__ import annotations
 from typing import Any, Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.bounds import range_in
-from webots_mcp.server.budget import BUDGET, LARGE_BUDGET, answer_about, notes_of, size_of
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.history_results import TimelineAnswer
-from webots_mcp.server.parameters import (
+from webots_mcp.questions.argument_types import (
     LogLevel,
     ShownLimit,
     TextCursor,
     TimelineKinds,
 )
-from webots_mcp.server.tools.events import events_table, verdicts_of
+from webots_mcp.questions.bounds import range_in
+from webots_mcp.questions.budget import BUDGET, LARGE_BUDGET, answer_about, notes_of, size_of
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.find_events import events_table, verdicts_of
+from webots_mcp.questions.history_answers import TimelineAnswer
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.registry import stored_kinds
 from webots_mcp.store.questions.timeline import timeline
@@ -25,7 +25,7 @@ from webots_mcp.store.recording import Recording, View
 DEFAULT_LIMIT: Final = 50
 
 
-@tool("Get the timeline", READS)
+@question("Get the timeline", READS)
 def webots_get_timeline(
     recording: Recording,
     scope: Scope,

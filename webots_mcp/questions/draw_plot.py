@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated
 
-from mcp.server.mcpserver import Image
 from pydantic import Field
 
 from webots_mcp.plotting import (
@@ -21,19 +20,20 @@ from webots_mcp.plotting import (
     plot,
     plot_trials,
 )
-from webots_mcp.server.budget import notes_of
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.parameters import (
+from webots_mcp.questions.answers import ShownPicture
+from webots_mcp.questions.argument_types import (
     AnyNames,
     RunIds,
     TrialSetId,
 )
-from webots_mcp.server.shortening import compact_json
+from webots_mcp.questions.budget import notes_of
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.shortening import compact_json
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording, View
 
 
-@tool("Plot", READS)
+@question("Plot", READS)
 def webots_plot(
     recording: Recording,
     scope: Scope,
@@ -50,7 +50,7 @@ def webots_plot(
     height_px: Annotated[
         int, Field(ge=LEAST_HEIGHT_PX, le=MOST_PX, description="Pixels.")
     ] = HEIGHT_PX,
-) -> list[str | Image]:
+) -> list[str | ShownPicture]:
     """A picture of signals over time (mean line, min-max band, modes, events), way, or trials.
 
     Without signals those that changed most; a trajectory finds the position, or takes
@@ -71,18 +71,18 @@ def webots_plot(
             width_px=width_px,
             height_px=height_px,
         )
-        return [_caption(view, picture), Image(data=picture.data, format="png")]
+        return [_caption(view, picture), ShownPicture(data=picture.data, format="png")]
 
 
 def _trials(
     recording: Recording, set_id: int, names: Sequence[str], size_px: tuple[int, int]
-) -> list[str | Image]:
+) -> list[str | ShownPicture]:
     """The scores of a trial set, which may be of a robot that is gone."""
     with recording.reader() as connection:
         picture = plot_trials(connection, set_id, names, sheet=Sheet(*size_px))
     return [
         compact_json({"shows": picture.caption, "notes": notes_of(picture.notes) or []}),
-        Image(data=picture.data, format="png"),
+        ShownPicture(data=picture.data, format="png"),
     ]
 
 

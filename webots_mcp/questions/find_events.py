@@ -8,8 +8,18 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.bounds import range_in
-from webots_mcp.server.budget import (
+from webots_mcp.questions.answers import Table
+from webots_mcp.questions.argument_types import (
+    AnyNames,
+    Kinds,
+    LogLevel,
+    Mode,
+    Position,
+    ShownLimit,
+    TextCursor,
+)
+from webots_mcp.questions.bounds import range_in
+from webots_mcp.questions.budget import (
     BUDGET,
     LARGE_BUDGET,
     answer_about,
@@ -20,19 +30,9 @@ from webots_mcp.server.budget import (
     size_of,
     without_empty,
 )
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.history_results import EventsAnswer, KindVerdicts
-from webots_mcp.server.parameters import (
-    AnyNames,
-    Kinds,
-    LogLevel,
-    Mode,
-    Position,
-    ShownLimit,
-    TextCursor,
-)
-from webots_mcp.server.results import Table
-from webots_mcp.server.shortening import DETAIL_BUDGET, shorten
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.history_answers import EventsAnswer, KindVerdicts
+from webots_mcp.questions.shortening import DETAIL_BUDGET, shorten
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold, both_of
 from webots_mcp.store.detection.threshold import thresholds_on
 from webots_mcp.store.detection.verdict import Verdicts
@@ -47,7 +47,7 @@ DEFAULT_LIMIT: Final = 50
 _GROUP_BUDGET: Final = 640  # characters
 
 
-@tool("Find events", READS)
+@question("Find events", READS)
 def webots_find_events(
     recording: Recording,
     scope: Scope,

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field
 
-from webots_mcp.server.results import Answer, CommandAnswer, Table
+from webots_mcp.questions.answers import Answer, CommandAnswer, Table
 
 
 class NotedAnswer(Answer):

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from mcp.server.mcpserver import Context
 from pydantic import Field, WithJsonSchema
 
-from webots_mcp.server.declaring import ACTS, READS, RESTARTS, tool
-from webots_mcp.server.parameters import AnyNames, Cursor, RobotName
-from webots_mcp.server.results import CommandAnswer
+from webots_mcp.questions.answers import CommandAnswer
+from webots_mcp.questions.argument_types import AnyNames, Cursor, RobotName
+from webots_mcp.questions.declaring import CHANGES, DESTROYS, READS, Caller, question
 from webots_mcp.server.scene import ask_scene
 from webots_mcp.store.recording import Recording
 
@@ -25,10 +24,10 @@ _Count = Annotated[int, Field(ge=1, le=24)]
 _Start = Annotated[int, Field(ge=0)]
 
 
-@tool("Get the scene", READS)
+@question("Get the scene", READS)
 async def webots_get_scene(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     path: Annotated[str | None, Field(description="Only what is in this node.")] = None,
     depth: Annotated[_Count | None, Field(description="Levels; 2 unless types or names.")] = None,
     types: AnyNames = None,
@@ -45,26 +44,26 @@ async def webots_get_scene(
     """
     wanted = {"path": path, "depth": depth, "types": types, "names": names, "fields": fields}
     params = wanted | {"cursor": cursor}
-    return await ask_scene(recording, ctx.report_progress, "get_scene", params, robot=robot)
+    return await ask_scene(recording, caller.report, "get_scene", params, robot=robot)
 
 
-@tool("Get a field", READS)
+@question("Get a field", READS)
 async def webots_get_field(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     path: Path,
     start: Annotated[_Start | None, Field(description="From this entry or field on.")] = None,
     robot: RobotName = None,
 ) -> CommandAnswer:
     """The value of a field of the scene tree now, or of a node all its fields."""
     params = {"path": path, "start": start}
-    return await ask_scene(recording, ctx.report_progress, "get_field", params, robot=robot)
+    return await ask_scene(recording, caller.report, "get_field", params, robot=robot)
 
 
-@tool("Set a field", ACTS)
+@question("Set a field", CHANGES)
 async def webots_set_field(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     path: Path,
     value: Annotated[
         Any, WithJsonSchema({}), Field(description="0.5, true, a text, [0, 0, 1, 1.57].")
@@ -78,13 +77,13 @@ async def webots_set_field(
     reset puts it back.
     """
     params = {"path": path, "value": value, "stop": stop or None}
-    return await ask_scene(recording, ctx.report_progress, "set_field", params, robot=robot)
+    return await ask_scene(recording, caller.report, "set_field", params, robot=robot)
 
 
-@tool("Add a node", ACTS)
+@question("Add a node", CHANGES)
 async def webots_add_node(
     recording: Recording,
-    ctx: Context[Any],
+    caller: Caller,
     vrml: Annotated[
         str, Field(description='As in a world file: DEF BOX Solid { name "box" children [...] }')
     ],
@@ -96,13 +95,13 @@ async def webots_add_node(
     A PROTO has to be declared in the world as IMPORTABLE EXTERNPROTO. A reset removes the node.
     """
     params = {"vrml": vrml, "path": path}
-    return await ask_scene(recording, ctx.report_progress, "add_node", params, robot=robot)
+    return await ask_scene(recording, caller.report, "add_node", params, robot=robot)
 
 
-@tool("Remove a node", RESTARTS)
+@question("Remove a node", DESTROYS)
 async def webots_remove_node(
-    recording: Recording, ctx: Context[Any], path: Path, robot: RobotName = None
+    recording: Recording, caller: Caller, path: Path, robot: RobotName = None
 ) -> CommandAnswer:
     """Remove a node with all in it; a reset brings it back if the answer says so."""
     params = {"path": path}
-    return await ask_scene(recording, ctx.report_progress, "remove_node", params, robot=robot)
+    return await ask_scene(recording, caller.report, "remove_node", params, robot=robot)

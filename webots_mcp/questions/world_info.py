@@ -7,10 +7,10 @@ from typing import Any, Final
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.liveness import dead_sessions
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.parameters import RobotName, RunId
-from webots_mcp.server.results import RobotsAnswer, Table, WorldAnswer
-from webots_mcp.server.shortening import cut_text, round_number
+from webots_mcp.questions.answers import RobotsAnswer, Table, WorldAnswer
+from webots_mcp.questions.argument_types import RobotName, RunId
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.shortening import cut_text, round_number
 from webots_mcp.store.observers import WorldSeen, world_seen
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention.limits import described, unheeded
@@ -31,7 +31,7 @@ _ROBOT_COLUMNS: Final = (
 )  # fmt: skip
 
 
-@tool("List the robots", READS)
+@question("List the robots", READS)
 def webots_list_robots(recording: Recording) -> RobotsAnswer:
     """Every robot ever recorded: whether it is live, whether its time moves, its current run.
 
@@ -53,7 +53,7 @@ def webots_list_robots(recording: Recording) -> RobotsAnswer:
         )
 
 
-@tool("Get world information", READS)
+@question("Get world information", READS)
 def webots_get_world_info(
     recording: Recording, robot: RobotName = None, run_id: RunId = None
 ) -> WorldAnswer:

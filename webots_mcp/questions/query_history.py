@@ -9,8 +9,13 @@ from typing import Annotated, Any, Final
 from pydantic import Field
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.server.bounds import range_in
-from webots_mcp.server.budget import (
+from webots_mcp.questions.argument_types import (
+    Cursor,
+    MaxPoints,
+    Names,
+)
+from webots_mcp.questions.bounds import range_in
+from webots_mcp.questions.budget import (
     BUDGET,
     LARGE_BUDGET,
     answer_about,
@@ -23,18 +28,13 @@ from webots_mcp.server.budget import (
     size_of,
     some,
 )
-from webots_mcp.server.declaring import READS, tool
-from webots_mcp.server.history_results import (
+from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.history_answers import (
     ChangeSeries,
     HistoryAnswer,
     NumberSeries,
     RowColumns,
     RunSeries,
-)
-from webots_mcp.server.parameters import (
-    Cursor,
-    MaxPoints,
-    Names,
 )
 from webots_mcp.store.questions.series import (
     DEFAULT_POINTS,
@@ -53,7 +53,7 @@ _CELL_CHARACTERS: Final = 28  # of a bucket of a numeric signal: min, max, mean 
 _SIGNAL_CHARACTERS: Final = 200  # of a signal, beside its buckets
 
 
-@tool("Query the history", READS)
+@question("Query the history", READS)
 def webots_query_history(
     recording: Recording,
     scope: Scope,

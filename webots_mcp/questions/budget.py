@@ -9,8 +9,8 @@ from typing import Any, Final, TypeVar
 
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.naming import listed
-from webots_mcp.server.results import Answer, Table
-from webots_mcp.server.shortening import (
+from webots_mcp.questions.answers import Answer, Table
+from webots_mcp.questions.shortening import (
     DETAIL_BUDGET,
     compact_json,
     cut_text,

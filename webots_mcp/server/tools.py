@@ -1,4 +1,6 @@
-"""What a client gives a tool: refused where the tool cannot mean it, in words a model can act on.
+"""Where questions become MCP tools: their schemas, what a client gives them, what it gets.
+
+What a tool cannot mean is refused in words that a model can act on.
 
 The SDK ignores an argument that a tool does not have, so that the answer would be to another
 question than was asked; and it tells what is wrong with a value in the words of its validator.
@@ -10,25 +12,104 @@ What another server with tools of these names takes is taken as well: all argume
 
 from __future__ import annotations
 
-import difflib
+import functools
+import inspect
 import json
-import re
-from collections.abc import Collection, Iterable
+import logging
+from collections.abc import Callable, Collection, Iterable
 from typing import Any, Final, cast
 
+from mcp import MCPError
+from mcp.server.mcpserver import Context, Image
 from mcp.server.mcpserver.exceptions import ToolError
 from mcp.server.mcpserver.tools import Tool
+from mcp.types import CallToolResult, ContentBlock, TextContent, ToolAnnotations
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails
 
-from webots_mcp.naming import nearest_first, same_in_meaning
+from webots_mcp.errors import WebotsMCPError
+from webots_mcp.naming import nearest_first
+from webots_mcp.questions.answers import ShownPicture
+from webots_mcp.questions.declaring import Caller, Question, Reply
+from webots_mcp.questions.faults import faults_of, shown_value
+from webots_mcp.questions.shortening import cut_text
+from webots_mcp.store.recording import Recording
 
 _WRAPPER: Final = "params"
 _FORMAT: Final = "response_format"
 _FORMATS: Final = (None, "json", "markdown")
-_MOST_FAULTS: Final = 3
 _UNSAID: Final = ("title", "anyOf", "maxLength", "maxProperties")
-_LONGEST_VALUE: Final = 80
+_BAD_ENDS: Final = ("failed", "expired", "cancelled", "lost")
+_LONGEST_DEFECT: Final = 200
+_LONGEST_ERROR: Final = 4_000  # characters: it may repeat what the model itself has sent
+
+_log = logging.getLogger(__name__)
+
+
+def tool_of(question: Question, recording: Recording, *, output_schema: bool = False) -> Tool:
+    """A question on a recording as a tool; its schemas, which take milliseconds, are made once."""
+    tool = _tool(question, output_schema)
+    return tool.model_copy(update={"fn": functools.partial(tool.fn, recording)})
+
+
+@functools.cache
+def _tool(question: Question, output_schema: bool) -> Tool:
+    effect = question.effect
+    return CheckedTool.from_function(
+        _answering(question),
+        title=question.title,
+        description=inspect.getdoc(question.function),
+        annotations=ToolAnnotations(
+            read_only_hint=effect.reads,
+            destructive_hint=effect.destroys,
+            idempotent_hint=effect.repeats,
+            open_world_hint=False,
+        ),
+        structured_output=None if output_schema else False,
+    )
+
+
+def _answering(question: Question) -> Callable[..., Any]:
+    """The question as the SDK calls it, after a recording; with an answer whatever happens."""
+
+    @functools.wraps(question.function)
+    async def wrapper(recording: Recording, ctx: Context[Any], **arguments: Any) -> Any:
+        companions = ctx.request_context.lifespan_context
+        caller = Caller("mcp", ctx.report_progress, companions)
+        try:
+            return _as_result(await question.ask(recording, arguments, caller))
+        except WebotsMCPError as error:
+            rows = f" (left out: {'; '.join(error.left_out)})" if error.left_out else ""
+            raise ToolError(f"{cut_text(str(error), _LONGEST_ERROR)}{rows}") from error
+        except (MCPError, ToolError):
+            raise
+        except Exception as error:
+            _log.exception("%s failed", question.name)
+            raise ToolError(
+                "a defect of webots-mcp, or rows that it did not write "
+                f"({type(error).__name__}: {str(error)[:_LONGEST_DEFECT]}); ask for another range "
+                "or by another tool, and report what the server wrote to stderr"
+            ) from error
+
+    context = inspect.Parameter("ctx", inspect.Parameter.KEYWORD_ONLY, annotation=Context[Any])
+    own = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in question.parameters]
+    vars(wrapper)["__signature__"] = question.signature.replace(parameters=[*own, context])
+    wrapper.__annotations__ = {"ctx": Context[Any]}
+    return wrapper
+
+
+def _as_result(reply: Reply) -> CallToolResult:
+    """Structured content and the same as compact text; pictures and their captions as they are."""
+    content = [_block(each) for each in reply.shown]
+    if reply.data is None:
+        return CallToolResult(content=content)
+    bad = reply.data.get("outcome") in _BAD_ENDS
+    return CallToolResult(content=content, structured_content=reply.data, is_error=bad)
+
+
+def _block(shown: str | ShownPicture) -> ContentBlock:
+    if isinstance(shown, str):
+        return TextContent(text=shown)
+    return Image(data=shown.data, format=shown.format).to_image_content()
 
 
 class CheckedTool(Tool):
@@ -61,7 +142,7 @@ class CheckedTool(Tool):
             return await super().run(meant, context, convert_result)
         except ToolError as error:
             if isinstance(error.__cause__, ValidationError):
-                raise ToolError(_explained(error.__cause__)) from error
+                raise ToolError(faults_of(error.__cause__)) from error
             raise
 
 
@@ -90,7 +171,7 @@ def _unwrapped(
         arguments = arguments if inner is None else inner
     asked = arguments.get(_FORMAT)
     if asked not in _FORMATS:
-        raise ToolError(f"{_FORMAT} must be 'json' or 'markdown', not {_shown(asked)}")
+        raise ToolError(f"{_FORMAT} must be 'json' or 'markdown', not {shown_value(asked)}")
     return {name: value for name, value in arguments.items() if name != _FORMAT}
 
 
@@ -108,7 +189,7 @@ def _require_known(arguments: Iterable[str], known: Collection[str], listed: Ite
     for name in arguments:
         if name not in known:
             there = ", ".join(nearest_first(name, listed)) or "none"
-            raise ToolError(f"no parameter {_shown(name)}: there is {there}")
+            raise ToolError(f"no parameter {shown_value(name)}: there is {there}")
 
 
 def _as_meant(value: Any, schema: dict[str, Any]) -> Any:
@@ -120,32 +201,3 @@ def _as_meant(value: Any, schema: dict[str, Any]) -> Any:
 def _is_list(value: object) -> bool:
     """Whether it is a list, or the JSON text of one, which the SDK reads."""
     return isinstance(value, list) or (isinstance(value, str) and value.lstrip().startswith("["))
-
-
-def _explained(error: ValidationError) -> str:
-    faults = {str(each["loc"][0]): _fault(each) for each in reversed(error.errors())}
-    return "; ".join(list(faults.values())[:_MOST_FAULTS])
-
-
-def _fault(error: ErrorDetails) -> str:
-    """One thing that is wrong: the parameter, what is asked of it, and what came."""
-    parameter, *inside = error["loc"]  # a name after it is a type that the value might have had
-    name = ".".join(map(str, (parameter, *(item for item in inside if isinstance(item, int)))))
-    if error["type"] == "missing":
-        return f"{name} is missing"
-    asked = re.sub(r"^(Value error, |\w+ should )", "must ", error["msg"])
-    if error["type"] == "int_parsing_size":
-        asked = "must be a smaller number"
-    return f"{name} {asked}, not {_shown(error['input'])}{_near(error)}"
-
-
-def _near(error: ErrorDetails) -> str:
-    """What was perhaps meant."""
-    choices = re.findall(r"'([^']+)'", error["msg"])
-    given = str(error["input"])[:_LONGEST_VALUE]
-    near = same_in_meaning(given, choices) or difflib.get_close_matches(given, choices, n=1)
-    return f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
-
-
-def _shown(value: object) -> str:
-    return repr(value)[:_LONGEST_VALUE]

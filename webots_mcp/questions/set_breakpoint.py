@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
-from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.contract import BreakpointAction
+from webots_mcp.questions.answers import BreakpointAnswer, BreakpointsAnswer, Table
+from webots_mcp.questions.argument_types import Id, RobotName
+from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.server import arming
-from webots_mcp.server.declaring import ACTS, READS, tool
-from webots_mcp.server.parameters import Id, RobotName
-from webots_mcp.server.results import BreakpointAnswer, BreakpointsAnswer, Table
 from webots_mcp.store.recording import Recording
 
 BreakpointId = Annotated[Id, Field(description="From webots_breakpoint.")]
 
 
-@tool("Set a breakpoint", ACTS)
+@question("Set a breakpoint", CHANGES)
 async def webots_breakpoint(
     recording: Recording,
     condition: Annotated[
@@ -28,7 +27,7 @@ async def webots_breakpoint(
             "< 0.05; changed(mode); abs(rate(v)) > 2; missing(gps.x); pose.0 > 1.",
         ),
     ],
-    ctx: Context[Any],
+    caller: Caller,
     action: Annotated[
         BreakpointAction,
         Field(description="keep records the seconds around at full rate, log only the hit."),
@@ -45,7 +44,7 @@ async def webots_breakpoint(
     """
     return await arming.set_breakpoint(
         recording,
-        ctx.report_progress,
+        caller.report,
         condition,
         action=action,
         after_hits=after_hits,
@@ -53,7 +52,7 @@ async def webots_breakpoint(
     )
 
 
-@tool("List the breakpoints", READS)
+@question("List the breakpoints", READS)
 def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> BreakpointsAnswer:
     """The robot's breakpoints, how often each was hit, and when last."""
     with recording.view(robot) as view:
@@ -65,13 +64,13 @@ def webots_list_breakpoints(recording: Recording, robot: RobotName = None) -> Br
         )
 
 
-@tool("Remove a breakpoint", ACTS)
+@question("Remove a breakpoint", CHANGES)
 async def webots_remove_breakpoint(
     recording: Recording,
     breakpoint_id: BreakpointId,
-    ctx: Context[Any],
+    caller: Caller,
     robot: RobotName = None,
 ) -> BreakpointAnswer:
     """Remove a breakpoint. The events of its hits stay; a paused simulation stays paused."""
-    report = ctx.report_progress
+    report = caller.report
     return await arming.remove_breakpoint(recording, report, breakpoint_id, robot=robot)

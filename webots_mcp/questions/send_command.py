@@ -5,17 +5,16 @@ from __future__ import annotations
 import json
 from typing import Annotated, Any, Final
 
-from mcp.server.mcpserver import Context
 from pydantic import Field
 
 from webots_mcp.contract import BUILT_IN_ACTIONS, CommandStatus
+from webots_mcp.questions.answers import CommandAnswer, CommandsAnswer
+from webots_mcp.questions.argument_types import Cursor, Id, RobotName, TimeoutS
+from webots_mcp.questions.budget import condensed
+from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
+from webots_mcp.questions.shortening import DETAIL_BUDGET, cut_text, shorten
 from webots_mcp.queue import Command, list_commands
-from webots_mcp.server.budget import condensed
-from webots_mcp.server.declaring import ACTS, READS, tool
 from webots_mcp.server.dispatch import Dispatcher, shown_result
-from webots_mcp.server.parameters import Cursor, Id, RobotName, TimeoutS
-from webots_mcp.server.results import CommandAnswer, CommandsAnswer
-from webots_mcp.server.shortening import DETAIL_BUDGET, cut_text, shorten
 from webots_mcp.store.recording import Recording, View
 
 COMMAND_COLUMNS: Final = (
@@ -26,14 +25,14 @@ _ACTIONS_BUDGET: Final = 2_400
 _LONGEST_TEXT: Final = 200
 
 
-@tool("Send a command", ACTS)
+@question("Send a command", CHANGES)
 async def webots_send_command(
     recording: Recording,
     action: Annotated[
         str,
         Field(min_length=1, max_length=200, description="As in webots_list_commands."),
     ],
-    ctx: Context[Any],
+    caller: Caller,
     params: Annotated[dict[str, Any] | None, Field(description="As its docstring says.")] = None,
     robot: RobotName = None,
     timeout_s: TimeoutS = _WAIT_S,
@@ -42,22 +41,22 @@ async def webots_send_command(
 
     webots_list_commands lists the actions. Built-in actions have tools of their own.
     """
-    dispatcher = Dispatcher(recording, ctx.report_progress)
+    dispatcher = Dispatcher(recording, caller.report)
     return await dispatcher.ask(robot, action, timeout_s, params)
 
 
-@tool("Wait for a command", READS)
+@question("Wait for a command", READS)
 async def webots_wait_for_command(
     recording: Recording,
     command_id: Annotated[Id, Field(description="From its answer.")],
-    ctx: Context[Any],
+    caller: Caller,
     timeout_s: TimeoutS = _WAIT_S,
 ) -> CommandAnswer:
     """Go on waiting for a command that was still under way when its call was answered."""
-    return await Dispatcher(recording, ctx.report_progress).wait(command_id, timeout_s)
+    return await Dispatcher(recording, caller.report).wait(command_id, timeout_s)
 
 
-@tool("List the commands", READS)
+@question("List the commands", READS)
 def webots_list_commands(
     recording: Recording,
     limit: Annotated[int, Field(ge=1, le=200, description="The most to return.")] = 10,

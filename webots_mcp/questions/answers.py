@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
-from mcp.types import ImageContent
 from pydantic import BaseModel, Field, PrivateAttr
+
+
+@dataclass(frozen=True)
+class ShownPicture:
+    """A picture beside the data: an encoded file.
+
+    Attributes:
+        format: Of the data, as in `image/png`.
+    """
+
+    data: bytes
+    format: str
 
 
 class Table(BaseModel):
@@ -38,10 +50,10 @@ class Answer(BaseModel):
     left_out: list[str] | None = Field(
         default=None, description="Rows and values that no bridge has written; they do not count."
     )
-    _pictures: list[ImageContent] = PrivateAttr(default_factory=list[ImageContent])
+    _pictures: list[ShownPicture] = PrivateAttr(default_factory=list[ShownPicture])
 
     @property
-    def pictures(self) -> list[ImageContent]:
+    def pictures(self) -> list[ShownPicture]:
         """What is shown beside the data, by clients that show both."""
         return self._pictures
 

@@ -1,0 +1,46 @@
+"""What is wrong with an argument, in words that a model or a person can act on."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from typing import Final
+
+from pydantic import ValidationError
+from pydantic_core import ErrorDetails
+
+from webots_mcp.naming import same_in_meaning
+
+_MOST_FAULTS: Final = 3
+_LONGEST_VALUE: Final = 80
+
+
+def faults_of(error: ValidationError) -> str:
+    """The first things that are wrong: the argument, what is asked of it, and its value."""
+    faults = {str(each["loc"][0]): _fault(each) for each in reversed(error.errors())}
+    return "; ".join(list(faults.values())[:_MOST_FAULTS])
+
+
+def _fault(error: ErrorDetails) -> str:
+    """One thing that is wrong: the parameter, what is asked of it, and what came."""
+    parameter, *inside = error["loc"]  # a name after it is a type that the value might have had
+    name = ".".join(map(str, (parameter, *(item for item in inside if isinstance(item, int)))))
+    if error["type"] == "missing":
+        return f"{name} is missing"
+    asked = re.sub(r"^(Value error, |\w+ should )", "must ", error["msg"])
+    if error["type"] == "int_parsing_size":
+        asked = "must be a smaller number"
+    return f"{name} {asked}, not {shown_value(error['input'])}{_near(error)}"
+
+
+def _near(error: ErrorDetails) -> str:
+    """What was perhaps meant."""
+    choices = re.findall(r"'([^']+)'", error["msg"])
+    given = str(error["input"])[:_LONGEST_VALUE]
+    near = same_in_meaning(given, choices) or difflib.get_close_matches(given, choices, n=1)
+    return f"; did you mean {' or '.join(map(repr, near))}?" if near else ""
+
+
+def shown_value(value: object) -> str:
+    """A value as it was given, if not too long."""
+    return repr(value)[:_LONGEST_VALUE]

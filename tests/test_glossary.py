@@ -7,7 +7,8 @@ import tokenize
 from pathlib import Path
 
 _ROOT = Path(__file__).parents[1]
-_GLOSSARY = (_ROOT / "CONTRIBUTING.md").read_text("utf-8").partition("## Glossary")[2]
+_CONTRIBUTING = (_ROOT / "CONTRIBUTING.md").read_text("utf-8")
+_GLOSSARY = _CONTRIBUTING.partition("## Glossary")[2].partition("\n## ")[0]
 _BRIDGE = _ROOT / "webots_mcp" / "bridge"
 
 

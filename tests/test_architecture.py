@@ -48,21 +48,26 @@ STDLIB = {
 }
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
-ALLOWED["store"] = STDLIB | {"store"}
-ALLOWED["pool"] = STDLIB | {"store", "pool"}
-ALLOWED["trials"] = STDLIB | {"pool", "store", "trials", "webots", "__version__"}
+ALLOWED["store"] = STDLIB | {"plugins", "store"}
+ALLOWED["trials"] = STDLIB | {"store", "trials", "webots", "__version__"}
 ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}
 ALLOWED["launch"] = STDLIB | {"console", "store", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
-ALLOWED["charts"] = ALLOWED["plotting"] | {"charts", "plotting", "standin"}
-ALLOWED["report"] = ALLOWED["charts"] | {"charts", "report", "__version__"}
 ALLOWED["console"] = STDLIB | {"console", "store", "webots"}
 ALLOWED["server"] = STDLIB | {
     "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
-    "launch", "questions", "report", "__version__",
+    "launch", "plugins", "questions", "__version__",
 }  # fmt: skip
 ALLOWED["questions"] = ALLOWED["server"]
-ALLOWED["page"] = ALLOWED["server"] | ALLOWED["charts"] | {"page"}
+ALLOWED["cli"] = ALLOWED["server"] | {"cli", "observer", "setup"}
+ON_ALL = ALLOWED["cli"]
+ALLOWED["plugins"] = set[str]()
+ALLOWED["plugins.cluster"] = ALLOWED["trials"] | {"plugins", "plugins.cluster", "plugins.pool"}
+ALLOWED["plugins.demo"] = ON_ALL | {"standin", "plugins.demo"}
+ALLOWED["plugins.formats"] = ALLOWED["store"] | {"plugins.formats"}
+ALLOWED["plugins.pool"] = ALLOWED["store"] | {"cli", "plugins.pool"}
+ALLOWED["plugins.report"] = ON_ALL | {"standin", "plugins.report"}
+ALLOWED["plugins.page"] = ALLOWED["plugins.report"] | {"plugins.page"}
 ALLOWED["testing"] = STDLIB | {"store", "standin", "testing"}
 ALLOWED["pytest_plugin"] = {
     "connection",
@@ -74,24 +79,58 @@ ALLOWED["pytest_plugin"] = {
 }
 
 
+# The parts that stand in a folder of their own: each is a part, and so is the folder's `__init__`.
+PLUGINS = PACKAGE / "plugins"
+
+
 def imports(file: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(file.read_text("utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module == "webots_mcp":
-            yield from (f"webots_mcp.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module in (
+            "webots_mcp",
+            "webots_mcp.plugins",
+        ):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
         elif isinstance(node, ast.ImportFrom) and node.module:
             yield node.module
 
 
+def part_of(name: str) -> str:
+    _, part, *rest = name.split(".")
+    in_plugin = part == "plugins" and rest and (PLUGINS / rest[0]).is_dir()
+    return f"plugins.{rest[0]}" if in_plugin else part
+
+
+def files_of(part: str) -> list[Path]:
+    place = PACKAGE.joinpath(*part.split("."))
+    if place == PLUGINS:
+        return [PLUGINS / "__init__.py"]
+    return [place.with_suffix(".py")] if not place.is_dir() else [*place.rglob("*.py")]
+
+
 @pytest.mark.parametrize("part", ALLOWED)
 def test_each_part_imports_only_what_stands_below_it(part: str) -> None:
-    files = [PACKAGE / f"{part}.py"] if (PACKAGE / f"{part}.py").exists() else []
-    files += (PACKAGE / part).rglob("*.py")
-    assert files
-    for file in files:
-        ours = {name.split(".")[1] for name in imports(file) if name.startswith("webots_mcp.")}
+    for file in files_of(part):
+        ours = {part_of(name) for name in imports(file) if name.startswith("webots_mcp.")}
         assert ours <= ALLOWED[part], f"{file.name} imports {ours - ALLOWED[part]}"
+
+
+def test_nothing_but_plugins_knows_a_plugin_by_its_name() -> None:
+    names = [each.name for each in PLUGINS.iterdir() if (each / "__init__.py").exists()]
+    assert all(f"plugins.{name}" in ALLOWED for name in names)
+    for file in PACKAGE.rglob("*.py"):
+        if not file.is_relative_to(PLUGINS):
+            known = {part_of(n) for n in imports(file) if n.startswith("webots_mcp.plugins")}
+            assert known <= {"plugins"}, f"{file.relative_to(PACKAGE)} imports {known}"
+            assert "webots_mcp.plugins." not in file.read_text("utf-8"), file
+
+
+def test_only_what_needs_a_simulator_in_this_process_imports_the_stand_in() -> None:
+    above = (PACKAGE / "standin", PACKAGE / "testing", PACKAGE / "pytest_plugin.py", PLUGINS)
+    for file in PACKAGE.rglob("*.py"):
+        if not any(file.is_relative_to(each) for each in above):
+            assert "standin" not in {part_of(n) for n in imports(file) if "webots_mcp." in n}, file
 
 
 def test_the_public_surface_is_exactly_this() -> None:

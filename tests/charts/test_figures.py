@@ -15,9 +15,9 @@ from bokeh.models import GlyphRenderer, HoverTool, LegendItem, Patches, Plot, Sc
 from bokeh.resources import INLINE
 
 from tests.plotting.conftest import Record, whole
-from webots_mcp.charts import signals_chart, way_chart
 from webots_mcp.errors import NothingRecordedError, UnknownSignalError
 from webots_mcp.plotting.signals import compose_signals
+from webots_mcp.plugins.report.charts import signals_chart, way_chart
 
 ARENA = Path(__file__).parents[2] / "examples" / "worlds" / "arena.wbt"
 

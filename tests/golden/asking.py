@@ -25,7 +25,7 @@ from webots_mcp.errors import WebotsMCPError
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
 from webots_mcp.plotting.trials import compose_trials
-from webots_mcp.report import make_report
+from webots_mcp.plugins.report.making import make_report
 from webots_mcp.server import create_server
 from webots_mcp.store.export import TrialTable, export, export_for_viewers
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S, Deadline
@@ -185,7 +185,7 @@ def _exports(connection: sqlite3.Connection, kind: Kind, folder: Path) -> Iterat
         yield f"export as {form}", {"rows": rows, **_content(form, sink.getvalue())}
     for form in ("mcap", "rrd"):
         file = folder / f"golden.{form}"
-        yield f"export as {form}", export_for_viewers(connection, folder, whole, form, file)
+        yield f"export as {form}", export_for_viewers(connection, folder, whole, form, file).counts
     yield "export as bundle", _imported_again(whole.segments[0].run_id, folder)
     try:
         sink = io.BytesIO()

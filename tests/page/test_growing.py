@@ -12,10 +12,10 @@ import pytest
 
 from tests.memory import memory_connection
 from tests.recordings.rover import record_rover
-from webots_mcp.charts import draw_signals, draw_way
-from webots_mcp.page.growing import grow_signals, grow_way
 from webots_mcp.plotting.signals import compose_signals
 from webots_mcp.plotting.trajectory import compose_trajectory
+from webots_mcp.plugins.page.growing import grow_signals, grow_way
+from webots_mcp.plugins.report.charts import draw_signals, draw_way
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.reading.rows import Columns
 

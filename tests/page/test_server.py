@@ -14,7 +14,7 @@ import pytest
 from tests.page.conftest import Server
 from webots_mcp.cli import main
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.page.server import MOST_TABS
+from webots_mcp.plugins.page.server import MOST_TABS
 
 UPGRADE = {
     "Upgrade": "websocket",

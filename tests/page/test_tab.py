@@ -18,8 +18,8 @@ from tests.recordings.long import build
 from tests.recordings.rover import start_run
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.page.summing import Summing
-from webots_mcp.page.tab import Tab
+from webots_mcp.plugins.page.summing import Summing
+from webots_mcp.plugins.page.tab import Tab
 from webots_mcp.schema import create_schema
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.rollup.rolling import watermark

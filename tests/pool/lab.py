@@ -11,11 +11,11 @@ from typing import Any
 from tests.recordings.runs import Recorded
 from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.pool.catalogue import Choice, meant
-from webots_mcp.pool.fetching import Fetched, fetch
-from webots_mcp.pool.report import Report
-from webots_mcp.pool.shipping import Order, ship
-from webots_mcp.pool.target import Pool, Target
+from webots_mcp.plugins.pool.catalogue import Choice, meant
+from webots_mcp.plugins.pool.fetching import Fetched, fetch
+from webots_mcp.plugins.pool.report import Report
+from webots_mcp.plugins.pool.shipping import Order, ship
+from webots_mcp.plugins.pool.target import Pool, Target
 from webots_mcp.schema import create_schema
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result, create_trial_set, finish_trial, trials_of

@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from webots_mcp.errors import PoolBusyError, PoolError, PoolUnavailableError
-from webots_mcp.pool.batch import Batch, batches
-from webots_mcp.pool.tables import SQLValue, Table, tables
-from webots_mcp.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
+from webots_mcp.plugins.pool.batch import Batch, batches
+from webots_mcp.plugins.pool.tables import SQLValue, Table, tables
+from webots_mcp.plugins.pool.target import PooledRecording, PooledRun, PooledSize, PooledTrialSet
 from webots_mcp.store.questions.sql import Result, query_sql
 
 

@@ -23,11 +23,11 @@ from webots_mcp.errors import (
     PoolUnavailableError,
     SchemaTooOldError,
 )
-from webots_mcp.pool.batch import BATCH_BYTES
-from webots_mcp.pool.following import follow
-from webots_mcp.pool.report import Report
-from webots_mcp.pool.tables import table
-from webots_mcp.pool.target import is_whole
+from webots_mcp.plugins.pool.batch import BATCH_BYTES
+from webots_mcp.plugins.pool.following import follow
+from webots_mcp.plugins.pool.report import Report
+from webots_mcp.plugins.pool.tables import table
+from webots_mcp.plugins.pool.target import is_whole
 from webots_mcp.schema import create_schema
 from webots_mcp.store.merging import merge
 from webots_mcp.store.migrate import downgrade
@@ -289,8 +289,8 @@ def test_a_recording_that_nobody_can_write_is_shipped(shipped: Shipped) -> None:
     code = (
         "import functools, sys; from pathlib import Path; "
         "from tests.pool.sqlite_target import SQLiteTarget; "
-        "from webots_mcp.pool.report import Report; "
-        "from webots_mcp.pool.shipping import Order, ship; "
+        "from webots_mcp.plugins.pool.report import Report; "
+        "from webots_mcp.plugins.pool.shipping import Order, ship; "
         "from webots_mcp.store.recording import Recording; folder, pool = map(Path, sys.argv[1:]); "
         "recording = Recording(folder / 'webots.db', folder, read_only=True); "
         "ship(Order(recording, functools.partial(SQLiteTarget, pool), full=True), Report())"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.pool.tables import tables
-from webots_mcp.pool.target import open_target, redacted
+from webots_mcp.plugins.pool.tables import tables
+from webots_mcp.plugins.pool.target import open_target, redacted
 
 SECRET = "hunter2"
 

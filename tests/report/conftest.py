@@ -12,7 +12,7 @@ import pytest
 
 from tests.browsing import chromium
 from webots_mcp.connection import connect
-from webots_mcp.report import Report, make_report
+from webots_mcp.plugins.report.making import Report, make_report
 
 pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from webots_mcp.report import Report
+from webots_mcp.plugins.report.making import Report
 
 DRAWN = (
     "() => window.Bokeh && [...document.querySelectorAll('[data-figure] > div')]"

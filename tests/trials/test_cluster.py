@@ -21,10 +21,10 @@ from tests.server.conftest import anyio_backend, ask, fail  # fixtures
 from tests.trials.conftest import Run, command, rows
 from tests.trials.dask_cluster import Cluster, found
 from webots_mcp import __version__
+from webots_mcp.plugins.cluster import dask_cluster as cluster
+from webots_mcp.plugins.cluster.dask_cluster import Needs, digest_of, packed, what_lacks
 from webots_mcp.server import create_server
 from webots_mcp.store.trials import Result
-from webots_mcp.trials import cluster
-from webots_mcp.trials.cluster import Needs, digest_of, packed, what_lacks
 
 __all__ = ["anyio_backend"]
 Write = Callable[[str], Path]

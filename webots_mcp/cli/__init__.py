@@ -24,16 +24,12 @@ from webots_mcp.cli import (
     launching,
     looking,
     observing,
-    pooling,
-    reporting,
     scene,
     serving,
     setting_up,
-    shipping,
     steering,
     trials,
     tuning,
-    viewing,
 )
 from webots_mcp.cli.command import COMMANDS
 from webots_mcp.cli.ending import ended_by, ending_by_signals
@@ -41,6 +37,7 @@ from webots_mcp.cli.terminal import spelling_out
 from webots_mcp.cli.wording import as_typed, speak_of
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.naming import spelled_out
+from webots_mcp.plugins import command_modules
 
 __all__ = ["COMMANDS", "main"]
 
@@ -54,16 +51,13 @@ FAMILIES: Final = (
     diagnosing,
     history,
     contents,
-    reporting,
     data,
-    shipping,
     trials,
     tuning,
     steering,
     scene,
     breakpoints,
-    viewing,
-    pooling,
+    *command_modules(),
 )
 EXIT_SYSTEM: Final = 1
 EXIT_BAD_INPUT: Final = 2

@@ -29,6 +29,7 @@ from webots_mcp.cli.ranges import RANGE, range_of, scope_of
 from webots_mcp.cli.tables import id_ranges, print_json, print_notes, print_table
 from webots_mcp.cli.terminal import binary_stdout
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.plugins import export_formats
 
 if TYPE_CHECKING:
     from webots_mcp.store.recording import Recording
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     "export", DATA_DIR, DATABASE, *RANGE,
     argument("-o", "--output", metavar="FILE",
              help="a .csv, .jsonl, .parquet, .mcap, .rrd or .zip file (default: CSV to stdout)"),
-    argument("--format", choices=("csv", "jsonl", "parquet", "mcap", "rrd", "zip"),
+    argument("--format", choices=("csv", "jsonl", *(each.name for each in export_formats()), "zip"),
              help="where the file's name does not tell it"),
     argument("--safe-cells", action="store_true",
              help="in CSV, an apostrophe before texts that a spreadsheet would run as a formula "
@@ -57,7 +58,14 @@ def export(arguments: argparse.Namespace) -> None:
     over, as a recording of its own with its pictures, which 'webots-mcp import' takes in. Parquet
     needs pyarrow, MCAP mcap, and Rerun rerun-sdk: pip install ...
     """
-    from webots_mcp.store.export import BUNDLE, FOR_VIEWERS, TrialTable, export_file, format_of
+    from webots_mcp.store.export import (
+        BUNDLE,
+        FOR_VIEWERS,
+        FORMATS,
+        TrialTable,
+        export_file,
+        format_of,
+    )
     from webots_mcp.store.export import export as write
     from webots_mcp.store.reading.ranges import Scope
 
@@ -70,8 +78,8 @@ def export(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"{file} is the recording itself: choose another file")
     if form in (*FOR_VIEWERS, BUNDLE):
         return _export_whole(arguments, recording, file, form)
-    if file is None and form == "parquet" and sys.stdout.isatty():
-        raise InvalidInputError("Parquet is not for a terminal: give a file with -o")
+    if file is None and not FORMATS[form].is_text and sys.stdout.isatty():
+        raise InvalidInputError(f"{form} is not for a terminal: give a file with -o")
 
     def run() -> None:
         with reading(arguments) as connection, shown_progress("exporting") as progress:
@@ -94,12 +102,12 @@ def export(arguments: argparse.Namespace) -> None:
 def _export_whole(
     arguments: argparse.Namespace, recording: Recording, file: Path | None, form: str
 ) -> None:
-    from webots_mcp.store.export import BUNDLE
+    from webots_mcp.store.export import BUNDLE, FORMATS
 
     if file is None:
         raise InvalidInputError(f"{form} is not for stdout: give a file with -o")
     if arguments.trial_set is not None:
-        raise InvalidInputError(f"trials are a table: choose csv, jsonl or parquet, not {form}")
+        raise InvalidInputError(f"trials are a table: choose {' or '.join(FORMATS)}, not {form}")
     if form == BUNDLE:
         return _export_bundle(arguments, recording, file)
     past_wrong_values(functools.partial(_export_for_viewers, arguments, recording, file, form))
@@ -108,14 +116,13 @@ def _export_whole(
 def _export_for_viewers(
     arguments: argparse.Namespace, recording: Recording, file: Path, form: str
 ) -> None:
-    from webots_mcp.store.export import export_for_viewers, layout_file
+    from webots_mcp.store.export import export_for_viewers
 
     with reading(arguments) as connection, shown_progress("exporting") as progress:
         wanted = range_of(connection, arguments)
-        counts = export_for_viewers(connection, recording.data_dir, wanted, form, file, progress)
-    told = ", ".join(f"{count} {kind}" for kind, count in counts.items() if count)
-    beside = f"; layout for Foxglove and Lichtblick: {layout_file(file)}"
-    print(f"{file}: {told}{beside if form == 'mcap' else ''}")
+        written = export_for_viewers(connection, recording.data_dir, wanted, form, file, progress)
+    told = ", ".join(f"{count} {kind}" for kind, count in written.counts.items() if count)
+    print(f"{file}: {told}{written.beside and f'; {written.beside}'}")
     print_notes(wanted.notes, sys.stderr)
 
 

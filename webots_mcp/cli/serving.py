@@ -1,4 +1,4 @@
-"""Commands that run something: the server, the demo, a migration."""
+"""Commands that run something: the server, a migration."""
 
 from __future__ import annotations
 
@@ -134,17 +134,3 @@ def migrate(arguments: argparse.Namespace) -> None:
     except CommandError as error:
         raise InvalidInputError(f"--revision {arguments.revision}: {error}") from error
     print(f"{database}: schema {before}, now {after}" if before != after else f"schema {after}")
-
-
-@command(
-    "demo",
-    argument("--data-dir", metavar="DIR", help="where to record (default: ~/.webots-mcp/demo)"),
-    argument("--keep", action="store_true", help="leave the robot running until Ctrl-C"),
-)
-def demo(arguments: argparse.Namespace) -> None:
-    """Run a robot on the stand-in simulator and talk to it: no Webots needed, under 30 s."""
-    from webots_mcp.contract import full_path
-    from webots_mcp.demo import DEFAULT_DATA_DIR, run
-
-    chosen = full_path(arguments.data_dir) if arguments.data_dir else None
-    run(chosen or DEFAULT_DATA_DIR, keep=arguments.keep)

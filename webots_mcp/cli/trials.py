@@ -120,9 +120,9 @@ def _simulators(
 
 @contextmanager
 def _cluster(arguments: argparse.Namespace, plan: WorldPlan) -> Generator[Simulators]:
-    from webots_mcp.trials.cluster import cluster
+    from webots_mcp.plugins import cluster_offered, load
 
-    with cluster(
+    with load(cluster_offered().simulators)(
         arguments.scheduler,
         plan,
         is_stand_in=arguments.stand_in,

@@ -281,12 +281,3 @@ class ComparisonAnswer(NotedAnswer):
     only_in: dict[str, list[str]] | None = Field(
         default=None, description="Signals that not every group has."
     )
-
-
-class ReportAnswer(NotedAnswer):
-    """A report that was written."""
-
-    file: str | None = None
-    size_bytes: int | None = None
-    holds: dict[str, int] | None = Field(default=None, description="How many of each.")
-    not_in_it: list[str] | None = Field(default=None, description="What had no room, and why.")

@@ -13,9 +13,10 @@ import sqlite3
 import threading
 import time
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, Protocol
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, LeaseLostError, WebotsMCPError
+from webots_mcp.plugins import cluster_offered, load
 from webots_mcp.queue import Command, CommandQueue, fetch_command, find_command
 from webots_mcp.server.running import ACTION
 from webots_mcp.server.target import find_target
@@ -40,9 +41,6 @@ from webots_mcp.store.trials import (
     trials_of,
 )
 from webots_mcp.trials.plan import Plan, WorldPlan, stored_plan
-
-if TYPE_CHECKING:
-    from webots_mcp.server.cluster_worker import ClusterWorker
 
 _LOOK_EVERY_S: Final = 0.02
 # So long that a controller that knows a reset only by its time having gone back notices the next.
@@ -341,6 +339,20 @@ class TrialWorker(threading.Thread):
         return CommandQueue(connection).enqueue(noted.robot_id, action, params, requested_by=_ASKER)
 
 
+class SetWorker(Protocol):
+    """A thread that works on a trial set, here or by other machines."""
+
+    set_id: int
+
+    def is_alive(self) -> bool:
+        """Whether it still does."""
+        ...
+
+    def stop(self) -> None:
+        """End soon, and leave the set as it is."""
+        ...
+
+
 class TrialWorkers:
     """Those of a server.
 
@@ -350,7 +362,7 @@ class TrialWorkers:
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
-        self._workers: list[TrialWorker | ClusterWorker] = []
+        self._workers: list[SetWorker] = []
 
     def begin(self, set_id: int) -> None:
         """Work on a set.
@@ -379,16 +391,15 @@ class TrialWorkers:
             is_stand_in: They run on the stand-in.
 
         Raises:
-            CommandRefusedError, InvalidInputError: As `ClusterWorker`.
+            CommandRefusedError, InvalidInputError: As the worker of the plugin.
         """
-        from webots_mcp.server.cluster_worker import ClusterWorker
-
-        worker = ClusterWorker(self._recording, scheduler, plan, is_stand_in=is_stand_in)
-        set_id = worker.begin(enter)
+        worker_of = load(cluster_offered().worker)
+        worker = worker_of(self._recording, scheduler, plan, is_stand_in=is_stand_in)
+        set_id: int = worker.begin(enter)
         self._keep(worker)
         return set_id
 
-    def _keep(self, worker: TrialWorker | ClusterWorker) -> None:
+    def _keep(self, worker: SetWorker) -> None:
         self._workers = [each for each in self._workers if each.is_alive()] + [worker]
 
     def end(self, set_id: int) -> None:

@@ -13,9 +13,9 @@ import pytest
 from tests.pool.parquet import bucket
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME, new_uuid
-from webots_mcp.pool.parquet.writing import ParquetTarget
-from webots_mcp.pool.report import Report
-from webots_mcp.pool.shipping import Order, ship
+from webots_mcp.plugins.pool.parquet.writing import ParquetTarget
+from webots_mcp.plugins.pool.report import Report
+from webots_mcp.plugins.pool.shipping import Order, ship
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.rollup.rolling import roll
 

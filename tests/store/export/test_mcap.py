@@ -20,7 +20,8 @@ from tests.recordings.rover import Recorder
 from tests.recordings.runs import Recorded
 from tests.store.export.test_export import STATES, publish, recorded_run, same, without_odd
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.export import export_for_viewers, layout_file
+from webots_mcp.plugins.formats.foxglove import layout_file
+from webots_mcp.store.export import export_for_viewers
 from webots_mcp.store.reading.ranges import Scope, find_range
 
 
@@ -208,10 +209,10 @@ def test_a_picture_that_is_gone_or_outside_is_counted_and_left_out(
         )  # fmt: skip
     wanted = find_range(recorder.connection, Scope())
     (tmp_path / "data").mkdir()
-    counts = export_for_viewers(
+    written = export_for_viewers(
         recorder.connection, tmp_path / "data", wanted, "mcap", tmp_path / "run.mcap"
     )
-    assert +counts == {"states": 1, "pictures that are gone": 2}
+    assert +written.counts == {"states": 1, "pictures that are gone": 2}
 
 
 def test_devices_with_names_alike_have_topics_of_their_own(

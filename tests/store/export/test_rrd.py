@@ -183,7 +183,7 @@ def test_several_runs_have_branches_of_their_own(recorded: Recorded, tmp_path: P
 def test_groups_of_rows_follow_each_other(
     recorder: Recorder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.store.export.rrd._GROUP_ROWS", 7)
+    monkeypatch.setattr("webots_mcp.plugins.formats.rrd._GROUP_ROWS", 7)
     for i in range(30):
         recorder.publish(float(i), {"x": i, "mode": "ab"[i // 15]})
     read = exported(recorder, tmp_path)

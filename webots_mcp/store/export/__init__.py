@@ -2,40 +2,46 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 from collections import Counter
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
 from webots_mcp.contract import whole_file
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.export.contents import Contents
-from webots_mcp.store.export.layout import layout
-from webots_mcp.store.export.mcap import write_mcap
-from webots_mcp.store.export.parquet import write_parquet
-from webots_mcp.store.export.rows import Progress, Source, Table
-from webots_mcp.store.export.rrd import write_rrd
-from webots_mcp.store.export.text import write_csv, write_json_lines
+from webots_mcp.plugins import ExportFormat, export_formats, load
+from webots_mcp.store.export.rows import Progress, Source
+from webots_mcp.store.export.text import write_csv
 from webots_mcp.store.export.trials import TrialTable
 from webots_mcp.store.reading.ranges import TimeRange
 
 
-class Format(NamedTuple):
-    """How rows are written, and how often they are read for it."""
+class Exported(NamedTuple):
+    """What was written for viewers.
 
-    write: Callable[[Table, BinaryIO], None]
-    passes: int
+    Attributes:
+        counts: How many there are of each kind: states, log lines, events, commands, pictures.
+        beside: Which other file was written, and what for; empty where none was.
+    """
+
+    counts: Counter[str]
+    beside: str = ""
 
 
-FORMATS: Final = {
-    "csv": Format(write_csv, 2),
-    "jsonl": Format(write_json_lines, 1),
-    "parquet": Format(write_parquet, 2),
-}
-FOR_VIEWERS: Final = ("mcap", "rrd")
+_OWN: Final = (
+    ExportFormat("csv", ("csv",), "webots_mcp.store.export.text:write_csv", passes=2, is_text=True),
+    ExportFormat(
+        "jsonl",
+        ("jsonl", "json", "ndjson"),
+        "webots_mcp.store.export.text:write_json_lines",
+        is_text=True,
+    ),
+)
+_ALL: Final = (*_OWN, *export_formats())
+FORMATS: Final = {each.name: each for each in _ALL if not each.for_viewers}  # of tables
+FOR_VIEWERS: Final = {each.name: each for each in _ALL if each.for_viewers}
 BUNDLE: Final = "zip"
 
 
@@ -78,7 +84,7 @@ def export(
     if safe_cells and form == "csv":
         write_csv(source, sink, safe_cells=True)
     else:
-        chosen.write(source, sink)
+        load(chosen.write)(source, sink)
     return source.total
 
 
@@ -107,8 +113,8 @@ def export_for_viewers(
     form: str,
     file: Path,
     progress: Progress | None = None,
-) -> Counter[str]:
-    """Write all of a range as MCAP, with a layout beside it, or as a recording of Rerun's.
+) -> Exported:
+    """Write all of a range in a format that viewers read.
 
     The files are of their owner alone and appear when they are complete.
 
@@ -117,29 +123,14 @@ def export_for_viewers(
         data_dir: The folder of the pictures.
         wanted: From `find_range`.
         form: One of `FOR_VIEWERS`.
-        file: Where to; the layout is `layout_file` of it.
+        file: Where to.
         progress: Called now and then with the rows read so far and in all.
-
-    Returns:
-        How many there are of each kind: states, log lines, events, commands, pictures.
 
     Raises:
         InvalidInputError: The library is not installed, or a file cannot be written.
     """
-    if form == "rrd":
-        with placed(file) as aside:
-            return write_rrd(Contents.of(connection, data_dir, wanted, 1, progress), aside)
-    contents = Contents.of(connection, data_dir, wanted, 2, progress)
-    with placed(file) as aside, aside.open("wb") as sink:
-        counts = write_mcap(contents, sink)
-    with placed(layout_file(file)) as aside:
-        aside.write_text(json.dumps(layout(contents), indent=2), "utf-8")
-    return counts
-
-
-def layout_file(file: Path) -> Path:
-    """The layout beside a file for viewers."""
-    return file.with_suffix(".layout.json")
+    exported: Exported = load(FOR_VIEWERS[form].write)(connection, data_dir, wanted, file, progress)
+    return exported
 
 
 @contextmanager
@@ -163,10 +154,13 @@ def format_of(file: Path) -> str:
         InvalidInputError: None does.
     """
     ending = file.suffix.lower().lstrip(".")
-    form = {"json": "jsonl", "ndjson": "jsonl", "pq": "parquet"}.get(ending, ending)
-    if form not in (*FORMATS, *FOR_VIEWERS, BUNDLE):
-        raise InvalidInputError(
-            f"{file.name} does not tell its format: end it in .csv, .jsonl, .parquet, .mcap, .rrd "
-            "or .zip, or give the format"
-        )
-    return form
+    if ending == BUNDLE:
+        return BUNDLE
+    for each in _ALL:
+        if ending in each.suffixes:
+            return each.name
+    endings = ", ".join(f".{each.name}" for each in _ALL)
+    raise InvalidInputError(
+        f"{file.name} does not tell its format: end it in {endings} or .{BUNDLE}, or give the "
+        "format"
+    )

@@ -1,0 +1,97 @@
+"""What is built on the core, each in a package of this folder: plugins.
+
+The core (bridge, store, server, command line) does not know them. It asks here what there is to
+offer, and imports a plugin's code when it is used. A plugin names what it offers in `PLUGIN` of its
+`__init__`, by modules and by functions as `module:function`; nothing else is imported with it, so
+that `webots-mcp --help` and a server start as fast as without.
+"""
+
+from __future__ import annotations
+
+import pkgutil
+from collections.abc import Iterator
+from functools import cache
+from importlib import import_module
+from types import ModuleType
+from typing import Any, NamedTuple
+
+
+class ExportFormat(NamedTuple):
+    """A format of `webots-mcp export`.
+
+    Attributes:
+        name: As `--format` takes it.
+        suffixes: The endings of files of this format, without the dot.
+        write: For a table `write(table, sink)`, as `store.export.rows.Table`; for viewers
+            `write(connection, data_dir, wanted, file, progress)`, as `export_for_viewers`.
+        for_viewers: All of a range (poses, pictures, log lines), not a table of states or trials.
+        passes: How often a table's rows are read for it.
+        is_text: Whether a terminal can show it.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    write: str
+    for_viewers: bool = False
+    passes: int = 1
+    is_text: bool = False
+
+
+class Cluster(NamedTuple):
+    """Trials on other machines.
+
+    Attributes:
+        simulators: A context manager that gives `trials.running.Simulators`, of a scheduler.
+        worker: A thread of the server that hands the trials of a set out.
+    """
+
+    simulators: str
+    worker: str
+
+
+class Plugin(NamedTuple):
+    """What a plugin adds to the core.
+
+    Attributes:
+        commands: Modules that register commands (`cli.command`).
+        questions: Modules that declare questions (`questions.declaring`), which are MCP tools.
+        formats: Of exports.
+        cluster: Where else trials can run.
+    """
+
+    commands: tuple[str, ...] = ()
+    questions: tuple[str, ...] = ()
+    formats: tuple[ExportFormat, ...] = ()
+    cluster: Cluster | None = None
+
+
+@cache
+def plugins() -> tuple[Plugin, ...]:
+    """What each package of this folder offers, in the order of their names."""
+    names = sorted(each.name for each in pkgutil.iter_modules(__path__) if each.ispkg)
+    return tuple(import_module(f"{__name__}.{name}").PLUGIN for name in names)
+
+
+def load(name: str) -> Any:
+    """What a plugin named as `module:function`."""
+    return pkgutil.resolve_name(name)
+
+
+def command_modules() -> Iterator[ModuleType]:
+    """Import the plugins' commands, which registers them."""
+    return (import_module(name) for plugin in plugins() for name in plugin.commands)
+
+
+def question_modules() -> Iterator[ModuleType]:
+    """Import the plugins' questions."""
+    return (import_module(name) for plugin in plugins() for name in plugin.questions)
+
+
+def export_formats() -> tuple[ExportFormat, ...]:
+    """The formats that plugins write."""
+    return tuple(each for plugin in plugins() for each in plugin.formats)
+
+
+def cluster_offered() -> Cluster:
+    """Where trials run on other machines."""
+    return next(plugin.cluster for plugin in plugins() if plugin.cluster is not None)

@@ -1,0 +1,475 @@
+"""Trials on a Dask cluster: a worker runs a simulator, and returns its score and its recording.
+
+Workers have to have Dask's resource `simulator`: a task of ours takes one of it, so that no machine
+runs more simulators than its owner says. Dask runs a trial again whose worker died, and says when
+that happened too often. Needs the extra `cluster`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import json
+import logging
+import re
+import tempfile
+import time
+from collections.abc import Callable, Generator, Iterator
+from concurrent.futures import CancelledError, Executor, Future, wait
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from importlib import import_module
+from operator import methodcaller
+from pathlib import Path
+from pkgutil import resolve_name
+from platform import python_version
+from typing import Any, Final, NamedTuple
+
+from webots_mcp import __version__
+from webots_mcp.contract import DATABASE_NAME, host_name
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
+from webots_mcp.plugins.pool.target import open_pool, open_target
+from webots_mcp.store.bundle import pack, unpack
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.trials import Result
+from webots_mcp.trials.plan import WorldPlan
+from webots_mcp.trials.running import Attempt, Command, StoppedError, run_attempt
+from webots_mcp.trials.simulators import stand_in, webots
+
+RESOURCE: Final = "simulator"
+MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler
+_CONNECT_S: Final = 10.0
+_PATIENCE_S: Final = 0.5  # between two looks at whether somebody wants to stop
+_COUNT_EVERY_S: Final = 2.0
+_WITHOUT_WORKERS_S: Final = 60.0
+_SOURCES: Final = (".py", ".c", ".cc", ".cpp", ".h", ".hpp", ".java", ".m")
+_ADDRESS: Final = re.compile(r"(tcp|tls|ws|wss)://[^\s/]+:[0-9]{1,5}")
+_WITH_TLS: Final = ("tls://", "wss://")
+_TASK: Final = "webots_mcp.plugins.cluster.dask_cluster:run_here"
+_BUNDLE: Final = "recording.zip"
+_LOST: Final = "the scheduler {} was lost: what is left can be gone on with once it is back"
+_SHARED: Final = "all workers need the project under the same path, such as in a shared folder"
+
+
+# -- on a worker ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a worker has to have.
+
+    Attributes:
+        version: Of webots-mcp.
+        world: The path of the world file.
+        digest: Of that file and the sources of the project's controllers.
+        is_stand_in: Whether the stand-in runs it, and not Webots.
+        ship_to: The URL of a pool that takes the recordings; None where they are returned.
+    """
+
+    version: str
+    world: str
+    digest: str
+    is_stand_in: bool
+    ship_to: str | None = None
+
+    @property
+    def command(self) -> Command:
+        """Of the simulator."""
+        return stand_in if self.is_stand_in else webots
+
+
+class Returned(NamedTuple):
+    """What a worker returns: what became of a trial, and what it recorded.
+
+    Attributes:
+        result: With the id of its run in that recording.
+        recording: Packed; None where there is none, or it was shipped.
+        shipped: The UUID of the recording, where it was shipped.
+    """
+
+    result: Result
+    recording: bytes | None = None
+    shipped: str | None = None
+
+
+def what_lacks(needs: Needs) -> str | None:
+    """What keeps this machine from running a trial; None where nothing does."""
+    if needs.version != __version__:
+        return f"it has webots-mcp {__version__}, not {needs.version}"
+    if not Path(needs.world).is_file():
+        return f"there is no file {needs.world}: {_SHARED}"
+    if digest_of(needs.world) != needs.digest:
+        return f"{needs.world}, or its controllers, are not the same there: {_SHARED}"
+    try:
+        needs.command(needs.world)
+        if needs.ship_to is not None:
+            _require_pool(needs.ship_to)
+    except WebotsMCPError as error:
+        return str(error)
+    return None
+
+
+def _require_pool(url: str) -> None:
+    """See that it can be the address of a pool, without connecting.
+
+    Raises:
+        InvalidInputError: It cannot, or the packages for it are missing.
+    """
+    try:
+        open_target(url)
+    except ModuleNotFoundError as error:
+        raise InvalidInputError(str(error)) from error
+
+
+def digest_of(world: str) -> str:
+    """Of a world and of the sources of its project's controllers."""
+    controllers = Path(world).parent.parent / "controllers"
+    sources = (each for each in controllers.rglob("*.*") if each.suffix in _SOURCES)
+    digest = hashlib.sha256()
+    for file in (Path(world), *sorted(sources)):
+        digest.update(f"{file}\0".encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
+    """Run the only trial of a plan on this worker, in a scratch folder of its own.
+
+    Args:
+        asked: The fields of its `Needs`.
+        plan_text: The plan.
+
+    Raises:
+        CommandRefusedError: This machine cannot run it.
+        InvalidInputError: No trial of the set can succeed.
+    """
+    from distributed import get_worker
+
+    needs = Needs(**asked)
+    worker: Any = get_worker()
+    unwanted = _Unwanted(worker)
+    where = f"worker {worker.address} on {host_name()}"
+    if (lack := what_lacks(needs)) is not None:
+        raise CommandRefusedError(f"{where}: {lack}")
+    plan = WorldPlan(**json.loads(plan_text))
+    try:
+        with tempfile.TemporaryDirectory(prefix="trial-", dir=worker.local_directory) as name:
+            folder = Path(name) / "data"
+            folder.mkdir()
+            attempt = Attempt(plan, plan.parameters[0], folder, unwanted, _note_nothing)
+            result = run_attempt(attempt, needs.command)
+            if result.run_id is None:
+                return Returned(result)
+            if needs.ship_to is None:
+                return packed(result, folder)
+            return Returned(result, shipped=_shipped(folder, needs.ship_to))
+    except StoppedError:
+        raise unwanted.as_dask_says() from None
+    except InvalidInputError:
+        raise  # no other worker could run it either
+    except (OSError, WebotsMCPError) as error:
+        raise CommandRefusedError(f"{where}: {error}") from error
+
+
+def _note_nothing(pid: int | None) -> None:
+    """Whoever handed the trial out cannot end a process of this machine; its keeper does."""
+
+
+def packed(result: Result, folder: Path) -> Returned:
+    """A result with its recording, unless that is too large."""
+    bundle = folder.parent / _BUNDLE
+    pack(folder, bundle)
+    size = bundle.stat().st_size
+    if size > MOST_BYTES:
+        why = (
+            f"its recording has {size:,} bytes packed, and a worker returns at most "
+            f"{MOST_BYTES:,}: --ship-to has it come through a pool instead"
+        )
+        return Returned(replace(result, run_id=None, score=None, error=why, pruned=False))
+    return Returned(result, bundle.read_bytes())
+
+
+def _shipped(folder: Path, url: str) -> str:
+    """The UUID of the recording, which is in the pool then."""
+    from webots_mcp.plugins.pool.reading import Source
+    from webots_mcp.plugins.pool.report import Report
+    from webots_mcp.plugins.pool.shipping import Order, ship
+
+    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    ship(Order(recording, partial(open_target, url), full=True, pictures=True), Report())
+    with recording.reader() as connection:
+        return Source(connection).uuid()
+
+
+class _Unwanted:
+    """Whether nobody wants the current task any more: it was cancelled, or its worker closes.
+
+    A client that is gone, killed or not, cancels what it asked for.
+    """
+
+    def __init__(self, worker: Any) -> None:
+        self._worker = worker
+        self._key = worker.get_current_task()
+
+    def wait(self, timeout: float | None = None, /) -> bool:
+        """Wait for so long; returns whether nobody wants it."""
+        time.sleep(timeout or 0.0)
+        task = self._worker.state.tasks.get(self._key)
+        return task is None or task.state == "cancelled" or self._closes
+
+    @property
+    def _closes(self) -> bool:
+        return self._worker.status.name in ("closing", "closed", "failed")
+
+    def as_dask_says(self) -> Exception:
+        """What tells Dask that the task is not done; one whose worker closes runs elsewhere."""
+        from distributed import Reschedule
+
+        return Reschedule() if self._closes else StoppedError()
+
+
+# -- where the set is -------------------------------------------------------------------------
+
+
+class ClusterSimulators:
+    """The simulators of a cluster's workers.
+
+    Attributes:
+        client: Dask's.
+        address: Of the scheduler.
+        needs: What each worker has to have.
+        most: How many trials run at once at most; None for as many as there are workers.
+        notes: What its owner should know.
+    """
+
+    def __init__(self, client: Any, address: str, needs: Needs, most: int | None) -> None:
+        self.notes = _other_pythons(client)
+        self._client = client
+        self._address = address
+        self._needs = needs
+        self._most = most
+        self._executor: Executor = client.get_executor(pure=False, resources={RESOURCE: 1})
+        self._count = 0
+        self._seen_s = time.monotonic()
+        self._look_again_s = 0.0
+
+    @property
+    def count(self) -> int:
+        """How many can run at once, now; one where workers may come back.
+
+        Raises:
+            CommandRefusedError: The scheduler is gone, or its workers for a minute.
+        """
+        now_s = time.monotonic()
+        if now_s >= self._look_again_s:
+            self._look_again_s = now_s + _COUNT_EVERY_S
+            self._count = sum(_simulators_of(self._client, self._address).values())
+        if self._count:
+            self._seen_s = now_s
+        elif now_s > self._seen_s + _WITHOUT_WORKERS_S:
+            raise CommandRefusedError(_no_workers(self._address, "any more"))
+        return max(1, min(self._count, self._most or self._count))
+
+    def run(self, attempt: Attempt) -> Result:
+        """As `Simulators.run`."""
+        attempt.begun(None)
+        text = _alone(attempt.plan, attempt.values).text
+        future: Future[Returned] = self._executor.submit(_call(asdict(self._needs), text), _TASK)
+        while not wait([future], _PATIENCE_S).done:
+            if attempt.stopping.wait(0):
+                future.cancel()
+                raise StoppedError
+        returned = self._returned(future)
+        if returned.shipped is not None:
+            return self._fetched(returned.result, returned.shipped, attempt.folder)
+        if returned.recording is not None:
+            bundle = attempt.folder / _BUNDLE
+            bundle.write_bytes(returned.recording)
+            unpack(bundle, attempt.folder)
+            bundle.unlink()
+        return returned.result
+
+    def _fetched(self, result: Result, recording_uuid: str, folder: Path) -> Result:
+        """The result, with its runs in a recording in the folder, as if it had been returned."""
+        from webots_mcp.plugins.pool.catalogue import Meant
+        from webots_mcp.plugins.pool.fetching import fetch
+
+        assert self._needs.ship_to is not None
+        recording = Recording(folder / DATABASE_NAME, folder)
+        recording.create()
+        with open_pool(self._needs.ship_to) as pool, recording.writer() as connection:
+            runs = list(pool.runs(recording_uuid))
+            ids = fetch(pool, connection, folder, Meant(runs, ())).runs
+        (own,) = (ids[each.uuid] for each in runs if each.run_id == result.run_id)
+        return replace(result, run_id=own)
+
+    def _returned(self, future: Future[Returned]) -> Returned:
+        from distributed import KilledWorker
+
+        try:
+            return future.result()
+        except KilledWorker as error:
+            why = (
+                f"{error.allowed_failures + 1} workers died while they ran it, the last one "
+                f"{error.last_worker.address}: see their logs"
+            )
+            return Returned(Result(None, None, why))
+        except CancelledError as error:
+            raise CommandRefusedError(_LOST.format(self._address)) from error
+        except WebotsMCPError:
+            raise
+        except Exception as error:
+            raise CommandRefusedError(
+                f"a worker of {self._address} failed ({type(error).__name__}: {error})"
+            ) from error
+
+
+@contextmanager
+def cluster(
+    address: str,
+    plan: WorldPlan,
+    *,
+    is_stand_in: bool,
+    most: int | None = None,
+    ship_to: str | None = None,
+) -> Generator[ClusterSimulators]:
+    """The simulators of a cluster, as long as the block goes on.
+
+    Args:
+        address: Of the scheduler.
+        plan: Of the trials.
+        is_stand_in: Whether the stand-in runs them, and not Webots.
+        most: How many trials run at once at most; None for as many as there are workers.
+        ship_to: The URL of a pool through which the recordings come; None for the scheduler.
+
+    Raises:
+        CommandRefusedError: Nobody answers there, no worker has a simulator, or one lacks
+            something.
+        InvalidInputError: It is no address, or Dask is not installed.
+    """
+    if ship_to is not None:
+        _require_pool(ship_to)
+        ship_to = ship_to if "://" in ship_to else str(Path(ship_to).absolute())
+    with _connected(address) as client:
+        needs = Needs(__version__, plan.world, digest_of(plan.world), is_stand_in, ship_to)
+        _require_fit(client, address, needs)
+        yield ClusterSimulators(client, address, needs, most)
+
+
+@contextmanager
+def _connected(address: str) -> Generator[Any]:
+    try:
+        distributed: Any = import_module("distributed")
+    except ImportError as error:
+        raise InvalidInputError(
+            "trials on a cluster need Dask: pip install 'distributed>=2024.12' (the extra "
+            "[cluster] of webots-mcp)"
+        ) from error
+    # That a scheduler was lost is told by who misses it, in a sentence and not by a traceback.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
+    if not _ADDRESS.fullmatch(address):
+        raise InvalidInputError(
+            f"scheduler {address!r} is no address, such as tcp://HOST:8786 or tls://HOST:8786"
+        )
+    if address.startswith(_WITH_TLS) and distributed.Security().tls_ca_file is None:
+        raise InvalidInputError(
+            f"{address} needs certificates, of which Dask's configuration tells: "
+            "DASK_DISTRIBUTED__COMM__TLS__CA_FILE, ..._TLS__CLIENT__CERT and ..._TLS__CLIENT__KEY"
+        )
+    nobody = f"no Dask scheduler answers at {address}"
+    try:
+        kind = asyncio.run(asyncio.wait_for(_kind_of_server(distributed, address), 2 * _CONNECT_S))
+    except Exception as error:
+        why = str(error) or "what listens there is something else"
+        raise CommandRefusedError(f"{nobody}: {why}") from error
+    if kind != "Scheduler":
+        raise CommandRefusedError(f"{nobody}, but a {kind.lower()}")
+    client = distributed.Client(address, timeout=_CONNECT_S, set_as_default=False)
+    try:
+        yield client
+    finally:
+        client.close(timeout=_PATIENCE_S)
+
+
+async def _kind_of_server(distributed: Any, address: str) -> str:
+    """`Scheduler` or `Worker`. A `Client` waits without end for the answer of what is neither."""
+    security = distributed.Security().get_connection_args("client")
+    async with distributed.rpc(address, timeout=_CONNECT_S, connection_args=security) as server:
+        return (await server.identity())["type"]
+
+
+def _require_fit(client: Any, address: str, needs: Needs) -> None:
+    """See that there are workers with simulators, which have what they need.
+
+    Raises:
+        CommandRefusedError: There is none, or one lacks something.
+    """
+    workers = list(_simulators_of(client, address))
+    if not workers:
+        raise CommandRefusedError(_no_workers(address, "yet"))
+    lacks = [*_other_versions(client, workers)]
+    if not lacks:
+        found = client.run(what_lacks, needs, workers=workers)
+        lacks = [f"worker {each}: {lack}" for each, lack in found.items() if lack is not None]
+    if lacks:
+        more = f" (and {len(lacks) - 1} other workers)" if len(lacks) > 1 else ""
+        raise CommandRefusedError(f"{lacks[0]}{more}")
+
+
+def _other_versions(client: Any, workers: list[str]) -> Iterator[str]:
+    """Workers of which Dask tells that they cannot even be asked: ours is not what is there."""
+    told = client.get_versions(packages=["webots_mcp"])["workers"]
+    for each in workers:
+        version = told[each]["packages"].get("webots_mcp")
+        if version != __version__:
+            has = f"webots-mcp {version}" if version else "no webots-mcp"
+            python = told[each]["host"]["python"]
+            yield f"worker {each} (Python {python}) has {has}: here is {__version__}"
+
+
+def _other_pythons(client: Any) -> list[str]:
+    """Notes on workers whose Python is of another minor version: scores may hang on it."""
+    here, workers = python_version(), client.get_versions()["workers"]
+    minor = here.split(".")[:2]
+    pythons = {each: str(told["host"]["python"]) for each, told in workers.items()}
+    others = {each: said for each, said in pythons.items() if said.split(".")[:2] != minor}
+    if not others:
+        return []
+    some, said = next(iter(others.items()))
+    return [f"{len(others)} workers, such as {some}, have Python {said}: here is {here}"]
+
+
+def _simulators_of(client: Any, address: str) -> dict[str, int]:
+    """How many simulators each worker runs at once, by its address."""
+    try:
+        workers = client.scheduler_info(n_workers=-1)["workers"]
+    except Exception as error:
+        raise CommandRefusedError(_LOST.format(address)) from error
+    found = {
+        each: min(int(told["resources"].get(RESOURCE, 0)), told["nthreads"])
+        for each, told in workers.items()
+    }
+    return {each: number for each, number in found.items() if number}
+
+
+def _no_workers(address: str, when: str) -> str:
+    return (
+        f"the scheduler {address} has no worker with the resource {RESOURCE!r} {when}: start some "
+        f"with 'dask worker {address} --resources {RESOURCE}=1 --nthreads 1'"
+    )
+
+
+def _call(*arguments: Any) -> Callable[[str], Any]:
+    """What calls a function of that name with these arguments.
+
+    The scheduler unpacks what it passes on, and need not have this package: only a worker looks
+    the name up.
+    """
+    toolz: Any = import_module("toolz")  # a part of Dask
+    return toolz.compose(methodcaller("__call__", *arguments), resolve_name)
+
+
+def _alone(plan: WorldPlan, values: dict[str, Any]) -> WorldPlan:
+    """A plan of one trial: a worker need not know of the others."""
+    return replace(plan, parameters=[values], repeats=1, ranges={}, search=None, sets=0, seed=0)

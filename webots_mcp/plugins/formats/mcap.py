@@ -1,0 +1,275 @@
+"""A range as an MCAP file, through the extra `mcap`, for Foxglove, Lichtblick and PlotJuggler.
+
+Messages are JSON. Their log time is simulation time in nanoseconds from 0, so that plots have the
+robot's own clock, whatever the simulation's speed was and however long it was paused; their publish
+time is wall time in nanoseconds since 1970. Of several runs each has topics of its own, which lie
+over each other, since simulation time begins again in each.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import re
+from collections import Counter
+from functools import partial, singledispatchmethod
+from importlib import import_module
+from itertools import chain, count
+from typing import Any, BinaryIO, Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
+from webots_mcp.plugins.formats.mcap_schemas import FIXED, Schema, Shape
+from webots_mcp.store.events import Event
+from webots_mcp.store.export.rows import Recorded, value_at
+from webots_mcp.store.export.text import json_text
+from webots_mcp.store.images import StoredImage
+from webots_mcp.store.logs import LogLine
+from webots_mcp.store.signals.flatten import parse
+
+WORLD_FRAME: Final = "world"
+_PROFILE: Final = ""  # of no middleware
+_LEVELS: Final = {"debug": 1, "info": 2, "warning": 3, "error": 4, "critical": 5}
+_NOT_IN_TOPICS: Final = re.compile(r"[^A-Za-z0-9_-]+")  # as message paths take them unquoted
+_NOT_IN_JSON: Final = re.compile("NaN|Infinity")  # Python reads them as numbers, viewers do not
+
+
+def write_mcap(contents: Contents, sink: BinaryIO) -> Counter[str]:
+    """Everything of a range as messages: see `Topics` for the topics.
+
+    A state is the message as it was published, with `odd` beside, which names the path of every
+    value that JSON cannot hold (null in the message) and what it was.
+
+    Returns:
+        How many there are of each kind.
+
+    Raises:
+        InvalidInputError: The library is not installed.
+    """
+    writer = _library().Writer(sink)
+    writer.start(profile=_PROFILE, library="webots-mcp")
+    writing = _Writing(contents, writer)
+    writing.begin()
+    for item in contents.items(pass_number=2):
+        writing.write(item)
+    writer.finish()
+    return writing.counts
+
+
+def _library() -> Any:
+    try:
+        return import_module("mcap.writer")
+    except ImportError as error:
+        raise InvalidInputError(
+            "MCAP needs its library: pip install mcap, or export as csv or jsonl"
+        ) from error
+
+
+class Topics:
+    """How the topics of a range are called.
+
+    They are /ROBOT/state, /ROBOT/pose, /ROBOT/way, /ROBOT/camera/DEVICE, /ROBOT/screenshot,
+    /ROBOT/log, /ROBOT/events and /ROBOT/commands; of several runs /run_ID/ROBOT/... each. Of two
+    devices that would be called the same, one is called NAME_2.
+    """
+
+    def __init__(self, contents: Contents) -> None:
+        self._devices: dict[str, str] = {}
+        devices = {image.device for image in contents.images() if image.device}
+        for device in sorted(devices, key=lambda each: (_named(each) != each, each)):
+            self._device(device)  # first those that may be called as they are
+        self._robot = _named(contents.wanted.robot)
+        self._several = len(contents.run_ids) > 1
+
+    def frame(self, run_id: int) -> str:
+        """The coordinate frame of the robot, and the branch of its topics."""
+        return f"run_{run_id}/{self._robot}" if self._several else self._robot
+
+    def topic(self, run_id: int, name: str) -> str:
+        """The topic of that name."""
+        return f"/{self.frame(run_id)}/{name}"
+
+    def image(self, image: StoredImage) -> str:
+        """The topic of a picture; those of a kept stretch are its camera's."""
+        name = f"camera/{self._device(image.device)}" if image.device else image.kind
+        return self.topic(image.run_id, name)
+
+    def _device(self, name: str) -> str:
+        """What a device is called, unlike all others; its first picture may have come just now."""
+        if name not in self._devices:
+            plain, taken = _named(name), self._devices.values()
+            numbered = (f"{plain}_{number}" for number in count(2))
+            free = (each for each in chain([plain], numbered) if each not in taken)
+            self._devices[name] = next(free)
+        return self._devices[name]
+
+
+def _named(name: str) -> str:
+    return _NOT_IN_TOPICS.sub("_", name)
+
+
+class _Writing:
+    """A file that is being written."""
+
+    def __init__(self, contents: Contents, writer: Any) -> None:
+        self.counts: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
+        self._contents = contents
+        self._writer = writer
+        self._topics = Topics(contents)
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
+
+    def begin(self) -> None:
+        """What comes before the messages: the schemas of states, ways, and what runs these are."""
+        shapes = {run_id: Shape({"object"}) for run_id in self._contents.run_ids}
+        ways = {run_id: Way() for run_id in self._contents.run_ids}
+        for recorded in self._contents.source.recorded():
+            state = parse(recorded.data)
+            shapes[recorded.run_id].see(_renamed(state))
+            pose = self._contents.pose(partial(value_at, state))
+            if pose is not None:
+                ways[recorded.run_id].see(recorded, pose)
+        for run_id, shape in shapes.items():
+            name = f"webots_mcp.State.{self._topics.frame(run_id)}".replace("/", ".")
+            schema = shape.schema() or {"type": "object", "properties": {}}
+            self._register(self._topics.topic(run_id, "state"), name, schema)
+            self._writer.add_metadata(f"run {run_id}", self._contents.about(run_id))
+            if ways[run_id].poses:
+                self._write_way(run_id, ways[run_id])
+
+    @singledispatchmethod
+    def write(self, item: Any) -> None:
+        """Write what was recorded as the messages that it is."""
+        raise TypeError(f"no message is made of {type(item)}")
+
+    @write.register
+    def _(self, item: Recorded) -> None:
+        self.counts["states"] += 1
+        state = parse(item.data)
+        self._send(item, self._topics.topic(item.run_id, "state"), _state_text(item, state))
+        pose = self._contents.pose(partial(value_at, state))
+        if pose is not None:
+            self._write_pose(item, pose)
+
+    @write.register
+    def _(self, item: LogLine) -> None:
+        self.counts["log lines"] += 1
+        name = ": ".join(filter(None, (item.source, item.logger)))
+        level = _LEVELS.get(item.level, 0)
+        message = {"level": level, "message": item.message, "name": name, "file": "", "line": 0}
+        self._encode(item, "log", "foxglove.Log", message)
+
+    @write.register
+    def _(self, item: Event) -> None:
+        self.counts["events"] += 1
+        message = {"kind": item.kind, "name": item.name, "data": item.details()}
+        self._encode(item, "events", "webots_mcp.Event", message)
+
+    @write.register
+    def _(self, item: PlacedCommand) -> None:
+        self.counts["commands"] += 1
+        took_s = item.finished_wall_time_s and item.finished_wall_time_s - item.wall_time_s
+        message = {
+            "id": item.id,
+            "action": item.action,
+            "params": json.loads(item.params),
+            "status": item.status,
+            "requested_by": item.requested_by,
+            "finished_sim_time_s": item.finished_sim_time_s,
+            "took_wall_s": took_s,
+            "result": json.loads(item.result) if item.result else None,
+            "error": item.error,
+        }
+        self._encode(item, "commands", "webots_mcp.Command", message)
+
+    @write.register
+    def _(self, item: StoredImage) -> None:
+        data = self._contents.picture(item)
+        self.counts["pictures" if data is not None else "pictures that are gone"] += 1
+        if data is None:
+            return
+        ending = item.path.rpartition(".")[2].lower()
+        message = {
+            "timestamp": _time(item.sim_time_s),
+            "frame_id": item.device or item.kind,
+            "data": base64.b64encode(data).decode(),
+            "format": {"jpg": "jpeg"}.get(ending, ending),
+        }
+        self._message(item, self._topics.image(item), "foxglove.CompressedImage", message)
+
+    def _write_pose(self, item: Recorded, pose: Pose) -> None:
+        parts = _pose(pose)
+        message = {
+            "timestamp": _time(item.sim_time_s),
+            "parent_frame_id": WORLD_FRAME,
+            "child_frame_id": self._topics.frame(item.run_id),
+            "translation": parts["position"],
+            "rotation": parts["orientation"],
+        }
+        topic = self._topics.topic(item.run_id, "pose")
+        self._message(item, topic, "foxglove.FrameTransform", message)
+
+    def _write_way(self, run_id: int, way: Way) -> None:
+        first = way.first
+        assert first is not None
+        poses = [_pose(pose) for pose in way.poses]
+        message = {"timestamp": _time(first.sim_time_s), "frame_id": WORLD_FRAME, "poses": poses}
+        topic = self._topics.topic(run_id, "way")
+        self._message(first, topic, "foxglove.PosesInFrame", message)
+
+    def _encode(self, item: Any, name: str, schema: str, message: dict[str, Any]) -> None:
+        """A message with its time, without what is null."""
+        told = {key: value for key, value in message.items() if value is not None}
+        stamped = {"timestamp": _time(item.sim_time_s), **told}
+        self._message(item, self._topics.topic(item.run_id, name), schema, stamped)
+
+    def _message(self, item: Any, topic: str, schema: str, message: dict[str, Any]) -> None:
+        if topic not in self._channels:
+            self._register(topic, schema, FIXED[schema])
+        self._send(item, topic, json_text(message))
+
+    def _send(self, item: Any, topic: str, text: str) -> None:
+        times = (_nanoseconds(item.sim_time_s), _nanoseconds(item.wall_time_s))
+        self._writer.add_message(self._channels[topic], times[0], text.encode(), times[1])
+
+    def _register(self, topic: str, name: str, schema: Schema) -> None:
+        if name not in self._schemas:
+            data = json.dumps({"title": name, **schema}).encode()
+            self._schemas[name] = self._writer.register_schema(name, "jsonschema", data)
+        self._channels[topic] = self._writer.register_channel(topic, "json", self._schemas[name])
+
+
+def _state_text(item: Recorded, state: dict[str, Any]) -> str:
+    """The state as it is stored, unless it has to be written anew."""
+    renamed = _renamed(state)
+    if renamed is not state or not state or _NOT_IN_JSON.search(item.data):
+        return json_text(renamed | ({"odd": json.loads(item.odd)} if item.odd else {}))
+    if item.odd:
+        return f'{item.data.rstrip()[:-1]},"odd":{item.odd}}}'
+    return item.data
+
+
+def _renamed(state: dict[str, Any]) -> dict[str, Any]:
+    """With `odd` called `state.odd`, as in all exports: the message has an `odd` of its own."""
+    if "odd" not in state:
+        return state
+    return {("state.odd" if key == "odd" else key): value for key, value in state.items()}
+
+
+def _pose(pose: Pose) -> dict[str, Any]:
+    half_rad = pose.yaw_rad / 2
+    return {
+        "position": {"x": pose.x_m, "y": pose.y_m, "z": pose.z_m},
+        "orientation": {"x": 0.0, "y": 0.0, "z": math.sin(half_rad), "w": math.cos(half_rad)},
+    }
+
+
+def _time(time_s: float) -> dict[str, int]:
+    seconds, nanoseconds = divmod(_nanoseconds(time_s), 10**9)
+    return {"sec": seconds, "nsec": nanoseconds}
+
+
+def _nanoseconds(time_s: float) -> int:
+    """MCAP knows no time before 0."""
+    return max(0, round(time_s * 1e9))

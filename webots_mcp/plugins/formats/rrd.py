@@ -1,0 +1,361 @@
+"""A range as a recording of Rerun's, through the extra `rerun` (rerun-sdk 0.24 or newer).
+
+Everything stands on two timelines: `sim_time`, a duration, and `wall_time`, a timestamp.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sqlite3
+import sys
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+from importlib import import_module
+from itertools import chain, groupby, islice
+from operator import attrgetter
+from pathlib import Path
+from shutil import copyfileobj
+from tempfile import TemporaryDirectory
+from threading import Thread
+from typing import Any, Final, NamedTuple, TypeVar
+from uuid import NAMESPACE_URL, uuid5
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.plugins.formats.contents import KINDS, Contents, Item, PlacedCommand, Pose, Way
+from webots_mcp.plugins.formats.foxglove import main_signals
+from webots_mcp.store.analysis.arrays import np
+from webots_mcp.store.events import Event
+from webots_mcp.store.export import Exported, placed
+from webots_mcp.store.export.rows import Progress, Recorded, Row, as_text, flat_row, kind_of
+from webots_mcp.store.logs import LogLine
+from webots_mcp.store.reading.ranges import TimeRange
+
+_COPY_BYTES: Final = 1 << 16
+_GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
+_LEVELS: Final = {"warning": "WARN"}  # Rerun's other names are ours in capitals
+_MEDIA_TYPES: Final = {"png": "image/png", "jpg": "image/jpeg", "jpeg": "image/jpeg"}
+_WORLD: Final = "world"
+_Item = TypeVar("_Item", bound=Item)
+
+
+def export_rrd(
+    connection: sqlite3.Connection,
+    data_dir: Path,
+    wanted: TimeRange,
+    file: Path,
+    progress: Progress | None = None,
+) -> Exported:
+    """As `export_for_viewers`."""
+    with placed(file) as aside:
+        contents = Contents.of(connection, data_dir, wanted, 1, progress)
+        return Exported(write_rrd(contents, aside))
+
+
+def write_rrd(contents: Contents, file: Path) -> Counter[str]:
+    """Everything of a range, in columns.
+
+    Each number and flag of the states is scalars of an entity of its own (flags are 0 and 1, a long
+    array is several scalars at a time), each text its changes; null is nothing. The entities are
+    /ROBOT/state/..., /ROBOT/camera/DEVICE, /ROBOT/screenshot, /ROBOT/log, /ROBOT/events,
+    /ROBOT/commands and /world/ROBOT, of several runs below /run_ID each.
+
+    Returns:
+        How many there are of each kind.
+
+    Raises:
+        InvalidInputError: The library is not installed, or is switched off.
+        OSError: The file takes no more.
+    """
+    rerun = _library()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", rerun.error_utils.RerunWarning)
+        stream = rerun.RecordingStream("webots_mcp", recording_id=_recording_id(contents))
+        with _Saved(file) as saved:
+            writing = _Writing(contents, rerun, stream, saved)
+            stream.save(str(saved.path), default_blueprint=writing.blueprint())
+            saved.begin()
+            try:
+                writing.write()
+            finally:
+                stream.disconnect()
+    if not file.stat().st_size:
+        raise InvalidInputError("Rerun wrote nothing: is the environment variable RERUN 'off'?")
+    return writing.counts
+
+
+class _Saved:
+    """A pipe for Rerun to save to, of which a thread of ours writes the bytes to the file.
+
+    Rerun's own thread stops at the first byte that a full disk refuses, and whoever flushes then
+    waits for it for ever. A pipe takes everything; `check` raises what the file has refused.
+    """
+
+    def __init__(self, file: Path) -> None:
+        self.path = file
+        self._file = file
+        self._folder: TemporaryDirectory[str] | None = None
+        self._end = -1
+        self._error: OSError | None = None
+        self._thread = Thread(target=self._copy, name="rrd")
+
+    def __enter__(self) -> _Saved:
+        if sys.platform != "win32":  # has no pipes among its files: Rerun writes the file itself
+            self._folder = TemporaryDirectory()
+            self.path = Path(self._folder.name, "pipe")
+            try:
+                os.mkfifo(self.path)
+                self._end = os.open(self.path, os.O_RDONLY | os.O_NONBLOCK)  # no writer yet
+                os.set_blocking(self._end, True)
+            except OSError:
+                self._folder.cleanup()
+                raise
+        return self
+
+    def begin(self) -> None:
+        """Write from here on: Rerun has opened the pipe."""
+        if self._folder:
+            self._thread.start()
+
+    def check(self) -> None:
+        """Raise the OSError of the file, if it takes no more."""
+        if self._error:
+            raise self._error
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        if self._folder:
+            if self._thread.ident:
+                self._thread.join()
+            os.close(self._end)
+            self._folder.cleanup()
+        if kind is None:
+            self.check()
+
+    def _copy(self) -> None:
+        try:
+            with open(self._end, "rb", 0, closefd=False) as pipe, self._file.open("wb") as sink:
+                copyfileobj(pipe, sink)
+        except OSError as error:
+            self._error = error
+        finally:
+            while os.read(self._end, _COPY_BYTES):  # Rerun waits until all of it has been taken
+                pass
+
+
+def _library() -> Any:
+    try:
+        import_module("rerun.blueprint")
+        return import_module("rerun")
+    except ImportError as error:
+        raise InvalidInputError(
+            "Rerun's format needs its SDK: pip install rerun-sdk, or export as mcap or csv"
+        ) from error
+
+
+def _recording_id(contents: Contents) -> str:
+    """The same for the same runs: a viewer shows one that is opened again as the same."""
+    names = [contents.about(run_id).get("uuid", f"{run_id}") for run_id in contents.run_ids]
+    return names[0] if len(names) == 1 else str(uuid5(NAMESPACE_URL, " ".join(names)))
+
+
+class _Times(NamedTuple):
+    """Of the items of a group, as NumPy has durations and timestamps."""
+
+    sim: Any
+    wall: Any
+
+
+class _Writing:
+    """A recording that is being written."""
+
+    def __init__(self, contents: Contents, rerun: Any, stream: Any, saved: _Saved) -> None:
+        self.counts: Counter[str] = Counter(dict.fromkeys(KINDS, 0))
+        self._contents = contents
+        self._rerun = rerun
+        self._stream = stream
+        self._saved = saved
+        self._text_type = getattr(rerun, "StateChange", None)  # Rerun 0.33 and newer
+        self._last_texts: dict[tuple[int, str], str | None] = {}
+        self._several = len(contents.run_ids) > 1
+
+    def blueprint(self) -> Any:
+        """Views of the main signals, the way, the pictures and the log."""
+        views, run_id = self._rerun.blueprint, self._contents.run_ids[-1]
+        shown = [
+            self._path(each, "state", *signal.name.split("."))
+            for each in self._contents.run_ids
+            for signal in main_signals(self._contents)
+        ]
+        parts = [views.TimeSeriesView(name="signals", contents=shown)]
+        if self._contents.motion.position is not None:
+            parts.append(views.Spatial3DView(name="way", origin=f"/{_WORLD}"))
+        cameras = {(image.run_id, *_picture_name(image)): None for image in self._contents.images()}
+        for run, *name in islice(cameras, 4):
+            parts.append(views.Spatial2DView(name=name[-1], origin=self._path(run, *name)))
+        parts.append(views.TextLogView(name="log", origin=self._path(run_id)))
+        return views.Blueprint(views.Grid(*parts), collapse_panels=False)
+
+    def write(self) -> None:
+        """All of it."""
+        contents = self._contents
+        for run_id in contents.run_ids:
+            about = self._rerun.AnyValues(**_identifiers(contents.about(run_id)))
+            self._stream.log(self._path(run_id, "run"), about, static=True)
+        self._write_states()
+        self._write_lines("log lines", "log", contents.log_lines(), _log_text)
+        self._write_lines("events", "events", contents.events(), _event_text)
+        self._write_lines("commands", "commands", contents.commands(), _command_text)
+        self._write_pictures()
+
+    def _write_states(self) -> None:
+        recorded = self._contents.source.recorded()
+        for run_id, rows in groupby(recorded, attrgetter("run_id")):
+            way = Way()
+            for group in _groups(rows):
+                self.counts["states"] += len(group)
+                self._write_group(run_id, group, [flat_row(each) for each in group], way)
+            if way.poses:
+                points = [[pose.x_m, pose.y_m, pose.z_m] for pose in way.poses]
+                line = self._rerun.LineStrips3D([points])
+                self._stream.log(f"{self._frame(run_id)}_way", line, static=True)
+
+    def _write_group(
+        self, run_id: int, group: Sequence[Recorded], rows: Sequence[Row], way: Way
+    ) -> None:
+        numbers, texts = dict[str, list[tuple[int, Any]]](), dict[str, list[tuple[int, str]]]()
+        poses: list[tuple[int, Pose]] = []
+        for index, row in enumerate(rows):
+            for name, value in row.values.items():
+                self._sort_in(run_id, name, index, value, numbers, texts)
+            pose = self._contents.pose(row.values.get)
+            if pose is not None:
+                poses.append((index, pose))
+                way.see(group[index], pose)
+        times = _times(group)
+        for name, pairs in numbers.items():
+            self._send(self._signal(run_id, name), times, pairs, self._scalars(pairs))
+        for name, pairs in texts.items():
+            self._send(self._signal(run_id, name), times, pairs, self._texts(pairs))
+        if poses:
+            self._send(self._frame(run_id), times, poses, self._transforms(poses))
+        self._stream.flush()
+
+    def _sort_in(
+        self,
+        run_id: int,
+        name: str,
+        index: int,
+        value: Any,
+        numbers: dict[str, list[tuple[int, Any]]],
+        texts: dict[str, list[tuple[int, str]]],
+    ) -> None:
+        if kind_of(value) in ("num", "int", "bool", "numbers"):
+            numbers.setdefault(name, []).append((index, value))
+            return
+        text = as_text(value)
+        if self._last_texts.get((run_id, name)) != text:
+            self._last_texts[run_id, name] = text
+            if text is not None:
+                texts.setdefault(name, []).append((index, text))
+
+    def _scalars(self, pairs: Sequence[tuple[int, Any]]) -> Any:
+        values = [value for _, value in pairs]
+        listed = [isinstance(value, list) for value in values]
+        if not any(listed):
+            return self._rerun.Scalars.columns(scalars=np.array(values, float))
+        parts: list[list[float]] = [
+            value if is_list else [value] for value, is_list in zip(values, listed, strict=True)
+        ]
+        flat = np.fromiter(chain.from_iterable(parts), float)
+        return self._rerun.Scalars.columns(scalars=flat).partition([*map(len, parts)])
+
+    def _texts(self, pairs: Sequence[tuple[int, str]]) -> Any:
+        texts = [text for _, text in pairs]
+        if self._text_type is None:
+            return self._rerun.TextLog.columns(text=texts)
+        return self._text_type.columns(state=texts)
+
+    def _transforms(self, poses: Sequence[tuple[int, Pose]]) -> Any:
+        halves = [pose.yaw_rad / 2 for _, pose in poses]
+        return self._rerun.Transform3D.columns(
+            translation=[[pose.x_m, pose.y_m, pose.z_m] for _, pose in poses],
+            quaternion=[[0.0, 0.0, math.sin(half), math.cos(half)] for half in halves],
+        )
+
+    def _write_lines(self, kind: str, name: str, items: Iterable[Any], told: Any) -> None:
+        for run_id, rows in groupby(items, attrgetter("run_id")):
+            for group in _groups(rows):
+                self.counts[kind] += len(group)
+                texts, levels = zip(*map(told, group), strict=True)
+                lines = self._rerun.TextLog.columns(text=texts, level=levels)
+                self._send(self._path(run_id, name), _times(group), [*enumerate(texts)], lines)
+
+    def _write_pictures(self) -> None:
+        for image in self._contents.images():
+            data = self._contents.picture(image)
+            self.counts["pictures" if data is not None else "pictures that are gone"] += 1
+            if data is not None:
+                media = _MEDIA_TYPES.get(image.path.rpartition(".")[2].lower(), "image/png")
+                picture = self._rerun.EncodedImage.columns(blob=[data], media_type=[media])
+                path = self._path(image.run_id, *_picture_name(image))
+                self._send(path, _times([image]), [(0, None)], picture)
+
+    def _send(
+        self, path: str, times: _Times, pairs: Sequence[tuple[int, Any]], columns: Any
+    ) -> None:
+        """Columns for those items of a group that `pairs` names, with their times."""
+        chosen = [index for index, _ in pairs]
+        column = self._rerun.TimeColumn
+        indexes = [
+            column("sim_time", duration=times.sim[chosen]),
+            column("wall_time", timestamp=times.wall[chosen]),
+        ]
+        self._stream.send_columns(path, indexes=indexes, columns=columns)
+        self._saved.check()
+
+    def _signal(self, run_id: int, name: str) -> str:
+        return self._path(run_id, "state", *name.split("."))
+
+    def _frame(self, run_id: int) -> str:
+        return f"/{_WORLD}{self._path(run_id)}"
+
+    def _path(self, run_id: int, *parts: str) -> str:
+        branch = (f"run_{run_id}",) if self._several else ()
+        named = (part or "(empty)" for part in (*branch, self._contents.wanted.robot, *parts))
+        return str(self._rerun.new_entity_path(list(named)))
+
+
+def _times(group: Sequence[Any]) -> _Times:
+    sim = np.array([round(each.sim_time_s * 1e9) for each in group], "timedelta64[ns]")
+    wall = np.array([round(each.wall_time_s * 1e9) for each in group], "datetime64[ns]")
+    return _Times(sim, wall)
+
+
+def _groups(rows: Iterable[_Item]) -> Iterator[list[_Item]]:
+    going = iter(rows)
+    while group := list(islice(going, _GROUP_ROWS)):
+        yield group
+
+
+def _picture_name(image: Any) -> tuple[str, ...]:
+    return ("camera", image.device) if image.device else (image.kind,)
+
+
+def _identifiers(about: dict[str, str]) -> dict[str, str]:
+    return {name.replace(" ", "_"): value for name, value in about.items()}
+
+
+def _log_text(line: LogLine) -> tuple[str, str]:
+    who = ": ".join(filter(None, (line.source, line.logger)))
+    return f"[{who}] {line.message}", _LEVELS.get(line.level, line.level.upper())
+
+
+def _event_text(event: Event) -> tuple[str, str]:
+    return " ".join(filter(None, (event.kind, event.name, event.data))), "INFO"
+
+
+def _command_text(command: PlacedCommand) -> tuple[str, str]:
+    fate = command.error or command.result
+    told = f"{command.action} {command.params}: {command.status}"
+    return f"{told} {fate}" if fate else told, "ERROR" if command.error else "INFO"

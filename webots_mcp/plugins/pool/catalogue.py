@@ -1,0 +1,189 @@
+"""What is in a pool, and which of its runs are meant."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.naming import nearest_first
+from webots_mcp.plugins.pool.target import Pool, PooledRun, PooledTrialSet
+from webots_mcp.store.reading.wall_time import parse_wall_time
+
+_MOST_OFFERED: Final = 3
+_MOST_COMPARED: Final = 2000  # names or UUIDs, with one that is not there
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which runs are meant: those of which all that is given is true.
+
+    Attributes:
+        run_uuid: The UUID of one, or the first letters of it.
+        label: Its label; `*` stands for any letters.
+        trials: The UUID of a trial set, or the first letters of it: the runs of its trials.
+        robot: Its robot.
+        since: It went on after this wall time (ISO 8601 or Unix seconds).
+        until: It began before this wall time.
+    """
+
+    run_uuid: str | None = None
+    label: str | None = None
+    trials: str | None = None
+    robot: str | None = None
+    since: str | None = None
+    until: str | None = None
+
+
+@dataclass(frozen=True)
+class Meant:
+    """What a choice means in a pool.
+
+    Attributes:
+        runs: By when they began.
+        trial_sets: The set of which all trials are meant, as each recording has it.
+    """
+
+    runs: Sequence[PooledRun]
+    trial_sets: Sequence[PooledTrialSet]
+
+
+@dataclass(frozen=True)
+class PooledRobot:
+    """A robot name in a pool, and what all its runs come to."""
+
+    robot: str
+    recordings: int
+    runs: int
+    rows: int
+    started_wall_time_s: float
+    last_wall_time_s: float
+
+
+def chosen_runs(pool: Pool, choice: Choice) -> list[PooledRun]:
+    """The runs that are meant, by when they began.
+
+    Raises:
+        InvalidInputError: There is none; the text names what comes nearest.
+    """
+    runs = list(pool.runs())
+    if not runs:
+        raise InvalidInputError(f"the pool {pool.address} holds no run yet")
+    found = runs
+    if choice.run_uuid is not None:
+        found = [_one_of(runs, choice.run_uuid)]
+    if choice.trials is not None:
+        sets = chosen_trial_sets(pool, choice)
+        ids = {run for each in sets for run in each.runs}
+        found = [run for run in found if (run.recording_uuid, run.run_id) in ids]
+    if choice.robot is not None:
+        _require_known("robot", choice.robot, [run.robot for run in runs])
+        found = [run for run in found if run.robot == choice.robot]
+    if choice.label is not None:
+        found = _labelled(runs, found, choice.label)
+    found = _in_time(found, choice)
+    if not found:
+        raise InvalidInputError(f"no run in {pool.address} is all of that: ask for less")
+    return found
+
+
+def meant(pool: Pool, choice: Choice) -> Meant:
+    """What is to be fetched.
+
+    Raises:
+        InvalidInputError: That is nothing, or nothing is given that says what.
+    """
+    if choice == Choice():
+        raise InvalidInputError(
+            "which runs? Give --run, --label, --trials, --robot, --since or --until; "
+            f"'webots-mcp pool {pool.address} runs' lists them"
+        )
+    sets = chosen_trial_sets(pool, choice) if choice.trials is not None else []
+    return Meant(chosen_runs(pool, choice), sets)
+
+
+def chosen_trial_sets(pool: Pool, choice: Choice) -> list[PooledTrialSet]:
+    """The trial sets that are meant: all, or the one of that UUID, as each recording has it."""
+    sets = list(pool.trial_sets())
+    if choice.trials is None:
+        return sets
+    if not sets:
+        raise InvalidInputError(f"the pool {pool.address} holds no trial set")
+    uuid = _named("trial set", choice.trials, [each.uuid for each in sets])
+    return [each for each in sets if each.uuid == uuid]
+
+
+def robots(runs: Iterable[PooledRun]) -> list[PooledRobot]:
+    """The robots of some runs, those that recorded last first."""
+    by_name: dict[str, list[PooledRun]] = {}
+    for run in runs:
+        by_name.setdefault(run.robot, []).append(run)
+    found = [
+        PooledRobot(
+            robot=name,
+            recordings=len({run.recording_uuid for run in own}),
+            runs=len(own),
+            rows=sum(run.rows for run in own),
+            started_wall_time_s=min(run.started_wall_time_s for run in own),
+            last_wall_time_s=max(run.last_wall_time_s for run in own),
+        )
+        for name, own in by_name.items()
+    ]
+    return sorted(found, key=lambda robot: -robot.last_wall_time_s)
+
+
+def _one_of(runs: Sequence[PooledRun], asked: str) -> PooledRun:
+    uuid = _named("run", asked, [run.uuid for run in runs])
+    return next(run for run in runs if run.uuid == uuid)
+
+
+def _named(what: str, asked: str, uuids: Sequence[str]) -> str:
+    """The only UUID that begins so.
+
+    Raises:
+        InvalidInputError: None does, or several do.
+    """
+    meant = asked.strip().lower()
+    found = sorted({uuid for uuid in uuids if uuid.lower().startswith(meant)})
+    if len(found) == 1:
+        return found[0]
+    if found and meant:
+        raise InvalidInputError(
+            f"{len(found)} of the {what}s have a UUID that begins with {asked!r} "
+            f"({', '.join(found[:_MOST_OFFERED])}, ...): give more of it"
+        )
+    raise _unknown(f"{what} whose UUID begins with", asked, uuids)
+
+
+def _labelled(runs: Sequence[PooledRun], found: Sequence[PooledRun], label: str) -> list[PooledRun]:
+    labels = [run.label for run in runs if run.label]
+    if not any(_matches(each, label) for each in labels):
+        raise _unknown("run with the label", label, labels)
+    return [run for run in found if run.label and _matches(run.label, label)]
+
+
+def _matches(label: str, pattern: str) -> bool:
+    return label == pattern or fnmatch.fnmatchcase(label, pattern)
+
+
+def _in_time(runs: Sequence[PooledRun], choice: Choice) -> list[PooledRun]:
+    since_s = parse_wall_time(choice.since, -math.inf)
+    until_s = parse_wall_time(choice.until, math.inf)
+    return [
+        run for run in runs if run.last_wall_time_s >= since_s and run.started_wall_time_s < until_s
+    ]
+
+
+def _require_known(what: str, asked: str, known: Sequence[str]) -> None:
+    if asked not in known:
+        raise _unknown(f"{what} called", asked, known)
+
+
+def _unknown(what: str, asked: str, known: Sequence[str]) -> InvalidInputError:
+    newest = list(dict.fromkeys(reversed(known)))[:_MOST_COMPARED]
+    offered = nearest_first(asked, newest)[:_MOST_OFFERED]
+    hint = f"; nearest are {', '.join(map(repr, offered))}" if offered else ""
+    return InvalidInputError(f"the pool holds no {what} {asked!r}{hint}")

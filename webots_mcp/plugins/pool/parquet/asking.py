@@ -1,0 +1,145 @@
+"""One SELECT over a pool of Parquet files, by DuckDB.
+
+Each table is a view of its name, with `recording_uuid` before its columns. What keeps a statement
+harmless: it is one SELECT, DuckDB may open files below the root of the pool only and write none,
+and it has the limits of `query_sql` on what it answers. It runs in a process of its own with a
+limit of memory, which is ended at the deadline: one call of a function may take any time and room.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from contextlib import closing, suppress
+from typing import Any, Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.plugins.pool.asking import Kind, answered, bounded
+from webots_mcp.plugins.pool.parquet.layout import files_of
+from webots_mcp.plugins.pool.parquet.packages import package
+from webots_mcp.plugins.pool.parquet.storage import Storage
+from webots_mcp.plugins.pool.tables import Table, tables
+from webots_mcp.store.questions.sql import MAX_BYTES, Result, require_max_rows
+from webots_mcp.store.questions.sql_process import FOLDER, Statement, decode, main
+
+DEADLINE_S: Final = 60.0
+_MEMORY: Final = "2GB"
+_MOST_BYTES: Final = 4_000_000_000  # of the process: DuckDB counts not all that it takes
+_LINE: Final = (sys.executable, "-m", __name__)
+_NUMBERS: Final = (
+    "BOOLEAN", "TINYINT", "SMALLINT", "INTEGER", "BIGINT", "HUGEINT", "UTINYINT", "USMALLINT",
+    "UINTEGER", "UBIGINT", "UHUGEINT", "FLOAT", "DOUBLE",
+)  # fmt: skip
+_TYPES: Final = {int: "BIGINT", float: "DOUBLE", str: "VARCHAR"}
+
+
+def ask(url: str, sql: str, max_rows: int) -> Result:
+    """The first rows of one SELECT over the pool.
+
+    Raises:
+        InvalidInputError: It is no single SELECT, is wrong, or takes too long or too much memory.
+        PoolError: DuckDB is not installed.
+    """
+    require_max_rows(max_rows)
+    package("duckdb")
+    asked = Statement(url, sql, max_rows, MAX_BYTES, DEADLINE_S)
+    ended = subprocess.run(
+        _LINE, input=asked.encoded(), stdout=subprocess.PIPE, cwd=FOLDER, check=False
+    )
+    return decode(
+        ended.stdout, ended.returncode, asked, f"no answer within {DEADLINE_S:g} s: narrow it by "
+        "recording_uuid and by day"
+    )  # fmt: skip
+
+
+def select(storage: Storage, sql: str, max_rows: int) -> Result:
+    """As `ask`, in this process, without a deadline."""
+    duckdb = package("duckdb")
+    with closing(duckdb.connect()) as connection:
+        _prepare(connection, storage, sql)
+        try:
+            _require_select(duckdb, connection, sql)
+            answer = connection.sql(sql)
+            rows = _bounded(answer).limit(max_rows + 1).fetchall()
+            return answered(map(str, answer.columns), rows, max_rows)
+        except duckdb.Error as error:
+            raise InvalidInputError(f"DuckDB says: {error}") from error
+
+
+def _prepare(connection: Any, storage: Storage, sql: str) -> None:
+    """The views, and then the bounds, which nothing takes back."""
+    if not storage.is_local:
+        connection.register_filesystem(storage.files)
+    for table in tables():
+        is_named = re.search(rf"\b{table.name}\b", sql, re.IGNORECASE)
+        paths = storage.find(files_of(table)) if is_named else []
+        connection.execute(_view(table, [storage.url_of(path) for path in paths]))
+    connection.execute(f"SET memory_limit = '{_MEMORY}'")
+    connection.execute("SET temp_directory = ''")  # nothing is spilled to the disk
+    connection.execute("SET TimeZone = 'UTC'")
+    connection.execute(f"SET allowed_directories = [{_quoted(storage.url_of('') + '/')}]")
+    connection.execute("SET enable_external_access = false")
+    connection.execute("SET lock_configuration = true")
+
+
+def _bounded(answer: Any) -> Any:
+    """The answer with long values cut, and at the end of each row how many of it are."""
+    columns = bounded([_column(at, str(kind)) for at, kind in enumerate(answer.types, 1)])
+    return answer.project(", ".join(f"{each} AS c{at}" for at, each in enumerate(columns)))
+
+
+def _column(at: int, kind: str) -> tuple[str, Kind]:
+    """A column, the first is 1, and how it is shown."""
+    if kind.startswith("DECIMAL"):
+        return f"CAST(#{at} AS DOUBLE)", "number"
+    return f"#{at}", "number" if kind in _NUMBERS else "bytes" if kind == "BLOB" else "text"
+
+
+def _view(table: Table, paths: list[str]) -> str:
+    """A table over its files; without any, a table without rows."""
+    if not paths:
+        columns = ", ".join(
+            f'CAST(NULL AS {_TYPES[kind]}) AS "{name}"'
+            for name, kind in zip(table.columns, table.types, strict=True)
+        )
+        day = ", CAST(NULL AS DATE) AS day" if table.is_appended else ""
+        return (
+            f'CREATE VIEW "{table.name}" AS SELECT CAST(NULL AS VARCHAR) AS recording_uuid, '
+            f"{columns}{day} WHERE false"
+        )
+    columns = ", ".join(f'"{name}"' for name in table.columns)
+    day = ", day" if table.is_appended else ""
+    types = "{'recording': VARCHAR, 'table': VARCHAR" + (", 'day': DATE}" if day else "}")
+    files = ", ".join(map(_quoted, paths))
+    return (
+        f'CREATE VIEW "{table.name}" AS SELECT recording AS recording_uuid, {columns}{day} '
+        f"FROM read_parquet([{files}], union_by_name = true, hive_partitioning = true, "
+        f"hive_types = {types})"
+    )
+
+
+def _quoted(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"
+
+
+def _require_select(duckdb: Any, connection: Any, sql: str) -> None:
+    statements = connection.extract_statements(sql)
+    kinds = [statement.type for statement in statements]
+    if kinds != [duckdb.StatementType.SELECT]:
+        raise InvalidInputError(
+            "only one SELECT is allowed, this has "
+            + (", ".join(kind.name for kind in kinds) or "no statement")
+        )
+
+
+def _ask(asked: Statement) -> Result:
+    with suppress(ImportError, ValueError, OSError):  # no such limits, or narrower ones
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_DATA, (_MOST_BYTES, _MOST_BYTES))
+    return select(Storage(asked.database), asked.sql, asked.max_rows)
+
+
+if __name__ == "__main__":
+    main(_ask)

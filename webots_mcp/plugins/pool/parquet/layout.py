@@ -1,0 +1,137 @@
+"""Which file of a pool a row is in: one of them, at any moment.
+
+    _pool                                       what this is, and of which version
+    _runs/UUID                                  the recording that a run belongs to
+    recording=UUID/_progress                    written last: what it says is there, is there
+    recording=UUID/_lease                       who ships this recording
+    recording=UUID/_pictures/PATH
+    recording=UUID/table=NAME/day=YYYY-MM-DD/part-NUMBER.parquet    rows that never change
+    recording=UUID/table=NAME/part-BLOCK.parquet                    rows that change
+
+A file is replaced as a whole, by itself with more rows. So whoever reads `*.parquet` while somebody
+ships sees each row once or, for a moment, not yet. Engines pass over names that begin with `_`.
+
+Rows that never change are in the part that was open when they came, and stay there: a part is over
+once it is large. The progress says which one is open and how many rows of its files count: rows
+beyond are those of a shipper that was killed. Rows that change are in blocks of ids. The summaries
+of a run, which are many, are cut by simulation time; the first minutes of neighbouring runs are
+together, so that a thousand short trials do not become a thousand files.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from datetime import datetime, timedelta, timezone
+from pathlib import PurePosixPath
+from typing import Final
+
+from webots_mcp.errors import PoolError
+from webots_mcp.plugins.pool.batch import Row
+from webots_mcp.plugins.pool.tables import SQLValue, Table
+
+POOL: Final = "_pool"
+RUNS: Final = "_runs"
+PROGRESS: Final = "_progress"
+LEASE: Final = "_lease"
+NO_DAY: Final = "__HIVE_DEFAULT_PARTITION__"  # read as null by engines
+
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=timezone.utc)
+_IDS_IN_BLOCK: Final = 4096
+_RUNS_IN_BLOCK: Final = 16
+_FIRST_BUCKETS: Final = 32
+_BUCKETS_IN_BLOCK: Final = 360  # an hour of rollups, two days of coarse ones
+_BUCKET_S: Final = 10.0
+
+
+def folder_of(recording_uuid: str) -> str:
+    """Where a recording is in the pool."""
+    return f"recording={recording_uuid}"
+
+
+def day_of(wall_time_s: SQLValue) -> str:
+    """The day in UTC, as it stands in a path; `NO_DAY` where the time is none."""
+    if not isinstance(wall_time_s, int | float):
+        return NO_DAY
+    try:
+        return (_EPOCH + timedelta(seconds=wall_time_s)).date().isoformat()
+    except (OverflowError, ValueError):  # NaN, or no year from 1 to 9999
+        return NO_DAY
+
+
+def picture_file(path: str) -> str:
+    """A picture, by the path in its row.
+
+    Raises:
+        PoolError: The path leads out of the folder of pictures.
+    """
+    parts = PurePosixPath(path).parts
+    if not parts or ".." in parts or path.startswith(("/", "\\")) or "\\" in path:
+        raise PoolError(f"{path!r} is no path of a picture: it leads out of the recording")
+    return f"_pictures/{'/'.join(parts)}"
+
+
+def appended_file(table: Table, day: str, number: int) -> str:
+    """The part of a table whose rows never change."""
+    return f"table={table.name}/day={day}/part-{number:06}.parquet"
+
+
+def files_of(table: Table, recording_uuid: str = "*") -> str:
+    """The pattern of all files of a table, of one recording or of all."""
+    day = "/day=*" if table.is_appended else ""
+    return f"{folder_of(recording_uuid)}/table={table.name}{day}/part-*.parquet"
+
+
+def uuid_in(path: str) -> str:
+    """The recording of a path."""
+    return path.partition("/")[0].removeprefix("recording=")
+
+
+def part_of(path: str) -> tuple[str, int]:
+    """The day and the number of a part."""
+    folder, _, name = path.rpartition("/part-")
+    return folder.rpartition("day=")[2], int(name.removesuffix(".parquet"))
+
+
+def by_day(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
+    """Rows of an appended table by their days."""
+    assert table.time_column is not None
+    place = table.columns.index(table.time_column)
+    found: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        found[day_of(row[place])].append(row)
+    return found
+
+
+def by_block(table: Table, rows: Iterable[Row]) -> Mapping[str, list[Row]]:
+    """Rows of a table that changes, by the files in which they are."""
+    found: dict[str, list[Row]] = defaultdict(list)
+    for row in rows:
+        found[f"table={table.name}/part-{_block(table, row)}.parquet"].append(row)
+    return found
+
+
+def _block(table: Table, row: Row) -> str:
+    if table.key == ("id",):
+        return f"{_whole(row[table.columns.index('id')]) // _IDS_IN_BLOCK:09}"
+    if "run_id" not in table.key:
+        return f"{0:09}"
+    run_id = _whole(row[table.columns.index("run_id")])
+    bucket = _bucket(table, row)
+    if bucket < _FIRST_BUCKETS:
+        return f"{run_id // _RUNS_IN_BLOCK * _RUNS_IN_BLOCK:09}-first"
+    return f"{run_id:09}-{bucket // _BUCKETS_IN_BLOCK:06}"
+
+
+def _bucket(table: Table, row: Row) -> int:
+    if "bucket" in table.key:
+        return _whole(row[table.columns.index("bucket")])
+    time_s = row[table.columns.index("sim_time_s")]
+    return _whole(time_s / _BUCKET_S) if isinstance(time_s, int | float) else 0
+
+
+def _whole(value: SQLValue) -> int:
+    if not isinstance(value, int | float) or not math.isfinite(value):
+        return 0
+    return math.floor(value)

@@ -1,0 +1,294 @@
+"""A recording as it is shipped: read in short transactions, a bounded piece at a time.
+
+No read transaction lasts while a pool is written to: the log of the database could not be cut back
+meanwhile, and the robot's disk would fill up because a server is slow.
+"""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Callable, Iterator, Sequence
+from hashlib import blake2b
+from typing import Any, Final, NamedTuple, TypeGuard
+
+from webots_mcp.errors import DatabaseError
+from webots_mcp.plugins.pool.batch import BATCH_BYTES, BATCH_ROWS, Batch, Row, batches, row_bytes
+from webots_mcp.plugins.pool.tables import SQLValue, Table
+from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, bucket_of
+from webots_mcp.store.rollup.rolling import watermark
+
+CHUNK_ROWS: Final = 32
+NOT_YET: Final = -(2**62)  # before the first bucket
+ROLLED: Final = ("rollup", "coarse_rollup", "change")
+_UUID: Final = "SELECT uuid FROM recording LIMIT 2"
+_RUNS: Final = "SELECT id, uuid FROM run"
+_SESSIONS: Final = "SELECT id, session_id FROM run"
+_ENDED: Final = "SELECT id FROM run WHERE ended_wall_time_s IS NOT NULL"
+_SEQUENCE: Final = "SELECT coalesce(max(seq), 0) FROM sqlite_sequence WHERE name = ?"
+_LAST: Final = "SELECT coalesce(max(id), 0) FROM {table}"
+_MARKS: Final = (
+    "SELECT id, robot_id, iif(typeof(rolled_state_id) = 'integer', rolled_state_id, 0), "
+    "iif(typeof(coarse_end) = 'integer', coarse_end, NULL) FROM run ORDER BY id"
+)
+# By the id of the rows, not by the index of a run: only what came since is looked at.
+_EARLIEST: Final = (
+    "SELECT min(sim_time_s) FROM state NOT INDEXED WHERE id > ? AND id <= ? AND +run_id = ?"
+)
+_FIRST_STATE: Final = "SELECT coalesce(min(id), 0) FROM state"
+_SIGNALS: Final = "SELECT id FROM signal WHERE robot_id = ? ORDER BY id"
+_OF_SIGNAL: Final = (
+    "SELECT {columns} FROM {table} WHERE run_id = ? AND signal_id = ? AND {third} > ? "
+    "ORDER BY {third}"
+)
+_STRETCHES: Final = (
+    "SELECT k.id, k.run_id, k.start_sim_time_s, k.end_sim_time_s, u.ended_wall_time_s IS NOT NULL "
+    "FROM kept_stretch k JOIN run u ON u.id = k.run_id ORDER BY k.id"
+)
+_IN_STRETCH: Final = (
+    "SELECT {columns} FROM state WHERE run_id = ? AND sim_time_s BETWEEN ? AND ? "
+    "AND id > ? AND id <= ? ORDER BY id"
+)
+_PICTURES: Final = (
+    "SELECT id, run_id, path FROM image WHERE id > ? AND id <= ? ORDER BY id LIMIT 100"
+)
+_OF_RUN: Final = (
+    "SELECT {columns} FROM {table} WHERE run_id = ? AND (signal_id, {third}) > (?, ?) "
+    "ORDER BY signal_id, {third}"
+)
+_RECENT: Final = "SELECT {columns} FROM recent_rollup WHERE run_id = ? AND bucket > ?"
+
+
+class Mark(NamedTuple):
+    """How far the rollups of a run have come; as columns of `run`."""
+
+    run_id: int
+    robot_id: int
+    state_id: int
+    coarse_end: int | None
+
+
+class Stretch(NamedTuple):
+    """Seconds that are kept at full rate; `is_over` where their run has ended."""
+
+    id: int
+    run_id: int
+    start_sim_time_s: float
+    end_sim_time_s: float
+    is_over: bool
+
+
+class Source:
+    """A connection to a recording, and which of its runs are another's to ship.
+
+    Args:
+        connection: A reader.
+    """
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        connection.text_factory = _text
+        self.foreign = set[int]()
+        self._foreign_sessions = set[int]()
+
+    def uuid(self) -> str:
+        """The recording's.
+
+        Raises:
+            DatabaseError: It has none, or several.
+        """
+        rows = self._connection.execute(_UUID).fetchall()
+        if len(rows) != 1 or not isinstance(rows[0][0], str) or not rows[0][0]:
+            raise DatabaseError(
+                f"the recording has {len(rows) or 'no'} UUIDs, by which a pool tells recordings "
+                "apart: import it into a new one ('webots-mcp import FILE --data-dir NEW') and "
+                "ship that"
+            )
+        return rows[0][0]
+
+    def runs(self) -> dict[int, str | None]:
+        """The UUIDs of the runs; those that an old version has recorded have none."""
+        return dict(self._connection.execute(_RUNS).fetchall())
+
+    def leave_out(self, runs: set[int]) -> None:
+        """These runs are another's to ship, and sessions that have no others are as well."""
+        self.foreign = runs
+        sessions = dict(self._connection.execute(_SESSIONS).fetchall() if runs else ())
+        ours = {session for run_id, session in sessions.items() if run_id not in runs}
+        self._foreign_sessions = set(sessions.values()) - ours
+
+    def ended_runs(self) -> set[int]:
+        """The runs that are over."""
+        return {run_id for (run_id,) in self._connection.execute(_ENDED)}
+
+    def sequence(self, table: Table) -> int:
+        """The largest id that a row of the table ever had."""
+        last = self._first(_LAST.format(table=table.name))
+        return max(last, self._first(_SEQUENCE, table.name))
+
+    def in_one_moment(self, read: Callable[[], bool]) -> bool:
+        """Read several things from one state of the database."""
+        self._connection.execute("BEGIN")
+        try:
+            return read()
+        finally:
+            self._connection.execute("COMMIT")
+
+    def last_id(self, table: Table) -> int:
+        """The largest id in the table now; 0 where it is empty."""
+        return self._first(_LAST.format(table=table.name))
+
+    def row(self, table: Table, row_id: int) -> Row | None:
+        """One row of an appended table; None where retention has deleted it."""
+        query = f"SELECT {', '.join(table.columns)} FROM {table.name} WHERE id = ?"
+        return self._connection.execute(query, (row_id,)).fetchone()
+
+    def appended(self, table: Table, after: int, upto: int) -> tuple[Batch, int, int]:
+        """The next rows of an appended table.
+
+        Returns:
+            Those that are ours to ship; the last id that was looked at; how many rows were there.
+        """
+        query = (
+            f"SELECT {', '.join(table.columns)} FROM {table.name} "
+            "WHERE id > ? AND id <= ? ORDER BY id"
+        )
+        rows, is_all = self._some(query, (after, upto))
+        last = upto if is_all else int(str(rows[-1][0]))
+        return Batch(table, self.ours(table, rows)), last, len(rows)
+
+    def chunk(self, table: Table, number: int) -> list[Row]:
+        """The rows of a changing table whose ids lie in that chunk; all where it has no ids."""
+        columns = ", ".join(table.columns)
+        if table.key != ("id",):
+            rows = self._connection.execute(f"SELECT {columns} FROM {table.name}").fetchall()
+        else:
+            query = f"SELECT {columns} FROM {table.name} WHERE id >= ? AND id < ? ORDER BY id"
+            bounds = (number * CHUNK_ROWS, (number + 1) * CHUNK_ROWS)
+            rows = self._connection.execute(query, bounds).fetchall()
+        return self.ours(table, rows)
+
+    def chunks(self, table: Table, since: int) -> range:
+        """The numbers of the chunks from the one that holds that id on."""
+        if table.key != ("id",):
+            return range(1)
+        return range(since // CHUNK_ROWS, self.last_id(table) // CHUNK_ROWS + 1)
+
+    def watermark(self) -> int:
+        """The id of the last state row that is in the rollups of all runs."""
+        return watermark(self._connection)
+
+    def marks(self) -> list[Mark]:
+        """How far the rollups have come, of the runs that are ours to ship, in their order."""
+        found = map(Mark._make, self._connection.execute(_MARKS).fetchall())
+        return [mark for mark in found if mark.run_id not in self.foreign]
+
+    def since_bucket(self, mark: Mark, known: int) -> int | None:
+        """The first bucket that state rows after `known` may have changed; None for all."""
+        if not 0 < known < mark.state_id or self._first(_FIRST_STATE) > known + 1:
+            return None  # rolled up anew, or rows that would tell are deleted
+        asked = (known, mark.state_id, mark.run_id)
+        earliest = self._connection.execute(_EARLIEST, asked).fetchone()[0]
+        return bucket_of(earliest) if is_finite(earliest) else None
+
+    def rolled(self, table: Table, mark: Mark, after: int) -> Iterator[Batch]:
+        """Rollups or change points of a run whose bucket or state row comes after that one."""
+        if table.name == "rollup":
+            query = _RECENT.format(columns=", ".join(table.columns))
+            rows = self._connection.execute(query, (mark.run_id, after)).fetchall()
+            yield from batches(table, rows)
+        yield from batches(table, self._rolled_rows(table, mark, after))
+
+    def _rolled_rows(self, table: Table, mark: Mark, after: int) -> Iterator[Row]:
+        """All of a run in the order of its key, or signal by signal the newest."""
+        columns, (_, _, third) = ", ".join(table.columns), table.key
+        if after == NOT_YET:
+            query = _OF_RUN.format(columns=columns, table=table.name, third=third)
+            yield from self._in_pieces(query, (mark.run_id,), (NOT_YET, NOT_YET), table)
+            return
+        query = _OF_SIGNAL.format(columns=columns, table=table.name, third=third)
+        for (signal_id,) in self._connection.execute(_SIGNALS, (mark.robot_id,)).fetchall():
+            yield from self._in_pieces(query, (mark.run_id, signal_id), (after,), table)
+
+    def _in_pieces(
+        self, query: str, owner: tuple[int, ...], after: tuple[Any, ...], table: Table
+    ) -> Iterator[Row]:
+        """Rows after a key, with no transaction open while they are used."""
+        places = [table.columns.index(name) for name in table.key[-len(after) :]]
+        is_all = False
+        while not is_all:
+            rows, is_all = self._some(query, (*owner, *after))
+            yield from rows
+            after = tuple(rows[-1][place] for place in places) if rows else after
+
+    def stretches(self) -> list[Stretch]:
+        """Kept stretches of the runs that are ours to ship."""
+        found = map(Stretch._make, self._connection.execute(_STRETCHES).fetchall())
+        return [stretch for stretch in found if stretch.run_id not in self.foreign]
+
+    def kept(self, states: Table, stretch: Stretch, after: int, upto: int) -> tuple[Batch, bool]:
+        """The next states of a kept stretch, and whether they are all."""
+        query = _IN_STRETCH.format(columns=", ".join(states.columns))
+        bounds = (stretch.start_sim_time_s, stretch.end_sim_time_s)
+        rows, is_all = self._some(query, (stretch.run_id, *bounds, after, upto))
+        return Batch(states, rows), is_all
+
+    def pictures(self, after: int, upto: int) -> list[tuple[int, int, str]]:
+        """The next pictures: their ids, runs and paths."""
+        return self._connection.execute(_PICTURES, (after, upto)).fetchall()
+
+    def ours(self, table: Table, rows: Sequence[Row]) -> list[Row]:
+        """Without what belongs to runs and sessions of another recording, or refers to them."""
+        rows = _without(table, rows, table.run_column, self.foreign)
+        return _without(table, rows, table.session_column, self._foreign_sessions)
+
+    def _some(self, query: str, values: tuple[Any, ...]) -> tuple[list[Row], bool]:
+        """Rows up to a bounded size, and whether they are all; the transaction is over then."""
+        rows: list[Row] = []
+        size = 0
+        cursor = self._connection.execute(query, values)
+        try:
+            for row in cursor:
+                rows.append(row)
+                size += row_bytes(row)
+                if size >= BATCH_BYTES or len(rows) >= BATCH_ROWS:
+                    return rows, False
+            return rows, True
+        finally:
+            cursor.close()
+
+    def _first(self, query: str, *values: object) -> int:
+        return int(self._connection.execute(query, values).fetchone()[0])
+
+
+def _without(table: Table, rows: Sequence[Row], column: str | None, foreign: set[int]) -> list[Row]:
+    """Rows whose column names none of these; what outlasts them names nothing then."""
+    if column is None or not foreign:
+        return list(rows)
+    at = table.columns.index(column)
+    if table.outlasts_runs:
+        return [(*row[:at], None, *row[at + 1 :]) if row[at] in foreign else row for row in rows]
+    return [row for row in rows if row[at] not in foreign]
+
+
+def is_finite(value: SQLValue) -> TypeGuard[int | float]:
+    """Whether it is a number that can be reckoned with, as all that a bridge writes."""
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def coarse_after(known_end: int | None, since: int | None) -> int:
+    """The last coarse bucket that has not changed since that end and that bucket."""
+    if known_end is None or since is None:
+        return NOT_YET
+    return min(known_end, since // COARSE_BUCKETS) - 1
+
+
+def digest(rows: Sequence[Sequence[SQLValue]]) -> int:
+    """A number that other rows have with a chance of one in 2**63."""
+    text = repr([tuple(row) for row in rows]).encode("utf-8", "surrogatepass")
+    return int.from_bytes(blake2b(text, digest_size=8).digest(), "big") >> 1
+
+
+def _text(value: bytes) -> str:
+    """Bytes that are no UTF-8, which another program has written, are read as what comes near."""
+    return value.decode("utf-8", "replace")

@@ -1,0 +1,358 @@
+"""Shipping a recording to a pool, as long as both are there; `following` goes on and on.
+
+What the pool holds is told by numbers that it stores in the same transaction as the rows. So a
+shipper may be killed anywhere, and the next one goes on; nothing at the edge has to be remembered.
+What changes is compared by digests, and sent again only where they differ.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Callable, Generator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.connection import FrozenConnection
+from webots_mcp.errors import (
+    DatabaseError,
+    InvalidInputError,
+    NothingRecordedError,
+    PoolBusyError,
+    PoolError,
+)
+from webots_mcp.liveness import dead_sessions
+from webots_mcp.plugins.pool.batch import Batch
+from webots_mcp.plugins.pool.kept import Kept
+from webots_mcp.plugins.pool.outbox import WRITE_BYTES, Outbox
+from webots_mcp.plugins.pool.reading import (
+    ROLLED,
+    Mark,
+    Source,
+    digest,
+)
+from webots_mcp.plugins.pool.report import Report
+from webots_mcp.plugins.pool.summaries import Summaries
+from webots_mcp.plugins.pool.tables import Table, table, tables
+from webots_mcp.plugins.pool.target import Shipment, Target, whole_runs
+from webots_mcp.store.images import MAX_FILE_BYTES, PICTURES, inside
+from webots_mcp.store.merging import settled
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.retention.shipped import Shipped, read_shipped, write_shipped
+
+MOST_BATCHES: Final = 8  # of a table in a round, before the others get their turn
+_HANDOVER_S: Final = (0.02, 0.1, 0.3, 0.6)
+_UNCHECKED: Final = -1
+_PICTURE: Final = "picture"  # of the progress: the last one whose file was shipped
+
+
+@dataclass(frozen=True)
+class Order:
+    """What is to be shipped.
+
+    Attributes:
+        recording: From where.
+        open_target: Opens the pool, each time that it is connected to.
+        full: States as well.
+        pictures: The files of pictures as well.
+    """
+
+    recording: Recording
+    open_target: Callable[[], Target]
+    full: bool = False
+    pictures: bool = False
+
+
+def ship(order: Order, report: Report) -> None:
+    """Ship all that is there, and end.
+
+    Raises:
+        PoolError: The pool cannot be reached or written, or another ships this recording.
+        DatabaseError: The recording cannot be read.
+    """
+    with shipper(order, report) as connected:
+        while not connected.round(thorough=True):
+            pass
+        connected.note_unsummed()
+
+
+@contextmanager
+def shipper(order: Order, report: Report) -> Generator[Shipper]:
+    """Be connected to recording and pool, as the one who ships the recording.
+
+    Raises:
+        PoolError: The pool cannot be reached or written, or another ships this recording.
+        DatabaseError: The recording cannot be read.
+    """
+    with order.recording.reader() as connection:
+        uuid = Source(connection).uuid()  # first: nothing is asked of the pool in vain
+    with order.open_target() as target, ExitStack() as stack:
+        target.prepare()
+        shipment = _enter(stack, target, uuid)
+        yield Shipper(order, report, uuid, target, shipment)
+
+
+def _enter(stack: ExitStack, target: Target, uuid: str) -> Shipment:
+    """Wait a moment for a server that has not noticed yet that the shipper before was killed."""
+    for wait_s in _HANDOVER_S:
+        with suppress(PoolBusyError):
+            return stack.enter_context(target.shipment(uuid))
+        time.sleep(wait_s)
+    return stack.enter_context(target.shipment(uuid))
+
+
+class ReplacedError(PoolError):
+    """Another recording stands where the one was that is shipped."""
+
+
+class Shipper:
+    """One connection to a pool, as long as it lasts.
+
+    Attributes:
+        address: The pool's URL without secrets.
+    """
+
+    def __init__(
+        self, order: Order, report: Report, uuid: str, target: Target, shipment: Shipment
+    ) -> None:
+        self._order = order
+        self._report = report
+        self._uuid = uuid
+        self._shipment = shipment
+        self._outbox = Outbox(shipment, report, shipment.progress())
+        self._progress = self._outbox.progress
+        self._owners = dict[str, str | None]()
+        self._is_checked = False
+        self._last_ids = dict[str, int]()
+        self._marks: list[Mark] = []
+        self._watermark = 0
+        self._summaries = Summaries(self._progress, self._put)
+        self._kept = Kept(self._progress, self._put)
+        self._ended = set[int]()
+        self.address = target.address
+
+    def round(self, *, thorough: bool) -> bool:
+        """Ship what is new.
+
+        Args:
+            thorough: Look at all rows that may have changed, and not only at the newest.
+
+        Returns:
+            Whether the pool holds all that was there when the round began.
+        """
+        started_s = time.time()
+        with self._order.recording.reader() as connection:
+            source = Source(connection)
+            self._require_the_same(source)
+            if thorough:
+                self._end_what_was_killed(connection)
+            self._ship_changing(source, thorough=thorough)
+            self._summaries.ship(source, self._marks, self._watermark)
+            is_complete = self._ship_all_appended(source)
+            if is_complete and not self._order.full:
+                self._kept.ship(source, self._last_ids["state"], thorough=thorough)
+            if self._order.pictures:
+                self._ship_pictures(source)
+            is_whole = is_complete and thorough  # else some of what may change was not looked at
+            if is_whole:
+                self._tell_whole(source)
+            self._outbox.send()
+            is_frozen = isinstance(connection, FrozenConnection)
+        if not is_frozen:
+            self._leave_word(started_s, is_complete=is_whole)
+        return is_complete
+
+    def note_unsummed(self) -> None:
+        """Say that states are neither shipped nor in rollups, which only a server makes."""
+        shipped = self._progress.get("state", 0)  # at full rate, now or before
+        behind = self._last_ids["state"] - max(self._watermark, shipped)
+        if behind > 0:
+            self._report.note(
+                f"the newest {behind} states are in no rollups yet, which 'webots-mcp serve' makes "
+                "at the edge, or a question there such as 'webots-mcp trends': ship with --full"
+            )
+
+    def _end_what_was_killed(self, connection: sqlite3.Connection) -> None:
+        """End runs whose process is gone, at the edge: nobody at the pool could judge that."""
+        database = self._order.recording.database
+        if not isinstance(database, Path) or not dead_sessions(connection):
+            return
+        try:
+            settled(database)
+        except DatabaseError as error:
+            self._report.note(f"runs whose process was killed stay open in the pool: {error}")
+
+    def _appended(self) -> list[Table]:
+        """States last: others should not wait for the largest table."""
+        wanted = [each for each in tables() if each.is_appended]
+        wanted = [each for each in wanted if self._order.full or not each.full_rate_only]
+        return sorted(wanted, key=lambda each: each.full_rate_only)
+
+    def _require_the_same(self, source: Source) -> None:
+        """That the recording is the one of before, and not an older copy of it.
+
+        Raises:
+            PoolError: It is not.
+        """
+        if (uuid := source.uuid()) != self._uuid:
+            raise ReplacedError(f"the recording {uuid} stands now where {self._uuid} was")
+        if self._is_checked:
+            return
+        for each in (table("run"), *self._appended()):
+            known = self._progress.get(each.name, 0)
+            if source.sequence(each) < known or self._is_other(source, each, known):
+                raise PoolError(
+                    f"the recording {self._uuid} is not the one that was shipped to {self.address} "
+                    f"before: its table {each.name!r} is not the same up to row {known}. It is an "
+                    "older copy, or one that was gone on with elsewhere: ship the newest one, or "
+                    "import this one into a new recording ('webots-mcp import FILE --data-dir "
+                    "NEW') and ship that"
+                )
+        self._is_checked = True
+
+    def _is_other(self, source: Source, each: Table, known: int) -> bool:
+        check = self._progress.get(f"{each.name}.check", _UNCHECKED)
+        row = source.row(each, known) if check != _UNCHECKED else None
+        return row is not None and digest([row]) != check
+
+    def _ship_changing(self, source: Source, *, thorough: bool) -> None:
+        """Ship what differs in tables that change.
+
+        What the rows of the others refer to is at the pool then, up to where they were read: to
+        `_last_ids`, `_marks` and `_watermark`.
+        """
+
+        def read() -> bool:
+            if not self._knows_owners(source):
+                return False
+            for each in tables():
+                if each.is_appended:
+                    self._last_ids[each.name] = source.last_id(each)
+                elif each.name not in ROLLED and not self._compare(source, each, thorough=thorough):
+                    return False
+            self._marks, self._watermark = source.marks(), source.watermark()
+            self._ended = source.ended_runs()
+            return True
+
+        while not source.in_one_moment(read):
+            self._ask_for_owners(source)
+            self._outbox.send()
+
+    def _knows_owners(self, source: Source) -> bool:
+        """Whether the pool was asked whose the runs are; those of others are left out then."""
+        runs = {run_id: uuid for run_id, uuid in source.runs().items() if uuid}
+        if not self._owners.keys() >= set(runs.values()):
+            return False
+        source.leave_out({run_id for run_id, uuid in runs.items() if self._owners[uuid]})
+        return True
+
+    def _ask_for_owners(self, source: Source) -> None:
+        new = {uuid for uuid in source.runs().values() if uuid} - self._owners.keys()
+        found = self._shipment.foreign_runs(new) if new else {}
+        self._owners |= {uuid: found.get(uuid) for uuid in new}
+        self._report.foreign |= found
+
+    def _compare(self, source: Source, each: Table, *, thorough: bool) -> bool:
+        """Take the chunks whose digests differ from the pool's; False where they are too many."""
+        last = self._progress.get(each.name, 0)
+        for number in source.chunks(each, 0 if thorough else last):
+            rows = source.chunk(each, number)
+            name, value = f"{each.name}:{number}", digest(rows)
+            if rows and self._progress.get(name) != value:
+                if self._outbox.is_full:
+                    return False
+                ids = [row[0] for row in rows if isinstance(row[0], int)]
+                self._outbox.add(Batch(each, rows), {name: value, each.name: max([last, *ids])})
+                last = self._progress[each.name]
+        return True
+
+    def _ship_all_appended(self, source: Source) -> bool:
+        """Ship the next rows of the appended tables; returns whether these were all.
+
+        States come after all others: where retention moves one, it is looked for among them.
+        """
+        *others, last = self._appended()
+        are_all = [self._ship_appended(source, each) for each in others]
+        return all(are_all) and self._ship_appended(source, last)
+
+    def _ship_appended(self, source: Source, each: Table) -> bool:
+        """Ship the next rows; returns whether these were all."""
+        after, upto = self._progress.get(each.name, 0), self._last_ids[each.name]
+        for _ in range(MOST_BATCHES):
+            if after >= upto:
+                return True
+            batch, last, found = source.appended(each, after, upto)
+            told = _told_of(batch, last)
+            lost = last - after - found
+            if lost:
+                self._report.lost[each.name] += lost
+            if each.name == "state":
+                told |= self._kept.told_of(batch.rows, lost, after)
+            elif each.name == "kept_state":
+                batch = self._kept.without_moved(source, batch)
+            self._put(batch, told)
+            after = last
+        return after >= upto
+
+    def _ship_pictures(self, source: Source) -> None:
+        """Ship the files of the pictures whose rows are shipped."""
+        upto = self._progress.get("image", 0)
+        while some := source.pictures(self._progress.get(_PICTURE, 0), upto):
+            size = 0
+            for image_id, run_id, path in some:
+                if run_id not in source.foreign:
+                    size += self._ship_picture(path)
+                self._outbox.add(None, {_PICTURE: image_id})
+                if size >= WRITE_BYTES:
+                    break
+            self._outbox.send()
+
+    def _ship_picture(self, path: str) -> int:
+        """Returns how many bytes it has."""
+        try:
+            file = inside(self._order.recording.data_dir, path)
+            if file.suffix.lower() not in PICTURES or file.stat().st_size > MAX_FILE_BYTES:
+                raise InvalidInputError(f"{path!r} is no picture")
+            content = file.read_bytes()
+        except (InvalidInputError, NothingRecordedError, OSError):
+            self._report.lost_pictures += 1
+            return 0
+        self._shipment.write_picture(path, content)
+        self._report.pictures += 1
+        return len(content)
+
+    def _tell_whole(self, source: Source) -> None:
+        """Say that all of the runs is there that were over when the round began."""
+        told = whole_runs(self._ended - source.foreign).items()
+        told = {name: mask | self._progress.get(name, 0) for name, mask in told}
+        self._outbox.add(None, dict(told.items() - self._progress.items()))
+
+    def _put(self, batch: Batch | None, told: Mapping[str, int]) -> None:
+        """Send it with others, when they have come to a size."""
+        self._outbox.add(batch, told)
+        if self._outbox.is_full:
+            self._outbox.send()
+
+    def _leave_word(self, started_s: float, *, is_complete: bool) -> None:
+        """Tell retention, by a file beside the database."""
+        database = self._order.recording.database
+        assert isinstance(database, Path)
+        before = read_shipped(database, self._uuid).get(self.address)
+        complete_s = before.complete_wall_time_s if before else 0.0
+        last_ids = {each.name: self._progress.get(each.name, 0) for each in self._appended()}
+        shipped = Shipped(
+            self._uuid, last_ids, started_s if is_complete else complete_s, time.time()
+        )
+        try:
+            write_shipped(database, self.address, shipped)
+        except OSError as error:
+            self._report.note(f"retention cannot learn here what is shipped: {error}")
+
+
+def _told_of(batch: Batch, last: int) -> dict[str, int]:
+    """The progress that these rows make, with a digest of the last one."""
+    name = batch.table.name
+    newest = batch.rows[-1] if batch.rows and batch.rows[-1][0] == last else None
+    return {name: last, f"{name}.check": digest([newest]) if newest else _UNCHECKED}

@@ -1,0 +1,8 @@
+"""Reports: one or two runs as one HTML file that needs nothing else, to read and to send.
+
+Jinja2 and Bokeh, the extra `view`, are imported with the first report.
+"""
+
+from webots_mcp.plugins import Plugin
+
+PLUGIN = Plugin(commands=(f"{__name__}.report_command",), questions=(f"{__name__}.write_report",))

@@ -1,0 +1,475 @@
+"""What a report tells of one run: what ran, what happened, and what was recorded of it in texts."""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, NamedTuple
+
+from webots_mcp.contract import MODE_EVENT, WORLD_EVENT
+from webots_mcp.errors import NothingRecordedError
+from webots_mcp.naming import find_mode
+from webots_mcp.plugins.report.grid import Grid, Row
+from webots_mcp.plugins.report.words import (
+    clock,
+    counted,
+    cut,
+    length,
+    listed,
+    number,
+    paced,
+    share,
+    spelled,
+    time_at,
+    told,
+    valued,
+)
+from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.detection.registry import KINDS, stored_kinds
+from webots_mcp.store.detection.verdict import Verdicts
+from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, count_lines, newest_lines
+from webots_mcp.store.parameters import described
+from webots_mcp.store.questions.compare import compare_runs
+from webots_mcp.store.questions.events import Found, choose, search_events
+from webots_mcp.store.questions.runs import RunInfo, run_info
+from webots_mcp.store.questions.trend import Trend
+from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
+from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.sessions import Session, fetch_session
+from webots_mcp.store.window import Window
+
+MOST_EVENTS: Final = 200
+MOST_ENTRIES: Final = 500  # of the timeline
+MOST_LINES: Final = 2_000  # of the log
+MOST_MOMENTS: Final = 6  # events that are shown with the seconds around them
+AROUND_S: Final = 5.0  # before and after
+MOST_SHOWN_S: Final = 30.0  # of the event itself
+_LINES_AROUND: Final = 12
+_MOST_VALUES: Final = 20  # of a mode
+_ORDINARY: Final = ("pause", "resume", WORLD_EVENT, MODE_EVENT)  # that the bridge notices
+_MARKS: Final = {"warning": "warning", "error": "error", "critical": "error"}
+# Where the room for texts goes; what one table leaves, the next ones have.
+_SHARES: Final = {
+    "parameters": 0.05, "moments": 0.1, "events": 0.15, "trends": 0.15, "commands": 0.1,
+    "timeline": 0.2, "log": 0.25,
+}  # fmt: skip
+
+
+class Held(NamedTuple):
+    """For how long a mode had a value."""
+
+    value: str
+    time: str
+    percent: float
+
+
+@dataclass(frozen=True)
+class Moment:
+    """An event with the seconds around it.
+
+    Attributes:
+        values: What a few signals were when it began.
+        lines: What else happened around it.
+    """
+
+    event: Event
+    title: str
+    says: str
+    values: str
+    lines: Grid
+
+    @property
+    def start_s(self) -> float:
+        """Where the seconds around it begin."""
+        return self.event.start_s - AROUND_S
+
+    @property
+    def end_s(self) -> float:
+        """Where they end; of a long event its begin is shown."""
+        return min(self.event.end_s, self.event.start_s + MOST_SHOWN_S) + AROUND_S
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """One run; a table that would be empty is None.
+
+    Attributes:
+        range: The whole run; None where it has no state row.
+        numbers: How many numeric signals have values.
+        changed_most: Those that changed, what changed most first.
+        findings: What was found, and what is absent.
+        unsearched: What was not looked for, or not everywhere, and why.
+    """
+
+    info: RunInfo
+    range: TimeRange | None
+    title: str
+    summary: str
+    facts: Mapping[str, str]
+    findings: Sequence[str] = ()
+    unsearched: Sequence[str] = ()
+    mode: str = ""
+    held: Sequence[Held] = ()
+    moments: Sequence[Moment] = ()
+    parameters: Grid | None = None
+    events: Grid | None = None
+    trends: Grid | None = None
+    commands: Grid | None = None
+    timeline: Grid | None = None
+    log: Grid | None = None
+    numbers: int = 0
+    changed_most: Sequence[str] = ()
+    notes: Sequence[str] = ()
+
+    @property
+    def grids(self) -> dict[str, Grid]:
+        """The tables that can lack rows, by what their rows are called."""
+        named = {
+            "parameters": self.parameters, "events": self.events, "trends": self.trends,
+            "commands": self.commands, "entries of the timeline": self.timeline,
+            "log lines": self.log,
+        }  # fmt: skip
+        return {name: grid for name, grid in named.items() if grid is not None}
+
+
+class _Room:
+    """Bytes for the texts of a run, shared out in order."""
+
+    def __init__(self, room_bytes: float) -> None:
+        self._room_bytes, self._spare_bytes = room_bytes, 0.0
+
+    def fit(self, name: str, grid: Grid, *, newest: bool = False) -> Grid | None:
+        """The table with as many rows as have room; None without any."""
+        room_bytes = _SHARES[name] * self._room_bytes + self._spare_bytes
+        fitted = grid.within(room_bytes, newest=newest)
+        self._spare_bytes = room_bytes - sum(row.size_bytes for row in fitted.rows)
+        return fitted if fitted.rows or fitted.left_out else None
+
+
+def chapter_of(
+    connection: sqlite3.Connection, run_id: int, room_bytes: float, deadline_s: float
+) -> Chapter:
+    """What there is to tell of a run.
+
+    Args:
+        connection: Any.
+        run_id: The run.
+        room_bytes: About what its texts may take.
+        deadline_s: For how long events are looked for in its values; what is read besides has a
+            third of that each. What was not looked at by then is said.
+
+    Raises:
+        UnknownRunError: No run has that id.
+    """
+    run, info = fetch_run(connection, run_id), run_info(connection, run_id)
+    session = fetch_session(connection, run.session_id)
+    room = _Room(room_bytes)
+    facts = _facts(info, session, run.basic_time_step_ms)
+    parameters = room.fit("parameters", _parameters(connection, run_id))
+    title = f"Run {run_id} of {info.robot}" + (f": {info.label}" if info.label else "")
+    try:
+        whole = find_range(connection, Scope(run_id=run_id))
+    except NothingRecordedError as error:
+        log = room.fit("log", _log(connection, run_id), newest=True)
+        return Chapter(info, None, title, f"{_first_words(info)} {error}.", facts,
+                       parameters=parameters, log=log)  # fmt: skip
+    found = _found(connection, whole, deadline_s)
+    stored = _stored(connection, whole, deadline_s / 3)
+    moments = [_moment(each, stored) for each in _outstanding(connection, found)]
+    course = trends(connection, whole, limit=500, deadline_s=deadline_s / 3)
+    (told_trends,) = course.runs
+    mode = _mode(told_trends)
+    travelled, why_not = _travelled(connection, run_id)
+    return Chapter(
+        info, whole, title,
+        summary=_first_words(info),
+        facts=facts,
+        findings=[*travelled, *_findings(found.verdicts)],
+        unsearched=[f"{kinds}: {why}" for kinds, why in found.verdicts.gaps.items()],
+        mode=mode.name if mode else "",
+        held=_held(mode) if mode else (),
+        moments=[
+            each for each in moments if room.fit("moments", each.lines) or not each.lines.rows
+        ],
+        parameters=parameters,
+        events=room.fit("events", _events(connection, found)),
+        trends=room.fit("trends", _trends(told_trends)),
+        commands=room.fit("commands", _commands(connection, whole), newest=True),
+        timeline=room.fit("timeline", _timeline(connection, stored), newest=True),
+        log=room.fit("log", _log(connection, run_id), newest=True),
+        numbers=told_trends.total,
+        changed_most=[each.name for each in told_trends.numbers if each.shape != "constant"],
+        notes=tuple(
+            dict.fromkeys((*found.notes, *course.notes, *_unread(told_trends), *why_not))
+        ),
+    )  # fmt: skip
+
+
+def _unread(course: RunTrends) -> list[str]:
+    """That what is told of modes and trends is not told of all rows."""
+    if course.cut_at_s is None:
+        return []
+    since = time_at(course.cut_at_s)
+    return [f"modes and trends are those of what was read in time: not all was from {since} s on"]
+
+
+def _first_words(info: RunInfo) -> str:
+    world = f" in {_file(info.world)}" if info.world else ""
+    ended = f"It ended: {info.end_reason}." if info.end_reason else "It goes on."
+    pace = info.real_time_factor
+    how_fast = f", {paced(pace)}" if pace is not None else ""
+    return (
+        f"{info.robot} ran for {length(info.duration_s)} of simulation time{world}, from "
+        f"{clock(info.started_wall_time_s)} on{how_fast}. {ended}"
+    )
+
+
+def _facts(info: RunInfo, session: Session | None, step_ms: float | None) -> dict[str, str]:
+    """As recorded in the rows of run and session, without what is not known."""
+    facts: dict[str, object] = {
+        "robot": info.robot,
+        "run": f"{info.run_id} (session {info.session_id})",
+        "label": info.label,
+        "note": info.note,
+        "controller": info.controller,
+        "SHA-256 of its file": info.controller_sha256,
+        "git commit": info.git_commit,
+        "world": info.world,
+        "basic time step": f"{step_ms:g} ms" if step_ms else None,
+        "began": f"{clock(info.started_wall_time_s)}, by {info.start_reason}",
+        "ended": info.end_reason or "it goes on",
+        "simulation time": length(info.duration_s),
+        "wall time": length(info.wall_duration_s)
+        + (f", of which {length(info.held_s)} paused by a command" if info.held_s else ""),
+        "rows": f"{info.rows:,}"
+        + (f" ({info.purged_rows:,} of them purged since)" if info.purged_rows else ""),
+        "needs attention": listed(info.notable) or None,
+    }
+    if session is not None:
+        facts |= {
+            "host": session.host,
+            "supervisor": "yes" if session.supervisor else "no",
+            "versions": valued(session.versions) or None,
+            "end of the controller": session.end_reason,
+            "newest error of the recorder": session.last_error,
+            "rows dropped": session.rows_dropped or None,
+        }
+    return {name: cut(str(fact), 4_000) for name, fact in facts.items() if fact is not None}
+
+
+def _parameters(connection: sqlite3.Connection, run_id: int) -> Grid:
+    columns = ("name", "value", "unit", "default", "set_by", "since_s", "doc")
+    rows = [
+        Row([_text(each[column]) for column in columns])
+        for each in described(connection, fetch_run(connection, run_id))
+    ]
+    return Grid(("parameter", "value", "unit", "default", "set by", "since [s]", "what"), rows)
+
+
+def _found(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float) -> Found:
+    """What stands out: all kinds that are looked for unless asked, but for what is routine."""
+    usual = EventOptions()
+    kinds = tuple(
+        kind.name for kind in KINDS if kind.usual(usual) and kind.counted and not kind.routine
+    )
+    return search_events(connection, whole, EventOptions(kinds=kinds), deadline_s=deadline_s)
+
+
+def _stored(connection: sqlite3.Connection, whole: TimeRange, deadline_s: float) -> Found:
+    """What was noted when it happened, one by one."""
+    options = EventOptions(kinds=stored_kinds(), log_level="info")
+    return search_events(connection, whole, options, around=(), group=False, deadline_s=deadline_s)
+
+
+def _findings(verdicts: Verdicts) -> list[str]:
+    """What there is of each kind that was looked for, and what there is none of."""
+    found = [f"{kind} ({count})" for kind, count in verdicts.found.items()]
+    said = [f"Found: {', '.join(found)}."] if found else []
+    said += [f"Looked for and absent: {', '.join(verdicts.far)}."] if verdicts.far else []
+    said += [
+        f"Absent, but came near: {kind} ({what})." for kind, what in verdicts.came_near.items()
+    ]
+    return said
+
+
+def _events(connection: sqlite3.Connection, found: Found) -> Grid:
+    """What stands out; commands that were done have a table of their own."""
+    matter = [each for each in found.events if each.kind != "command" or _mark(each)]
+    answer = found.only(matter).told(connection, MOST_EVENTS)
+    rows = [
+        Row(
+            [time_at(each.start_s), _lasted(each), each.kind, told(each), _around(each)],
+            _mark(each),
+        )
+        for each in answer.events
+    ]
+    left_out = sum(each.count for each in answer.left_out.values())
+    columns = ("from [s]", "for [s]", "kind", "what", "values when it began")
+    return Grid(columns, rows, left_out=left_out)
+
+
+def _outstanding(connection: sqlite3.Connection, found: Found) -> list[Event]:
+    """The few whose surroundings are shown: what was found in the values, else in the log."""
+    matter = [each for each in found.events if each.kind not in ("kept", "command", "log")]
+    matter = [each for each in matter if each.details.get("what") not in _ORDINARY]
+    failed = [each for each in found.events if _mark(each)]
+    chosen = choose(matter, MOST_MOMENTS) or choose(failed, MOST_MOMENTS)
+    return list(found.only(chosen).told(connection, MOST_MOMENTS).events)
+
+
+def _moment(event: Event, stored: Found) -> Moment:
+    many = f", the first of {event.count}" if event.count > 1 else ""
+    lasted = f", for {length(event.duration_s)}" if event.duration_s and not many else ""
+    title = f"{event.kind} at {time_at(event.start_s)} s{lasted}{many}"
+    columns = ("at [s]", "kind", "what")
+    moment = Moment(event, title, told(event), _around(event), Grid(columns, ()))
+    around = [
+        each for each in stored.events
+        if moment.start_s <= each.start_s <= moment.end_s and each.kind != "image"
+    ]  # fmt: skip
+    nearest = sorted(around, key=lambda each: abs(each.start_s - event.start_s))[:_LINES_AROUND]
+    shown = [each for each in around if any(each is near for near in nearest)]
+    rows = [Row([time_at(each.start_s), each.kind, told(each)], _mark(each)) for each in shown]
+    return replace(moment, lines=Grid(columns, rows, left_out=len(around) - len(shown)))
+
+
+def _timeline(connection: sqlite3.Connection, stored: Found) -> Grid:
+    """What was noted, in order; of a long run the log alone has what needs no attention."""
+    notes: list[str] = []
+    if len(stored.events) > MOST_ENTRIES:
+        stored = stored.only([e for e in stored.events if e.kind != "log" or _mark(e)])
+        notes = ["Of the log only warnings and errors stand here."]
+    answer = stored.told(connection, MOST_ENTRIES, exact=False)
+    rows = [
+        Row([time_at(each.start_s), _lasted(each), each.kind, told(each)], _mark(each))
+        for each in answer.events
+    ]
+    left_out = sum(each.count for each in answer.left_out.values())
+    return Grid(("at [s]", "for [s]", "kind", "what"), rows, notes, left_out=left_out)
+
+
+def _commands(connection: sqlite3.Connection, whole: TimeRange) -> Grid:
+    found = search_events(
+        connection, whole, EventOptions(kinds=("command",)), around=(), group=False
+    )
+    answer = found.told(connection, MOST_EVENTS)
+    rows = [
+        Row([
+            time_at(each.start_s), str(each.details["id"]), each.name or "",
+            valued(each.details.get("params") or {}), each.details["status"],
+            number(each.details.get("took_wall_s")),
+            cut(str(each.details.get("error") or spelled(each.details.get("result", "")))),
+        ], _mark(each))
+        for each in answer.events
+    ]  # fmt: skip
+    columns = ("at [s]", "id", "action", "parameters", "outcome", "took [s]", "answer")
+    return Grid(columns, rows, left_out=sum(each.count for each in answer.left_out.values()))
+
+
+def _log(connection: sqlite3.Connection, run_id: int) -> Grid:
+    robot_id = fetch_run(connection, run_id).robot_id
+    asked = LogFilter(run_id, Window(-math.inf, math.inf), robot_id=robot_id)
+    lines = newest_lines(connection, asked, MOST_LINES)
+    count = count_lines(connection, asked)
+    return Grid(
+        ("at [s]", "level", "from", "line"),
+        [_line(line) for line in lines],
+        left_out=count - len(lines),
+        or_more=count >= COUNT_LIMIT,
+    )
+
+
+def _line(line: LogLine) -> Row:
+    cells = [time_at(line.sim_time_s), line.level, line.source, cut(line.message, 2_000)]
+    return Row(cells, _MARKS.get(line.level, ""))
+
+
+def _trends(run: RunTrends) -> Grid:
+    """Numbers, what changed most first; then texts and flags."""
+    rows = [
+        Row([trend.name, trend.unit or "", trend.says, *_figures(trend)]) for trend in run.numbers
+    ]
+    rows += [Row([state.name, "", _course(state), "", "", "", ""]) for state in run.states]
+    notes = [f"Without a value: {', '.join(run.silent[:50])}."] if run.silent else []
+    columns = ("signal", "unit", "what it did", "mean", "deviation", "least", "greatest")
+    return Grid(columns, rows, notes, left_out=run.total - len(run.numbers))
+
+
+def _figures(trend: Trend) -> list[str]:
+    """Mean, deviation, least and greatest value."""
+    least, greatest = trend.summary.min, trend.summary.max
+    span = 0.0 if least is None or greatest is None else greatest - least
+    return [number(each, span) for each in (trend.mean, trend.deviation, least, greatest)]
+
+
+def _course(state: StateTrend) -> str:
+    if state.changes == 0:
+        return f"always {spelled(state.last)}"
+    since = "" if state.since_s is None else f" since {time_at(state.since_s)} s"
+    times = ", ".join(
+        f"{cut(value, 40)} {length(held_s)}"
+        for value, held_s in list(state.time_by_value_s.items())[:_MOST_VALUES]
+    )
+    changed = counted(state.changes, "change")
+    return f"{changed}, {spelled(state.last)}{since}; {times}"
+
+
+def _mode(run: RunTrends) -> StateTrend | None:
+    name = find_mode([state.name for state in run.states if state.kind == "text"])
+    return next((state for state in run.states if state.name == name), None)
+
+
+def _held(mode: StateTrend) -> list[Held]:
+    whole_s = sum(mode.time_by_value_s.values())
+    return [
+        Held(
+            cut(value, 60),
+            f"{length(held_s)}, {share(held_s, whole_s)}",
+            100 * held_s / whole_s if whole_s else 0.0,
+        )
+        for value, held_s in list(mode.time_by_value_s.items())[:_MOST_VALUES]
+    ]
+
+
+def _travelled(connection: sqlite3.Connection, run_id: int) -> tuple[list[str], list[str]]:
+    """How far it went, in words, and why that is not known."""
+    found = compare_runs(connection, [run_id])
+    known = {each.name: each.spread[0] for each in found.measures}
+    distance, speed = known.get("distance_m"), known.get("mean_speed_m_s")
+    why_not = [
+        f"not known: {figures}: {why}"
+        for figures, why in found.not_known.items()
+        if "distance_m" in figures
+    ]
+    if distance is None or speed is None:
+        return [], why_not
+    went = f"It went {number(distance.median)} m, at {number(speed.median)} m/s in the mean."
+    return [went], why_not
+
+
+def _around(event: Event) -> str:
+    """Values when it began; nothing where those rows are gone."""
+    known = any(value is not None for value in event.around.values())
+    return valued(event.around) if known else ""
+
+
+def _mark(event: Event) -> str:
+    if event.kind == "log":
+        return _MARKS.get(event.name or "", "")
+    failed = event.kind == "command" and event.details.get("status") in ("failed", "lost")
+    return "error" if failed else ""
+
+
+def _lasted(event: Event) -> str:
+    return number(event.duration_s) if event.count == 1 and event.duration_s else ""
+
+
+def _text(value: object) -> str:
+    return "" if value is None else spelled(value)
+
+
+def _file(path: str) -> str:
+    return path.replace("\\", "/").rpartition("/")[2]

@@ -1,0 +1,246 @@
+"""The interactive figures of a report, as marks for its page; Bokeh's script goes in with them."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Final
+
+from webots_mcp.errors import InvalidInputError, NothingRecordedError
+from webots_mcp.plugins.report.chapter import Chapter, Moment
+from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
+from webots_mcp.store.signals.catalogue import known_signals, resolve_signals
+from webots_mcp.store.signals.registry import Signal
+
+if TYPE_CHECKING:
+    from webots_mcp.plugins.report.charts import Chart
+
+MOST_SIGNALS: Final = 16
+_PANELS: Final = 12
+_POINTS: Final = 500
+_MOMENT_POINTS: Final = 200
+
+
+def require_view(what: str = "a report") -> None:
+    """See that there is what a page is made with, before anything is read.
+
+    Args:
+        what: What needs it.
+
+    Raises:
+        InvalidInputError: The extra `view` is not installed.
+    """
+    try:
+        import_module("bokeh")
+        import_module("jinja2")
+    except ImportError as error:
+        raise InvalidInputError(
+            f"{what} needs Bokeh: pip install 'webots-mcp[view]' (the extra [view] of webots-mcp)"
+        ) from error
+
+
+def library() -> str:
+    """Bokeh's own script, as it stands in the page."""
+    from bokeh.resources import Resources
+
+    return Resources(mode="inline", components=["bokeh"]).render_js()
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Figures as marks.
+
+    Attributes:
+        script: What draws them all.
+        marks: Where each goes, by its key.
+        titles: What each shows.
+        notes: What is not in each.
+        left_out: What is in none.
+    """
+
+    script: str = ""
+    marks: Mapping[str, str] = field(default_factory=dict[str, str])
+    titles: Mapping[str, str] = field(default_factory=dict[str, str])
+    notes: Mapping[str, Sequence[str]] = field(default_factory=dict[str, Sequence[str]])
+    left_out: Sequence[str] = ()
+
+    @property
+    def size_bytes(self) -> int:
+        """What they take in the page."""
+        return len(self.script.encode()) + sum(len(mark) for mark in self.marks.values())
+
+
+def figures_of(
+    connection: sqlite3.Connection,
+    chapters: Sequence[Chapter],
+    names: Sequence[str],
+    differing: Sequence[str],
+    room_bytes: float,
+) -> Figures:
+    """All figures of a report, with as many signals as have room.
+
+    Args:
+        connection: Any.
+        chapters: Its runs; two are laid over each other as well.
+        names: Signals, with `*`; none for those that changed most.
+        differing: Of two runs those that differ, which are laid over each other if none is named.
+        room_bytes: How much they may take.
+
+    Raises:
+        UnknownSignalError: A name meets nothing.
+    """
+    known = [_known(connection, each) for each in chapters]
+    chosen = _chosen(chapters, known, names)
+    both = list(dict.fromkeys(name for had in chosen.values() for name in had))
+    both = both if names else [*differing[:MOST_SIGNALS]] or both
+    both = [name for name in both if all(name in each for each in known)]
+    count = max(map(len, chosen.values()), default=0)
+    while True:
+        first = {run_id: had[:count] for run_id, had in chosen.items()}
+        charts = _charts(connection, chapters, first, both[:count], with_moments=count > 1)
+        if not both[:count] and len([each for each in chapters if each.range is not None]) > 1:
+            charts.not_drawn.append(f"the signals of both runs: {_why_none(known, names)}")
+        made = _embedded(charts.drawn)
+        if made.size_bytes <= room_bytes:
+            return replace(made, left_out=[*_curves_missing(chapters, first), *charts.not_drawn])
+        if count <= 1:
+            return Figures(left_out=("the figures: they would take more than the file may",))
+        count //= 2
+
+
+def _curves_missing(chapters: Sequence[Chapter], drawn: Mapping[int, Sequence[str]]) -> list[str]:
+    """How many numbers have no curve."""
+    return [
+        f"curves of {missing} of {each.numbers} numeric signals of run {each.info.run_id} (drawn "
+        "is what changed most, or is named)"
+        for each in chapters
+        if (missing := each.numbers - len(drawn[each.info.run_id])) > 0
+    ]
+
+
+def moment_key(chapter: Chapter, moment: Moment) -> str:
+    """Under which the figure of a moment stands."""
+    return f"moment {chapter.info.run_id} {list(chapter.moments).index(moment)}"
+
+
+def _known(connection: sqlite3.Connection, chapter: Chapter) -> dict[str, Signal]:
+    return {} if chapter.range is None else known_signals(connection, chapter.range)
+
+
+def _chosen(
+    chapters: Sequence[Chapter], known: Sequence[dict[str, Signal]], names: Sequence[str]
+) -> dict[int, list[str]]:
+    """The signals to draw of each run; of two robots each may lack what the other has."""
+    if not names:
+        return {each.info.run_id: [*each.changed_most[:MOST_SIGNALS]] for each in chapters}
+    of_any = {name: signal for each in known for name, signal in each.items()}
+    asked = {signal.name for signal in resolve_signals(of_any, names)}
+    return {
+        chapter.info.run_id: [name for name in had if name in asked]
+        for chapter, had in zip(chapters, known, strict=True)
+    }
+
+
+def _why_none(known: Sequence[dict[str, Signal]], names: Sequence[str]) -> str:
+    """Why none can be laid over each other: texts, and what rests, are chosen by name alone."""
+    if names:
+        return "none that was asked for is in both"
+    shared = [name for name in known[0] if all(name in each for each in known)]
+    if any(each[name].is_number for name in shared for each in known):
+        return "none of those that changed most is in both"
+    return "they share no numeric signals"
+
+
+class _Charts:
+    """The charts of a report by their keys, and why others could not be drawn."""
+
+    def __init__(self, connection: sqlite3.Connection) -> None:
+        self._connection = connection
+        self.drawn: dict[str, Chart] = {}
+        self.not_drawn: list[str] = []
+
+    def alone(self, run_id: int, whole: TimeRange, names: Sequence[str]) -> None:
+        """Signals of a run over time, and its way."""
+        key, drawn = f"signals {run_id}", names or ["*"]
+        self._add(key, f"the signals of run {run_id}", self._signals, [whole], drawn)
+        self._add(f"way {run_id}", f"the way of run {run_id}", self._way, [whole])
+
+    def overlaid(self, ranges: Sequence[TimeRange], names: Sequence[str]) -> None:
+        """The same of two runs over each other."""
+        if names:
+            self._add("signals both", "the signals of both runs", self._signals, ranges, names)
+        self._add("way both", "the ways of both runs", self._way, ranges)
+
+    def _add(self, key: str, what: str, draw: Callable[..., Chart], *asked: Any) -> None:
+        try:
+            self.drawn[key] = draw(*asked)
+        except (InvalidInputError, NothingRecordedError) as error:
+            self.not_drawn.append(f"{what}: {error}")
+
+    def _signals(self, ranges: Sequence[TimeRange], names: Sequence[str]) -> Chart:
+        from webots_mcp.plotting.canvas import Room
+        from webots_mcp.plugins.report.charts import signals_chart
+
+        room = Room(points=_POINTS, panels=_PANELS, lanes=8, rows=16)
+        return signals_chart(self._connection, ranges, names, room=room)
+
+    def _way(self, ranges: Sequence[TimeRange]) -> Chart:
+        from webots_mcp.plugins.report.charts import way_chart
+
+        return way_chart(self._connection, ranges)
+
+    def around(self, chapter: Chapter, moment: Moment) -> None:
+        """The signals that an event is about, or the usual ones, in the seconds around it."""
+        about = [moment.event.name] if moment.event.name else []
+        for names in filter(None, (about, list(moment.event.around))):
+            # It may be named after no signal, or after one without a value there.
+            with suppress(InvalidInputError, NothingRecordedError):
+                self.drawn[moment_key(chapter, moment)] = self._seconds(chapter, moment, names)
+                return
+
+    def _seconds(self, chapter: Chapter, moment: Moment, names: Sequence[str]) -> Chart:
+        from webots_mcp.plotting.canvas import Room
+        from webots_mcp.plugins.report.charts import signals_chart
+
+        scope = Scope(run_id=chapter.info.run_id, start_s=moment.start_s, end_s=moment.end_s)
+        around = find_range(self._connection, scope)
+        room = Room(points=_MOMENT_POINTS, panels=2, lanes=1, rows=0)
+        chart = signals_chart(self._connection, [around], names, events=False, room=room)
+        grid: Any = chart.layout
+        grid.toolbar_location = None  # the small figure has no room for it
+        return chart
+
+
+def _charts(
+    connection: sqlite3.Connection,
+    chapters: Sequence[Chapter],
+    chosen: Mapping[int, Sequence[str]],
+    both: Sequence[str],
+    *,
+    with_moments: bool,
+) -> _Charts:
+    charts = _Charts(connection)
+    ranges = [each.range for each in chapters if each.range is not None]
+    if len(ranges) > 1:
+        charts.overlaid(ranges, both)
+    for chapter in chapters:
+        if chapter.range is not None:
+            run_id = chapter.info.run_id
+            charts.alone(run_id, chapter.range, chosen[run_id])
+        for moment in chapter.moments if with_moments else ():
+            charts.around(chapter, moment)
+    return charts
+
+
+def _embedded(charts: Mapping[str, Chart]) -> Figures:
+    from bokeh.embed import components
+
+    if not charts:
+        return Figures()
+    embed: Any = components
+    script, marks = embed({key: chart.layout for key, chart in charts.items()})
+    titles = {key: chart.title for key, chart in charts.items()}
+    return Figures(script, marks, titles, {key: chart.notes for key, chart in charts.items()})

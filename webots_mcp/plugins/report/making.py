@@ -1,0 +1,168 @@
+"""How a report is put together, in the room that it may take."""
+
+from __future__ import annotations
+
+import sqlite3
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.plugins.report.chapter import Chapter, chapter_of
+from webots_mcp.plugins.report.comparison import beside
+from webots_mcp.plugins.report.figures import figures_of, library, require_view
+from webots_mcp.plugins.report.page import Page, render
+from webots_mcp.plugins.report.pictures import Pictures, pictures_of
+from webots_mcp.plugins.report.words import counted
+from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.sound import left_out_so_far
+
+MAX_MB: Final = 10.0
+MIN_MB: Final = 2.0  # Bokeh's script takes more than half of it
+MOST_RUNS: Final = 2
+DEADLINE_S: Final = 12.0  # for all searches in values: a report may take a while
+_SHARE_OF_TEXTS: Final = 0.35  # of what Bokeh's script leaves; then the figures have
+_SHARE_OF_FIGURES: Final = 0.7  # of the rest, and the pictures what remains
+_FRAME_BYTES: Final = 40_000  # style, headings, facts: all that is not shared out
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Report:
+    """A finished report.
+
+    Attributes:
+        html: The file's content.
+        title: What it is about, in one line.
+        holds: How many there are of what it holds.
+        left_out: What is not in it, and why.
+    """
+
+    html: bytes
+    title: str
+    holds: dict[str, int]
+    left_out: tuple[str, ...]
+
+
+@in_one_snapshot
+def make_report(
+    connection: sqlite3.Connection,
+    run_ids: Sequence[int],
+    data_dir: Path,
+    *,
+    names: Sequence[str] = (),
+    max_mb: float = MAX_MB,
+    progress: Progress | None = None,
+) -> Report:
+    """Put a report of one run together, or of two beside each other.
+
+    Args:
+        connection: Any.
+        run_ids: One run, or two.
+        data_dir: Where the pictures are.
+        names: The signals to draw, with `*`; none for those that changed most.
+        max_mb: What the file may take at most, 2 to 100 (1 MB is 1,000,000 bytes).
+        progress: Called now and then with how much is done and how much there is to do.
+
+    Raises:
+        InvalidInputError: No run, more than two, or one twice; a size out of bounds; or what a
+            page is made with is not installed.
+        UnknownRunError, UnknownSignalError: As they say.
+    """
+    _require_sound(run_ids, max_mb)
+    for run_id in run_ids:
+        fetch_run(connection, run_id)
+    require_view()
+    done = _Steps(progress, 2 * len(run_ids) + 3)
+    script = library()
+    room_bytes = max_mb * 1e6 - len(script.encode()) - _FRAME_BYTES
+    texts_bytes = _SHARE_OF_TEXTS * room_bytes
+    chapters: list[Chapter] = []
+    count = len(run_ids)
+    for run_id in run_ids:
+        chapters.append(chapter_of(connection, run_id, texts_bytes / count, DEADLINE_S / count))
+        done.step()
+    compared = beside(connection, run_ids, texts_bytes) if len(run_ids) > 1 else None
+    done.step()
+    figures_bytes = _SHARE_OF_FIGURES * (room_bytes - texts_bytes)
+    differing = compared.differing if compared is not None else ()
+    figures = figures_of(connection, chapters, names, differing, figures_bytes)
+    done.step()
+    page = Page(_title(chapters), time.time(), max_mb, script, chapters, compared, figures)
+    rest_bytes = max_mb * 1e6 - len(render(page))
+    for chapter in chapters:
+        pictures = _pictures(connection, chapter, data_dir, rest_bytes / len(chapters))
+        page.pictures[chapter.info.run_id] = pictures
+        done.step()
+    page = replace(page, left_out=_left_out(page))
+    page = replace(page, size_bytes=len(render(page)))
+    html = render(page)
+    done.step()
+    return Report(html, page.title, _holds(page), tuple(page.left_out))
+
+
+class _Steps:
+    """Tells how far the work has come."""
+
+    def __init__(self, progress: Progress | None, of: int) -> None:
+        self._progress, self._of, self._done = progress, of, 0
+
+    def step(self) -> None:
+        """One more is done."""
+        self._done += 1
+        if self._progress is not None:
+            self._progress(self._done, self._of)
+
+
+def _require_sound(run_ids: Sequence[int], max_mb: float) -> None:
+    if not 1 <= len(run_ids) <= MOST_RUNS:
+        raise InvalidInputError(
+            f"a report is about one run or two, not {len(run_ids)}: compare more of them with "
+            "webots_compare_runs"
+        )
+    if len(set(run_ids)) < len(run_ids):
+        raise InvalidInputError(f"run {run_ids[0]} is named twice: name another one, or it alone")
+    if not MIN_MB <= max_mb <= 100:
+        raise InvalidInputError(f"max_mb={max_mb:g} must be from {MIN_MB:g} to 100")
+
+
+def _title(chapters: Sequence[Chapter]) -> str:
+    return " and ".join(chapter.title for chapter in chapters)
+
+
+def _pictures(
+    connection: sqlite3.Connection, chapter: Chapter, data_dir: Path, room_bytes: float
+) -> Pictures:
+    if chapter.range is None:
+        return Pictures((), 0, 0)
+    return pictures_of(connection, chapter.range, data_dir, room_bytes)
+
+
+def _left_out(page: Page) -> list[str]:
+    """What a reader would miss, and why it is not there."""
+    said: list[str] = []
+    for chapter in page.chapters:
+        of_run = f"of run {chapter.info.run_id}"
+        for name, grid in chapter.grids.items():
+            if grid.left_out:
+                said.append(f"{grid.missing} of the {name} {of_run}")
+        pictures = page.pictures[chapter.info.run_id]
+        if missing := pictures.total - len(pictures.shown):
+            gone = f" ({counted(pictures.unusable, 'file')} cannot be read)"
+            gone = gone if pictures.unusable else ""
+            said.append(f"{missing:,} of the pictures {of_run}{gone}")
+    return [*said, *page.figures.left_out, *left_out_so_far()]
+
+
+def _holds(page: Page) -> dict[str, int]:
+    """How many rows, figures and pictures there are."""
+    counts: dict[str, int] = {"figures": len(page.figures.marks)}
+    for chapter in page.chapters:
+        for name, grid in chapter.grids.items():
+            counts[name] = counts.get(name, 0) + len(grid.rows)
+    counts["pictures"] = sum(len(each.shown) for each in page.pictures.values())
+    return {name: count for name, count in counts.items() if count}

@@ -22,6 +22,7 @@ ALLOWED = {
     "connection": {"contract", "errors", "schema", "transactions"},
     "liveness": {"contract", "queue", "waiting_file"},
     "queue": {"contract", "errors", "transactions"},
+    "requirements": set[str](),
     "naming": set[str](),
     "conditions": {"conditions", "errors", "naming"},
     "parameter": {"errors", "naming"},
@@ -31,7 +32,7 @@ ALLOWED = {
     "standin": {"standin", "contract"},
     "webots": {"connection", "contract", "errors", "liveness", "webots"},
 }
-ALLOWED["setup"] = {"contract", "errors", "setup", "webots", "__version__"}
+ALLOWED["setup"] = {"contract", "errors", "requirements", "setup", "webots", "__version__"}
 ENTRIES = {
     "conditions",
     "maintenance",
@@ -48,9 +49,9 @@ STDLIB = {
 }
 ALLOWED["bridge"] = STDLIB | {"bridge", "__version__"}
 ALLOWED["observer"] = STDLIB | {"bridge", "observer"}
-ALLOWED["store"] = STDLIB | {"plugins", "store"}
-ALLOWED["trials"] = STDLIB | {"store", "trials", "webots", "__version__"}
-ALLOWED["diagnosis"] = STDLIB | {"store", "diagnosis", "setup", "webots"}
+ALLOWED["store"] = STDLIB | {"plugins", "requirements", "store"}
+ALLOWED["trials"] = STDLIB | {"requirements", "store", "trials", "webots", "__version__"}
+ALLOWED["diagnosis"] = STDLIB | {"requirements", "store", "diagnosis", "setup", "webots"}
 ALLOWED["launch"] = STDLIB | {"console", "store", "setup", "webots"}
 ALLOWED["plotting"] = STDLIB | {"store", "plotting"}
 ALLOWED["console"] = STDLIB | {"console", "store", "webots"}

@@ -51,7 +51,6 @@ def test_the_plots_look_as_they_are_drawn_today(data_dir: Path, tmp_path: Path) 
 @pytest.mark.usefixtures("simulation")
 def test_the_pages_look_as_a_browser_shows_them_today(data_dir: Path, tmp_path: Path) -> None:
     pytest.importorskip("playwright", reason="Playwright is not installed")
-    pytest.importorskip("bokeh", reason="Bokeh is not installed")
     if pictures.CHROMIUM is None:
         pytest.skip("there is no Chromium")
     with pictures.started_browser() as browser:

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from tests.plotting.conftest import record, rover
-
-pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
 
 __all__ = ["record", "rover"]

@@ -65,8 +65,6 @@ COMMANDS = [
 def test_no_command_lets_a_recording_steer_the_terminal(
     recorded: Recorded, command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    if command[0] == "report":
-        pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
     main([*command, "--database", "webots.db"])
     said = capsys.readouterr()
     assert said.out or said.err
@@ -85,7 +83,6 @@ def test_pictures_and_reports_are_files_that_nothing_turns_round(recorded: Recor
         text = Path("x.svg").read_text("utf-8")
         assert not OBEYED.search(text)
         ElementTree.fromstring(text)
-    pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
     assert main(["report", "-o", "x.html", "--database", "webots.db"]) == 0
     text = Path("x.html").read_text("utf-8")
     assert not OBEYED.search(text)

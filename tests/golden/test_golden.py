@@ -7,8 +7,6 @@ import pytest
 from tests.golden.drawing import KINDS
 from tests.golden.stored import answers_of, difference
 
-pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
-
 
 @pytest.mark.parametrize("name", KINDS)
 def test_every_answer_is_the_accepted_one(name: str) -> None:

@@ -19,8 +19,6 @@ from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.rollup.rolling import roll
 
-pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
-
 __all__ = ["chromium"]
 NAME = "<img src=x onerror=hacked=1>"
 LINE = "<script>window.hacked = 1</script>"

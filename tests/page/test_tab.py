@@ -9,9 +9,6 @@ from typing import Any
 
 import anyio
 import pytest
-
-pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
-
 from bokeh.document import Document
 
 from tests.recordings.long import build

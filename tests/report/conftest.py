@@ -14,8 +14,6 @@ from tests.browsing import chromium
 from webots_mcp.connection import connect
 from webots_mcp.plugins.report.making import Report, make_report
 
-pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
-
 __all__ = ["chromium"]
 
 _VOID = {"meta", "img", "br", "link", "input"}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 import sqlite3
-import sys
 from base64 import b64decode
 from collections.abc import Mapping
 from io import BytesIO
@@ -229,14 +228,6 @@ def test_what_cannot_be_reported_is_refused(
 ) -> None:
     with pytest.raises(error, match=says):
         make_report(recording, run_ids, tmp_path, **options)
-
-
-def test_without_the_extra_it_says_what_to_install(
-    recording: sqlite3.Connection, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "bokeh", None)
-    with pytest.raises(InvalidInputError, match=r"pip install 'webots-mcp\[view\]'"):
-        make_report(recording, [1], tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.requirements import checkout
 from webots_mcp.setup.clients import (
     Client,
     Entry,
@@ -153,7 +154,7 @@ def test_claude_desktop_has_its_file_where_that_system_keeps_it(
 def test_a_server_that_lacks_its_packages_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
     assert server_hindrance() is None
     monkeypatch.setitem(sys.modules, "mcp", None)
-    assert "without --no-deps" in (server_hindrance() or "")
+    assert f"pip install '{checkout()}'" in (server_hindrance() or "")
     monkeypatch.undo()
     monkeypatch.setattr(sys, "prefix", "/home/me/.cache/uv/archive-v0/Ab1")
-    assert "uv tool install" in (server_hindrance() or "")
+    assert f"uv tool install {checkout()}" in (server_hindrance() or "")

@@ -11,7 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from webots_mcp.setup.interpreter import chosen, look_into, quoted, source
+from webots_mcp.requirements import checkout, quoted
+from webots_mcp.setup.interpreter import chosen, look_into
 
 
 @pytest.fixture(autouse=True)
@@ -125,7 +126,7 @@ def test_one_without_it_gets_the_line_that_mends_it_quoted(controller: Path, bar
         ["sh", "-c", f"printf '%s\\n' {line}"], capture_output=True, text=True, check=True
     ).stdout.splitlines()
     assert words[:4] == [str(bare), "-m", "pip", "install"]
-    assert words[-2:] == ["--no-deps", source()]
+    assert words[-2:] == ["--no-deps", checkout()]
     assert "ensurepip" in (found.fix or ""), "it has no pip"
 
 

@@ -107,8 +107,6 @@ def test_questions_of_the_command_line_roll_up_before_they_answer(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    if command[0] == "report":
-        pytest.importorskip("bokeh", reason="the extra 'view' is not installed")
     monkeypatch.chdir(tmp_path)
     assert main([*command, "--database", "webots.db"]) == 0
     assert rolled(recording) == ROWS

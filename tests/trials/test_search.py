@@ -182,7 +182,7 @@ def test_without_optuna_it_names_what_to_install(
     refused = run("--search", "tpe", env={**os.environ, "PYTHONPATH": str(tmp_path / "missing")})
 
     assert refused.returncode == 2
-    assert "pip install 'optuna>=4.0,<5'" in refused.stderr
+    assert "pip install 'optuna" in refused.stderr
     assert not (project / "data").exists()
 
 

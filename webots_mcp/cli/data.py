@@ -56,7 +56,7 @@ def export(arguments: argparse.Namespace) -> None:
     NaN and infinity are kept. A .mcap (Foxglove, Lichtblick, PlotJuggler) or .rrd file (Rerun) has
     states, poses, pictures, log lines, events and commands. A .zip file is a bundle: a run that is
     over, as a recording of its own with its pictures, which 'webots-mcp import' takes in. Parquet
-    needs pyarrow, MCAP mcap, and Rerun rerun-sdk: pip install ...
+    needs pyarrow, MCAP mcap, and Rerun rerun-sdk; the line that installs them is printed.
     """
     from webots_mcp.store.export import (
         BUNDLE,

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from webots_mcp.diagnosis.requirements import (
-    missing_requirements,
-    package_of,
-    pip_line,
-    this_python,
-)
+from webots_mcp.requirements import checkout, install_line, missing_requirements, package_of
 
 
 def explain_missing(error: ModuleNotFoundError) -> str:
     """Which packages are missing, and the line that installs them."""
-    wanted = list(missing_requirements())
+    wanted = missing_requirements()
     if not wanted:
         return (
             f"the Python package {error.name!r} is missing: install webots-mcp with what it "
-            f"depends on, from its checkout by '{this_python()} -m pip install .'"
+            f"depends on, by {install_line([checkout()])}"
         )
     names = ", ".join(map(package_of, wanted))
     return (
         f"this command needs packages that a bridge does without, and they are missing: {names}. "
-        f"Install them with\n\n    {pip_line(wanted)}\n"
+        f"Install them with\n\n    {install_line(wanted)}\n"
     )

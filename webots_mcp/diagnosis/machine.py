@@ -9,7 +9,7 @@ from typing import Final
 
 from webots_mcp.connection import OLDEST_SQLITE
 from webots_mcp.diagnosis.finding import Finding, Subject
-from webots_mcp.diagnosis.requirements import missing_requirements, package_of, pip_line
+from webots_mcp.requirements import install_line, missing_requirements, package_of
 
 _OLDEST_PYTHON: Final = (3, 10)
 _NEWEST_PYTHON: Final = (3, 13)  # that it was tried with
@@ -31,11 +31,11 @@ def python(_: Subject) -> Finding:
 
 def packages(_: Subject) -> Finding:
     """What the server and most commands need; a bridge does without."""
-    missing = list(missing_requirements())
+    missing = missing_requirements()
     if not missing:
         return Finding("ok", "all that the server needs are installed")
     seen = f"missing: {', '.join(map(package_of, missing))} (a bridge does without)"
-    return Finding("wrong", seen, f"run {pip_line(missing)}")
+    return Finding("wrong", seen, f"run {install_line(missing)}")
 
 
 def sqlite(_: Subject) -> Finding:

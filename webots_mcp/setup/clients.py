@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
+from webots_mcp.requirements import checkout, install_line, quoted
 from webots_mcp.setup.commented_json import CommentedJSON
 from webots_mcp.setup.files import Change, read
 
@@ -69,13 +70,13 @@ def server_hindrance() -> str | None:
     if importlib.util.find_spec("mcp") is None:
         return (
             f"the server cannot be started by {sys.executable}, which lacks the package mcp: "
-            "install webots-mcp without --no-deps, and run 'webots-mcp init' from there"
+            f"run {install_line([checkout()])}, and 'webots-mcp init' from there"
         )
     if not any(map(_PASSING.fullmatch, Path(sys.prefix).parts)):
         return None
     return (
         f"this webots-mcp runs from uv's cache ({sys.prefix}), which may be cleared: install it "
-        "by 'uv tool install' and run 'webots-mcp init' again"
+        f"by '{quoted(['uv', 'tool', 'install', checkout()])}' and run 'webots-mcp init' again"
     )
 
 

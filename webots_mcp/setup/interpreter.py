@@ -10,17 +10,14 @@ import json
 import os
 import plistlib
 import re
-import shlex
 import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any, Final, cast
-from urllib.parse import unquote, urlparse
-from urllib.request import url2pathname
 
+from webots_mcp.requirements import checkout, quoted
 from webots_mcp.webots.installations import installations
 
 PROBE_TIMEOUT_S: Final = 30.0
@@ -234,7 +231,7 @@ def _fix(said: dict[str, Any]) -> str:
             "Webots (Preferences, General, Python command)"
         )
     options = ["--user", "--break-system-packages"] if said["managed"] else []
-    command = [said["executable"], "-m", "pip", "install", *options, "--no-deps", source()]
+    command = [said["executable"], "-m", "pip", "install", *options, "--no-deps", checkout()]
     line = quoted(command)
     return line if said["pip"] else f"{line}   (it has no pip yet: {_how_to_get_pip(said)})"
 
@@ -243,28 +240,6 @@ def _how_to_get_pip(said: dict[str, Any]) -> str:
     if said["managed"]:
         return "install it with the system's packages, as 'apt install python3-pip'"
     return quoted([said["executable"], "-m", "ensurepip"])
-
-
-def source() -> str:
-    """What `pip install` is given for this package: its checkout, else its name and version."""
-    beside = Path(__file__).parents[2]
-    if (beside / "pyproject.toml").is_file():
-        return str(beside)
-    try:
-        told = metadata.distribution("webots-mcp")
-    except metadata.PackageNotFoundError:
-        return "webots-mcp"
-    url = str(json.loads(told.read_text("direct_url.json") or "{}").get("url", ""))
-    folder = url2pathname(unquote(urlparse(url).path)) if url.startswith("file:") else ""
-    return folder if folder and Path(folder).exists() else f"webots-mcp=={told.version}"
-
-
-def quoted(command: list[str], platform: str = sys.platform) -> str:
-    """The command as it is typed into the system's shell; on Windows cmd or PowerShell."""
-    if platform != "win32":
-        return shlex.join(command)
-    line = subprocess.list2cmdline(command)
-    return f"& {line}   (in cmd without the &)" if line.startswith('"') else line
 
 
 def _environment() -> dict[str, str]:

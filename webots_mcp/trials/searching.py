@@ -13,6 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.requirements import explain_extra
 from webots_mcp.store.trials import Trial, ranking_of
 from webots_mcp.trials.plan import Plan
 from webots_mcp.trials.ranges import Range
@@ -33,9 +34,7 @@ def require_optuna() -> None:
     try:
         import_module("optuna")
     except ImportError as error:
-        raise InvalidInputError(
-            "a search needs Optuna: pip install 'optuna>=4.0,<5' (the extra [search] of webots-mcp)"
-        ) from error
+        raise InvalidInputError(explain_extra("a search", "search")) from error
 
 
 def next_parameters(plan: Plan, trials: Sequence[Trial]) -> dict[str, Any] | None:

@@ -48,9 +48,8 @@ def measure_page(bench: Bench) -> Iterable[Line]:
 
 
 def _require_browser() -> str:
-    for module in ("bokeh", "playwright"):
-        if importlib.util.find_spec(module) is None:
-            raise NotMeasurableError(f"{module} is not installed")
+    if importlib.util.find_spec("playwright") is None:
+        raise NotMeasurableError("playwright is not installed")
     browser = shutil.which("chromium") or shutil.which("chromium-browser")
     if browser is None:
         raise NotMeasurableError("there is no Chromium")

@@ -358,7 +358,7 @@ def test_without_the_library_the_extra_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     recorder.publish(0.0, {"x": 1})
-    with pytest.raises(InvalidInputError, match="pip install mcap"):
+    with pytest.raises(InvalidInputError, match="pip install 'mcap>="):
         exported(recorder, tmp_path)
     assert list(tmp_path.iterdir()) == []
 

@@ -244,6 +244,6 @@ def test_without_the_sdk_the_extra_is_named(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun.blueprint", None)
     recorder.publish(0.0, {"x": 1})
-    with pytest.raises(InvalidInputError, match="pip install rerun-sdk"):
+    with pytest.raises(InvalidInputError, match="pip install 'rerun-sdk>="):
         exported(recorder, tmp_path)
     assert list(tmp_path.iterdir()) == []

@@ -30,6 +30,7 @@ from webots_mcp import __version__
 from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 from webots_mcp.plugins.pool.target import open_pool, open_target
+from webots_mcp.requirements import explain_extra
 from webots_mcp.store.bundle import pack, unpack
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result
@@ -362,10 +363,7 @@ def _connected(address: str) -> Generator[Any]:
     try:
         distributed: Any = import_module("distributed")
     except ImportError as error:
-        raise InvalidInputError(
-            "trials on a cluster need Dask: pip install 'distributed>=2024.12' (the extra "
-            "[cluster] of webots-mcp)"
-        ) from error
+        raise InvalidInputError(explain_extra("a cluster of Dask", "cluster")) from error
     # That a scheduler was lost is told by who misses it, in a sentence and not by a traceback.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     if not _ADDRESS.fullmatch(address):

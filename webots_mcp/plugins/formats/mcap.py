@@ -21,6 +21,7 @@ from typing import Any, BinaryIO, Final
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.contents import KINDS, Contents, PlacedCommand, Pose, Way
 from webots_mcp.plugins.formats.mcap_schemas import FIXED, Schema, Shape
+from webots_mcp.requirements import explain_extra
 from webots_mcp.store.events import Event
 from webots_mcp.store.export.rows import Recorded, value_at
 from webots_mcp.store.export.text import json_text
@@ -62,7 +63,7 @@ def _library() -> Any:
         return import_module("mcap.writer")
     except ImportError as error:
         raise InvalidInputError(
-            "MCAP needs its library: pip install mcap, or export as csv or jsonl"
+            f"{explain_extra('an MCAP file', 'mcap')}; or export as csv or jsonl"
         ) from error
 
 

@@ -8,6 +8,7 @@ from itertools import islice
 from typing import Any, BinaryIO, Final
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.requirements import install_line
 from webots_mcp.store.export.rows import Column, ColumnKind, Row, Table, as_text
 
 _GROUP_ROWS: Final = 10_000  # about 10 MB of rows in memory at a time
@@ -43,7 +44,7 @@ def _pyarrow() -> tuple[Any, Any]:
         return import_module("pyarrow"), import_module("pyarrow.parquet")
     except ImportError as error:
         raise InvalidInputError(
-            "Parquet needs pyarrow: pip install pyarrow, or export as csv or jsonl"
+            f"a Parquet file needs pyarrow: {install_line(['pyarrow'])}; or export as csv or jsonl"
         ) from error
 
 

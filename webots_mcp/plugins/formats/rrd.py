@@ -25,6 +25,7 @@ from uuid import NAMESPACE_URL, uuid5
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.formats.contents import KINDS, Contents, Item, PlacedCommand, Pose, Way
 from webots_mcp.plugins.formats.foxglove import main_signals
+from webots_mcp.requirements import explain_extra
 from webots_mcp.store.analysis.arrays import np
 from webots_mcp.store.events import Event
 from webots_mcp.store.export import Exported, placed
@@ -149,7 +150,7 @@ def _library() -> Any:
         return import_module("rerun")
     except ImportError as error:
         raise InvalidInputError(
-            "Rerun's format needs its SDK: pip install rerun-sdk, or export as mcap or csv"
+            f"{explain_extra('a file of Rerun', 'rerun')}; or export as mcap or csv"
         ) from error
 
 

@@ -1,7 +1,7 @@
 """A live page of a recording in the browser: `webots-mcp view`.
 
 A Bokeh server on loopback. It asks the same questions as the tools, on connections that cannot
-write; what a button does goes the way that the tools' commands go. Needs the extra `view`.
+write; what a button does goes the way that the tools' commands go.
 """
 
 from webots_mcp.plugins import Plugin

@@ -25,18 +25,14 @@ def view(arguments: argparse.Namespace) -> None:
     """Show a recording as a page in the browser, live: signals, the way, pictures, the log.
 
     The page is for this computer only (127.0.0.1) and needs no network. Its buttons pause, resume,
-    step and reset the simulation and set parameters, as the commands of the same names do. It needs
-    the extra 'view' (Bokeh): pip install '.[view]' in a checkout. Ctrl-C ends it, and the robots
-    do not notice.
+    step and reset the simulation and set parameters, as the commands of the same names do. Ctrl-C
+    ends it, and the robots do not notice.
     """
     import webbrowser
     from contextlib import suppress
 
     from webots_mcp.contract import resolve_database
     from webots_mcp.errors import NoDatabaseError
-    from webots_mcp.plugins.report.figures import require_view
-
-    require_view("the live page")
     from webots_mcp.plugins.page.server import create_page_server
     from webots_mcp.store.recording import Recording
 

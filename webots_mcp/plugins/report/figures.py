@@ -6,7 +6,6 @@ import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
@@ -22,24 +21,6 @@ MOST_SIGNALS: Final = 16
 _PANELS: Final = 12
 _POINTS: Final = 500
 _MOMENT_POINTS: Final = 200
-
-
-def require_view(what: str = "a report") -> None:
-    """See that there is what a page is made with, before anything is read.
-
-    Args:
-        what: What needs it.
-
-    Raises:
-        InvalidInputError: The extra `view` is not installed.
-    """
-    try:
-        import_module("bokeh")
-        import_module("jinja2")
-    except ImportError as error:
-        raise InvalidInputError(
-            f"{what} needs Bokeh: pip install 'webots-mcp[view]' (the extra [view] of webots-mcp)"
-        ) from error
 
 
 def library() -> str:

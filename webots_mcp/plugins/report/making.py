@@ -12,7 +12,7 @@ from typing import Final
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins.report.chapter import Chapter, chapter_of
 from webots_mcp.plugins.report.comparison import beside
-from webots_mcp.plugins.report.figures import figures_of, library, require_view
+from webots_mcp.plugins.report.figures import figures_of, library
 from webots_mcp.plugins.report.page import Page, render
 from webots_mcp.plugins.report.pictures import Pictures, pictures_of
 from webots_mcp.plugins.report.words import counted
@@ -69,14 +69,12 @@ def make_report(
         progress: Called now and then with how much is done and how much there is to do.
 
     Raises:
-        InvalidInputError: No run, more than two, or one twice; a size out of bounds; or what a
-            page is made with is not installed.
+        InvalidInputError: No run, more than two, or one twice; or a size out of bounds.
         UnknownRunError, UnknownSignalError: As they say.
     """
     _require_sound(run_ids, max_mb)
     for run_id in run_ids:
         fetch_run(connection, run_id)
-    require_view()
     done = _Steps(progress, 2 * len(run_ids) + 3)
     script = library()
     room_bytes = max_mb * 1e6 - len(script.encode()) - _FRAME_BYTES

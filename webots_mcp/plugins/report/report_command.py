@@ -36,8 +36,7 @@ def report(arguments: argparse.Namespace) -> None:
 
     What ran (code, commit, parameters, world), what happened (events with the seconds around them,
     trends and the timeline in words), interactive figures, the way, pictures, commands and log. The
-    file needs nothing else and opens without a network. It needs the extra view:
-    pip install 'webots-mcp[view]'.
+    file needs nothing else and opens without a network.
     """
     from webots_mcp.plugins.report.making import make_report
     from webots_mcp.plugins.report.words import size

@@ -6,9 +6,9 @@ from importlib import import_module
 from typing import Any, Final
 
 from webots_mcp.errors import PoolError
+from webots_mcp.requirements import explain_extra, install_line
 
 _EXTRA: Final = ("pyarrow", "fsspec")
-_NEEDS: Final = {"duckdb": "a SELECT over a pool of Parquet files"}
 
 
 def package(name: str) -> Any:
@@ -21,7 +21,7 @@ def package(name: str) -> Any:
         return import_module(name)
     except ImportError as error:
         whose = name.partition(".")[0]
-        what = "webots-mcp[parquet]" if whose in _EXTRA else whose
-        raise PoolError(
-            f"{_NEEDS.get(whose, 'a pool of Parquet files')} needs {whose}: pip install '{what}'"
-        ) from error
+        if whose in _EXTRA:
+            raise PoolError(explain_extra("a pool of Parquet files", "parquet")) from error
+        asked = f"a SELECT over a pool of Parquet files needs {whose}"
+        raise PoolError(f"{asked}: {install_line([whose])}") from error

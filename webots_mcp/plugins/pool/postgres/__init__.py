@@ -6,11 +6,9 @@ It needs psycopg, which is an extra.
 from __future__ import annotations
 
 from webots_mcp.errors import PoolError
+from webots_mcp.requirements import explain_extra
 
 try:
     import psycopg as psycopg
 except ImportError as missing:  # psycopg itself, or a libpq for it
-    raise PoolError(
-        "a pool in PostgreSQL needs psycopg: pip install 'webots-mcp[postgres]' "
-        "(the extra [postgres] of webots-mcp)"
-    ) from missing
+    raise PoolError(explain_extra("a pool in PostgreSQL", "postgres")) from missing

@@ -4,7 +4,7 @@ Both answer with a `Chart`: its `layout` goes into a page (`bokeh.embed`, or a s
 its `notes` say what is not in it. They draw what `plotting` gathers for its pictures; a `Chart`
 keeps the data sources of its figures, so that a page can go on with them.
 
-Importing this package imports Bokeh, which the extra `view` brings.
+Importing this package imports Bokeh, which takes a while.
 """
 
 from webots_mcp.plugins.report.charts.chart import Chart

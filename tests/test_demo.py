@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from webots_mcp import demo
+from webots_mcp.plugins.demo import conversation as demo
 from webots_mcp.setup.clients import can_be_started, is_ours, words_of
 
 TURNS = tuple(

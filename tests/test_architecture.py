@@ -60,7 +60,7 @@ ALLOWED["server"] = STDLIB | {
     "launch", "plugins", "questions", "__version__",
 }  # fmt: skip
 ALLOWED["questions"] = ALLOWED["server"]
-ALLOWED["cli"] = ALLOWED["server"] | {"cli", "observer", "setup"}
+ALLOWED["cli"] = ALLOWED["server"] | {"cli", "observer", "requirements", "setup"}
 ON_ALL = ALLOWED["cli"]
 ALLOWED["plugins"] = set[str]()
 ALLOWED["plugins.cluster"] = ALLOWED["trials"] | {"plugins", "plugins.cluster", "plugins.pool"}

@@ -26,8 +26,8 @@ from webots_mcp.connection import connect
 from webots_mcp.contract import DATABASE_NAME, new_uuid
 from webots_mcp.errors import InvalidInputError, PoolError
 from webots_mcp.plugins.pool import fetching
+from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.plugins.pool.key_order import in_order
-from webots_mcp.plugins.pool.target import open_pool, open_target
 from webots_mcp.standin import InProcessSupervisor
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.retention import Limit, Retention, prune

@@ -21,11 +21,11 @@ from tests.postgres import Server
 from tests.recordings.bridge import STEP_MS, Rover
 from webots_mcp.connection import connect
 from webots_mcp.plugins.pool.batch import Row
+from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.plugins.pool.following import follow
 from webots_mcp.plugins.pool.report import Report
 from webots_mcp.plugins.pool.shipping import Order, ship
 from webots_mcp.plugins.pool.tables import Table, tables
-from webots_mcp.plugins.pool.target import open_pool, open_target
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.rollup.rolling import roll
 

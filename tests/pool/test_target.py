@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.plugins.pool.engines import open_target
 from webots_mcp.plugins.pool.tables import tables
-from webots_mcp.plugins.pool.target import open_target, redacted
+from webots_mcp.plugins.pool.target import redacted
 
 SECRET = "hunter2"
 

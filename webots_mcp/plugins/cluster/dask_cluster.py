@@ -29,7 +29,7 @@ from typing import Any, Final, NamedTuple
 from webots_mcp import __version__
 from webots_mcp.contract import DATABASE_NAME, host_name
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
-from webots_mcp.plugins.pool.target import open_pool, open_target
+from webots_mcp.plugins.pool.engines import open_pool, open_target
 from webots_mcp.requirements import explain_extra
 from webots_mcp.store.bundle import pack, unpack
 from webots_mcp.store.recording import Recording

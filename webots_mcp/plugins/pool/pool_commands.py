@@ -54,8 +54,8 @@ def fetch(arguments: argparse.Namespace) -> int:
     still being shipped is not taken: fetch it again when it is whole.
     """
     from webots_mcp.plugins.pool.catalogue import meant
+    from webots_mcp.plugins.pool.engines import open_pool
     from webots_mcp.plugins.pool.fetching import fetch as fetch_runs
-    from webots_mcp.plugins.pool.target import open_pool
 
     with open_pool(arguments.url) as pool:
         wanted = meant(pool, _choice(arguments))  # first: no database is made for nothing
@@ -118,7 +118,7 @@ def pool(arguments: argparse.Namespace) -> None:
 
     webots-mcp pool postgresql:///lab --sql 'SELECT count(*) FROM run'
     """
-    from webots_mcp.plugins.pool.target import open_pool
+    from webots_mcp.plugins.pool.engines import open_pool
 
     with open_pool(arguments.url) as opened:
         if arguments.sql is not None:

@@ -50,11 +50,12 @@ def ship(arguments: argparse.Namespace) -> None:
     with --full each state. A password comes from PGPASSWORD, ~/.pgpass or a service file, never
     from the URL.
     """
+    from webots_mcp.plugins.pool.engines import open_target, pause_of
     from webots_mcp.plugins.pool.following import follow
     from webots_mcp.plugins.pool.report import Report
     from webots_mcp.plugins.pool.shipping import Order
     from webots_mcp.plugins.pool.shipping import ship as ship_once
-    from webots_mcp.plugins.pool.target import open_target, pause_of, redacted
+    from webots_mcp.plugins.pool.target import redacted
 
     if len(arguments.urls) > 1:
         raise InvalidInputError(

@@ -1,9 +1,4 @@
-"""What a pool can do, and opening the one that a URL names.
-
-`postgresql://[USER@]HOST[:PORT]/DATABASE` and `postgresql:///?service=NAME` are PostgreSQL; a
-folder, `file:///FOLDER` and any other URL that fsspec knows are a dataset of Parquet files.
-Passwords come from PGPASSWORD, ~/.pgpass or a service file: in a URL, every process would see them.
-"""
+"""What a pool can do, and how its URL may be shown."""
 
 from __future__ import annotations
 
@@ -26,13 +21,8 @@ _SECRET: Final = re.compile(
     "^(pass|key|sig|pwd)$",
     re.IGNORECASE,
 )
-_CONNECTION_STRING: Final = re.compile(
-    r"(^|\s)(host|hostaddr|dbname|user|password|passfile|service)\s*=", re.IGNORECASE
-)
-_NEARLY_A_URL: Final = re.compile(r"[A-Za-z][A-Za-z0-9+.-]+:")
 _WHOLE: Final = "run.whole:{}"  # a bit for each of so many runs
 _RUNS_TOLD: Final = 60
-_POSTGRES: Final = ("postgresql", "postgres")
 
 
 class Shipment(Protocol):
@@ -229,38 +219,6 @@ def is_whole(progress: Mapping[str, int], run_id: int) -> bool:
     return bool(progress.get(_WHOLE.format(run_id // _RUNS_TOLD), 0) >> run_id % _RUNS_TOLD & 1)
 
 
-def open_target(url: str) -> Target:
-    """The pool of a URL, to ship to: not yet connected. What it needs is imported only here.
-
-    Raises:
-        InvalidInputError: The URL names no pool, or holds a secret.
-        PoolError: The packages of an extra are missing.
-    """
-    if _is_postgres(url):
-        from webots_mcp.plugins.pool.postgres.writing import PostgresTarget
-
-        return PostgresTarget(url)
-    from webots_mcp.plugins.pool.parquet.writing import ParquetTarget
-
-    return ParquetTarget(url)
-
-
-def open_pool(url: str) -> Pool:
-    """The pool of a URL, to read from; as `open_target`."""
-    if _is_postgres(url):
-        from webots_mcp.plugins.pool.postgres.reading import PostgresPool
-
-        return PostgresPool(url)
-    from webots_mcp.plugins.pool.parquet.reading import ParquetPool
-
-    return ParquetPool(url)
-
-
-def pause_of(url: str) -> float:
-    """How long to wait between two looks at a recording: of small files a pool has soon many."""
-    return 2.0 if _is_postgres(url) else 60.0
-
-
 def redacted(url: str) -> str:
     """A URL as it may be shown: without a password and without whatever looks like a secret."""
     scheme, sign, rest = url.partition("://")
@@ -282,33 +240,13 @@ def _place_and_query(rest: str) -> tuple[str, str, str]:
     return (rest, "", "") if end < 0 else (rest[:end], "?", rest[end + 1 :])
 
 
-def _is_postgres(url: str) -> bool:
-    """Whether it is PostgreSQL rather than files.
+def require_no_secret(url: str) -> None:
+    """Refuse a URL with a password or a key in it.
 
     Raises:
-        InvalidInputError: It holds a secret, or is no URL and no folder.
+        InvalidInputError: It holds one.
     """
-    if not url.strip():
-        raise InvalidInputError("the URL is empty: give postgresql://HOST/DATABASE or a folder")
-    scheme, sign, rest = url.partition("://")
-    if sign:
-        _require_no_secret(url, rest)
-        return scheme.lower() in _POSTGRES
-    if _CONNECTION_STRING.search(url):
-        raise InvalidInputError(
-            "a connection string of PostgreSQL is no URL: write postgresql://USER@HOST/DATABASE, "
-            "and give the password in PGPASSWORD, ~/.pgpass or a service file"
-        )
-    if _NEARLY_A_URL.match(url):
-        raise InvalidInputError(
-            f"{url!r} is neither a URL nor a folder: write postgresql://HOST/DATABASE, "
-            "s3://BUCKET/PREFIX or ./FOLDER"
-        )
-    return False
-
-
-def _require_no_secret(url: str, rest: str) -> None:
-    place, _, query = _place_and_query(rest)
+    place, _, query = _place_and_query(url.partition("://")[2])
     user, _, _ = place.rpartition("@")
     named = [name for name, _ in parse_qsl(query) if _SECRET.search(name)]
     if ":" in user or named:

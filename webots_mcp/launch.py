@@ -22,9 +22,8 @@ from webots_mcp.setup.project import controllers_in, has_bridge
 from webots_mcp.store.console import ConsoleRows
 from webots_mcp.store.recording import Recording
 from webots_mcp.transactions import transaction
-from webots_mcp.webots.command_line import Start
-from webots_mcp.webots.launched import LaunchedWebots, Show
-from webots_mcp.webots.stream import Address, ConsoleLine, address_of
+from webots_mcp.webots.starting import LaunchedWebots, Show, Start
+from webots_mcp.webots.stream import WebotsAddress, WebotsLine, address_of
 
 _SHOWN_LINES: Final = 3
 _EXTERN: Final = "<extern>"
@@ -150,7 +149,7 @@ class Launch:
                 rows.write(connection, [said(line) for line in self.webots.lines])
 
     def _begun(self) -> list[SessionStart]:
-        asked = Address("127.0.0.1", self.start.port)
+        asked = WebotsAddress("127.0.0.1", self.start.port)
         address, pids = self.webots.address or asked, self.webots.pids
         found = starts_since(self._recording, self._before)
         return [each for each in found if each.pid in pids or address_of(each.instance) == address]
@@ -175,7 +174,7 @@ class Launch:
         return list(_without_record(self.world))
 
 
-def _is_of_trouble(line: ConsoleLine) -> bool:
+def _is_of_trouble(line: WebotsLine) -> bool:
     """What came on stderr; also what looks so, as `xvfb-run` may put both into one."""
     if line.stream == "stderr":
         return bool(line.text.strip()) and not line.text.startswith(_NO_NEWS)

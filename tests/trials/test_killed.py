@@ -20,7 +20,7 @@ from tests.processes.stopping import stop_between_writes
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.liveness import process_identity
 from webots_mcp.trials.simulators import Simulator
-from webots_mcp.webots.kept_program import CommandLine
+from webots_mcp.webots.starting import CommandLine
 
 Write = Callable[[str], Path]
 
@@ -38,7 +38,7 @@ time.sleep(600)
 RUNNER = """
 import os, pathlib, signal, sys, time
 from webots_mcp.trials.simulators import Simulator
-from webots_mcp.webots.kept_program import CommandLine
+from webots_mcp.webots.starting import CommandLine
 command = CommandLine([sys.executable, "simulator.py"], [])
 simulator = Simulator(command, pathlib.Path(), {})
 print(simulator.pid, flush=True)

@@ -15,9 +15,8 @@ import pytest
 
 from tests.trials.test_killed import wait_until
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots import keeper
-from webots_mcp.webots.command_line import Start, any_port, free_port
-from webots_mcp.webots.kept_program import CommandLine, KeptProgram
+from webots_mcp.webots import program_keeper
+from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, any_port, free_port
 
 needs_xvfb = pytest.mark.skipif(shutil.which("xvfb-run") is None, reason="xvfb-run is missing")
 
@@ -35,7 +34,7 @@ time.sleep(600)
 """
 OWNER = """
 import subprocess, sys, time
-from webots_mcp.webots.kept_program import CommandLine, KeptProgram
+from webots_mcp.webots.starting import CommandLine, KeptProgram
 command = CommandLine([sys.executable, "program.py"], ["xvfb-run", "--auto-servernum"])
 kept = KeptProgram(command, {}, subprocess.DEVNULL, subprocess.DEVNULL)
 kept.start()
@@ -133,5 +132,5 @@ def test_a_port_that_is_taken_is_left_out() -> None:
 
 
 def test_windows_ends_a_program_with_all_that_it_started() -> None:
-    assert keeper.windows_command(12, hard=False) == ["taskkill", "/T", "/PID", "12"]
-    assert keeper.windows_command(12, hard=True) == ["taskkill", "/T", "/F", "/PID", "12"]
+    assert program_keeper.windows_command(12, hard=False) == ["taskkill", "/T", "/PID", "12"]
+    assert program_keeper.windows_command(12, hard=True) == ["taskkill", "/T", "/F", "/PID", "12"]

@@ -14,7 +14,7 @@ from typing import get_args
 import pytest
 
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots.keyboard import KEYS, macos_command, press, windows_command
+from webots_mcp.webots.key_presses import KEYS, macos_command, press, windows_command
 from webots_mcp.webots.stream import Order
 
 NEEDED = ("Xvfb", "xdotool", "xev")

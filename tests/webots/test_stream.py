@@ -12,24 +12,25 @@ import pytest
 from tests.webots.server import WebotsServer
 from webots_mcp.contract import host_name
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots.frames import MAX_FRAME_BYTES, FrameTrimmer
 from webots_mcp.webots.stream import (
-    Address,
-    ConsoleLine,
+    MAX_FRAME_BYTES,
+    FrameTrimmer,
     Order,
     Stream,
+    WebotsAddress,
+    WebotsLine,
     address_of,
     begin_console,
     connected,
     console_lines,
     give_order,
     load_world,
-    no_obedience,
+    why_not_obeyed,
 )
 
 
-def at(server: WebotsServer) -> Address:
-    return Address("127.0.0.1", server.port)
+def at(server: WebotsServer) -> WebotsAddress:
+    return WebotsAddress("127.0.0.1", server.port)
 
 
 @pytest.mark.parametrize(
@@ -67,15 +68,15 @@ def test_without_stream_it_is_said_that_webots_hears_but_does_not_obey() -> None
         for order in get_args(Order):
             reply = give_order(at(server), order, 0.3)
             assert reply.heard is None
-            assert "was started without --stream" in no_obedience(at(server), reply)
-            assert "busy" not in no_obedience(at(server), reply)
+            assert "was started without --stream" in why_not_obeyed(at(server), reply)
+            assert "busy" not in why_not_obeyed(at(server), reply)
         assert server.mode == "pause"
 
 
 def test_an_answer_that_is_not_known_is_told_and_is_no_sign_of_a_start_without_stream() -> None:
     with WebotsServer(streams=True, manner="in other words") as server:
         reply = give_order(at(server), "pause", 5)
-        told = no_obedience(at(server), reply)
+        told = why_not_obeyed(at(server), reply)
         assert (reply.heard, server.mode) == (None, "pause")
         assert "answered 'state: changed', which does not tell whether it obeyed" in told
         assert "--stream" not in told
@@ -95,12 +96,14 @@ def test_a_busy_main_thread_is_one_of_the_reasons_and_nothing_takes_longer_than_
         began_s = time.monotonic()
         reply = give_order(at(server), "pause", 0.3)
         assert time.monotonic() - began_s < 0.3 + 2  # the machine may be slow, Webots is not asked
-        assert "its main thread is busy and may still obey later" in no_obedience(at(server), reply)
+        assert "its main thread is busy and may still obey later" in why_not_obeyed(
+            at(server), reply
+        )
 
 
 def test_who_listens_but_never_shakes_hands_is_told_apart_from_nobody() -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
-        address = Address("127.0.0.1", silent.getsockname()[1])
+        address = WebotsAddress("127.0.0.1", silent.getsockname()[1])
         with pytest.raises(CommandRefusedError, match=r"did not answer within 0\.1 s"):
             give_order(address, "pause", 0.1)
     with pytest.raises(CommandRefusedError, match="no Webots listens"):
@@ -109,7 +112,7 @@ def test_who_listens_but_never_shakes_hands_is_told_apart_from_nobody() -> None:
 
 def test_another_program_at_the_port_is_no_webots() -> None:
     with socket.create_server(("127.0.0.1", 0)) as door:
-        address = Address("127.0.0.1", door.getsockname()[1])
+        address = WebotsAddress("127.0.0.1", door.getsockname()[1])
 
         def answer() -> None:
             with door.accept()[0] as client:
@@ -169,15 +172,15 @@ def test_the_console_is_told_without_stream_from_its_first_line_on() -> None:
         with connected(at(server), 5) as stream:
             begin_console(stream)
             assert _next_lines(stream) == [
-                ConsoleLine("stdout", "INFO: rover: Starting controller: python3 -u rover.py"),
-                ConsoleLine("stderr", "Traceback"),
-                ConsoleLine("stderr", "  in loop"),
+                WebotsLine("stdout", "INFO: rover: Starting controller: python3 -u rover.py"),
+                WebotsLine("stderr", "Traceback"),
+                WebotsLine("stderr", "  in loop"),
             ]
             server.log("stdout", "later\n")
-            assert _next_lines(stream) == [ConsoleLine("stdout", "later")]
+            assert _next_lines(stream) == [WebotsLine("stdout", "later")]
 
 
-def _next_lines(stream: Stream) -> list[ConsoleLine]:
+def _next_lines(stream: Stream) -> list[WebotsLine]:
     message = stream.receive(time.monotonic() + 20)
     assert message is not None
     return list(console_lines(message.text))
@@ -187,16 +190,16 @@ def test_what_is_no_console_is_none() -> None:
     assert list(console_lines('application/json:{"time":12}\nstdout:no')) == []
     assert list(console_lines("paused by client")) == []
     assert list(console_lines("stdout:a:b\n\nstderr:")) == [
-        ConsoleLine("stdout", "a:b"),
+        WebotsLine("stdout", "a:b"),
     ]
     assert list(console_lines("stderr:two\nlines")) == [
-        ConsoleLine("stderr", "two"),
-        ConsoleLine("stderr", "lines"),
+        WebotsLine("stderr", "two"),
+        WebotsLine("stderr", "lines"),
     ]
 
 
 def test_a_session_tells_where_its_webots_listens() -> None:
-    assert address_of(f"{host_name()}:1234") == Address("127.0.0.1", 1234)
-    assert address_of("192.168.1.5:1235") == Address("192.168.1.5", 1235)
+    assert address_of(f"{host_name()}:1234") == WebotsAddress("127.0.0.1", 1234)
+    assert address_of("192.168.1.5:1235") == WebotsAddress("192.168.1.5", 1235)
     for unknown in (f"{host_name()} process 12", f"{host_name()}:/tmp/x", "a:0", "a:99999", ""):
         assert address_of(unknown) is None

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from webots_mcp.launch import Launch, SessionStart
     from webots_mcp.store.recording import Recording
-    from webots_mcp.webots.stream import ConsoleLine
+    from webots_mcp.webots.stream import WebotsLine
 
 _LOOK_EVERY_S: Final = 0.2
 _PORTS: Final = range(1, 1 << 16)
@@ -55,7 +55,7 @@ def launch(arguments: argparse.Namespace) -> int:
     """
     from webots_mcp.contract import DATA_DIR_VARIABLE
     from webots_mcp.launch import Launch, require_world
-    from webots_mcp.webots.command_line import Start, free_port
+    from webots_mcp.webots.starting import Start, free_port
 
     world, project = require_world(arguments.world)
     recording = _recording(arguments, project)
@@ -94,7 +94,7 @@ def _follow(launched: Launch, patience_s: float, console: _Console, recorder: _R
         console.require_reader()
         recorder.begin()
         time.sleep(_LOOK_EVERY_S)
-    webots.wait_for_last_words()
+    webots.wait_for_output()
     if first is None and _told(launched) is None:
         launched.record_last_words()
         _say(launched.silence())
@@ -117,7 +117,7 @@ class _Console:
     def __init__(self) -> None:
         self._broken: OSError | None = None
 
-    def show(self, line: ConsoleLine) -> None:
+    def show(self, line: WebotsLine) -> None:
         """In a thread of its own."""
         try:
             print(line.text, file=getattr(sys, line.stream), flush=True)

@@ -8,7 +8,7 @@ from typing import Final
 
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.store.console import Said
-from webots_mcp.webots.stream import ConsoleLine, Message, console_lines
+from webots_mcp.webots.stream import Message, WebotsLine, console_lines
 
 MOST_LINES_PER_S: Final = 500  # of wall time
 MOST_OLD_LINES: Final = 2_000  # of those that were said before somebody listened, the newest
@@ -49,7 +49,7 @@ class ConsoleLines:
         if lines and message.dropped_bytes:
             yield note(f"{message.dropped_bytes} bytes of the console that came at once")
 
-    def _that_waited(self, lines: list[ConsoleLine]) -> Iterator[Said]:
+    def _that_waited(self, lines: list[WebotsLine]) -> Iterator[Said]:
         newest = lines[-MOST_OLD_LINES:]
         told = f"the next {len(newest)} lines are from before somebody followed the console"
         if len(newest) < len(lines):
@@ -64,7 +64,7 @@ class ConsoleLines:
         if int(time.monotonic()) != self._second:
             yield from self._tell_left_out()
 
-    def _within_limit(self, line: ConsoleLine) -> Iterator[Said]:
+    def _within_limit(self, line: WebotsLine) -> Iterator[Said]:
         second = int(time.monotonic())
         if second != self._second:
             yield from self._tell_left_out()
@@ -82,7 +82,7 @@ class ConsoleLines:
             self._left_out = 0
 
 
-def said(line: ConsoleLine) -> Said:
+def said(line: WebotsLine) -> Said:
     """A line as a row, now: who said it, and how grave it is."""
     # What a terminal shows of a line that was written over, as by a progress bar.
     text = line.text.rstrip("\r").rpartition("\r")[2].replace("\0", "�")

@@ -19,7 +19,7 @@ from webots_mcp.server.dispatch import Dispatcher
 from webots_mcp.server.launcher import project_of
 from webots_mcp.server.worlds import WorldRequest
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots.command_line import Mode, Start, free_port
+from webots_mcp.webots.starting import Mode, Start, free_port
 
 _STARTING_S: Final = 60.0  # Webots downloads what it has not cached
 _WAIT_S: Final = 30.0

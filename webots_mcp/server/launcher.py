@@ -11,8 +11,8 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.launch import Launch
 from webots_mcp.server.trial_worker import TrialWorkers
 from webots_mcp.store.recording import Recording
-from webots_mcp.webots.command_line import Start
-from webots_mcp.webots.stream import ConsoleLine
+from webots_mcp.webots.starting import Start
+from webots_mcp.webots.stream import WebotsLine
 
 
 class Launcher:
@@ -91,5 +91,5 @@ def project_of(recording: Recording) -> Path:
     return project.resolve()
 
 
-def _overhear(line: ConsoleLine) -> None:
+def _overhear(line: WebotsLine) -> None:
     """Its newest lines are kept by `LaunchedWebots`."""

@@ -30,17 +30,17 @@ from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.sessions import Session
 from webots_mcp.store.status import find_holder
-from webots_mcp.webots import keyboard
 from webots_mcp.webots.instances import Instance, instance_at, instances
+from webots_mcp.webots.key_presses import KEYS, press
 from webots_mcp.webots.stream import (
     ANSWER_S,
     RESTARTING,
-    Address,
     Order,
     Reply,
+    WebotsAddress,
     address_of,
     give_order,
-    no_obedience,
+    why_not_obeyed,
 )
 
 _POLL_S: Final = 0.05
@@ -79,7 +79,7 @@ class Situation:
     robot: str | None
     can_command: bool
     silent: str | None
-    address: Address | None
+    address: WebotsAddress | None
     before: Moment
     observer: str | None = None
     is_there: bool = False
@@ -124,7 +124,7 @@ class Attempt(Request):
 
     async def _look_around(self) -> Situation:
         found = await to_thread.run_sync(look_around, self.recording, self.robot, self.order)
-        named = None if self.port is None else Address("127.0.0.1", self.port)
+        named = None if self.port is None else WebotsAddress("127.0.0.1", self.port)
         if named is None or (found.is_there and found.address == named):
             return found
         why = f"no controller that lives records from the Webots at port {self.port}"
@@ -188,7 +188,7 @@ class Attempt(Request):
             return None
         return await self._answered(situation, "websocket", seen)
 
-    async def _give(self, address: Address) -> tuple[Reply, int]:
+    async def _give(self, address: WebotsAddress) -> tuple[Reply, int]:
         """Once, or as many steps as are asked for; the last reply, and how many were heard."""
         reply, made = Reply(None, is_alive=False), 0
         while made < self._wanted and (made == 0 or self._left_s > LEAST_S):
@@ -224,7 +224,7 @@ class Attempt(Request):
             return None
         try:
             pid = await to_thread.run_sync(_window_owner, self.recording, situation)
-            await to_thread.run_sync(keyboard.press, self.order, pid)
+            await to_thread.run_sync(press, self.order, pid)
         except CommandRefusedError as error:
             self.tried["keyboard"] = str(error)
             return None
@@ -232,7 +232,7 @@ class Attempt(Request):
         if seen is not None:
             return await self._answered(situation, "keyboard", seen)
         self.tried["keyboard"] = (
-            f"{keyboard.KEYS[self.order].spoken} was sent, and nothing in the recording shows that "
+            f"{KEYS[self.order].spoken} was sent, and nothing in the recording shows that "
             "Webots obeyed: look at its window"
         )
         return None
@@ -358,7 +358,7 @@ _SIGNS: Final[dict[Order, Callable[[Moment, View], str | None]]] = {
 }
 
 
-def why_no_word(address: Address, reply: Reply) -> str:
+def why_no_word(address: WebotsAddress, reply: Reply) -> str:
     """Why Webots said nothing to an order: how it was started shows it, where it runs here."""
     found = instance_at(address.port)
     if reply.is_alive and found is not None and found.address == address and found.streams:
@@ -366,10 +366,10 @@ def why_no_word(address: Address, reply: Reply) -> str:
             f"Webots at {address} was started with --stream and hears: it was asked, and may have "
             "obeyed, but neither its answer nor the recording shows it; webots_get_logs may"
         )
-    return no_obedience(address, reply)
+    return why_not_obeyed(address, reply)
 
 
-def webots_meant(recording: Recording, situation: Situation) -> Address:
+def webots_meant(recording: Recording, situation: Situation) -> WebotsAddress:
     """Where the Webots listens that is meant; where that is not known, the only one of ours.
 
     Raises:
@@ -414,7 +414,7 @@ def _only(ours: list[Instance], running: list[Instance]) -> Instance:
 
 def _no_way(order: Order, told: str) -> str:
     return (
-        f"no way to {order} the simulation works. {told}. Press {keyboard.KEYS[order].spoken} in "
+        f"no way to {order} the simulation works. {told}. Press {KEYS[order].spoken} in "
         "Webots, start Webots with --stream, or open the world with an observer in it (made by "
         "'webots-mcp init --observer WORLD'): both let it be steered without a controller"
     )

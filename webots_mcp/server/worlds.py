@@ -18,7 +18,7 @@ from webots_mcp.server.launcher import Launcher
 from webots_mcp.server.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
 from webots_mcp.server.routes import Situation, look_around, webots_meant, why_no_word
 from webots_mcp.webots.instances import instance_at
-from webots_mcp.webots.stream import ANSWER_S, Address, address_of, load_world
+from webots_mcp.webots.stream import ANSWER_S, WebotsAddress, address_of, load_world
 
 _POLL_S: Final = 0.1
 _GONE_S: Final = 5.0  # from the end of its controllers to that of Webots
@@ -135,7 +135,7 @@ class WorldRequest(Request):
             ) from error
         return f"Webots said {reply.heard!r}"
 
-    def _require_beside(self, situation: Situation, address: Address, world: Path) -> None:
+    def _require_beside(self, situation: Situation, address: WebotsAddress, world: Path) -> None:
         """Webots looks for it in the folder of the present world, and there alone."""
         present = self._present_world(situation, address)
         if present is None or present.parent != world.parent:
@@ -144,7 +144,7 @@ class WorldRequest(Request):
                 f"Webots opens only worlds of the folder of the present one, {folder}"
             )
 
-    def _present_world(self, situation: Situation, address: Address) -> Path | None:
+    def _present_world(self, situation: Situation, address: WebotsAddress) -> Path | None:
         if situation.robot is not None:
             with self.recording.view(situation.robot) as view:
                 known = view.run.world if view.run else None
@@ -155,7 +155,7 @@ class WorldRequest(Request):
             known = found.world if found is not None and found.address == address else None
         return Path(known).resolve() if known else None
 
-    def _address(self, situation: Situation) -> Address:
+    def _address(self, situation: Situation) -> WebotsAddress:
         """Of the robot's Webots, else of that which this server has started, else of the only one.
 
         Raises:
@@ -194,7 +194,7 @@ class WorldRequest(Request):
                 return found
             await anyio.sleep(_POLL_S)
 
-    async def _gone(self, address: Address | None) -> str:
+    async def _gone(self, address: WebotsAddress | None) -> str:
         """What shows that Webots has ended."""
         if address is None:
             return "its controller has ended"

@@ -38,7 +38,7 @@ from webots_mcp.store.trials import (
 )
 from webots_mcp.trials.plan import Plan, WorldPlan
 from webots_mcp.trials.running import Attempt, Simulators, StoppedError, recorded_result
-from webots_mcp.webots.kept_program import end_left_over
+from webots_mcp.webots.starting import end_left_over
 
 FOLDER: Final = "trials"
 _MOST_THREADS: Final = 1000  # each waits for one trial

@@ -27,7 +27,7 @@ from webots_mcp.store.window import Window
 from webots_mcp.trials.plan import Plan, WorldPlan
 from webots_mcp.trials.simulators import Simulator
 from webots_mcp.trials.watching import End, Watch
-from webots_mcp.webots.kept_program import CommandLine
+from webots_mcp.webots.starting import CommandLine
 
 _LOOK_EVERY_S: Final = 0.05
 

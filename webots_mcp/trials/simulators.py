@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots.command_line import Start, any_port
-from webots_mcp.webots.kept_program import CommandLine, KeptProgram
+from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, any_port
 
 CONSOLE: Final = "simulator.log"
 

@@ -94,15 +94,16 @@ def _at(home: Path, found_by: str, platform: str) -> Iterator[Installation]:
     """The installation in a folder; nothing where no program is there."""
     program = _program(home, "webots", platform)
     if program is not None:
+        libraries = _LIBRARIES.get(platform, ("lib",))
+        python_apis = [home / library / "controller/python" for library in libraries]
         yield Installation(
             home,
             found_by,
             program,
             _program(home, "webots-controller", platform),
-            _first(home / library / "controller/python" for library in _places(_LIBRARIES, "lib",
-                                                                               platform)),
+            next((folder for folder in python_apis if folder.is_dir()), None),
             _version(home, platform),
-        )  # fmt: skip
+        )
 
 
 def _of_program(program: Path, platform: str) -> Installation:
@@ -129,7 +130,7 @@ def _program(home: Path, name: str, platform: str) -> Path | None:
 
 
 def _version(home: Path, platform: str) -> str | None:
-    for folder in _places(_RESOURCES, "resources", platform):
+    for folder in _RESOURCES.get(platform, ("resources",)):
         try:
             text = (home / folder / "version.txt").read_text("utf-8", "replace")
         except OSError:
@@ -137,11 +138,3 @@ def _version(home: Path, platform: str) -> str | None:
         found = _VERSION.search(text)
         return found.group() if found else text.strip() or None
     return None
-
-
-def _places(by_platform: dict[str, tuple[str, ...]], usual: str, platform: str) -> tuple[str, ...]:
-    return by_platform.get(platform, (usual,))
-
-
-def _first(folders: Iterator[Path]) -> Path | None:
-    return next((folder for folder in folders if folder.is_dir()), None)

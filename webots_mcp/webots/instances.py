@@ -8,7 +8,7 @@ from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.contract import DATA_DIR_VARIABLE, host_name
-from webots_mcp.webots.stream import Address
+from webots_mcp.webots.stream import WebotsAddress
 
 if TYPE_CHECKING:
     import psutil
@@ -74,9 +74,9 @@ class Instance:
             return False
 
     @property
-    def address(self) -> Address:
+    def address(self) -> WebotsAddress:
         """Where to speak to it."""
-        return Address("127.0.0.1", self.port)
+        return WebotsAddress("127.0.0.1", self.port)
 
 
 def instances() -> list[Instance]:

@@ -1,7 +1,8 @@
 """A client of Webots' own WebSocket, which listens at the port of `--port` in every Webots.
 
-It obeys orders only where Webots was started with `--stream`; the console it tells to anybody. It
-never sends the bare words `w3d` and `x3d`, which pause the simulation at its next step.
+Webots carries out orders only where it was started with `--stream`; its console it sends to every
+client. This module never sends the bare words `w3d` and `x3d`, which pause the simulation at its
+next step.
 """
 
 from __future__ import annotations
@@ -15,18 +16,20 @@ from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple
 
 from webots_mcp.contract import host_name
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.webots.frames import MAX_FRAME_BYTES, FrameTrimmer
 
 if TYPE_CHECKING:
     from websockets.frames import Frame
 
 Order = Literal["pause", "resume", "fast", "step", "reset", "reload"]
 
+MAX_FRAME_BYTES: Final = 4 << 20  # Qt, which Webots is built with, cuts messages into 512 kB
 ANSWER_S: Final = 1.0  # Webots answers at once, or it does not obey
 _CLOSING_S: Final = 0.2
 _CHUNK_BYTES: Final = 1 << 16
 _HEAD_END: Final = b"\r\n\r\n"
 _LONGEST_HEAD_BYTES: Final = 1 << 16
+_LENGTH: Final = 0x7F  # of the second byte; 126 and 127 say that the length follows
+_LENGTH_BYTES: Final = {126: 2, 127: 8}
 # A robot of this name need not exist: asking for a window begins the logs for this client.
 _BEGIN_CONSOLE: Final = "robot:" + json.dumps(
     {"name": "webots-mcp", "message": "init robot window"}, separators=(",", ":")
@@ -46,7 +49,7 @@ _LONGEST_OTHER: Final = 60
 RESTARTING: Final = ("reset", "reload")  # may be answered to others, or much later
 
 
-class Address(NamedTuple):
+class WebotsAddress(NamedTuple):
     """Where a Webots listens."""
 
     host: str
@@ -68,7 +71,7 @@ class Message(NamedTuple):
     dropped_bytes: int = 0
 
 
-class ConsoleLine(NamedTuple):
+class WebotsLine(NamedTuple):
     """A line of Webots' console, of `stdout` or `stderr`."""
 
     stream: str
@@ -89,18 +92,67 @@ class Reply(NamedTuple):
     other: str | None = None
 
 
-def address_of(instance: str) -> Address | None:
+def address_of(instance: str) -> WebotsAddress | None:
     """Where the Webots of a session listens, from its `instance`; None where that is not told."""
     host, _, port = instance.rpartition(":")
     if not (host and port.isascii() and port.isdecimal() and 0 < int(port) < 1 << 16):
         return None
-    return Address("127.0.0.1" if host == host_name() else host, int(port))
+    return WebotsAddress("127.0.0.1" if host == host_name() else host, int(port))
+
+
+class FrameTrimmer:
+    """Shortens WebSocket frames that are too long while they are read (RFC 6455, section 5.2).
+
+    The scene of a large world is one message of hundreds of megabytes, and every client gets those
+    that another has asked for. Libraries either keep such a frame whole or hang up. Of each frame
+    the first bytes are passed on.
+    """
+
+    def __init__(self, limit_bytes: int = MAX_FRAME_BYTES) -> None:
+        self.trimmed_bytes = 0
+        self._limit = limit_bytes
+        self._header = bytearray()
+        self._pass = self._drop = 0
+
+    def feed(self, data: bytes) -> bytes:
+        """What is left of the next bytes from the server."""
+        left, at = bytearray(), 0
+        while at < len(data):
+            if self._pass:
+                part = data[at : at + self._pass]
+                left += part
+                self._pass -= len(part)
+            elif self._drop:
+                part = data[at : at + self._drop]
+                self._drop -= len(part)
+            else:
+                part = data[at : at + 1]
+                self._header += part
+                left += self._begin() if self._is_complete() else b""
+            at += len(part)
+        return bytes(left)
+
+    def _is_complete(self) -> bool:
+        if len(self._header) < 2:
+            return False
+        return len(self._header) == 2 + _LENGTH_BYTES.get(self._header[1] & _LENGTH, 0)
+
+    def _begin(self) -> bytes:
+        """The header of a frame that is no longer than the limit."""
+        header, self._header = bytes(self._header), bytearray()
+        length = int.from_bytes(header[2:], "big") if len(header) > 2 else header[1] & _LENGTH
+        if length <= self._limit:
+            self._pass = length
+            return header
+        self._pass, self._drop = self._limit, length - self._limit
+        self.trimmed_bytes += self._drop
+        return bytes((header[0], header[1] | _LENGTH)) + self._limit.to_bytes(8, "big")
 
 
 class Stream:
     """A connection to Webots, in this thread alone. Times are those of `time.monotonic`."""
 
-    def __init__(self, address: Address, until_s: float) -> None:
+    def __init__(self, address: WebotsAddress, until_s: float) -> None:
         from websockets.client import ClientProtocol
         from websockets.uri import parse_uri
 
@@ -156,10 +208,10 @@ class Stream:
         return self._dropped_bytes + self._trimmer.trimmed_bytes
 
     def close(self) -> None:
-        """Say goodbye, wait a moment for the same, and close the socket."""
+        """Send the closing frame, wait a moment for that of Webots, and close the socket."""
         until_s = time.monotonic() + _CLOSING_S
         try:
-            self._say_goodbye(until_s)
+            self._shake_hands_to_close(until_s)
         finally:
             self._socket.close()
 
@@ -169,7 +221,7 @@ class Stream:
 
         return self._protocol.state is OPEN
 
-    def _say_goodbye(self, until_s: float) -> None:
+    def _shake_hands_to_close(self, until_s: float) -> None:
         with suppress(OSError, CommandRefusedError):
             if self._is_open:  # else Webots was first
                 self._protocol.send_close(1000)
@@ -256,7 +308,7 @@ class Stream:
 
 
 @contextmanager
-def connected(address: Address, timeout_s: float) -> Generator[Stream]:
+def connected(address: WebotsAddress, timeout_s: float) -> Generator[Stream]:
     """A connection to Webots.
 
     Raises:
@@ -282,8 +334,8 @@ def connected(address: Address, timeout_s: float) -> Generator[Stream]:
         stream.close()
 
 
-def give_order(address: Address, order: Order, timeout_s: float = ANSWER_S) -> Reply:
-    """Have Webots do something, and hear what it says to it.
+def give_order(address: WebotsAddress, order: Order, timeout_s: float = ANSWER_S) -> Reply:
+    """Send Webots an order, and return its reply.
 
     Raises:
         CommandRefusedError: There is no Webots to speak to.
@@ -292,7 +344,7 @@ def give_order(address: Address, order: Order, timeout_s: float = ANSWER_S) -> R
     return _give(address, words, answers, timeout_s, late=order in RESTARTING)
 
 
-def load_world(address: Address, file_name: str, timeout_s: float = ANSWER_S) -> Reply:
+def load_world(address: WebotsAddress, file_name: str, timeout_s: float = ANSWER_S) -> Reply:
     """Have Webots open another world of the folder of the present one.
 
     Raises:
@@ -302,7 +354,7 @@ def load_world(address: Address, file_name: str, timeout_s: float = ANSWER_S) ->
 
 
 def _give(
-    address: Address, words: str, answers: tuple[str, ...], timeout_s: float, *, late: bool
+    address: WebotsAddress, words: str, answers: tuple[str, ...], timeout_s: float, *, late: bool
 ) -> Reply:
     until_s = time.monotonic() + timeout_s
     is_alive, other = False, None
@@ -322,8 +374,8 @@ def _give(
     return Reply(None, is_alive, other)
 
 
-def no_obedience(address: Address, reply: Reply) -> str:
-    """Why Webots said nothing to an order, as far as that can be told."""
+def why_not_obeyed(address: WebotsAddress, reply: Reply) -> str:
+    """Why Webots did not answer an order, as far as that is known."""
     if reply.other is not None:
         return (
             f"Webots at {address} answered {reply.other!r}, which does not tell whether it obeyed: "
@@ -341,11 +393,11 @@ def no_obedience(address: Address, reply: Reply) -> str:
 
 
 def begin_console(stream: Stream) -> None:
-    """Have Webots tell its console to all its clients, from its first line that nobody has had."""
+    """Have Webots send its console to all its clients, from the first line not sent yet."""
     stream.send(_BEGIN_CONSOLE)
 
 
-def console_lines(text: str) -> Iterator[ConsoleLine]:
+def console_lines(text: str) -> Iterator[WebotsLine]:
     """The lines of a message; each names its stream, those that go on with it do not.
 
     Empty ones are left out: where a line of a controller ends, there is one.
@@ -358,7 +410,7 @@ def console_lines(text: str) -> Iterator[ConsoleLine]:
         if kind is None:  # it is about something else
             return
         if line.strip():
-            yield ConsoleLine(kind, line)
+            yield WebotsLine(kind, line)
 
 
 def _left_s(until_s: float) -> float:

@@ -1,4 +1,4 @@
-"""Runs a simulator for as long as whoever started it lives: `python keeper.py COMMAND...`.
+"""Runs a simulator for as long as whoever started it lives: `python program_keeper.py COMMAND...`.
 
 It starts the command when it reads a byte from its standard input, and ends it when that input
 ends: it is closed by who holds the other end, or with him, however he dies. It runs in a Python of

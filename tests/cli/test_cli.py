@@ -19,7 +19,7 @@ from tests.recordings.rows import Recorded, RecordedRobot
 from webots_mcp.cli import COMMANDS, main
 from webots_mcp.contract import SCHEMA_VERSION
 from webots_mcp.queue import CommandQueue
-from webots_mcp.store.follow import Follower
+from webots_mcp.store.logs import Follower
 from webots_mcp.store.migrate import upgrade
 
 

@@ -150,7 +150,7 @@ def test_what_a_person_has_added_is_left_alone(
         assert "table state" in described
         assert not {"endless", "mine", "diary"} & set(described.split())
     assert main(["sql", "SELECT i FROM endless LIMIT 1", "--json", "--database", str(file)]) == 0
-    assert main(["export", "--database", str(file)]) == 0  # past unsound rows, by views of ours
+    assert main(["export", "--database", str(file)]) == 0  # past invalid rows, by views of ours
     assert "1" in capsys.readouterr().out
 
 

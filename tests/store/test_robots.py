@@ -14,7 +14,7 @@ from webots_mcp.errors import (
     UnknownRunError,
 )
 from webots_mcp.store.robots import list_robots, resolve_robot
-from webots_mcp.store.runs import count_runs, current_run, fetch_run, runs_of
+from webots_mcp.store.run_rows import count_runs, current_run, fetch_run, runs_of
 
 
 def ended(recorded: Recorded, name: str) -> None:

@@ -11,16 +11,9 @@ from hypothesis import strategies as st
 from tests.recordings.rows import Recorded
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.errors import InvalidInputError, InvalidRangeError
-from webots_mcp.store.logs import LogFilter, count_lines, newest_lines
+from webots_mcp.store.logs import LogFilter, Window, count_lines, newest_lines, window_of
 from webots_mcp.store.reading.ranges import Scope
-from webots_mcp.store.states import (
-    State,
-    newest_state,
-    real_time_factor,
-    select,
-    states_of,
-)
-from webots_mcp.store.window import Window, window_of
+from webots_mcp.store.run_rows import State, newest_state, real_time_factor, select, states_of
 
 
 def recorded_state(published: dict[str, Any]) -> State:

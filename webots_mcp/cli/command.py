@@ -55,7 +55,7 @@ class Command(NamedTuple):
 _Run = TypeVar("_Run", bound=Callable[[argparse.Namespace], int | None])
 COMMANDS: Final[list[Command]] = []
 _SUM_UP_S: Final = 300.0  # a million rows of 40 values take 100 s
-# Not owed to a value in a row: asking past unsound rows would not help.
+# Not owed to a value in a row: asking past invalid rows would not help.
 _OF_NO_VALUE: Final = (WebotsMCPError, OSError, ImportError)
 
 
@@ -125,22 +125,22 @@ def question(
 
 
 def past_wrong_values(run: Callable[[], None]) -> None:
-    """Run what only reads; where it fails over a value, again past the rows that are not sound."""
+    """Run what only reads; where it fails over a value, again past invalid rows."""
     try:
         return run()
     except Exception as error:
         if isinstance(error, _OF_NO_VALUE) and not isinstance(error, MalformedRowError):
             raise
-    past_unsound_rows(run)
+    past_invalid_rows(run)
 
 
-def past_unsound_rows(run: Callable[[], None]) -> None:
-    """Run what only reads past the rows that are not sound, which are named on stderr."""
-    from webots_mcp.store import sound
+def past_invalid_rows(run: Callable[[], None]) -> None:
+    """Run what only reads past invalid rows, which are named on stderr."""
+    from webots_mcp.store import invalid_rows
 
-    with sound.past_unsound_rows() as unsound:
+    with invalid_rows.past_invalid_rows() as invalid:
         run()
-    for said in unsound.described():
+    for said in invalid.described():
         print(f"webots-mcp: left out: {said}", file=sys.stderr)
 
 

@@ -107,10 +107,9 @@ def logs(arguments: argparse.Namespace) -> None:
 def _filter_of(connection: sqlite3.Connection, arguments: argparse.Namespace) -> LogFilter:
     """What is asked for; before the first run only what the console has said."""
     from webots_mcp.errors import NothingRecordedError
-    from webots_mcp.store.logs import LogFilter, waiting_lines
+    from webots_mcp.store.logs import LogFilter, Window, waiting_lines, window_of
     from webots_mcp.store.reading.ranges import Scope
     from webots_mcp.store.recording import look
-    from webots_mcp.store.window import Window, window_of
 
     asked = ("robot", "run_id", "last_s", "start_s", "end_s")
     scope = Scope(**{name: getattr(arguments, name) for name in asked})

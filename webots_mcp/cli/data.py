@@ -17,7 +17,7 @@ from webots_mcp.cli.command import (
     argument,
     command,
     open_recording,
-    past_unsound_rows,
+    past_invalid_rows,
     past_wrong_values,
     reading,
     row_id,
@@ -96,7 +96,7 @@ def export(arguments: argparse.Namespace) -> None:
         print_notes(wanted.notes, sys.stderr)  # stdout may be the table
 
     # What went to stdout cannot be taken back: there each row is looked at first.
-    past_unsound_rows(run) if file is None else past_wrong_values(run)
+    past_invalid_rows(run) if file is None else past_wrong_values(run)
 
 
 def _export_whole(

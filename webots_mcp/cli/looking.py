@@ -25,7 +25,7 @@ from webots_mcp.cli.tables import printable
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.store.follow import Line
+    from webots_mcp.store.logs import Line
     from webots_mcp.store.recording import View
 
 
@@ -70,7 +70,7 @@ def tail(arguments: argparse.Namespace) -> None:
     Of the states that came since the last look the newest of each robot is shown. Where nothing
     can be written, nothing can come, and it ends after the last lines.
     """
-    from webots_mcp.store.follow import Follower
+    from webots_mcp.store.logs import Follower
     from webots_mcp.store.recording import storage
     from webots_mcp.store.robots import resolve_robot
 
@@ -103,8 +103,8 @@ def wait(seconds: float) -> None:
 
 
 def _facts(view: View) -> dict[str, Any]:
-    from webots_mcp.store.runs import count_runs
-    from webots_mcp.store.waiting import waiting
+    from webots_mcp.store.run_rows import count_runs
+    from webots_mcp.store.status import rows_waiting
 
     session = view.session
     return {
@@ -113,7 +113,7 @@ def _facts(view: View) -> dict[str, Any]:
         "live": view.robot.live,
         "runs": count_runs(view.connection, view.robot.id),
         "rows": view.run.rows if view.run else 0,
-        **waiting(view.connection, session),
+        **rows_waiting(view.connection, session),
         "rows_dropped": session.rows_dropped if session else 0,
         "last_error": session.last_error if session else None,
         "controller": session.controller if session else None,

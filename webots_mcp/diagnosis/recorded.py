@@ -12,8 +12,7 @@ from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldEr
 from webots_mcp.schema import schema_version
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
 from webots_mcp.store.sessions import Session, fetch_session
-from webots_mcp.store.status import handler_at_work
-from webots_mcp.store.waiting import waiting
+from webots_mcp.store.status import handler_at_work, rows_waiting
 from webots_mcp.waiting_file import count_rows, waiting_paths
 
 _GET_COMMAND: Final = (
@@ -107,7 +106,7 @@ def rows(subject: Subject) -> Finding:
 def _lost(view: View) -> Finding:
     session = view.session
     assert session is not None
-    told = waiting(view.connection, session) if view.robot.live else {"rows_waiting": 0}
+    told = rows_waiting(view.connection, session) if view.robot.live else {"rows_waiting": 0}
     name, error = view.robot.name, session.last_error
     why = f" ({error[:200]})" if error else ""
     if session.rows_dropped:
@@ -130,7 +129,7 @@ def _left_waiting(subject: Subject) -> list[Finding]:
     """Files that no living controller will empty."""
     if subject.file is None:
         return []
-    waiting_in = [waiting(v.connection, v.session).get("waiting_in") for v in subject.live]
+    waiting_in = [rows_waiting(v.connection, v.session).get("waiting_in") for v in subject.live]
     left = [path for path in waiting_paths(subject.file) if path.name not in waiting_in]
     return [
         Finding(

@@ -28,9 +28,9 @@ from webots_mcp.errors import (
 from webots_mcp.questions.answers import Answer, ShownPicture
 from webots_mcp.questions.argument_types import SCOPE
 from webots_mcp.questions.shortening import compact_json
+from webots_mcp.store.invalid_rows import past_invalid_rows
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording
-from webots_mcp.store.sound import past_unsound_rows
 
 if TYPE_CHECKING:
     from webots_mcp.server.launcher import Companions
@@ -177,17 +177,17 @@ class Question:
             except Exception as error:
                 if isinstance(error, WebotsMCPError) and not isinstance(error, MalformedRowError):
                     raise
-        with past_unsound_rows() as unsound:
+        with past_invalid_rows() as invalid:
             try:
                 reply = await self._call(recording, arguments, caller)
             except (NoDatabaseError, NothingRecordedError) as error:
                 if not self.effect.reads:
                     raise
-                return self._empty(error, unsound.described())
+                return self._empty(error, invalid.described())
             except WebotsMCPError as error:
-                error.left_out = tuple(unsound.described())
+                error.left_out = tuple(invalid.described())
                 raise
-        return _with_left_out(reply, unsound.described())
+        return _with_left_out(reply, invalid.described())
 
     async def _call(
         self, recording: Recording, arguments: Mapping[str, Any], caller: Caller

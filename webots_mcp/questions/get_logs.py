@@ -20,14 +20,15 @@ from webots_mcp.store.logs import (
     OF_CONSOLE,
     LogFilter,
     LogLine,
+    Window,
     count_lines,
     newest_lines,
     waiting_lines,
+    window_of,
 )
 from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.robots import list_robots
-from webots_mcp.store.window import Window, window_of
 
 LOG_COLUMNS: Final = ("sim_time_s", "level", "message", "run_id")
 _LONGEST_MESSAGE: Final = 500

@@ -19,12 +19,11 @@ from webots_mcp.questions.shortening import (
     shorten,
 )
 from webots_mcp.server.sensing import sensor_part, unnamed_devices
-from webots_mcp.store.events import newest_events
 from webots_mcp.store.reading.kept import newest_kept
 from webots_mcp.store.recording import Recording, View
+from webots_mcp.store.run_rows import State, newest_events, select
 from webots_mcp.store.sessions import fetch_session
-from webots_mcp.store.states import State, select
-from webots_mcp.store.waiting import waiting
+from webots_mcp.store.status import rows_waiting
 
 _PUBLISH: Final = (
     "nothing was recorded in this run yet: of the calls of bridge.publish({...}) in the "
@@ -201,7 +200,7 @@ def _recorder(view: View) -> dict[str, Any] | None:
     return {
         "rows_recorded": view.run.rows if view.run else 0,
         **({"kept_at_full_rate": kept} if (kept := _kept(view)) else {}),
-        **waiting(view.connection, session),
+        **rows_waiting(view.connection, session),
         "rows_dropped": session.rows_dropped,
         "last_error": error,
         "heartbeat_age_s": round(session.silent_s(view.now_s), 2),

@@ -11,14 +11,12 @@ from webots_mcp.questions.answers import RobotsAnswer, Table, WorldAnswer
 from webots_mcp.questions.argument_types import RobotName, RunId
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.shortening import cut_text, round_number
-from webots_mcp.store.observers import WorldSeen, world_seen
 from webots_mcp.store.recording import GETTING_STARTED, Recording, View, name_of, storage, view_of
 from webots_mcp.store.retention.limits import described, unheeded
 from webots_mcp.store.retention.usage import file_sizes
-from webots_mcp.store.robots import list_robots
-from webots_mcp.store.runs import Run, count_runs
+from webots_mcp.store.robots import WorldSeen, list_robots, world_seen
+from webots_mcp.store.run_rows import Run, count_runs, real_time_factor
 from webots_mcp.store.sessions import Session, companions, fetch_session
-from webots_mcp.store.states import real_time_factor
 
 _SHOWN_ROBOTS: Final = 50
 _SHOWN_IN_WORLD: Final = 40

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from webots_mcp.contract import KEPT_FRAME
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
-from webots_mcp.store.rows import columns_of
+from webots_mcp.store.run_rows import columns_of
 
 if TYPE_CHECKING:
     from PIL.Image import Image

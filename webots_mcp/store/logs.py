@@ -1,14 +1,16 @@
-"""Log lines of a run, or of all runs of a robot: by text, level and time."""
+"""Log lines of a run, or of all runs of a robot; and all that is recorded, as lines to follow."""
 
 from __future__ import annotations
 
+import math
 import sqlite3
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 from webots_mcp.contract import LOG_LEVELS, LogSource
-from webots_mcp.store.rows import columns_of
-from webots_mcp.store.window import Window
+from webots_mcp.store.reading.moments import moment_of
+from webots_mcp.store.reading.ranges import Scope
+from webots_mcp.store.run_rows import columns_of
 
 COUNT_LIMIT: Final = 10_000  # beyond it a count would cost more than it tells
 OF_CONSOLE: Final[tuple[LogSource, ...]] = ("console", "webots")
@@ -72,6 +74,71 @@ _WAITING: Final = (
     "SELECT id, NULL, NULL, wall_time_s, level, source, message, logger FROM console_line "
     f"WHERE {_SAYING} ORDER BY id DESC LIMIT :limit"
 )
+_LONGEST_FOLLOWED_TEXT: Final = 400  # of a state, log line or result; the database has it whole
+_MOST_FOLLOWED_LINES: Final = 500  # of one kind in one look
+
+_NEWS_OF_ROBOT: Final = (
+    "AND (:robot_id IS NULL OR r.id = :robot_id) ORDER BY {order} DESC LIMIT :limit"
+)
+_NEWS_ROW: Final = (
+    "SELECT t.id, t.wall_time_s, r.name, t.run_id, t.sim_time_s, {kind}, {text} FROM {table} t "
+    "JOIN run ON run.id = t.run_id JOIN robot r ON r.id = run.robot_id WHERE t.id > :after "
+)
+_NEWS_COMMAND: Final = (
+    "SELECT {cursor}, {wall}, r.name, NULL, {sim}, 'command', {text} FROM command t "
+    "JOIN robot r ON r.id = t.robot_id WHERE {cursor} > :after "
+)
+# Kind of news: which cursor it moves, and the rows after that cursor.
+_NEWS: Final[dict[str, str]] = {
+    "state": _NEWS_ROW.format(
+        table="state", kind="'state'", text=f"substr(t.data, 1, {_LONGEST_FOLLOWED_TEXT})"
+    )
+    + _NEWS_OF_ROBOT.format(order="t.id"),
+    "log": _NEWS_ROW.format(
+        table="log",
+        kind="t.level",
+        text=(
+            "iif(t.source IN ('console', 'webots'), t.source || ': ', '') || "
+            f"substr(t.message, 1, {_LONGEST_FOLLOWED_TEXT})"
+        ),
+    )
+    + _NEWS_OF_ROBOT.format(order="t.id"),
+    "event": _NEWS_ROW.format(
+        table="event",
+        kind="'event'",
+        text=f"concat_text(t.kind, t.name, substr(t.data, 1, {_LONGEST_FOLLOWED_TEXT}))",
+    )
+    + _NEWS_OF_ROBOT.format(order="t.id"),
+    "asked": _NEWS_COMMAND.format(
+        cursor="t.id",
+        wall="t.created_wall_time_s",
+        sim="NULL",
+        text=f"concat_text('#' || t.id, t.action, substr(t.params, 1, {_LONGEST_FOLLOWED_TEXT}))",
+    )
+    + _NEWS_OF_ROBOT.format(order="t.id"),
+    "settled": _NEWS_COMMAND.format(
+        cursor="t.finished_wall_time_s",
+        wall="t.finished_wall_time_s",
+        sim="t.finished_sim_time_s",
+        text=(
+            "concat_text('#' || t.id, t.action, t.status, "
+            f"substr(coalesce(t.error, t.result), 1, {_LONGEST_FOLLOWED_TEXT}))"
+        ),
+    )
+    + _NEWS_OF_ROBOT.format(order="t.finished_wall_time_s"),
+}
+
+
+class Window(NamedTuple):
+    """The part of a run whose log lines are asked for: from `start_s`, up to and without `end_s`.
+
+    Its bounds are simulation seconds, compared as those of the ranges of `store.reading.ranges`.
+    Unlike them it is not bounded by the state rows: the last lines of a controller often come after
+    its last state, and some controllers only log.
+    """
+
+    start_s: float
+    end_s: float
 
 
 @dataclass(frozen=True)
@@ -95,6 +162,19 @@ class LogFilter:
     before_id: int | None = None
     robot_id: int | None = None
     source: LogSource | None = None
+
+
+def window_of(scope: Scope, newest_s: float) -> Window:
+    """The window that was asked for in simulation time; without any bound the whole run.
+
+    Args:
+        scope: Its `last_s` counts back from the newest row, which is included.
+        newest_s: Simulation time of the newest row of the run.
+    """
+    if scope.last_s is not None:
+        return Window(moment_of(newest_s - scope.last_s), math.inf)
+    start_s = -math.inf if scope.start_s is None else moment_of(scope.start_s)
+    return Window(start_s, math.inf if scope.end_s is None else moment_of(scope.end_s))
 
 
 def newest_lines(connection: sqlite3.Connection, asked: LogFilter, limit: int) -> list[LogLine]:
@@ -136,3 +216,45 @@ def _values(asked: LogFilter) -> dict[str, object]:
         "before_id": asked.before_id,
         "source": asked.source,
     }
+
+
+class Line(NamedTuple):
+    """Something recorded. `kind` is state, event, command, or a log line's level."""
+
+    wall_time_s: float
+    robot: str
+    run_id: int | None
+    sim_time_s: float | None
+    kind: str
+    text: str
+
+
+class Follower:
+    """Reads what was recorded since it last looked.
+
+    Args:
+        connection: A reader connection.
+        robot_id: Only this robot; None for all.
+    """
+
+    def __init__(self, connection: sqlite3.Connection, robot_id: int | None = None) -> None:
+        connection.create_function("concat_text", -1, _joined)
+        self._connection = connection
+        self._robot_id = robot_id
+        self._cursors = dict.fromkeys(_NEWS, 0.0)
+
+    def look(self, limit: int = _MOST_FOLLOWED_LINES) -> list[Line]:
+        """The newest lines recorded since the last look, at most `limit`, oldest first."""
+        lines = [line for news in _NEWS for line in self._read(news, limit)]
+        return sorted(lines, key=lambda line: line.wall_time_s)[-limit:] if limit else []
+
+    def _read(self, news: str, limit: int) -> list[Line]:
+        values = {"after": self._cursors[news], "robot_id": self._robot_id, "limit": max(limit, 1)}
+        rows: list[Any] = self._connection.execute(_NEWS[news], values).fetchall()
+        if rows:
+            self._cursors[news] = rows[0][0]
+        return [Line(*row[1:]) for row in rows]
+
+
+def _joined(*parts: object) -> str:
+    return " ".join(str(part) for part in parts if part is not None)

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.parameter import Declaration, Value, require_known
-from webots_mcp.store.runs import Run
+from webots_mcp.store.run_rows import Run
 
 COLUMNS: Final = (
     "name", "value", "unit", "default", "low", "high", "choices", "next", "since_s", "set_by",

@@ -23,13 +23,12 @@ from webots_mcp.errors import (
 )
 from webots_mcp.queue import any_unfinished
 from webots_mcp.schema import create_schema, require_current, schema_version
+from webots_mcp.store.invalid_rows import shadow_if_asked
 from webots_mcp.store.reading.subject import Subject, choose, require_run
 from webots_mcp.store.retention.limits import Asked
 from webots_mcp.store.robots import Robot
-from webots_mcp.store.runs import Run, current_run
+from webots_mcp.store.run_rows import Run, State, current_run, newest_state
 from webots_mcp.store.sessions import Session
-from webots_mcp.store.sound import shadow_if_asked
-from webots_mcp.store.states import State, newest_state
 from webots_mcp.store.status import Status, judge, stopped_for
 from webots_mcp.transactions import (
     FAILURES,

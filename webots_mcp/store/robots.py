@@ -1,4 +1,4 @@
-"""Which robots were ever seen, which one is meant, and which are alive."""
+"""Which robots were ever seen, which one is meant, which are alive; and what an observer saw."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import difflib
 import json
 import sqlite3
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
-from webots_mcp.contract import OBSERVER
+from webots_mcp.contract import OBSERVER, WORLD_EVENT
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError, UnknownRobotError
+from webots_mcp.naming import SOLIDS, WORLD
+from webots_mcp.store.run_rows import Run, state_at
 from webots_mcp.store.sessions import Session, newest_session
 
 _ALL: Final = (
@@ -18,6 +20,18 @@ _ALL: Final = (
 )
 _NAME: Final = "SELECT name FROM robot WHERE id = ?"
 _SHOWN_NAMES: Final = 20
+_BESIDE: Final = (
+    "SELECT r.id, b.name FROM session s JOIN robot b ON b.id = s.robot_id "
+    "JOIN run r ON r.session_id = s.id JOIN session me ON me.id = :session "
+    f"WHERE b.kind = '{OBSERVER}' AND s.instance = me.instance "
+    "AND r.started_wall_time_s <= :last AND r.last_wall_time_s >= :first "
+    "ORDER BY r.id DESC LIMIT 1"
+)
+_SEEN: Final = (
+    "SELECT data FROM event WHERE run_id IN (SELECT id FROM run WHERE session_id = "
+    f"(SELECT session_id FROM run WHERE id = ?)) AND kind = '{WORLD_EVENT}' AND run_id <= ? "
+    "ORDER BY id DESC LIMIT 1"
+)
 
 
 @dataclass(frozen=True)
@@ -32,6 +46,21 @@ class Robot:
     last_seen_wall_time_s: float
     session: Session | None
     live: bool
+
+
+@dataclass(frozen=True)
+class WorldSeen:
+    """What an observer has seen of a world.
+
+    Attributes:
+        observer: Its name.
+        told: What there is: title, robots, solids.
+        places: Where each is, by the word that it has in signals; its newest of the run.
+    """
+
+    observer: str
+    told: dict[str, Any]
+    places: dict[str, dict[str, float | None]]
 
 
 def list_robots(connection: sqlite3.Connection, now_s: float) -> list[Robot]:
@@ -112,3 +141,39 @@ def _robot(
     live = session is not None and session.is_alive(now_s)
     known = json.loads(devices or "{}")
     return Robot(robot_id, name, kind, known, first_seen_s, last_seen_s, session, live)
+
+
+def live_observer(
+    connection: sqlite3.Connection, session: Session | None, now_s: float
+) -> Robot | None:
+    """The observer of a session's simulation; without a session the only one that lives."""
+    robots = [robot for robot in list_robots(connection, now_s) if robot.live]
+    found = [robot for robot in robots if robot.kind == OBSERVER and robot.session is not None]
+    if session is not None:
+        here = session.instance
+        found = [each for each in found if each.session and each.session.instance == here]
+    return found[0] if len(found) == 1 or (found and session is not None) else None
+
+
+def world_seen(connection: sqlite3.Connection, run: Run) -> WorldSeen | None:
+    """What an observer saw while that run lasted, last of all; None where none was there."""
+    values = {
+        "session": run.session_id,
+        "first": run.started_wall_time_s,
+        "last": run.last_wall_time_s,
+    }
+    row = connection.execute(_BESIDE, values).fetchone()
+    if row is None:
+        return None
+    run_id, observer = row
+    told = connection.execute(_SEEN, (run_id, run_id)).fetchone()
+    if told is None:
+        return None
+    return WorldSeen(observer, json.loads(told[0]), _places(connection, run_id, run))
+
+
+def _places(connection: sqlite3.Connection, run_id: int, run: Run) -> dict[str, Any]:
+    until_s = run.last_sim_time_s if run.ended_wall_time_s is not None else float("inf")
+    state = state_at(connection, run_id, until_s)
+    seen = state.value() if state else {}
+    return {**seen.get(WORLD, {}), **seen.get(SOLIDS, {})}

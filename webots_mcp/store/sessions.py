@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from webots_mcp.contract import HEARTBEAT_LATE_S, PAUSED, REMOTE_SILENCE_S, host_name
 from webots_mcp.liveness import process_alive
-from webots_mcp.store.rows import columns_of
+from webots_mcp.store.run_rows import columns_of
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRec
 from webots_mcp.liveness import process_alive, process_identity
 from webots_mcp.store.analysis.ranking import Best, Outcome, Ranking, rank
 from webots_mcp.store.leases import Lease, give_back, holder_of, take
-from webots_mcp.store.rows import columns_of
+from webots_mcp.store.run_rows import columns_of
 from webots_mcp.transactions import transaction
 
 _NEW_SET: Final = (

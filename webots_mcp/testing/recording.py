@@ -17,8 +17,7 @@ from webots_mcp.queue import CommandQueue, list_commands
 from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.detection.event import Event as FoundEvent
 from webots_mcp.store.detection.event import EventOptions
-from webots_mcp.store.events import Event, newest_events
-from webots_mcp.store.logs import LogFilter, LogLine, newest_lines
+from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import parameters_of
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.reading.deadline import Deadline
@@ -26,11 +25,9 @@ from webots_mcp.store.reading.ranges import Scope, find_range, whole_run
 from webots_mcp.store.reading.rows import read_columns
 from webots_mcp.store.reading.subject import Subject, find_subject
 from webots_mcp.store.rollup.rolling import roll
-from webots_mcp.store.runs import runs_of
+from webots_mcp.store.run_rows import Event, fetch_state, newest_events, runs_of, states_of
 from webots_mcp.store.signals.catalogue import resolve_signals
 from webots_mcp.store.signals.registry import Signal, registered
-from webots_mcp.store.states import fetch_state, states_of
-from webots_mcp.store.window import Window
 from webots_mcp.testing.commands import RecordedCommand
 from webots_mcp.testing.signals import RecordedSignal
 

@@ -17,13 +17,12 @@ from typing import Any, Final, Protocol
 
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, ENDED_BY, PARAMETERS_VARIABLE
 from webots_mcp.errors import ConditionFailedError, NoDatabaseError
-from webots_mcp.store.logs import LogFilter, newest_lines
+from webots_mcp.store.logs import LogFilter, Window, newest_lines
 from webots_mcp.store.merging import settled
 from webots_mcp.store.questions.runs import run_info
 from webots_mcp.store.questions.score import score_run
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result
-from webots_mcp.store.window import Window
 from webots_mcp.trials.plan import Plan, WorldPlan
 from webots_mcp.trials.simulators import Simulator
 from webots_mcp.trials.watching import End, Watch

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from tests.memory import memory_connection
 from tests.recordings.rover import start_run
 from webots_mcp.store.detection.event import Event, EventOptions
+from webots_mcp.store.logs import window_of
 from webots_mcp.store.questions.events import find_events
 from webots_mcp.store.questions.series import query_history
 from webots_mcp.store.questions.timeline import timeline
@@ -20,7 +21,6 @@ from webots_mcp.store.reading.moments import moment_of, shown_time
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, find_range
 from webots_mcp.store.rollup.rolling import roll
-from webots_mcp.store.window import window_of
 
 STEP_S = 0.032
 ROWS = 700

@@ -24,7 +24,7 @@ from webots_mcp.store.questions.trends import trends
 from webots_mcp.store.reading.pages import query_rows
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
 from webots_mcp.store.rollup.rolling import roll
-from webots_mcp.store.states import newest_state
+from webots_mcp.store.run_rows import newest_state
 
 STEP_MS = 16
 CALLS = 2000

@@ -28,7 +28,7 @@ from webots_mcp.plugins.report.charts.signals import ROOM
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.motion import find_motion
 from webots_mcp.store.images import StoredImage, newest_image
-from webots_mcp.store.logs import LogFilter, LogLine, newest_lines
+from webots_mcp.store.logs import LogFilter, LogLine, Window, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.runs import RunInfo, list_runs
 from webots_mcp.store.reading.deadline import Deadline
@@ -36,10 +36,9 @@ from webots_mcp.store.reading.ranges import Scope, Segment, TimeRange, find_rang
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.recording import Recording, View, view_of
 from webots_mcp.store.robots import list_robots, without_observers
-from webots_mcp.store.runs import Run, current_run, fetch_run
+from webots_mcp.store.run_rows import Run, current_run, fetch_run
 from webots_mcp.store.signals.catalogue import catalogue, known_signals
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.store.window import Window
 
 Axes = TypeVar("Axes", SignalAxes, TrajectoryAxes)
 

@@ -29,7 +29,7 @@ from webots_mcp.plugins.report.words import (
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.registry import KINDS, stored_kinds
 from webots_mcp.store.detection.verdict import Verdicts
-from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, count_lines, newest_lines
+from webots_mcp.store.logs import COUNT_LIMIT, LogFilter, LogLine, Window, count_lines, newest_lines
 from webots_mcp.store.parameters import described
 from webots_mcp.store.questions.compare import compare_runs
 from webots_mcp.store.questions.events import Found, choose, search_events
@@ -37,9 +37,8 @@ from webots_mcp.store.questions.runs import RunInfo, run_info
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange, find_range
-from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.sessions import Session, fetch_session
-from webots_mcp.store.window import Window
 
 MOST_EVENTS: Final = 200
 MOST_ENTRIES: Final = 500  # of the timeline

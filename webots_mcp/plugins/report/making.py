@@ -16,9 +16,9 @@ from webots_mcp.plugins.report.figures import figures_of, library
 from webots_mcp.plugins.report.page import Page, render
 from webots_mcp.plugins.report.pictures import Pictures, pictures_of
 from webots_mcp.plugins.report.words import counted
+from webots_mcp.store.invalid_rows import left_out_so_far
 from webots_mcp.store.reading.snapshot import in_one_snapshot
-from webots_mcp.store.runs import fetch_run
-from webots_mcp.store.sound import left_out_so_far
+from webots_mcp.store.run_rows import fetch_run
 
 MAX_MB: Final = 10.0
 MIN_MB: Final = 2.0  # Bokeh's script takes more than half of it

@@ -13,8 +13,8 @@ from typing import Any, ClassVar, Final, Literal, NamedTuple, cast
 from webots_mcp.naming import LONGEST_SPREAD_ARRAY, flatten
 from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment
+from webots_mcp.store.run_rows import put_back
 from webots_mcp.store.signals.flatten import parse
-from webots_mcp.store.states import put_back
 
 Progress = Callable[[int, int], object]
 ColumnKind = Literal["null", "bool", "int", "num", "text", "numbers"]

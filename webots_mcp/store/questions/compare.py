@@ -32,7 +32,7 @@ from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.robots import resolve_robot
 from webots_mcp.store.rollup.buckets import COARSE_S
-from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.signals.catalogue import catalogue, resolve_signals
 from webots_mcp.store.signals.registry import Signal
 from webots_mcp.store.trials import scored_runs

@@ -21,7 +21,7 @@ from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment, TimeRange, whole_run
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.reading.subject import Subject
-from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.store.signals.catalogue import catalogue
 from webots_mcp.store.signals.flatten import parse
 

@@ -15,9 +15,9 @@ from webots_mcp.store.reading.ranges import Segment, TimeRange
 from webots_mcp.store.reading.rollups import rows_after
 from webots_mcp.store.reading.rows import Columns, read_columns
 from webots_mcp.store.reading.snapshot import in_one_snapshot
+from webots_mcp.store.run_rows import State, fetch_state
 from webots_mcp.store.signals.catalogue import signals_of
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.store.states import State, fetch_state
 
 MOST_ROWS: Final = 1000
 

@@ -20,9 +20,9 @@ from webots_mcp.store.reading.deadline import Deadline
 from webots_mcp.store.reading.kept import kept_parts
 from webots_mcp.store.reading.ranges import Segment
 from webots_mcp.store.rollup.batch import is_odd, odd_names
+from webots_mcp.store.run_rows import State
 from webots_mcp.store.signals.flatten import parse, reductions, shown
 from webots_mcp.store.signals.registry import Signal
-from webots_mcp.store.states import State
 
 orjson: Any
 try:

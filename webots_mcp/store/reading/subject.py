@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from webots_mcp.errors import NothingRecordedError
 from webots_mcp.store.robots import Robot, resolve_robot, robot_name
-from webots_mcp.store.runs import Run, current_run, fetch_run
+from webots_mcp.store.run_rows import Run, current_run, fetch_run
 
 
 @dataclass(frozen=True)

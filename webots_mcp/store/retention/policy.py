@@ -9,7 +9,7 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.store.runs import fetch_run
+from webots_mcp.store.run_rows import fetch_run
 from webots_mcp.transactions import transaction
 
 # A run that a person named, described or marked is not retention's to judge.

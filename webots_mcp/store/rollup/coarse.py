@@ -15,10 +15,10 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import warn
 from webots_mcp.store.analysis.summary import Summary, merge
+from webots_mcp.store.invalid_rows import MAX_SIM_TIME_S, is_over_a_value, valid_rows
 from webots_mcp.store.rollup.buckets import COARSE_BUCKETS, COARSE_S, bucket_of
 from webots_mcp.store.rollup.findings import FINDINGS, findings_to_store
 from webots_mcp.store.rollup.tables import RUN_MARK, in_short_steps, run_mark
-from webots_mcp.store.sound import MAX_SIM_TIME_S, is_over_a_value, sound_rows
 from webots_mcp.transactions import Step
 
 _FIGURES: Final = ", ".join(Summary._fields)
@@ -124,10 +124,10 @@ def _merged(connection: sqlite3.Connection, run: _Run, bucket: int) -> Iterator[
     except Exception as error:
         if not is_over_a_value(error):
             raise
-        with sound_rows(connection) as unsound:
-            parts = connection.execute(_PARTS.format(table="sound_rollup"), values).fetchall()
+        with valid_rows(connection) as invalid:
+            parts = connection.execute(_PARTS.format(table="valid_rollup"), values).fetchall()
             merged = _merged_parts([row for row in parts if _is_whole(Summary._make(row[1:]))])
-        warn(f"left out of the coarse rollups: {'; '.join(unsound.described())}")
+        warn(f"left out of the coarse rollups: {'; '.join(invalid.described())}")
     for signal_id, summary in merged:
         found = (each.get(signal_id) for each in findings)
         yield (run.id, bucket, signal_id, *summary, *found)
@@ -141,7 +141,7 @@ def _merged_parts(rows: Sequence[Any]) -> list[tuple[int, Summary]]:
 
 
 def _is_whole(summary: Summary) -> bool:
-    """Whether it has all figures of numbers, or none: of a value that is not sound it lacks one."""
+    """Whether it has all figures of numbers, or none: of an invalid value it lacks one."""
     return summary.sum is None or (summary.present > 0 and None not in summary[:_ANGLES])
 
 

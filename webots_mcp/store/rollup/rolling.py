@@ -16,6 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp.errors import warn
 from webots_mcp.store.analysis.summary import Summary, merge
+from webots_mcp.store.invalid_rows import InvalidValues, is_over_a_value, valid_rows
 from webots_mcp.store.reading.rows import cleaned
 from webots_mcp.store.rollup.batch import Batch, BatchColumn
 from webots_mcp.store.rollup.buckets import BUCKET_S, bucket_of
@@ -33,7 +34,6 @@ from webots_mcp.store.rollup.tables import (
 )
 from webots_mcp.store.signals.flatten import shown
 from webots_mcp.store.signals.registry import Signal, count, enter_signals, seen_now
-from webots_mcp.store.sound import Unsound, is_over_a_value, sound_rows
 
 __all__ = ["Rolled", "forget", "roll", "watermark"]
 
@@ -51,7 +51,7 @@ _ROWS: Final = (
 )
 _IDS: Final = "SELECT id FROM state WHERE id > ? ORDER BY id LIMIT ?"
 _SOUND_ROWS: Final = (
-    f"SELECT {_COLUMNS} FROM sound_state s JOIN sound_run r ON r.id = s.run_id "
+    f"SELECT {_COLUMNS} FROM valid_state s JOIN valid_run r ON r.id = s.run_id "
     "WHERE s.id > ? AND s.id <= ? ORDER BY s.id"
 )
 _LAST_CHANGE: Final = (
@@ -126,16 +126,16 @@ def _roll_batch(connection: sqlite3.Connection, limit: int, pause_s: float) -> i
 
 def _take_in_sound(connection: sqlite3.Connection, after: int, last: int, pause_s: float) -> bool:
     """As `_take_in`, of rows among which are some that no bridge has written: they are left out."""
-    with sound_rows(connection) as unsound:
+    with valid_rows(connection) as invalid:
         rows = connection.execute(_SOUND_ROWS, (after, last)).fetchall()
-        stored = _take_in_halves(connection, rows, pause_s, unsound)
+        stored = _take_in_halves(connection, rows, pause_s, invalid)
     if stored:
-        warn(f"left out of the rollups: {'; '.join(unsound.described())}")
+        warn(f"left out of the rollups: {'; '.join(invalid.described())}")
     return stored
 
 
 def _take_in_halves(
-    connection: sqlite3.Connection, rows: Sequence[Any], pause_s: float, unsound: Unsound
+    connection: sqlite3.Connection, rows: Sequence[Any], pause_s: float, invalid: InvalidValues
 ) -> bool:
     """A row that cannot be summed up costs only itself: it is looked for by halving."""
     try:
@@ -144,11 +144,11 @@ def _take_in_halves(
         if not is_over_a_value(error):
             raise
         if len(rows) == 1:
-            unsound.note("state", rows[0][0], "data", "state")
+            invalid.note("state", rows[0][0], "data", "state")
             return True
     middle = len(rows) // 2
     return all(
-        _take_in_halves(connection, half, pause_s, unsound)
+        _take_in_halves(connection, half, pause_s, invalid)
         for half in (rows[:middle], rows[middle:])
     )
 

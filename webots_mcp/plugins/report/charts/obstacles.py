@@ -10,9 +10,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.store.observers import world_seen
 from webots_mcp.store.reading.ranges import TimeRange
-from webots_mcp.store.runs import Run, fetch_run
+from webots_mcp.store.robots import world_seen
+from webots_mcp.store.run_rows import Run, fetch_run
 
 if TYPE_CHECKING:
     from webots_mcp.standin.arena import Body

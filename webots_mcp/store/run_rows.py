@@ -1,16 +1,40 @@
-"""Published states: the newest one, those of a window, and how fast they come."""
+"""Runs and what is recorded in them: published states, and events that the bridge noticed."""
 
 from __future__ import annotations
 
 import itertools
 import json
 import sqlite3
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Final, cast
 
-from webots_mcp.errors import InvalidInputError
+from webots_mcp.errors import InvalidInputError, UnknownRunError
 from webots_mcp.naming import nearest_first
-from webots_mcp.store.rows import columns_of
+
+
+def columns_of(row: type[Any]) -> str:
+    """What to select so that a row is the arguments of this dataclass."""
+    return ", ".join(field.name for field in fields(row))
+
+
+@dataclass(frozen=True)
+class Run:
+    """A stretch of rising simulation time in one session. Columns as in `store.models`."""
+
+    id: int
+    session_id: int
+    robot_id: int
+    world: str | None
+    basic_time_step_ms: float | None
+    start_reason: str
+    started_wall_time_s: float
+    started_sim_time_s: float
+    last_wall_time_s: float
+    last_sim_time_s: float
+    ended_wall_time_s: float | None
+    end_reason: str | None
+    rows: int
+    label: str | None
 
 
 @dataclass(frozen=True)
@@ -36,22 +60,51 @@ class State:
         return json.loads(self.odd) if self.odd else {}
 
 
-_COLUMNS: Final = columns_of(State)
+@dataclass(frozen=True)
+class Event:
+    """Something noticed in a run; `data` is JSON text."""
+
+    id: int
+    run_id: int
+    sim_time_s: float
+    wall_time_s: float
+    kind: str
+    name: str | None
+    data: str | None
+
+    def details(self) -> Any:
+        """What was noticed, decoded; None where nothing was added."""
+        return json.loads(self.data) if self.data else None
+
+
+_RUN_COLUMNS: Final = columns_of(Run)
+_CURRENT_RUN: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id DESC LIMIT 1"
+_RUN_BY_ID: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE id = ?"
+_RUNS_OF_ROBOT: Final = f"SELECT {_RUN_COLUMNS} FROM run WHERE robot_id = ? ORDER BY id"
+_NEWEST_RUN_IDS: Final = (
+    "SELECT id FROM run WHERE :robot_id IS NULL OR robot_id = :robot_id ORDER BY id DESC LIMIT 10"
+)
+_RUN_COUNT: Final = "SELECT count(*) FROM run WHERE robot_id = ?"
+_STATE_COLUMNS: Final = columns_of(State)
 # Of a crash only a kept stretch has the newest state; it has a negative id.
-_NEWEST: Final = (
+_NEWEST_STATE: Final = (
     "SELECT * FROM (SELECT * FROM (SELECT {columns} FROM state WHERE run_id = :run "
     "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1) UNION ALL "
     "SELECT -id, {kept} FROM (SELECT {columns} FROM kept_state WHERE run_id = :run "
     "AND sim_time_s <= :until ORDER BY sim_time_s DESC, id DESC LIMIT 1)) "
     "ORDER BY sim_time_s DESC, wall_time_s DESC LIMIT 1"
-).format(columns=_COLUMNS, kept=_COLUMNS.partition(", ")[2])
+).format(columns=_STATE_COLUMNS, kept=_STATE_COLUMNS.partition(", ")[2])
 _RECENT_TIMES: Final = (
     "SELECT sim_time_s, wall_time_s FROM state WHERE run_id = ? "
     "ORDER BY sim_time_s DESC, id DESC LIMIT ?"
 )
-_BY_ID: Final = f"SELECT {_COLUMNS} FROM state WHERE id = ?"
-_KEPT_BY_ID: Final = f"SELECT -id, {_COLUMNS.partition(', ')[2]} FROM kept_state WHERE id = -?"
-_OF_RUN: Final = f"SELECT {_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s, id"
+_STATE_BY_ID: Final = f"SELECT {_STATE_COLUMNS} FROM state WHERE id = ?"
+_KEPT_STATE_BY_ID: Final = (
+    f"SELECT -id, {_STATE_COLUMNS.partition(', ')[2]} FROM kept_state WHERE id = -?"
+)
+_STATES_OF_RUN: Final = (
+    f"SELECT {_STATE_COLUMNS} FROM state WHERE run_id = ? ORDER BY sim_time_s, id"
+)
 
 # A blob is greater than any number or text: a time that is no number is met too, and told.
 _LATER_THAN_ANY: Final = b"\xff"
@@ -61,6 +114,50 @@ _PACE_WINDOW_ROWS: Final = 500
 _SHOWN_KEYS: Final = 20
 _SEARCHED_KEYS: Final = 1000  # for those like the one that is not there
 _SHOWN_KEY_CHARACTERS: Final = 40
+_EVENT_COLUMNS: Final = columns_of(Event)
+_NEWEST_EVENTS: Final = (
+    f"SELECT {_EVENT_COLUMNS} FROM event WHERE run_id = ? ORDER BY sim_time_s DESC, id DESC LIMIT ?"
+)
+
+
+def current_run(connection: sqlite3.Connection, robot_id: int) -> Run | None:
+    """The robot's newest run, going on or not."""
+    row = connection.execute(_CURRENT_RUN, (robot_id,)).fetchone()
+    return Run(*row) if row else None
+
+
+def fetch_run(connection: sqlite3.Connection, run_id: int, robot_id: int | None = None) -> Run:
+    """The run of that id.
+
+    Args:
+        connection: An open database.
+        run_id: The run.
+        robot_id: Whose run it has to be; None for anybody's.
+
+    Raises:
+        UnknownRunError: There is no such run, or it is another robot's.
+    """
+    row = connection.execute(_RUN_BY_ID, (run_id,)).fetchone()
+    if row is None or robot_id not in (None, Run(*row).robot_id):
+        raise UnknownRunError(_no_such_run(connection, run_id, robot_id))
+    return Run(*row)
+
+
+def runs_of(connection: sqlite3.Connection, robot_id: int) -> list[Run]:
+    """All runs of the robot, oldest first."""
+    return [Run(*row) for row in connection.execute(_RUNS_OF_ROBOT, (robot_id,)).fetchall()]
+
+
+def count_runs(connection: sqlite3.Connection, robot_id: int) -> int:
+    """How many runs of the robot were recorded."""
+    return int(connection.execute(_RUN_COUNT, (robot_id,)).fetchone()[0])
+
+
+def _no_such_run(connection: sqlite3.Connection, run_id: int, robot_id: int | None) -> str:
+    ids = [row[0] for row in connection.execute(_NEWEST_RUN_IDS, {"robot_id": robot_id}).fetchall()]
+    whose = "" if robot_id is None else " of this robot"
+    known = f"the newest runs{whose} are {ids}" if ids else f"no run{whose} was recorded"
+    return f"no run {run_id}{whose}: {known}"
 
 
 def newest_state(connection: sqlite3.Connection, run_id: int) -> State | None:
@@ -74,20 +171,20 @@ def state_at(connection: sqlite3.Connection, run_id: int, sim_time_s: float) -> 
 
 
 def _state_up_to(connection: sqlite3.Connection, run_id: int, until: float | bytes) -> State | None:
-    row = connection.execute(_NEWEST, {"run": run_id, "until": until}).fetchone()
+    row = connection.execute(_NEWEST_STATE, {"run": run_id, "until": until}).fetchone()
     return State(*row) if row else None
 
 
 def fetch_state(connection: sqlite3.Connection, state_id: int) -> State | None:
     """The row of that id; None where it was deleted."""
-    query = _BY_ID if state_id > 0 else _KEPT_BY_ID
+    query = _STATE_BY_ID if state_id > 0 else _KEPT_STATE_BY_ID
     row = connection.execute(query, (state_id,)).fetchone()
     return State(*row) if row else None
 
 
 def states_of(connection: sqlite3.Connection, run_id: int) -> list[State]:
     """All rows of a run, in order."""
-    return [State(*row) for row in connection.execute(_OF_RUN, (run_id,)).fetchall()]
+    return [State(*row) for row in connection.execute(_STATES_OF_RUN, (run_id,)).fetchall()]
 
 
 def recent_interval_s(connection: sqlite3.Connection, run_id: int) -> float | None:
@@ -156,3 +253,9 @@ def put_back(value: Any, parts: list[str], replaced: object) -> None:
         put_back(value[key], parts[taken:], replaced)
     elif value[key] is None:
         value[key] = replaced
+
+
+def newest_events(connection: sqlite3.Connection, run_id: int, limit: int) -> list[Event]:
+    """The latest events of a run, oldest first; with a limit of -1 all of them."""
+    rows = connection.execute(_NEWEST_EVENTS, (run_id, limit)).fetchall()
+    return [Event(*row) for row in reversed(rows)]

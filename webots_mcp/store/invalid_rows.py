@@ -1,8 +1,8 @@
-"""Reading past rows that hold what no bridge writes: the one place that knows what is sound.
+"""Reading past rows that hold what no bridge writes: the one place that says what is invalid.
 
 Other programs may write to a recording, and SQLite takes any value in any column. Checking each
 value would cost every question half of its time, so that a question is asked without it first; one
-that fails over a value is asked again of `shadow`, which costs only the rows that are not sound.
+that fails over a value is asked again of `shadow`, which leaves out the invalid rows only.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _SHAPES: Final = {  # of JSON that is no object
     "command.result": "any", "parameter.choices": "values", "parameter.default_value": "value",
     "parameter.next_value": "value", "parameter_value.value": "value",
 }  # fmt: skip
-# A row that refers to one that is not sound would lead there.
+# A row that refers to an invalid one would lead there.
 _REFERENCES: Final = {
     "session": (("robot_id", "robot"),),
     "run": (("session_id", "session"), ("robot_id", "robot")),
@@ -56,7 +56,7 @@ _UNSTORABLE: Final = (
 _COLUMNS: Final = 'SELECT name, type, "notnull", dflt_value, pk FROM pragma_table_info(?)'
 
 
-class Unsound:
+class InvalidValues:
     """The values that a question met and left out, in the order in which it met them."""
 
     def __init__(self) -> None:
@@ -72,7 +72,7 @@ class Unsound:
         return [*list(self._met)[:_SHOWN], *([f"and {more} more"] if more > 0 else [])]
 
 
-_reading: ContextVar[Unsound | None] = ContextVar("reading past unsound rows", default=None)
+_reading: ContextVar[InvalidValues | None] = ContextVar("reading past invalid rows", default=None)
 
 
 def is_over_a_value(error: Exception) -> bool:
@@ -83,54 +83,54 @@ def is_over_a_value(error: Exception) -> bool:
 
 
 @contextmanager
-def past_unsound_rows() -> Generator[Unsound]:
-    """Readers that are opened inside, in this context, do not see what is not sound."""
-    unsound = Unsound()
-    token = _reading.set(unsound)
+def past_invalid_rows() -> Generator[InvalidValues]:
+    """Readers that are opened inside, in this context, do not see invalid rows and values."""
+    invalid = InvalidValues()
+    token = _reading.set(invalid)
     try:
-        yield unsound
+        yield invalid
     finally:
         _reading.reset(token)
 
 
 def left_out_so_far() -> list[str]:
-    """What readers that were opened inside `past_unsound_rows` have left out until now."""
-    unsound = _reading.get()
-    return unsound.described() if unsound is not None else []
+    """What readers that were opened inside `past_invalid_rows` have left out until now."""
+    invalid = _reading.get()
+    return invalid.described() if invalid is not None else []
 
 
 @contextmanager
-def sound_rows(connection: sqlite3.Connection) -> Generator[Unsound]:
-    """Inside, a writer has the view `sound_NAME` of each table, and reads any text."""
-    unsound, text_factory = Unsound(), connection.text_factory
-    _show_sound(connection, unsound, prefix="sound_")
+def valid_rows(connection: sqlite3.Connection) -> Generator[InvalidValues]:
+    """Inside, a writer has the view `valid_NAME` of each table, and reads any text."""
+    invalid, text_factory = InvalidValues(), connection.text_factory
+    _show_valid(connection, invalid, prefix="valid_")
     try:
-        yield unsound
+        yield invalid
     finally:
         connection.text_factory = text_factory
         for table in _TABLES:
-            connection.execute(f"DROP VIEW temp.sound_{table}")
+            connection.execute(f"DROP VIEW temp.valid_{table}")
 
 
 def shadow_if_asked(connection: sqlite3.Connection) -> None:
-    """Inside `past_unsound_rows` give a reader views of the sound rows under the tables' names."""
-    if (unsound := _reading.get()) is not None:
-        _shadow(connection, unsound)
+    """Inside `past_invalid_rows` give a reader views of the valid rows under the tables' names."""
+    if (invalid := _reading.get()) is not None:
+        _shadow(connection, invalid)
 
 
-def _shadow(connection: sqlite3.Connection, unsound: Unsound) -> None:
+def _shadow(connection: sqlite3.Connection, invalid: InvalidValues) -> None:
     connection.execute("PRAGMA query_only=OFF")  # a view of this connection alone
-    _show_sound(connection, unsound)
+    _show_valid(connection, invalid)
     for sql in shipped_statements():
         if sql.startswith("CREATE VIEW"):
             connection.execute(sql.replace("CREATE VIEW", "CREATE TEMP VIEW", 1))
     connection.execute("PRAGMA query_only=ON")
 
 
-def _show_sound(connection: sqlite3.Connection, unsound: Unsound, prefix: str = "") -> None:
+def _show_valid(connection: sqlite3.Connection, invalid: InvalidValues, prefix: str = "") -> None:
     connection.text_factory = _as_text
-    connection.create_function("unsound", 4, unsound.note)
-    connection.create_function("sound_json", 2, _is_sound_json, deterministic=True)
+    connection.create_function("note_invalid", 4, invalid.note)
+    connection.create_function("valid_json", 2, _is_valid_json, deterministic=True)
     for table in _TABLES:
         connection.execute(_view(connection, table, prefix))
 
@@ -147,7 +147,7 @@ def _view(connection: sqlite3.Connection, table: str, prefix: str) -> str:
     needed: list[str] = []
     for name, kind, required, default, key in columns:
         check, said = _check(table, name, kind)
-        left_out = f"unsound('{table}', {row}, '{name}', '{said}')"
+        left_out = f"note_invalid('{table}', {row}, '{name}', '{said}')"
         if key and len(keys) == 1:
             shown.append(name)
         elif required and default is None:
@@ -163,7 +163,7 @@ def _view(connection: sqlite3.Connection, table: str, prefix: str) -> str:
         there = (
             f"EXISTS (SELECT 1 FROM temp.{prefix}{other} AS other WHERE other.id = {table}.{name})"
         )
-        left_out = f"unsound('{table}', {row}, '{name}', 'reference')"
+        left_out = f"note_invalid('{table}', {row}, '{name}', 'reference')"
         needed.append(f"CASE WHEN {there} THEN 1 ELSE {left_out} END")
     where = " AND ".join(needed) or "1"
     rows = f"SELECT {', '.join(shown)} FROM main.{table} WHERE {where}"
@@ -171,11 +171,11 @@ def _view(connection: sqlite3.Connection, table: str, prefix: str) -> str:
 
 
 def _check(table: str, name: str, kind: str) -> tuple[str, str]:
-    """An SQL condition that a sound value meets, and what such a value is called."""
+    """An SQL condition that a valid value meets, and what such a value is called."""
     place = f"{table}.{name}"
     if place in _OBJECTS or place in _SHAPES:
         what = "texts" if place in _OF_TEXTS else _SHAPES.get(place, "object")
-        checked = f"sound_json(CAST({name} AS BLOB), '{what}')"  # it may be no UTF-8
+        checked = f"valid_json(CAST({name} AS BLOB), '{what}')"  # it may be no UTF-8
         return f"CASE typeof({name}) WHEN 'text' THEN {checked} ELSE 0 END", "JSON"
     if kind == "TEXT":
         return f"typeof({name}) = 'text'", "text"
@@ -187,7 +187,7 @@ def _check(table: str, name: str, kind: str) -> tuple[str, str]:
     return f"typeof({name}) IN ('real', 'integer') AND abs({name}) <= {limit!r}", "number"
 
 
-def _is_sound_json(stored: bytes, what: str) -> int:
+def _is_valid_json(stored: bytes, what: str) -> int:
     """Whether it is JSON that SQLite, Python and a client read alike, and of the right shape."""
     try:
         value: Any = json.loads(stored.decode(), parse_constant=_refuse)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from webots_mcp.plugins.demo import conversation as demo
-from webots_mcp.setup.clients import can_be_started, is_ours, words_of
+from webots_mcp.setup.client_entries import can_be_started, is_ours, words_of
 
 TURNS = tuple(
     turn for turn in demo.CONVERSATION if turn[1] in ("webots_get_parameters", "webots_plot")

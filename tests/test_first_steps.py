@@ -14,7 +14,7 @@ import pytest
 from webots_mcp import MemoryDatabase
 from webots_mcp.cli import COMMANDS
 from webots_mcp.server import create_server
-from webots_mcp.setup.clients import claude_desktop, clients_of, is_ours
+from webots_mcp.setup.client_entries import claude_desktop, clients_of, is_ours
 
 DOCS = Path(__file__).parents[1] / "docs"
 FIRST_STEPS = (DOCS / "first-steps.md").read_text("utf-8")

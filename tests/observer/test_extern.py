@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tests.observer.conftest import CROWD
-from webots_mcp.setup.observing import with_observer
+from webots_mcp.setup.observed_world import with_observer
 from webots_mcp.standin import Simulation
 
 

@@ -21,8 +21,8 @@ from tests.webots.conftest import (
     write_project,
 )
 from webots_mcp.server import create_server
-from webots_mcp.setup.files import apply
-from webots_mcp.setup.observing import controller_change, with_observer
+from webots_mcp.setup.file_changes import apply
+from webots_mcp.setup.observed_world import controller_change, with_observer
 from webots_mcp.webots.instances import instances
 from webots_mcp.webots.stream import give_order
 

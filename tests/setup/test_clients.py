@@ -11,16 +11,16 @@ import pytest
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout
-from webots_mcp.setup.clients import (
+from webots_mcp.setup.client_entries import (
     Client,
-    Entry,
+    ClientEntry,
     claude_desktop,
     clients_of,
     plan_entry,
     server_command,
     server_hindrance,
 )
-from webots_mcp.setup.files import apply
+from webots_mcp.setup.file_changes import apply
 
 LINE = [sys.executable, "-m", "webots_mcp", "serve", "--data-dir", "/p/mcp_data"]
 
@@ -30,7 +30,7 @@ def client(tmp_path: Path) -> Client:
     return clients_of(tmp_path)[0]
 
 
-def plan(client: Client, held: dict[str, Any] | str) -> Entry:
+def plan(client: Client, held: dict[str, Any] | str) -> ClientEntry:
     client.file.write_text(held if isinstance(held, str) else json.dumps(held))
     return plan_entry(client, "webots", LINE)
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.setup.observing import (
+from webots_mcp.setup.observed_world import (
     copy_of,
     has_observer,
     undo,

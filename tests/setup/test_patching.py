@@ -7,7 +7,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.setup.patching import IMPORT, AlreadyPatchedError, attach_line, patch, unpatch
+from webots_mcp.setup.controller_patch import (
+    IMPORT,
+    AlreadyPatchedError,
+    attach_line,
+    patch,
+    unpatch,
+)
 
 PLAIN = """from controller import Robot
 

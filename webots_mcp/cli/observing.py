@@ -15,7 +15,7 @@ from webots_mcp.errors import CommandRefusedError
 from webots_mcp.observer.pace import PERIOD_MS, checked_period
 
 if TYPE_CHECKING:
-    from webots_mcp.setup.files import Change
+    from webots_mcp.setup.file_changes import FileChange
 
 _URL: Final = "WEBOTS_CONTROLLER_URL"
 
@@ -68,8 +68,8 @@ def _prepare(arguments: argparse.Namespace) -> None:
 
 def add_observer(arguments: argparse.Namespace) -> None:
     """Put the observer into a copy of a world, or into the world itself."""
-    from webots_mcp.setup.observing import controller_change, world_change
-    from webots_mcp.setup.project import project_of
+    from webots_mcp.setup.observed_world import controller_change, world_change
+    from webots_mcp.setup.webots_project import project_of
 
     world = Path(arguments.observer)
     change = world_change(world, in_place=arguments.in_place, extern=arguments.extern)
@@ -87,7 +87,7 @@ def _then(arguments: argparse.Namespace) -> str:
     return ", and run 'webots-mcp observe'" if arguments.extern else ""
 
 
-def _require_agreed(arguments: argparse.Namespace, change: Change, *, is_meant: bool) -> None:
+def _require_agreed(arguments: argparse.Namespace, change: FileChange, *, is_meant: bool) -> None:
     """What a file holds that somebody has changed is not written over without a yes."""
     if change.before is None or not change.is_needed or is_meant or arguments.dry_run:
         return
@@ -98,8 +98,8 @@ def _require_agreed(arguments: argparse.Namespace, change: Change, *, is_meant: 
 
 def _python_for(controller: Path) -> list[dict[str, str]]:
     """The Python that can run the observer, where the one that Webots takes cannot."""
-    from webots_mcp.setup.interpreter import look_into
-    from webots_mcp.setup.observing import python_change
+    from webots_mcp.setup.observed_world import python_change
+    from webots_mcp.setup.webots_project import look_into
 
     found = look_into(controller)
     if found.error is None:
@@ -113,7 +113,7 @@ def _python_for(controller: Path) -> list[dict[str, str]]:
 
 def remove_observer(arguments: argparse.Namespace) -> None:
     """Take the observer out of a world, or delete the copy that was made for it."""
-    from webots_mcp.setup.observing import undo, unused_controller
+    from webots_mcp.setup.observed_world import undo, unused_controller
 
     world = Path(arguments.undo)
     change = undo(world)

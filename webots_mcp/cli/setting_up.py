@@ -14,9 +14,9 @@ from webots_mcp.cli.tables import print_notes
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, WebotsMCPError
 
 if TYPE_CHECKING:
-    from webots_mcp.setup.clients import Client
-    from webots_mcp.setup.files import Change
-    from webots_mcp.setup.project import Controller
+    from webots_mcp.setup.client_entries import Client
+    from webots_mcp.setup.file_changes import FileChange
+    from webots_mcp.setup.webots_project import ProjectController
 
 
 @command(
@@ -75,8 +75,8 @@ def init(arguments: argparse.Namespace) -> None:
 
 
 def _change_controller(arguments: argparse.Namespace) -> None:
-    from webots_mcp.setup.files import Change, apply, read
-    from webots_mcp.setup.patching import AlreadyPatchedError, patch, unpatch
+    from webots_mcp.setup.controller_patch import AlreadyPatchedError, patch, unpatch
+    from webots_mcp.setup.file_changes import FileChange, apply, read
 
     file, change = (arguments.patch, patch) if arguments.patch else (arguments.undo, unpatch)
     if Path(file).is_dir():
@@ -85,7 +85,7 @@ def _change_controller(arguments: argparse.Namespace) -> None:
     if before is None:
         raise InvalidInputError(f"there is no file {file}")
     try:
-        wanted = Change(Path(file), before, change(before))
+        wanted = FileChange(Path(file), before, change(before))
     except AlreadyPatchedError as error:
         return _tell_patched(arguments, file, "unchanged", note=f"already patched: {error}")
     except InvalidInputError as error:
@@ -106,7 +106,7 @@ def _tell_patched(arguments: argparse.Namespace, file: str, outcome: str, **more
     print(f"{file}: {more.get('note', outcome)}")
 
 
-def diff_of(change: Change) -> str:
+def diff_of(change: FileChange) -> str:
     """The lines that change, whatever the file's encoding."""
     before, after = (
         (content or b"").decode("utf-8", "replace").splitlines()
@@ -141,13 +141,13 @@ def print_json(found: dict[str, Any]) -> None:
 
 def _make_ready(arguments: argparse.Namespace) -> None:
     from webots_mcp.contract import PROJECT_DATA_FOLDER
-    from webots_mcp.setup.clients import (
+    from webots_mcp.setup.client_entries import (
         claude_desktop,
         clients_of,
         server_command,
         server_hindrance,
     )
-    from webots_mcp.setup.project import controllers_of, project_of
+    from webots_mcp.setup.webots_project import controllers_of, project_of
 
     project = project_of(arguments.project)
     data_dir = project / PROJECT_DATA_FOLDER
@@ -169,7 +169,7 @@ def _make_ready(arguments: argparse.Namespace) -> None:
 
 def _ignored(data_dir: Path, *, dry_run: bool) -> dict[str, str]:
     from webots_mcp.contract import make_folder
-    from webots_mcp.setup.clients import ignore_file
+    from webots_mcp.setup.client_entries import ignore_file
 
     file = data_dir / ".gitignore"
     try:
@@ -182,7 +182,7 @@ def _ignored(data_dir: Path, *, dry_run: bool) -> dict[str, str]:
 
 
 def _told(client: Client, line: list[str], arguments: argparse.Namespace) -> dict[str, str]:
-    from webots_mcp.setup.clients import plan_entry
+    from webots_mcp.setup.client_entries import plan_entry
 
     named = {"client": client.name}
     try:
@@ -193,9 +193,9 @@ def _told(client: Client, line: list[str], arguments: argparse.Namespace) -> dic
         return {**named, "file": str(client.file), "outcome": "refused", "note": str(error)}
 
 
-def apply_change(change: Change, *, dry_run: bool) -> dict[str, str]:
+def apply_change(change: FileChange, *, dry_run: bool) -> dict[str, str]:
     """Write a file unless it holds that already or nothing is to be written; what was done."""
-    from webots_mcp.setup.files import apply
+    from webots_mcp.setup.file_changes import apply
 
     if not change.is_needed:
         return {"file": str(change.file), "outcome": "unchanged"}
@@ -204,12 +204,12 @@ def apply_change(change: Change, *, dry_run: bool) -> dict[str, str]:
     return {"file": str(change.file), "outcome": "would be written" if dry_run else "written"}
 
 
-def _described(controller: Controller, project: Path) -> dict[str, Any]:
+def _described(controller: ProjectController, project: Path) -> dict[str, Any]:
     """A controller, the lines that it needs, and the Python that it is started with."""
     from dataclasses import asdict
 
-    from webots_mcp.setup.interpreter import look_into
-    from webots_mcp.setup.patching import IMPORT, AlreadyPatchedError, attach_line
+    from webots_mcp.setup.controller_patch import IMPORT, AlreadyPatchedError, attach_line
+    from webots_mcp.setup.webots_project import look_into
 
     file = controller.file.relative_to(project)
     told: dict[str, Any] = {"file": file.as_posix(), "language": controller.language}

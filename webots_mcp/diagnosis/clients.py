@@ -8,7 +8,7 @@ from typing import Any, Final, cast
 
 from webots_mcp.diagnosis.finding import Finding, Subject, worst
 from webots_mcp.errors import InvalidInputError
-from webots_mcp.setup.clients import (
+from webots_mcp.setup.client_entries import (
     Client,
     can_be_started,
     claude_desktop,
@@ -16,7 +16,7 @@ from webots_mcp.setup.clients import (
     is_ours,
     words_of,
 )
-from webots_mcp.setup.commented_json import CommentedJSON
+from webots_mcp.setup.file_changes import CommentedJSON
 
 _PLACES: Final = ("--data-dir", "--database")
 _INIT: Final = "run 'webots-mcp init' in the project"

@@ -27,7 +27,7 @@ from webots_mcp.connection import connect
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, whole_file
 from webots_mcp.errors import NothingRecordedError, WebotsMCPError
 from webots_mcp.requirements import quoted
-from webots_mcp.setup.clients import server_command
+from webots_mcp.setup.client_entries import server_command
 from webots_mcp.standin import Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
 from webots_mcp.store.recording import Recording

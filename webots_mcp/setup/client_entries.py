@@ -13,8 +13,7 @@ from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.requirements import checkout, install_line, quoted
-from webots_mcp.setup.commented_json import CommentedJSON
-from webots_mcp.setup.files import Change, read
+from webots_mcp.setup.file_changes import CommentedJSON, FileChange, read
 
 _BOM: Final = "\ufeff"
 # Folders of environments that uv makes for one command and clears away with its cache.
@@ -29,10 +28,10 @@ class Client(NamedTuple):
     servers: str = "mcpServers"
 
 
-class Entry(NamedTuple):
+class ClientEntry(NamedTuple):
     """What is to be done in a client's file, and what there is to know about it."""
 
-    change: Change
+    change: FileChange
     note: str | None = None
 
 
@@ -80,7 +79,7 @@ def server_hindrance() -> str | None:
     )
 
 
-def plan_entry(client: Client, name: str, command: list[str]) -> Entry:
+def plan_entry(client: Client, name: str, command: list[str]) -> ClientEntry:
     """The change that makes a client know the server.
 
     An entry of ours that can be started is left as it is, also where it differs: its options are
@@ -99,7 +98,7 @@ def plan_entry(client: Client, name: str, command: list[str]) -> Entry:
         raise InvalidInputError(f"{client.file} is left as it is: {error}") from error
     bom = _BOM if before is not None and before.startswith(_BOM.encode()) else ""
     unchanged = before if before is not None and note else None
-    return Entry(Change(client.file, before, unchanged or (bom + after).encode()), note)
+    return ClientEntry(FileChange(client.file, before, unchanged or (bom + after).encode()), note)
 
 
 def _with_entry(
@@ -162,7 +161,7 @@ def can_be_started(entry: dict[str, Any]) -> bool:
     return command not in ("webots-mcp", "python", "python3") and bool(shutil.which(command))
 
 
-def ignore_file(data_dir: Path) -> Change:
+def ignore_file(data_dir: Path) -> FileChange:
     """The file that keeps the recordings out of a Git repository; one that is there is kept.
 
     Raises:
@@ -172,4 +171,4 @@ def ignore_file(data_dir: Path) -> Change:
         raise CommandRefusedError(f"{data_dir} is no folder: recordings go there; rename it")
     file = data_dir / ".gitignore"
     before = read(file)
-    return Change(file, before, b"*\n" if before is None else before)
+    return FileChange(file, before, b"*\n" if before is None else before)

@@ -12,7 +12,7 @@ from typing import Final
 
 from webots_mcp.contract import OBSERVER_NAME
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.setup.files import Change, read
+from webots_mcp.setup.file_changes import FileChange, read
 
 COPY_SUFFIX: Final = "_observed"
 CONTROLLER: Final = b'''"""The observer of webots-mcp: it records where all robots are."""
@@ -79,7 +79,7 @@ def copy_of(world: Path) -> Path:
     return world.with_name(f"{world.stem}{COPY_SUFFIX}{world.suffix}")
 
 
-def world_change(world: Path, *, in_place: bool, extern: bool) -> Change:
+def world_change(world: Path, *, in_place: bool, extern: bool) -> FileChange:
     """What is to be written so that a world has an observer.
 
     Raises:
@@ -90,14 +90,14 @@ def world_change(world: Path, *, in_place: bool, extern: bool) -> Change:
     if before is None or world.suffix != ".wbt":
         raise InvalidInputError(f"there is no world {world}: give a .wbt file")
     if in_place:
-        return Change(world, before, with_observer(before, extern=extern))
+        return FileChange(world, before, with_observer(before, extern=extern))
     if has_observer(before):
         raise InvalidInputError(f"{world} has an observer already: open it, or give another world")
     copy = copy_of(world)
-    return Change(copy, read(copy), with_observer(before, extern=extern))
+    return FileChange(copy, read(copy), with_observer(before, extern=extern))
 
 
-def undo(world: Path) -> Change | None:
+def undo(world: Path) -> FileChange | None:
     """What is to be written so that a world has none; None where the file is a copy to delete.
 
     Raises:
@@ -110,7 +110,7 @@ def undo(world: Path) -> Change | None:
         raise InvalidInputError(f"there is no file {world}")
     without = without_observer(held)
     if not world.stem.endswith(COPY_SUFFIX):
-        return Change(world, held, without)
+        return FileChange(world, held, without)
     source = world.with_name(f"{world.stem.removesuffix(COPY_SUFFIX)}{world.suffix}")
     if read(source) not in (without, without.rstrip(b"\r\n")):
         raise CommandRefusedError(
@@ -120,24 +120,24 @@ def undo(world: Path) -> Change | None:
     return None
 
 
-def controller_change(project: Path) -> Change:
+def controller_change(project: Path) -> FileChange:
     """What is to be written so that the project has the observer's controller.
 
     Raises:
         OSError: It cannot be read.
     """
     file = _controller_of(project)
-    return Change(file, read(file), CONTROLLER)
+    return FileChange(file, read(file), CONTROLLER)
 
 
-def python_change(controller: Path, python: str) -> Change:
+def python_change(controller: Path, python: str) -> FileChange:
     """What is to be written so that Webots starts the observer's controller with that Python.
 
     Raises:
         OSError: It cannot be read.
     """
     file = controller.with_name(_RUNTIME)
-    return Change(file, read(file), _RUNTIME_TEXT.format(python).encode())
+    return FileChange(file, read(file), _RUNTIME_TEXT.format(python).encode())
 
 
 def unused_controller(project: Path, python: str) -> list[Path]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from webots_mcp.console.lines import said
+from webots_mcp.console.console_follower import said
 from webots_mcp.contract import (
     WORLD_ENDING,
     find_project,

@@ -82,7 +82,7 @@ def logs(arguments: argparse.Namespace) -> None:
     current one. Those of Webots' console are recorded while 'webots-mcp serve' or
     'webots-mcp launch' runs: 'webots:' begins its own, 'console:' what a controller printed.
     """
-    from webots_mcp.console.ownership import console_state
+    from webots_mcp.console.console_follower import console_state
     from webots_mcp.store.logs import OF_CONSOLE, count_lines
     from webots_mcp.store.recording import storage
 

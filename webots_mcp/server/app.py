@@ -12,7 +12,7 @@ from anyio import CancelScope, to_thread
 from mcp.server import MCPServer
 
 from webots_mcp import __version__
-from webots_mcp.console.watching import ConsoleWatch
+from webots_mcp.console.console_follower import ConsoleWatch
 from webots_mcp.contract import Database
 from webots_mcp.liveness import reap_if_dead
 from webots_mcp.maintenance import Maintainer

@@ -1,6 +1,6 @@
-"""Whether the process of a session still runs, and what becomes of what a dead one left open.
+"""Whether a session lives: its process, its heartbeat, and what becomes of what a dead one left.
 
-The host's operating system says whether it runs. Bridge and store close dead sessions alike.
+The host's operating system says whether a process runs. Bridge and store close dead sessions alike.
 
 Standard library only, because the bridge imports it inside a robot's controller.
 """
@@ -12,9 +12,9 @@ import sqlite3
 import sys
 import time
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
-from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, host_name
+from webots_mcp.contract import ISSUED_TIME_TO_LIVE_S, REMOTE_SILENCE_S, host_name
 from webots_mcp.queue import CLAIMED_BY_ENDED, EXPIRE, LOSE
 from webots_mcp.waiting_file import waiting_path
 
@@ -25,6 +25,24 @@ _PIDS: Final = 2**31  # no system gives a process a higher id
 _TOLERANCE_S: Final = 2.0
 _WINDOWS_EPOCH_S: Final = 11_644_473_600  # from 1601 to 1970
 
+# A sign of life is proof against a judgement by others that the process was gone; but a session
+# that a later one has followed stays ended.
+_ALIVE: Final = (
+    "CASE WHEN end_reason = 'crashed' AND NOT EXISTS (SELECT 1 FROM session n "
+    "WHERE n.robot_id = {0}.robot_id AND n.id > {0}.{1}) THEN NULL ELSE {2} END"
+)
+_BEAT_SESSION: Final = (
+    "UPDATE session SET last_seen_wall_time_s = ?, last_seen_monotonic_s = ?, "
+    "last_poll_wall_time_s = ?, moved_wall_time_s = ?, sim_time_s = ?, hold = ?, hold_mode = ?, "
+    "rows_waiting = ?, rows_dropped = ?, last_error = ?, "
+    f"ended_wall_time_s = {_ALIVE.format('session', 'id', 'ended_wall_time_s')}, "
+    f"end_reason = {_ALIVE.format('session', 'id', 'end_reason')} WHERE id = ?"
+)
+_BEAT_RUN: Final = (
+    "UPDATE run SET last_wall_time_s = ?, last_sim_time_s = ?, rows = ?, "
+    f"ended_wall_time_s = {_ALIVE.format('run', 'session_id', 'ended_wall_time_s')}, "
+    f"end_reason = {_ALIVE.format('run', 'session_id', 'end_reason')} WHERE id = ?"
+)
 END_SESSION: Final = (
     "UPDATE session SET ended_wall_time_s = last_seen_wall_time_s, end_reason = :reason "
     "WHERE id = :id AND ended_wall_time_s IS NULL"
@@ -54,6 +72,19 @@ _OPEN_SESSIONS: Final = (
     "FROM session WHERE ended_wall_time_s IS NULL AND host = ?"
 )
 _FILE: Final = "SELECT file FROM pragma_database_list WHERE name = 'main'"
+
+
+def is_living(
+    host: str, pid: int, process: str | None, last_seen_wall_time_s: float, now_s: float
+) -> bool:
+    """Whether the process of a session that has not ended still runs.
+
+    On this host the process shows it, as `process_alive` says; on another only a recent heartbeat
+    does.
+    """
+    if host != host_name():
+        return now_s - last_seen_wall_time_s < REMOTE_SILENCE_S
+    return process_alive(pid, process, last_seen_wall_time_s)
 
 
 def process_alive(pid: int, process: str | None, last_seen_wall_time_s: float) -> bool:
@@ -158,6 +189,49 @@ def _windows_creation(pid: int) -> int | None:
     if code.value != still_active:
         return None
     return int(times[0]) if told else 0
+
+
+class LoopStatus(NamedTuple):
+    """What a heartbeat says of the loop."""
+
+    sim_time_s: float
+    last_poll_wall_time_s: float | None
+    moved_wall_time_s: float | None
+    command: str | None
+    mode_before: str | None
+
+
+class RecordingStatus(NamedTuple):
+    """What a heartbeat says of the recording."""
+
+    rows_waiting: int
+    rows_dropped: int
+    last_error: str | None
+
+
+def write_heartbeat(
+    connection: sqlite3.Connection,
+    loop: LoopStatus,
+    recording: RecordingStatus,
+    session_id: int,
+    run_id: int | None,
+    rows: int,
+) -> None:
+    """Write a session and its run as they are now, inside a transaction of the caller.
+
+    Args:
+        connection: To the database.
+        loop: What the loop does.
+        recording: What became of its rows.
+        session_id: The session.
+        run_id: Its run.
+        rows: How many states of that run are in the database.
+    """
+    now = time.time()
+    seen = (now, time.monotonic(), loop.last_poll_wall_time_s, loop.moved_wall_time_s)
+    how = (loop.sim_time_s, loop.command, loop.mode_before)
+    connection.execute(_BEAT_SESSION, (*seen, *how, *recording, session_id))
+    connection.execute(_BEAT_RUN, (now, loop.sim_time_s, rows, run_id))
 
 
 def reap(connection: sqlite3.Connection, now_s: float) -> None:

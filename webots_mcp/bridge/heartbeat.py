@@ -5,9 +5,9 @@ from __future__ import annotations
 import time
 
 from webots_mcp.bridge.clock import Clock
-from webots_mcp.bridge.heartbeat_rows import LoopStatus
 from webots_mcp.bridge.recorder import Recorder
 from webots_mcp.contract import HEARTBEAT_INTERVAL_S, PAUSED
+from webots_mcp.liveness import LoopStatus
 
 
 class Heartbeat:

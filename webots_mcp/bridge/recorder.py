@@ -25,7 +25,6 @@ from webots_mcp.bridge.backlog import Backlog, Row
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.connection_lock import ConnectionLock, this_call
 from webots_mcp.bridge.error_report import ErrorReport
-from webots_mcp.bridge.heartbeat_rows import LoopStatus, RecordingStatus, write_heartbeat
 from webots_mcp.bridge.identity import Identity
 from webots_mcp.bridge.recovery import Recovery
 from webots_mcp.bridge.row_counts import RowCounts
@@ -34,6 +33,7 @@ from webots_mcp.bridge.run import Run
 from webots_mcp.bridge.session_connection import SessionConnection, patiently
 from webots_mcp.contract import Database
 from webots_mcp.entries import Kind, Values
+from webots_mcp.liveness import LoopStatus, RecordingStatus, write_heartbeat
 from webots_mcp.transactions import in_transaction
 from webots_mcp.waiting_file import WaitingFile, waiting_path
 
@@ -150,7 +150,7 @@ class Recorder:
             return
         connection, registration = self.session.opened
         status = RecordingStatus(self.rows_waiting, self.counts.dropped, self.errors.last_error)
-        ids = (registration.session_id, run)
+        ids = (registration.session_id, run.id, run.rows)
         patiently(
             lambda: in_transaction(
                 connection, lambda: write_heartbeat(connection, loop, status, *ids)

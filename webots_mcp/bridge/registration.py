@@ -10,13 +10,12 @@ from typing import Any, Final, NamedTuple
 
 from webots_mcp import liveness
 from webots_mcp.bridge.identity import Identity
-from webots_mcp.contract import PAUSED, REMOTE_SILENCE_S
-from webots_mcp.liveness import process_alive
+from webots_mcp.contract import PAUSED
 from webots_mcp.transactions import transaction
 from webots_mcp.waiting_file import enter_robot, enter_session
 
 _OPEN_SESSIONS: Final = (
-    "SELECT s.id, s.pid, s.process, s.host, s.last_seen_wall_time_s FROM session s "
+    "SELECT s.id, s.host, s.pid, s.process, s.last_seen_wall_time_s FROM session s "
     "JOIN robot r ON r.id = s.robot_id WHERE r.name = ? AND s.ended_wall_time_s IS NULL"
 )
 # A successor in the same Webots, soon after, means a reload; so does one after a reload that was
@@ -128,15 +127,12 @@ def _paused_mode(connection: sqlite3.Connection, identity: Identity, robot_id: i
 
 
 def _is_living(
-    session: tuple[int, int, str | None, str, float], identity: Identity, now_s: float
+    session: tuple[int, str, int, str | None, float], identity: Identity, now_s: float
 ) -> bool:
-    """On this host the process shows it; on another only a recent heartbeat does."""
-    session_id, pid, process, host, last_seen_s = session
-    if host != identity.host:
-        return now_s - last_seen_s < REMOTE_SILENCE_S
-    if pid == identity.pid:
+    session_id, host, pid, process, last_seen_s = session
+    if (host, pid) == (identity.host, identity.pid):
         return session_id in _own_sessions
-    return process_alive(pid, process, last_seen_s)
+    return liveness.is_living(host, pid, process, last_seen_s, now_s)
 
 
 def describe_robot(identity: Identity, name: str) -> dict[str, Any]:

@@ -25,9 +25,9 @@ _PIECE_BYTES: Final = 1_000_000
 _MOST_TIMES: Final = 100
 _HARMLESS_BYTES: Final = 100_000_000
 _LINK: Final = 0o120000  # of a file's type in Unix, as archives keep it
-_END_SESSION: Final = (
-    "UPDATE session SET ended_wall_time_s = (SELECT max(ended_wall_time_s) FROM run), "
-    "end_reason = 'finished' WHERE ended_wall_time_s IS NULL"
+END_SESSIONS: Final = (  # with the last of their runs that is here
+    "UPDATE session SET ended_wall_time_s = (SELECT max(ended_wall_time_s) FROM run "
+    "WHERE session_id = session.id), end_reason = 'finished' WHERE ended_wall_time_s IS NULL"
 )
 _DAMAGED: Final = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 
@@ -61,7 +61,7 @@ def write_bundle(
             frozen = "&immutable=1" if isinstance(connection, FrozenConnection) else ""
             address = f"{database.absolute().as_uri()}?mode=ro{frozen}"
             merge(writer, folder, database, run_id=run_id, address=address, pictures=data_dir)
-            writer.execute(_END_SESSION)
+            writer.execute(END_SESSIONS)
         pack(folder, file, progress)
 
 

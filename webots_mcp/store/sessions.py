@@ -6,11 +6,10 @@ import json
 import sqlite3
 import time
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, Final
 
-from webots_mcp.contract import HEARTBEAT_LATE_S, PAUSED, REMOTE_SILENCE_S, host_name
-from webots_mcp.liveness import process_alive
+from webots_mcp.contract import HEARTBEAT_LATE_S, PAUSED, host_name
+from webots_mcp.liveness import is_living, process_alive
 from webots_mcp.store.run_rows import columns_of
 
 
@@ -45,16 +44,9 @@ class Session:
     end_reason: str | None
 
     def is_alive(self, now_s: float) -> bool:
-        """On this host its process tells; on another only its heartbeat can."""
-        if self.ended_wall_time_s is not None:
-            return False
-        if self.host == host_name():
-            return self._process_is_alive
-        return now_s - self.last_seen_wall_time_s < REMOTE_SILENCE_S
-
-    @cached_property
-    def _process_is_alive(self) -> bool:
-        return process_alive(self.pid, self.process, self.last_seen_wall_time_s)
+        """Whether it has not ended, and its process still runs."""
+        process = (self.host, self.pid, self.process, self.last_seen_wall_time_s)
+        return self.ended_wall_time_s is None and is_living(*process, now_s)
 
     def silent_s(self, now_s: float) -> float:
         """Time since its newest sign of life; of a process here by a clock that nobody sets."""
@@ -73,7 +65,8 @@ class Session:
 
     def _is_of_this_boot(self) -> bool:
         """A clock that counts from the boot tells nothing of the time before it."""
-        return self.host == host_name() and self._process_is_alive
+        process = (self.pid, self.process, self.last_seen_wall_time_s)
+        return self.host == host_name() and process_alive(*process)
 
 
 _COLUMNS: Final = columns_of(Session)

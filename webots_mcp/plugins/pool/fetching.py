@@ -28,7 +28,7 @@ from webots_mcp.plugins.pool.catalogue import Meant
 from webots_mcp.plugins.pool.key_order import Order, in_order, order_of
 from webots_mcp.plugins.pool.tables import SQLValue, table
 from webots_mcp.plugins.pool.target import Pool, PooledRun, is_whole
-from webots_mcp.store.bundle import small_recording
+from webots_mcp.store.bundle import END_SESSIONS, small_recording
 from webots_mcp.store.images import PICTURES
 from webots_mcp.store.merging import merge
 from webots_mcp.transactions import transaction
@@ -43,10 +43,6 @@ _OF_RUN: Final = (
 )  # fmt: skip
 _STATES: Final = ("state", "kept_state")
 _HERE: Final = "SELECT uuid, id FROM run WHERE uuid IS NOT NULL"
-_END_SESSIONS: Final = (
-    "UPDATE session SET ended_wall_time_s = (SELECT max(ended_wall_time_s) FROM run "
-    "WHERE session_id = session.id), end_reason = 'finished' WHERE ended_wall_time_s IS NULL"
-)
 _COUNTED: Final = (
     "SELECT id, rows, purged_rows, (SELECT count(*) FROM state WHERE run_id = run.id), "
     "(SELECT count(*) FROM state s WHERE run_id = run.id AND EXISTS (SELECT 1 FROM kept_stretch k "
@@ -208,7 +204,7 @@ class _Fetcher:
             with small_recording(folder) as small:
                 if not _Copy(self._pool, recording, small).trials(ids, sets):
                     return
-                small.execute(_END_SESSIONS)
+                small.execute(END_SESSIONS)
             merge(self._connection, self._data_dir, folder / DATABASE_NAME)
 
     def _settle(self, small: sqlite3.Connection, uuids: Mapping[int, str]) -> None:
@@ -227,7 +223,7 @@ class _Fetcher:
                 small.execute(_DROP_RUN, {"run": run_id})
             small.execute(_PURGED, (gone, run_id))
         small.execute(_DROP_SESSIONS)
-        small.execute(_END_SESSIONS)
+        small.execute(END_SESSIONS)
 
 
 class _Copy:

@@ -7,6 +7,7 @@ The names are imported when first asked for, and from the standard library only:
 inside a robot's controller, and its pytest plugin is loaded by every pytest run.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -18,14 +19,15 @@ __version__ = "0.1.0"
 __all__ = ["BridgeStats", "MCPBridge", "MemoryDatabase", "__version__"]
 
 
+_HOMES = {
+    "MCPBridge": "webots_mcp.bridge.mcp_bridge",
+    "BridgeStats": "webots_mcp.bridge.stats",
+    "MemoryDatabase": "webots_mcp.contract",
+}
+
+
 def __getattr__(name: str) -> Any:
-    if name == "MCPBridge":
-        from webots_mcp.bridge import mcp_bridge as home
-    elif name == "BridgeStats":
-        from webots_mcp.bridge import stats as home
-    elif name == "MemoryDatabase":
-        from webots_mcp import contract as home
-    else:
+    if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    globals()[name] = value = getattr(home, name)
+    globals()[name] = value = getattr(import_module(_HOMES[name]), name)
     return value

@@ -16,9 +16,9 @@ from typing import Any, Final
 
 from webots_mcp.bridge.commands import ClaimedCommand, Progress
 from webots_mcp.bridge.context import Context
-from webots_mcp.bridge.scene_edits import MOST_EDITS, FieldEdit, Removal
+from webots_mcp.bridge.scene_edits import MOST_EDITS
 from webots_mcp.bridge.scene_path import Place, children, find, find_node, label
-from webots_mcp.bridge.scene_restoring import find_again, import_node, spot_of
+from webots_mcp.bridge.scene_restoring import FieldEdit, Removal, find_again, import_node, spot_of
 from webots_mcp.bridge.scene_values import (
     MOST_ENTRIES,
     checked,

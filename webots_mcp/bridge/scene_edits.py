@@ -7,64 +7,16 @@ nor brings removed nodes back: that is done here, as long as the controller's pr
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final, NamedTuple
+from typing import TYPE_CHECKING, Final
 
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Simulation
 
 if TYPE_CHECKING:
-    from webots_mcp.bridge.scene_restoring import Restoration
+    from webots_mcp.bridge.scene_restoring import FieldEdit, Removal, Restoration
 
 MOST_EDITS: Final = 200  # that are put back
-MOST_EXPORTED_CHARACTERS: Final = 200_000  # of a removed node
-
-
-class FieldEdit(NamedTuple):
-    """A field, or an entry of one, that was set.
-
-    Attributes:
-        path: The way to it, as it was asked for.
-        node_id: The number of its node.
-        name: Of the field.
-        entry: Its place; None for all of the field.
-        type_name: Of what was set.
-        before: The value before it was set for the first time in this run.
-        value: The newest value that it was set to.
-    """
-
-    path: str
-    node_id: int
-    name: str
-    entry: int | None
-    type_name: str
-    before: Any
-    value: Any
-
-
-class Removal(NamedTuple):
-    """A node that was removed, as text, and where it stood.
-
-    Attributes:
-        path: The way to it, as it was asked for.
-        node_id: Of the node, or of the one that took its place at the last reset.
-        parent_id: Of the node around it; None for the top of the tree.
-        field: The name of the field in which it stood.
-        entry: Its place in the field; None in one that holds a single node.
-        text: As it would stand in a world file.
-    """
-
-    path: str
-    node_id: int
-    parent_id: int | None
-    field: str
-    entry: int | None
-    text: str
-
-    @property
-    def is_written_out(self) -> bool:
-        """Whether the text is there, and short enough to be remembered."""
-        return 0 < len(self.text) <= MOST_EXPORTED_CHARACTERS
 
 
 class SceneEdits:

@@ -26,6 +26,7 @@ from typing import Final, Literal
 
 from webots_mcp.connection import CHECKPOINT_TIMEOUT_MS, connect, identify_files
 from webots_mcp.errors import WebotsMCPError, warn
+from webots_mcp.leases import Lease, give_back, take
 from webots_mcp.schema import require_current
 from webots_mcp.transactions import is_busy, never_wait, text_of
 from webots_mcp.waiting_file import adopt
@@ -33,26 +34,18 @@ from webots_mcp.waiting_file import adopt
 INTERVAL_S: Final = 1.0
 HURRIED_INTERVAL_S: Final = 0.25  # while the log grows fast: a long one takes long to copy
 LEASE_S: Final = 5.0
-_LATEST_S: Final = 2 * LEASE_S  # one that ends later was taken before the clock was set back
+_JOB: Final = "maintainer"
+_BRIDGES: Final = "bridge %"  # which give way to a server
 WAL_LIMIT_BYTES: Final = 1_000_000  # a shorter log is left alone
 LONG_LOG_BYTES: Final = 12_000_000  # it begins anew, for which rows wait a few milliseconds
 LONGEST_LOG_BYTES: Final = 32_000_000  # its file is cut
 FAST_GROWTH_BYTES: Final = 4_000_000  # in one interval
 
-# Taken when free, ours already, or (by a server) held by a bridge; the row counts as changed in
-# each of these cases and in no other.
-TAKE_LEASE: Final = (
-    "INSERT INTO lease (name, holder, until_wall_time_s) VALUES ('maintainer', :holder, :until) "
-    "ON CONFLICT (name) DO UPDATE SET holder = :holder, until_wall_time_s = :until "
-    "WHERE holder = :holder OR until_wall_time_s NOT BETWEEN :now AND :latest "
-    "OR (:holder LIKE 'server %' AND holder LIKE 'bridge %')"
-)
-GIVE_LEASE_BACK: Final = "DELETE FROM lease WHERE name = 'maintainer' AND holder = ?"
 # Another program may have written anything there: an end that is no time has passed.
 _LEASE: Final = (
-    "SELECT holder = :holder, holder LIKE 'bridge %', "
+    f"SELECT holder = :holder, holder LIKE '{_BRIDGES}', "
     "iif(typeof(until_wall_time_s) IN ('real', 'integer'), until_wall_time_s, 0) "
-    "FROM lease WHERE name = 'maintainer'"
+    f"FROM lease WHERE name = '{_JOB}'"
 )
 
 
@@ -78,7 +71,8 @@ class Maintainer(threading.Thread):
     ) -> None:
         super().__init__(name="webots-mcp maintainer", daemon=True)
         self._database = database
-        self._holder = f"{kind} {os.getpid()} {os.urandom(3).hex()}"
+        self._lease = Lease(_JOB, f"{kind} {os.getpid()} {os.urandom(3).hex()}", LEASE_S)
+        self._outranked = _BRIDGES if kind == "server" else None
         self._on_tick = on_tick
         self._work = work
         self._connection: sqlite3.Connection | None = None
@@ -150,25 +144,20 @@ class Maintainer(threading.Thread):
     def _hold_lease(self, connection: sqlite3.Connection) -> bool:
         """Renew at half time only, so that most ticks write nothing."""
         now = time.time()
-        lease = connection.execute(_LEASE, {"holder": self._holder}).fetchone()
+        lease = connection.execute(_LEASE, {"holder": self._lease.holder}).fetchone()
         is_ours, is_bridges, until_s = lease or (False, False, 0.0)
         if is_ours and LEASE_S / 2 < until_s - now <= LEASE_S:
             return True
-        outranked = is_bridges and self._holder.startswith("server ")
-        if not is_ours and now <= until_s <= now + _LATEST_S and not outranked:
+        outranked = is_bridges and self._outranked
+        if not is_ours and now <= until_s <= self._lease.latest_s(now) and not outranked:
             return False
         if lease is None:  # it was free: there is no checkpoint of another's to wait for
             self._held_before = True
-        return self._take_lease(connection, now)
+        return self._take_lease(connection)
 
-    def _take_lease(self, connection: sqlite3.Connection, now: float) -> bool:
-        values = {
-            "holder": self._holder,
-            "until": now + LEASE_S,
-            "now": now,
-            "latest": now + _LATEST_S,
-        }
-        return connection.execute(TAKE_LEASE, values).rowcount > 0
+    def _take_lease(self, connection: sqlite3.Connection) -> bool:
+        """Also renew it, or take it from a bridge where this is a server."""
+        return take(connection, self._lease, outranked=self._outranked)
 
     def _checkpoint(self, connection: sqlite3.Connection) -> None:
         """Copy the log back, if it is long and grew since the last time; cut it once it rests."""
@@ -185,7 +174,7 @@ class Maintainer(threading.Thread):
             self._copy_log(connection, "TRUNCATE" if cut else "RESTART")
             # The first commit into a new log waits until the disk has the log's header. Made here
             # it costs no control loop its time: 5 ms at p99.9.
-            self._take_lease(connection, time.time())
+            self._take_lease(connection)
             log_bytes = 0
         self._log_bytes = log_bytes
 
@@ -195,7 +184,7 @@ class Maintainer(threading.Thread):
         Returns:
             How long the log is.
         """
-        if not self._take_lease(connection, time.time()):
+        if not self._take_lease(connection):
             return 0
         never_wait(connection)  # for readers, with the write lock in hand
         try:
@@ -208,7 +197,7 @@ class Maintainer(threading.Thread):
         if self._connection is None:
             return
         try:
-            self._connection.execute(GIVE_LEASE_BACK, (self._holder,))
+            give_back(self._connection, self._lease)
         except sqlite3.Error as error:
             warn(f"the lease runs out by itself: {error}")
         self._disconnect()

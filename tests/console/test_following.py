@@ -24,7 +24,7 @@ from tests.webots.server import WebotsServer
 from webots_mcp.console import console_follower
 from webots_mcp.console.console_follower import follow_console, job_of
 from webots_mcp.contract import host_name
-from webots_mcp.store.leases import holder_of
+from webots_mcp.leases import holder_of
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.instances import Instance
 

@@ -12,7 +12,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.connection import connect
-from webots_mcp.store.leases import LEASE_S, Lease, holder_of, still_held, take
+from webots_mcp.leases import LEASE_S, Lease, give_back, holder_of, lease_of, still_held, take
 
 JOB = "trial set 1"
 
@@ -26,9 +26,9 @@ def file(tmp_path: Path) -> Iterator[Path]:
 
 @pytest.fixture
 def lease(file: Path) -> Lease:
+    taken = lease_of(JOB)
     with closing(connect(file, "writer")) as connection:
-        taken = take(connection, JOB)
-    assert taken is not None
+        assert take(connection, taken)
     return taken
 
 
@@ -58,7 +58,7 @@ def test_a_lease_that_is_renewed_just_as_another_takes_it_stays_with_its_holder(
     file: Path, lease: Lease
 ) -> None:
     with renewed_before_each_statement(file, lease) as connection:
-        assert take(connection, JOB) is None
+        assert not take(connection, lease_of(JOB))
         assert holder_of(connection, JOB) == lease.holder
 
 
@@ -69,4 +69,15 @@ def test_a_lease_that_ran_out_or_is_of_a_clock_that_was_set_back_is_nobodys(
     with closing(connect(file, "writer")) as connection:
         connection.execute("UPDATE lease SET until_wall_time_s = ?", (time.time() + left_s,))
         assert holder_of(connection, JOB) is None
-        assert take(connection, JOB) is not None
+        assert take(connection, lease_of(JOB))
+
+
+def test_who_outranks_the_holder_of_a_lease_takes_it_and_gives_it_back(file: Path) -> None:
+    bridge, server = lease_of(JOB)._replace(holder="bridge 1"), lease_of(JOB)
+    with closing(connect(file, "writer")) as connection:
+        assert take(connection, bridge)
+        assert not take(connection, server, outranked="server %")
+        assert take(connection, server, outranked="bridge %")
+        assert not take(connection, bridge)
+        give_back(connection, server)
+        assert take(connection, bridge)

@@ -18,9 +18,9 @@ from typing import Final
 from webots_mcp.console.ownership import own_webots
 from webots_mcp.contract import LogLevel, LogSource
 from webots_mcp.errors import CommandRefusedError, DatabaseError, WebotsMCPError, warn
-from webots_mcp.store import leases
+from webots_mcp.leases import give_back, holder_of, lease_of, take
 from webots_mcp.store.console import ConsoleRows, Said
-from webots_mcp.store.leases import Job, holder_of
+from webots_mcp.store.jobs import Job
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.instances import Instance
 from webots_mcp.webots.stream import (
@@ -122,11 +122,11 @@ class ConsoleFollower(threading.Thread):
         self.join(timeout=3)
 
     def _follow_if_free(self) -> None:
+        lease = lease_of(job_of(self.instance))
         with self._recording.writer() as connection:
-            lease = leases.take(connection, job_of(self.instance))
-        if lease is None:
-            self.problem = "another process follows it"
-            return
+            if not take(connection, lease):
+                self.problem = "another process follows it"
+                return
         job = Job(self._recording, lease)
         try:
             with job.writer() as connection:
@@ -134,7 +134,7 @@ class ConsoleFollower(threading.Thread):
             self._follow(job)
         finally:
             with suppress(WebotsMCPError), self._recording.writer() as connection:
-                leases.give_back(connection, lease)
+                give_back(connection, lease)
 
     def _follow(self, job: Job) -> None:
         """Until it is to end, or Webots hangs up; what has come is recorded in any case."""

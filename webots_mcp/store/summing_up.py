@@ -15,8 +15,8 @@ from typing import Final
 
 from webots_mcp.connection import FrozenConnection
 from webots_mcp.errors import DatabaseError
+from webots_mcp.leases import holder_of
 from webots_mcp.maintenance import Maintainer
-from webots_mcp.store.leases import holder_of
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.rollup.rolling import BATCH_ROWS, roll, watermark

@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from webots_mcp.contract import host_name, new_uuid
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
+from webots_mcp.leases import Lease, give_back, holder_of, lease_of, take
 from webots_mcp.liveness import process_alive, process_identity
 from webots_mcp.store.analysis.ranking import Best, Outcome, Ranking, rank
-from webots_mcp.store.leases import Lease, give_back, holder_of, take
 from webots_mcp.store.run_rows import columns_of
 from webots_mcp.transactions import transaction
 
@@ -264,8 +264,8 @@ def take_up(connection: sqlite3.Connection, set_id: int) -> Lease:
     """
     with transaction(connection):
         found = fetch_trial_set(connection, set_id)
-        lease = take(connection, found.job, forced=found.is_left)
-        if lease is None:
+        lease = lease_of(found.job)
+        if not take(connection, lease, forced=found.is_left):
             raise CommandRefusedError(
                 f"process {found.pid} on {found.host} works on trial set {set_id}: wait for it, "
                 "or end it"

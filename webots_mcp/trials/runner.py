@@ -20,7 +20,7 @@ from typing import Any, Final
 
 from webots_mcp.contract import DATABASE_NAME, make_folder
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.store.leases import Job
+from webots_mcp.store.jobs import Job
 from webots_mcp.store.merging import merge
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import (

@@ -24,6 +24,7 @@ ALLOWED = {
     "queue": {"contract", "errors", "transactions"},
     "requirements": set[str](),
     "leases": {"contract", "errors", "transactions"},
+    "stored_breakpoints": {"conditions", "contract", "errors", "transactions"},
     "naming": set[str](),
     "conditions": {"conditions", "errors", "naming"},
     "parameter": {"errors", "naming"},
@@ -41,6 +42,7 @@ ENTRIES = {
     "parameter",
     "liveness",
     "queue",
+    "stored_breakpoints",
 }
 STDLIB = {
     *ENTRIES,

@@ -5,6 +5,7 @@ Standard library only, because the bridge imports it inside a robot's controller
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Sequence
 from typing import Any, Final, NamedTuple, TypeAlias, cast
@@ -51,6 +52,19 @@ class Declaration(NamedTuple):
     choices: tuple[Value, ...] | None = None
     doc: str = ""
     unit: str | None = None
+
+    def as_row(self) -> dict[str, Any]:
+        """What its row in the table `parameter` holds, where texts stand for JSON."""
+        choices = None if self.choices is None else json.dumps(self.choices, ensure_ascii=False)
+        default = json.dumps(self.default, ensure_ascii=False)
+        return {**self._asdict(), "default": default, "choices": choices}
+
+    @classmethod
+    def of_row(cls, *row: Any) -> Declaration:
+        """The declaration that a row holds, of which these are the values in the fields' order."""
+        name, kind, default, low, high, choices, doc, unit = row
+        listed = None if choices is None else tuple(json.loads(choices))
+        return cls(name, kind, json.loads(default), low, high, listed, doc, unit)
 
     def checked(self, value: object) -> Value:
         """The value as the parameter holds it: a float parameter takes 3 as 3.0.

@@ -17,6 +17,7 @@ from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.text import cut, describe, storable
 from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError, InvalidInputError
+from webots_mcp.stored_breakpoints import ARMED, OF_CONTROLLER, SET
 
 if TYPE_CHECKING:
     from webots_mcp.conditions import Condition, Evaluator
@@ -24,19 +25,6 @@ if TYPE_CHECKING:
 MOST_EVENTS: Final = 1000  # of one breakpoint in one run; a condition that flickers is no moment
 _UNPUBLISHED_S: Final = 1.0  # a signal that was not published for so long is told
 _MOST_ERROR_CHARACTERS: Final = 1000
-_OF_CONTROLLER: Final = "controller"
-
-# Those that the controller's own code sets end with its session; texts come as bytes, because one
-# that is no UTF-8 would fail the statement.
-_ARMED: Final = (
-    "SELECT id, CAST(condition AS BLOB), CAST(action AS BLOB), after_hits FROM breakpoint "
-    "WHERE robot_id = ? AND enabled AND typeof(after_hits) = 'integer' "
-    "AND (created_by IS NOT ? OR session_id = ?) ORDER BY id LIMIT ?"
-)
-_SET: Final = (
-    "INSERT INTO breakpoint (robot_id, session_id, condition, action, after_hits, "
-    "created_wall_time_s, created_by) VALUES (?, ?, ?, ?, ?, ?, ?) RETURNING id"
-)
 
 
 class Breakpoint:
@@ -121,7 +109,7 @@ class Breakpoints:
 
     def begin(self) -> None:
         """At the start of a session: what is stored, without what sessions before have set."""
-        self._recorder.record("breakpoints forgotten", None, {"by": _OF_CONTROLLER})
+        self._recorder.record("breakpoints forgotten", None, {"by": OF_CONTROLLER})
         self.load()
 
     def load(self) -> bool:
@@ -138,8 +126,8 @@ class Breakpoints:
         registration = self._recorder.session.registration
         if registration is None:
             return False
-        ids = (registration.robot_id, _OF_CONTROLLER, registration.session_id, MAX_BREAKPOINTS)
-        rows = self._recorder.fetch(_ARMED, ids)
+        ids = {"robot": registration.robot_id, "session": registration.session_id}
+        rows = self._recorder.fetch(ARMED, {**ids, "most": MAX_BREAKPOINTS})
         if rows is None:
             return False
         if registration is not self._registration:
@@ -213,8 +201,8 @@ class Breakpoints:
         if registration is None:
             return None
         ids = (registration.robot_id, registration.session_id)
-        values = (*ids, storable(text), action, after_hits, time.time(), _OF_CONTROLLER)
-        rows = self._recorder.fetch(_SET, values)
+        values = (*ids, storable(text), action, after_hits, time.time(), OF_CONTROLLER)
+        rows = self._recorder.fetch(SET, values)
         return int(rows[0][0]) if rows else None
 
     def describe(self) -> dict[str, object]:

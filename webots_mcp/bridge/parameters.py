@@ -141,7 +141,7 @@ class Parameters:
             self._redeclare(held, declaration)
         else:
             return held.parameter
-        self._recorder.record("parameter", None, _described(declaration))
+        self._recorder.record("parameter", None, {**declaration.as_row(), "now": time.time()})
         self._record_values([held])
         return held.parameter
 
@@ -214,7 +214,7 @@ class Parameters:
         """What a database that knows nothing of this session must be given: kind, of the run?"""
         held = tuple(self._held.values())
         for each in held:
-            yield "parameter", False, _described(each.declaration)
+            yield "parameter", False, {**each.declaration.as_row(), "now": time.time()}
         if held:
             yield "parameter values", True, self._values_of(held)
         if waiting := dict(self._from_reset):
@@ -276,15 +276,6 @@ def _declared_anew(before: Declaration, now: Declaration) -> str:
         f"parameter {now.name!r} is declared again, with {', '.join(changed)}: what was declared "
         "last counts, for both"
     )
-
-
-def _described(declaration: Declaration) -> dict[str, Any]:
-    """The values of the statement "parameter"."""
-    described = declaration._asdict()
-    described["default"] = json.dumps(declaration.default, ensure_ascii=False)
-    if declaration.choices is not None:
-        described["choices"] = json.dumps(declaration.choices, ensure_ascii=False)
-    return {**described, "now": time.time()}
 
 
 def _next(values: Mapping[str, Value | None]) -> dict[str, Any]:

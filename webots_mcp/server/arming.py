@@ -8,6 +8,7 @@ from typing import Any, Final
 
 from anyio import to_thread
 
+from webots_mcp import stored_breakpoints as stored
 from webots_mcp.conditions import Condition, parse_condition
 from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
@@ -15,7 +16,6 @@ from webots_mcp.questions.answers import BreakpointAnswer, CommandAnswer
 from webots_mcp.questions.shortening import cut_text
 from webots_mcp.server.dispatch import Dispatcher, Report
 from webots_mcp.server.running import holds_since
-from webots_mcp.store import breakpoints as stored
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.signals.catalogue import catalogue

@@ -201,10 +201,9 @@ def _described(name: str, values: RunParameter | None, declared: Declared | None
 
 
 def _declared(row: tuple[Any, ...]) -> Declared:
-    name, kind, default, low, high, choices, doc, unit, next_value = row
-    listed = None if choices is None else tuple(json.loads(choices))
-    declaration = Declaration(name, kind, json.loads(default), low, high, listed, doc, unit)
-    return Declared(declaration, None if next_value is None else json.loads(next_value))
+    *declared, next_value = row
+    value = None if next_value is None else json.loads(next_value)
+    return Declared(Declaration.of_row(*declared), value)
 
 
 def _text(value: Value) -> str:

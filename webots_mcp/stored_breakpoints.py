@@ -1,21 +1,33 @@
-"""The stored breakpoints: conditions that a robot's bridge asks of each published state."""
+"""The stored breakpoints: conditions that a robot's bridge asks of each published state.
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
 
 from __future__ import annotations
 
 import sqlite3
 import time
-from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
-from webots_mcp.conditions import Condition
 from webots_mcp.contract import MAX_BREAKPOINTS, BreakpointAction
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.transactions import transaction
 
-# Those of a controller's own code end with its session.
+if TYPE_CHECKING:
+    from webots_mcp.conditions import Condition
+
+OF_CONTROLLER: Final = "controller"  # `created_by` of those that the controller's own code has set
+# Those end with their session.
 _OF_ROBOT: Final = (
     "FROM breakpoint b LEFT JOIN session s ON s.id = b.session_id WHERE b.robot_id = ? "
-    "AND (b.created_by IS NOT 'controller' OR (s.id IS NOT NULL AND s.ended_wall_time_s IS NULL))"
+    f"AND (b.created_by IS NOT '{OF_CONTROLLER}' "
+    "OR (s.id IS NOT NULL AND s.ended_wall_time_s IS NULL))"
+)
+# What a bridge arms; texts come as bytes, because one that is no UTF-8 would fail the statement.
+ARMED: Final = (
+    "SELECT id, CAST(condition AS BLOB), CAST(action AS BLOB), after_hits FROM breakpoint "
+    "WHERE robot_id = :robot AND enabled AND typeof(after_hits) = 'integer' "
+    f"AND (created_by IS NOT '{OF_CONTROLLER}' OR session_id = :session) ORDER BY id LIMIT :most"
 )
 _LISTED: Final = (
     "SELECT b.id, b.robot_id, b.condition, b.action, b.after_hits, b.enabled, b.hits, "
@@ -27,9 +39,10 @@ _LIKE: Final = (
     f"SELECT b.id {_OF_ROBOT} AND b.enabled AND b.condition = ? AND b.action = ? "
     "AND b.after_hits = ?"
 )
-_SET: Final = (
-    "INSERT INTO breakpoint (robot_id, condition, action, after_hits, created_wall_time_s, "
-    "created_by) VALUES (?, ?, ?, ?, ?, ?) RETURNING id"
+# Of a controller's own code with its session, else without one.
+SET: Final = (
+    "INSERT INTO breakpoint (robot_id, session_id, condition, action, after_hits, "
+    "created_wall_time_s, created_by) VALUES (?, ?, ?, ?, ?, ?, ?) RETURNING id"
 )
 _REMOVE: Final = "DELETE FROM breakpoint WHERE id = ? AND robot_id = ? RETURNING id"
 _NEWEST_HIT: Final = (
@@ -39,8 +52,7 @@ _NEWEST_HIT: Final = (
 )
 
 
-@dataclass(frozen=True)
-class StoredBreakpoint:
+class StoredBreakpoint(NamedTuple):
     """A breakpoint as the database has it.
 
     Attributes:
@@ -86,8 +98,8 @@ def set_breakpoint(
             raise InvalidInputError(
                 f"this robot has {MAX_BREAKPOINTS} breakpoints: remove one first"
             )
-        values = (robot_id, *asked, time.time(), created_by)
-        return int(connection.execute(_SET, values).fetchall()[0][0])
+        values = (robot_id, None, *asked, time.time(), created_by)
+        return int(connection.execute(SET, values).fetchall()[0][0])
 
 
 def remove_breakpoint(connection: sqlite3.Connection, robot_id: int, breakpoint_id: int) -> None:

@@ -51,9 +51,6 @@ _LEVEL_ALIASES: Final[dict[str, LogLevel]] = {
     "fatal": "critical",
 }
 
-PAUSED: Final = "paused"  # what a command does to the loop, as the column session.hold tells it
-STEPPING: Final = "stepping"
-
 _PACKAGE: Final = Path(__file__).parent
 
 

@@ -33,6 +33,7 @@ from webots_mcp.errors import (
     InterruptedCommandError,
     InvalidInputError,
 )
+from webots_mcp.pauses import Cause
 
 Action = Callable[[Context, ClaimedCommand], Progress]
 
@@ -83,7 +84,7 @@ def pause(context: Context, command: ClaimedCommand) -> Progress:
     if context.throttle.stale and not context.pause.active:
         context.throttle.want()
         yield
-    context.pause.begin(command_id=command.id)
+    context.pause.begin(Cause(command.id))
     return _mode(context)
 
 
@@ -135,7 +136,7 @@ def _step(context: Context, command: ClaimedCommand, steps: int) -> Progress:
     ended_by = "it was cancelled" if watch.stepping != command.id else "a breakpoint paused it"
     why = {"why": f"{ended_by} before the last step"} if made < steps else {}
     watch.stepping = None
-    context.pause.begin(command_id=command.id)
+    context.pause.begin(Cause(command.id))
     advanced_s = round(clock.sim_time_s - from_s, 6)
     return {"steps": made, "advanced_s": advanced_s, **_mode(context), **why}
 
@@ -347,8 +348,8 @@ def _run_until(context: Context, command: ClaimedCommand, goal: Goal) -> Progres
             yield from _reset(context)
         while not watch.over():
             if pause.active:
-                cause = ", ".join(f"{name} {value}" for name, value in pause.cause.items())
-                watch.interrupt("interrupted", f"the simulation was paused meanwhile: {cause}")
+                why = f"the simulation was paused meanwhile: {pause.cause}"
+                watch.interrupt("interrupted", why)
             yield
         return watch.describe() | {"mode": context.simulation.mode_name}
     except ControllerEndedError as ending:
@@ -387,7 +388,7 @@ def _finish_of(context: Context, command: ClaimedCommand, then: Then) -> Callabl
         if then == "go_on" or (then == "as_before" and not was_paused):
             pause.give_mode_back()
         else:
-            pause.begin(command_id=command.id)
+            pause.begin(Cause(command.id))
 
     return finish
 

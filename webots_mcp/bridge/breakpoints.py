@@ -17,6 +17,7 @@ from webots_mcp.bridge.simulation import Simulation
 from webots_mcp.bridge.text import cut, describe, storable
 from webots_mcp.contract import BREAKPOINT_ACTIONS, MAX_BREAKPOINTS
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError, InvalidInputError
+from webots_mcp.pauses import Cause
 from webots_mcp.stored_breakpoints import ARMED, OF_CONTROLLER, SET
 
 if TYPE_CHECKING:
@@ -256,7 +257,7 @@ class Breakpoints:
         pausing = [each for each in hit if each.action == "pause"]
         if pausing and self._simulation.supervisor:
             first = pausing[0]
-            self._pause.begin(breakpoint_id=first.id, condition=first.condition.text)
+            self._pause.begin(Cause(breakpoint_id=first.id, condition=first.condition.text))
 
     def _tell(self, each: Breakpoint, state: Any) -> None:
         data: dict[str, object] = {

@@ -6,8 +6,9 @@ import time
 
 from webots_mcp.bridge.clock import Clock
 from webots_mcp.bridge.recorder import Recorder
-from webots_mcp.contract import HEARTBEAT_INTERVAL_S, PAUSED
+from webots_mcp.contract import HEARTBEAT_INTERVAL_S
 from webots_mcp.liveness import LoopStatus
+from webots_mcp.pauses import PAUSED
 
 
 class Heartbeat:

@@ -11,7 +11,16 @@ from webots_mcp.bridge.gate import QUIT, Step
 from webots_mcp.bridge.heartbeat import Heartbeat
 from webots_mcp.bridge.journal import Journal
 from webots_mcp.bridge.simulation import Simulation
-from webots_mcp.contract import PAUSED, STEPPING
+from webots_mcp.pauses import (
+    BRIDGE_CLOSED,
+    IN_WEBOTS,
+    PAUSE,
+    PAUSED,
+    RESUME,
+    SESSION_BEFORE,
+    STEPPING,
+    Cause,
+)
 
 PUMP_INTERVAL_S: Final = 0.01
 
@@ -67,7 +76,7 @@ class Pause:
         self._ask_before_steps: Callable[[], object] | None = None
         self._companion: Companion | None = None
         self.active = False
-        self.cause: dict[str, object] = {}
+        self.cause = Cause()
         self.serve: Callable[[], object] = self.pump
 
     @property
@@ -75,19 +84,15 @@ class Pause:
         """The simulation mode now; or before the pause, a run's own pace or steps."""
         return self._mode_before or self._simulation.mode_name
 
-    def begin(self, **cause: object) -> None:
-        """Pause the simulation and keep the loop from here on.
-
-        Args:
-            cause: What it is paused for, as its event tells it.
-        """
+    def begin(self, cause: Cause) -> None:
+        """Pause the simulation and keep the loop from here on."""
         if self.active:
             return
         self.cause = cause
         self._begins()
         self._activate(self.running_mode)
         self._simulation.set_mode("pause")
-        self._journal.event("pause", cause)
+        self._journal.event(PAUSE, cause.data)
         self._heartbeat.change_loop(PAUSED, self._mode_before)
 
     def end(
@@ -98,7 +103,7 @@ class Pause:
         self._simulation.set_mode(mode or _running(before))
         self._deactivate()
         if was_active:
-            self._journal.event("resume", {"command_id": command.id})
+            self._journal.event(RESUME, Cause(command.id).data)
         self._heartbeat.change_loop(STEPPING if stepping else None)
 
     def lend_mode(
@@ -124,7 +129,8 @@ class Pause:
             return
         if self._simulation.paused:
             self._activate(mode_before)
-            self._journal.event("pause", {"by": "the controller's session before this one"})
+            self.cause = Cause(by=SESSION_BEFORE)
+            self._journal.event(PAUSE, self.cause.data)
             self._heartbeat.change_loop(PAUSED, mode_before)
 
     def close(self) -> None:
@@ -133,14 +139,14 @@ class Pause:
             return
         self._simulation.set_mode(_running(self._mode_before))
         if self.active:
-            self._end_by("the bridge, which was closed")
+            self._end_by(BRIDGE_CLOSED)
 
     def pump(self) -> None:
         """Hear from Webots: it may want to quit, or a person may have pressed play."""
         if not self._simulation.pump():
             self._deactivate()
         elif not self._simulation.paused:
-            self._end_by("a person or another controller, in Webots")
+            self._end_by(IN_WEBOTS)
 
     def ask_before_steps(self, ask: Callable[[], object] | None) -> None:
         """Call it before each step that the loop begins: it may begin the pause. None: no more."""
@@ -181,7 +187,7 @@ class Pause:
 
     def _end_by(self, whom: str) -> None:
         self._deactivate()
-        self._journal.event("resume", {"by": whom})
+        self._journal.event(RESUME, Cause(by=whom).data)
         self._heartbeat.change_loop(None)
 
     def _activate(self, mode_before: str) -> None:

@@ -15,11 +15,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from webots_mcp.contract import PAUSED, UNSEEN, host_name
+from webots_mcp.contract import UNSEEN, host_name
 from webots_mcp.diagnosis.finding import Finding, Subject, last_seen_s, worst
+from webots_mcp.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.store.recording import View
 from webots_mcp.store.sessions import Session, companions
-from webots_mcp.store.status import SEEN_PAUSED, SEEN_RUNNING, SILENT
+from webots_mcp.store.status import SILENT
 from webots_mcp.webots.stream import address_of
 
 if TYPE_CHECKING:

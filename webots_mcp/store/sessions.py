@@ -8,8 +8,9 @@ import time
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.contract import HEARTBEAT_LATE_S, PAUSED, host_name
+from webots_mcp.contract import HEARTBEAT_LATE_S, host_name
 from webots_mcp.liveness import is_living, process_alive
+from webots_mcp.pauses import PAUSED
 from webots_mcp.store.run_rows import columns_of
 
 

@@ -12,12 +12,23 @@ from webots_mcp.contract import (
     ENDED_BY,
     HEARTBEAT_INTERVAL_S,
     MODE_EVENT,
-    PAUSED,
     UNMOVED,
     UNSEEN,
 )
 from webots_mcp.entries import Entry
 from webots_mcp.liveness import EXTERN
+from webots_mcp.pauses import (
+    HELD_ELSEWHERE,
+    LEFT_PAUSED,
+    PAUSE,
+    PAUSED,
+    RESUME,
+    SEEN_PAUSED_BY,
+    SEEN_RUNNING,
+    SEEN_RUNNING_BY,
+    breakpoint_at,
+    change_since,
+)
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.run_rows import Run, newest_state, recent_interval_s
 from webots_mcp.store.sessions import Session, companions, left_holding
@@ -26,14 +37,6 @@ from webots_mcp.waiting_file import count_rows, next_entries, read_header, waiti
 NEVER_SEEN: Final = "never seen"
 RUNNING: Final = "running"
 STARTING: Final = "starting"
-
-# A hold is noted as an event at the instant; the heartbeat tells of it only at its next beat.
-# What came after the beat has at least its simulation time, which bounds the search to the index.
-_HOLD_SINCE_BEAT: Final = (
-    "SELECT e.kind FROM run r JOIN event e ON e.run_id = r.id AND e.sim_time_s >= :sim_time_s "
-    "WHERE r.session_id = :session_id AND e.wall_time_s > :beat_s "
-    "AND e.kind IN ('pause', 'resume') ORDER BY e.id DESC LIMIT 1"
-)
 
 _CLAIMED: Final = (
     "SELECT id, action, coalesce(claimed_wall_time_s, created_wall_time_s) FROM command "
@@ -64,15 +67,6 @@ _ENDED_BY: Final = (
 )
 _MOST_ERROR_CHARACTERS: Final = 300
 _RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
-_BREAKPOINT_AT: Final = (
-    "SELECT CASE WHEN json_valid(data) THEN json_extract(data, '$.condition') END, sim_time_s "
-    "FROM event WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) AND kind = 'pause' "
-    "ORDER BY sim_time_s DESC, id DESC LIMIT 1"
-)
-_LEFT_PAUSED: Final = (
-    "robot {0!r} paused the simulation, and its controller has ended since: press play in Webots, "
-    "or start that controller again and resume it there"
-)
 # From inside these look alike; `diagnosis.simulation` looks at it from outside.
 SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
@@ -91,13 +85,6 @@ _NOT_STARTED: Final = (
 _SEEN_MODE: Final = (
     "SELECT json_extract(data, '$.mode') FROM event WHERE run_id IN "
     f"(SELECT id FROM run WHERE session_id = ?) AND kind = '{MODE_EVENT}' ORDER BY id DESC LIMIT 1"
-)
-SEEN_PAUSED: Final = "paused in Webots, as robot"
-SEEN_RUNNING: Final = "not paused, as robot"
-_SEEN_PAUSED: Final = f"{SEEN_PAUSED} {{!r}} sees; webots_simulation_control('resume') goes on"
-_SEEN_RUNNING: Final = (
-    f"{SEEN_RUNNING} {{!r}} sees, and yet time stands still: a controller hangs, or an extern "
-    "one is missing"
 )
 _STANDING: Final = (
     "its loop is alive but simulation time stands still: paused by the controller's own code, or "
@@ -134,11 +121,11 @@ def judge(
     if not session.is_alive(now_s):
         return _stopped(session, moved_s, now_s, _why_ended(connection, session))
     if holder := find_holder(connection, session, now_s):
-        here = holder is session
-        why = _breakpoint_at(connection, session) if here else _held_elsewhere(connection, holder)
-        return Status(PAUSED, why)
+        if holder is session:
+            return Status(PAUSED, breakpoint_at(connection, session.id))
+        return Status(PAUSED, HELD_ELSEWHERE.format(robot_name(connection, holder.robot_id)))
     fresh = session.heartbeat_is_fresh(now_s)
-    if fresh and _hold_since_beat(connection, session) == "resume":
+    if fresh and _change_since_beat(connection, session) == RESUME:
         return Status(RUNNING)
     still_moving_s = _still_moving_s(connection, run)
     if not fresh and (backlog := find_backlog(connection, session)) is not None:
@@ -225,7 +212,7 @@ def _why_standing(
     if session.heartbeat_is_fresh(now_s) and beaten_since_s > HEARTBEAT_INTERVAL_S:
         return _STANDING
     left = left_holding(connection, session, now_s)
-    return SILENT if left is None else _LEFT_PAUSED.format(robot_name(connection, left.robot_id))
+    return SILENT if left is None else LEFT_PAUSED.format(robot_name(connection, left.robot_id))
 
 
 def _seen_by_observer(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
@@ -233,17 +220,9 @@ def _seen_by_observer(connection: sqlite3.Connection, session: Session, now_s: f
     for each in (session, *companions(connection, session, now_s)):
         found = connection.execute(_SEEN_MODE, (each.id,)).fetchone()
         if found is not None and each.heartbeat_is_fresh(now_s):
-            text = _SEEN_PAUSED if found[0] == "pause" else _SEEN_RUNNING
+            text = SEEN_PAUSED_BY if found[0] == "pause" else SEEN_RUNNING_BY
             return text.format(robot_name(connection, each.robot_id))
     return None
-
-
-def _breakpoint_at(connection: sqlite3.Connection, session: Session) -> str | None:
-    """Which breakpoint paused a session; None where a command did."""
-    found = connection.execute(_BREAKPOINT_AT, (session.id,)).fetchone()
-    if found is None or found[0] is None:
-        return None
-    return f"breakpoint at {found[1]:.3f} s: {found[0]}"
 
 
 def handler_at_work(connection: sqlite3.Connection, session: Session, now_s: float) -> str | None:
@@ -280,24 +259,13 @@ def find_holder(connection: sqlite3.Connection, session: Session, now_s: float) 
 
 
 def _is_holding(connection: sqlite3.Connection, session: Session) -> bool:
-    since = _hold_since_beat(connection, session)
-    return session.hold == PAUSED if since is None else since == "pause"
+    since = _change_since_beat(connection, session)
+    return session.hold == PAUSED if since is None else since == PAUSE
 
 
-def _hold_since_beat(connection: sqlite3.Connection, session: Session) -> str | None:
-    """`pause` or `resume`, whichever happened last since the session's heartbeat."""
-    values = {
-        "session_id": session.id,
-        "sim_time_s": session.sim_time_s or 0.0,
-        "beat_s": session.last_seen_wall_time_s,
-    }
-    row = connection.execute(_HOLD_SINCE_BEAT, values).fetchone()
-    return row[0] if row else None
-
-
-def _held_elsewhere(connection: sqlite3.Connection, holder: Session) -> str:
-    name = robot_name(connection, holder.robot_id)
-    return f"the simulation is held by robot {name!r}: resume it there"
+def _change_since_beat(connection: sqlite3.Connection, session: Session) -> str | None:
+    beat = (session.sim_time_s or 0.0, session.last_seen_wall_time_s)
+    return change_since(connection, session.id, *beat)
 
 
 def _still_moving_s(connection: sqlite3.Connection, run: Run | None) -> float:

@@ -18,6 +18,7 @@ from webots_mcp.contract import (
 )
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.parameter import Value
+from webots_mcp.pauses import PAUSED
 from webots_mcp.schema import require_current
 from webots_mcp.standin import Mode, Simulation, StandInError
 from webots_mcp.standin.controllers import Controller
@@ -158,7 +159,7 @@ class RecordedSimulation(Simulation):
                 session = resolve_robot(connection, name, time.time()).session
         except WebotsMCPError:  # nothing was recorded yet
             return False
-        return session is not None and session.hold == "paused"
+        return session is not None and session.hold == PAUSED
 
     def _last_lines(self) -> str:
         return "\n".join(self.console[-_CONSOLE_LINES:])

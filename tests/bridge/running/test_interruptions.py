@@ -40,7 +40,7 @@ def test_a_breakpoint_that_pauses_interrupts_it(rounds: Rounds, recording: Recor
     rounds.drive(12)
     _, result, error = recording.fate(sent)
     assert (error, result["ended"]) == (None, "interrupted")
-    assert f"breakpoint_id {number}, condition n == 8" in result["why"]
+    assert f"breakpoint {number}: n == 8" in result["why"]
     assert paused == [pytest.approx(8 * STEP_S)] == [pytest.approx(result["sim_time_s"])]
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sqlite3
 import time
 from collections.abc import Mapping, Sequence
@@ -12,6 +11,7 @@ from typing import Any, Final
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.liveness import dead_sessions
 from webots_mcp.parameter import Value
+from webots_mcp.pauses import paused_s
 from webots_mcp.store.parameters import HAD_VALUES, as_filter, notable_parameters
 from webots_mcp.store.reading.snapshot import in_one_snapshot
 from webots_mcp.store.robots import resolve_robot
@@ -56,10 +56,6 @@ _NOTABLE: Final = (
     "AND r.session_id = c.session_id WHERE c.status IN ('failed', 'lost') "
     "AND c.claimed_wall_time_s BETWEEN r.started_wall_time_s AND r.last_wall_time_s "
     "GROUP BY status"
-)
-_HOLDS: Final = (
-    "SELECT kind, wall_time_s FROM event WHERE run_id = ? AND kind IN ('pause', 'resume') "
-    "ORDER BY id"
 )
 _ANNOTATE: Final = (
     "UPDATE run SET label = CASE WHEN :label IS NULL THEN label ELSE nullif(:label, '') END, "
@@ -232,19 +228,8 @@ def _info(
         **named,
         started_wall_time_s=started_wall_s,
         wall_duration_s=last_wall_s - started_wall_s,
-        held_s=_held_s(connection, row[0], last_wall_s),
+        held_s=paused_s(connection, row[0], last_wall_s),
         duration_s=last_s - started_s,
         notable=dict(connection.execute(_NOTABLE, {"run": row[0]}).fetchall()),
         parameters=parameters,
     )
-
-
-def _held_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> float:
-    held_s, since_s = 0.0, math.inf
-    for kind, wall_s in (*connection.execute(_HOLDS, (run_id,)), ("resume", end_wall_s)):
-        if kind == "pause":
-            since_s = min(since_s, wall_s)
-        else:
-            held_s += max(0.0, wall_s - since_s)
-            since_s = math.inf
-    return held_s

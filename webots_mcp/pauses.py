@@ -1,0 +1,127 @@
+"""Pauses of a simulation: who paused it, since when, how that ends, and how it is reported.
+
+Webots has one simulation mode `pause`. Who set it decides what is known of it:
+
+- A command (`pause`, the end of a `step`, that of a `run` whose `then` is "pause") or a breakpoint:
+  the bridge stays in the loop and serves commands there. The event `pause` has the cause and the
+  moment, the heartbeat has `PAUSED` in `session.hold` with the mode to go back to. A session that
+  comes after a reload goes on with the pause of the one before. It ends with a command that lets
+  time go on, with a person who presses play, or with the bridge: the event `resume` says which.
+- A person in Webots, another controller, or the controller's own code: its bridge is not asked and
+  may not get to run. Only an observer sees it (the event `mode`); press play, or ask the observer.
+
+While a `step` command lets the loop make its steps, `session.hold` has `STEPPING`.
+
+Standard library only, because the bridge imports it inside a robot's controller.
+"""
+
+from __future__ import annotations
+
+import math
+import sqlite3
+from typing import Final, NamedTuple
+
+PAUSED: Final = "paused"  # what a command does to the loop, as the column session.hold tells it
+STEPPING: Final = "stepping"
+PAUSE: Final = "pause"  # the kinds of the events
+RESUME: Final = "resume"
+
+IN_WEBOTS: Final = "a person or another controller, in Webots"
+SESSION_BEFORE: Final = "the controller's session before this one"
+BRIDGE_CLOSED: Final = "the bridge, which was closed"
+
+# What a status says of a pause that no bridge of ours holds.
+SEEN_PAUSED: Final = "paused in Webots, as robot"
+SEEN_RUNNING: Final = "not paused, as robot"
+SEEN_PAUSED_BY: Final = f"{SEEN_PAUSED} {{!r}} sees; webots_simulation_control('resume') goes on"
+SEEN_RUNNING_BY: Final = (
+    f"{SEEN_RUNNING} {{!r}} sees, and yet time stands still: a controller hangs, or an extern "
+    "one is missing"
+)
+HELD_ELSEWHERE: Final = "the simulation is held by robot {!r}: resume it there"
+LEFT_PAUSED: Final = (
+    "robot {0!r} paused the simulation, and its controller has ended since: press play in Webots, "
+    "or start that controller again and resume it there"
+)
+
+# A pause is noted as an event at the instant; the heartbeat tells of it only at its next beat.
+# What came after the beat has at least its simulation time, which bounds the search to the index.
+_CHANGE_SINCE: Final = (
+    "SELECT e.kind FROM run r JOIN event e ON e.run_id = r.id AND e.sim_time_s >= :sim_time_s "
+    "WHERE r.session_id = :session_id AND e.wall_time_s > :wall_time_s "
+    f"AND e.kind IN ('{PAUSE}', '{RESUME}') ORDER BY e.id DESC LIMIT 1"
+)
+_CONDITION: Final = (
+    "SELECT CASE WHEN json_valid(data) THEN json_extract(data, '$.condition') END, sim_time_s "
+    "FROM event WHERE run_id = (SELECT max(id) FROM run WHERE session_id = ?) "
+    f"AND kind = '{PAUSE}' ORDER BY sim_time_s DESC, id DESC LIMIT 1"
+)
+_OF_RUN: Final = (
+    "SELECT kind, wall_time_s FROM event WHERE run_id = ? "
+    f"AND kind IN ('{PAUSE}', '{RESUME}') ORDER BY id"
+)
+
+
+class Cause(NamedTuple):
+    """For what a pause began, or ended; of most fields nothing is known.
+
+    Attributes:
+        command_id: Of the command that did it.
+        breakpoint_id: Of the breakpoint that was hit; None also where it is not stored.
+        condition: Of that breakpoint.
+        by: Who else did it, in words.
+    """
+
+    command_id: int | None = None
+    breakpoint_id: int | None = None
+    condition: str | None = None
+    by: str | None = None
+
+    @property
+    def data(self) -> dict[str, object]:
+        """As the event has it."""
+        if self.condition is not None:
+            return {"breakpoint_id": self.breakpoint_id, "condition": self.condition}
+        return {"command_id": self.command_id} if self.by is None else {"by": self.by}
+
+    def __str__(self) -> str:
+        if self.condition is not None:
+            number = "" if self.breakpoint_id is None else f" {self.breakpoint_id}"
+            return f"breakpoint{number}: {self.condition}"
+        return self.by or f"command {self.command_id}"
+
+
+def change_since(
+    connection: sqlite3.Connection, session_id: int, sim_time_s: float, wall_time_s: float
+) -> str | None:
+    """`PAUSE` or `RESUME`, whichever happened last since a heartbeat; None for neither.
+
+    Args:
+        connection: To the recording.
+        session_id: The session.
+        sim_time_s: The simulation time of its heartbeat.
+        wall_time_s: When that was.
+    """
+    values = {"session_id": session_id, "sim_time_s": sim_time_s, "wall_time_s": wall_time_s}
+    row = connection.execute(_CHANGE_SINCE, values).fetchone()
+    return row[0] if row else None
+
+
+def breakpoint_at(connection: sqlite3.Connection, session_id: int) -> str | None:
+    """Which breakpoint began the newest pause of a session, and when; None where a command did."""
+    found = connection.execute(_CONDITION, (session_id,)).fetchone()
+    if found is None or found[0] is None:
+        return None
+    return f"breakpoint at {found[1]:.3f} s: {found[0]}"
+
+
+def paused_s(connection: sqlite3.Connection, run_id: int, end_wall_s: float) -> float:
+    """For how much of the wall time of a run, up to its end, its bridge kept it paused."""
+    total_s, since_s = 0.0, math.inf
+    for kind, wall_s in (*connection.execute(_OF_RUN, (run_id,)), (RESUME, end_wall_s)):
+        if kind == PAUSE:
+            since_s = min(since_s, wall_s)
+        else:
+            total_s += max(0.0, wall_s - since_s)
+            since_s = math.inf
+    return total_s

@@ -126,7 +126,7 @@ def test_of_what_was_said_before_it_is_told_that_nobody_knows_when(
         follow(server.port, os.getppid())  # which has run for a while
         until(lambda: bool(messages(recorded)))
     assert messages(recorded) == [
-        "(the next 2 lines are from before somebody followed the console, the last of 5: when "
+        "(the next 2 lines were printed before the console was followed, the last of 5: when "
         "they were printed is not known)",
         "3",
         "4",
@@ -179,7 +179,7 @@ def test_a_huge_message_is_kept_in_part_and_that_is_said(
         server.log("stdout", "x" * (6 << 20))
         server.log("stdout", "after it\n")
         until(lambda: "after it" in messages(recorded))
-    assert "bytes of the console that came at once" in " ".join(messages(recorded))
+    assert "bytes of the console in one burst" in " ".join(messages(recorded))
     assert max(map(len, messages(recorded))) == 10_000
 
 

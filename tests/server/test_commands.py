@@ -256,7 +256,7 @@ async def test_an_asker_who_goes_away_takes_the_command_with_it(
                 if commands and commands[0].is_final:
                     break
                 await anyio.sleep(0.01)
-    assert (commands[0].status, commands[0].error) == ("cancelled", "the asker went away")
+    assert (commands[0].status, commands[0].error) == ("cancelled", "the client disconnected")
 
 
 async def test_waiting_reports_progress_every_second(connect: Connect, recorded: Recorded) -> None:

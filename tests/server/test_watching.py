@@ -160,7 +160,7 @@ def test_a_long_movement_is_summed_from_samples_up_to_the_newest_row(
     assert answer is not None
     assert answer["distance_m"] == pytest.approx(20.03, abs=0.03)
     assert answer["to_m"] == pytest.approx([-0.03, 0])
-    assert answer["distance_note"] == "that of a position each 0.5 s"
+    assert answer["distance_note"] == "from one position every 0.5 s"
 
 
 async def test_a_robot_that_ended_is_not_waited_for_and_nothing_is_absent(

@@ -361,7 +361,10 @@ def test_a_database_that_is_none_of_ours_is_refused(
 
 @pytest.mark.parametrize(
     ("uuid", "path", "said"),
-    [("webots", "webots.db", "is no picture"), ("front", "camera/front.000001.png", None)],
+    [
+        ("webots", "webots.db", "not the name of a picture"),
+        ("front", "camera/front.000001.png", None),
+    ],
 )
 def test_no_file_that_is_here_is_replaced_whatever_a_foreign_recording_calls_its_pictures(
     there: Folder, here: Folder, uuid: str, path: str, said: str | None

@@ -54,7 +54,7 @@ def test_all_rows_are_rolled_up_and_counted_on_the_way(recording: Recording) -> 
 
 def test_a_server_that_maintains_it_is_left_to_it(recording: Recording) -> None:
     hold_lease(recording, "server")
-    assert sum_up(recording).startswith(f"{ROWS} of the newest rows are in no rollup yet: the serv")
+    assert sum_up(recording).startswith(f"the newest {ROWS} rows are not rolled up yet: the serv")
     assert rolled(recording) == 0
 
 
@@ -118,4 +118,4 @@ def test_a_question_says_that_another_is_still_at_it(
 ) -> None:
     hold_lease(recording, "server")
     assert main(["history", "mode", "--database", str(recording.database)]) == 0
-    assert f"{ROWS} of the newest rows are in no rollup yet" in capsys.readouterr().err
+    assert f"the newest {ROWS} rows are not rolled up yet" in capsys.readouterr().err

@@ -43,7 +43,7 @@ ARITHMETIC: Final[dict[type[ast.operator], Callable[[Any, Any], Any]]] = {
 }
 OF_NUMBERS: Final[dict[str, Callable[..., Any]]] = {"abs": abs, "min": min, "max": max}
 _GIVING_FLAGS: Final = ("changed", "missing")
-_ALWAYS_OR_NEVER: Final = "it would hold always or never"
+_ALWAYS_OR_NEVER: Final = "it would always be true or always be false"
 FUNCTIONS: Final = (*OF_NUMBERS, *_GIVING_FLAGS, "rate", "displacement", "signal")
 
 
@@ -195,7 +195,7 @@ class Compiler(Nodes):
 
     def _arithmetic(self, node: ast.BinOp) -> ReadNumber:
         if type(node.op) not in ARITHMETIC:
-            self._refuse_at(self._operator_column(node), "there are + - * / only")
+            self._refuse_at(self._operator_column(node), "only + - * / are possible")
         left, right = self._number(node.left), self._number(node.right)
         apply = ARITHMETIC[type(node.op)]
 

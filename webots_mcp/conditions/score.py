@@ -83,7 +83,7 @@ class Score:
             return Scored(None, str(error))
         except (ZeroDivisionError, OverflowError) as error:
             return Scored(None, f"score {self.text!r}: {error}")
-        return Scored(value) if math.isfinite(value) else Scored(None, "it is beyond all numbers")
+        return Scored(value) if math.isfinite(value) else Scored(None, "it is too large")
 
     def require_known(self, signals: Collection[str]) -> None:
         """See that each signal that it reads is one that the robot has published.

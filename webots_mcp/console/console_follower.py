@@ -57,7 +57,7 @@ _MOST_HELD: Final = 5_000  # while the database is locked
 _FIRST_LOOK_S: Final = 1.0  # a server that has just started has answers to give
 _LOOK_EVERY_S: Final = 5.0
 _NOBODY: Final = "no Webots of this recording runs on this machine, so no console is followed"
-_UNSURE: Final = "; it was started without --stream: if nothing comes of it, start it with that"
+_UNSURE: Final = "; it was started without --stream: if no lines appear, start it with --stream"
 
 
 def job_of(instance: Instance) -> str:
@@ -89,7 +89,7 @@ class ConsoleFollower(threading.Thread):
     def __init__(self, instance: Instance, recording: Recording) -> None:
         super().__init__(name=f"webots-mcp console {instance.port}", daemon=True)
         self.instance = instance
-        self.problem: str | None = "it has not begun yet"
+        self.problem: str | None = "it has not started yet"
         self._recording = recording
         self._ending = threading.Event()
         self._rows = ConsoleRows(instance.name, instance.started_wall_time_s)
@@ -282,11 +282,11 @@ class ConsoleLines:
             for line in lines:
                 yield from self._within_limit(line)
         if lines and message.dropped_bytes:
-            yield note(f"{message.dropped_bytes} bytes of the console that came at once")
+            yield note(f"{message.dropped_bytes} bytes of the console in one burst")
 
     def _that_waited(self, lines: list[WebotsLine]) -> Iterator[Said]:
         newest = lines[-MOST_OLD_LINES:]
-        told = f"the next {len(newest)} lines are from before somebody followed the console"
+        told = f"the next {len(newest)} lines were printed before the console was followed"
         if len(newest) < len(lines):
             told += f", the last of {len(lines)}"
         if self._is_old or len(newest) < len(lines):

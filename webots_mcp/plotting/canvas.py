@@ -177,7 +177,7 @@ def image_format_of(file: Path) -> ImageFormat:
     for known in get_args(ImageFormat):
         if suffix == known:
             return known
-    raise InvalidInputError(f"{file.name!r} is no picture's name: end it in .png or .svg")
+    raise InvalidInputError(f"{file.name!r} is not the name of a picture: end it in .png or .svg")
 
 
 def media_type(sheet: Sheet) -> str:

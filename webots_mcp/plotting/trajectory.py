@@ -98,7 +98,7 @@ def compose_trajectory(
     if not any(track.path.places for track in tracks):
         if not all(track.path.is_whole for track in tracks):
             raise NothingRecordedError(
-                f"no place was read in time in {title_of(parts)}: ask for less time"
+                f"no position was read in time in {title_of(parts)}: ask for less time"
             )
         raise NothingRecordedError(f"{x.name} and {y.name} have no values in {title_of(parts)}")
     metres = None if position else "m"
@@ -154,7 +154,7 @@ def _notes(parts: Sequence[Part], tracks: Sequence[Track]) -> tuple[str, ...]:
     notes = range_notes(parts)
     notes += merged_notes([track.modes for track in tracks if track.modes])
     notes += [
-        f"{track.name}: one place every {track.path.step_s:g} s (too many rows to draw each)"
+        f"{track.name}: one position every {track.path.step_s:g} s (too many rows to draw each)"
         for track in tracks
         if track.path.step_s is not None
     ]
@@ -164,7 +164,7 @@ def _notes(parts: Sequence[Part], tracks: Sequence[Track]) -> tuple[str, ...]:
 def _cut(tracks: Sequence[Track]) -> list[str]:
     """Up to when a way was read that goes on."""
     return [
-        f"the way of {track.name} is not read after {track.path.places[-1].time_s:g} s"
+        f"the path of {track.name} is not read after {track.path.places[-1].time_s:g} s"
         for track in tracks
         if track.path.places and not track.path.is_whole
     ]

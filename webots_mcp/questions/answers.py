@@ -48,7 +48,7 @@ class Answer(BaseModel):
     )
     hint: str | None = Field(default=None, description="What to do next.")
     left_out: list[str] | None = Field(
-        default=None, description="Rows and values that no bridge has written; they do not count."
+        default=None, description="Invalid rows and values, which are left out."
     )
     _pictures: list[ShownPicture] = PrivateAttr(default_factory=list[ShownPicture])
 
@@ -74,7 +74,7 @@ class SensorsAnswer(Answer):
         default=None, description="Values that JSON cannot hold: path to nan, inf, ..."
     )
     devices_not_named_in_state: str | None = Field(
-        default=None, description="Sensors that it names nowhere, or otherwise than Webots does."
+        default=None, description="Sensors that the state lacks, or names differently than Webots."
     )
     shortened: str | None = None
 
@@ -141,7 +141,7 @@ class DiagnosisAnswer(Answer):
     verdict: str | None = Field(default=None, description="ok, warning or wrong: the worst.")
     not_well: list[dict[str, str]] | None = None
     not_looked_at: dict[str, str] | None = Field(default=None, description="Why, and which.")
-    well: str | None = Field(default=None, description="Checks that found all well.")
+    well: str | None = Field(default=None, description="Checks that passed.")
 
 
 class LogsAnswer(Answer):

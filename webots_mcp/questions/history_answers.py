@@ -13,7 +13,7 @@ class NotedAnswer(Answer):
     """An answer about a range of time, with what there is to know about that range."""
 
     notes: list[str] | None = Field(
-        default=None, description="Where the range reaches outside the recording, and the like."
+        default=None, description="Limits of the range, of sampling, and similar remarks."
     )
 
 
@@ -112,7 +112,7 @@ class RunTrendTables(BaseModel):
     end_s: float | None
     rows: int
     from_means_of_s: float | None = Field(
-        default=None, description="Courses and slopes come from means over this many seconds."
+        default=None, description="Shapes and slopes come from means over this many seconds."
     )
     numbers: Table | None = Field(default=None, description="What changed most is first.")
     states: Table | None = Field(default=None, description="Text and flags that changed.")
@@ -135,13 +135,13 @@ class KindVerdicts(BaseModel):
     found: dict[str, int] | None = Field(
         default=None, description="How many there are in the range, shown or not."
     )
-    absent: str | None = Field(default=None, description="Looked for, and there is none.")
+    absent: str | None = Field(default=None, description="Searched for and not found.")
     came_near: dict[str, str] | None = Field(
-        default=None, description="Absent as well; what came nearest."
+        default=None, description="Not found either; what came nearest."
     )
     not_searched: dict[str, str] | None = Field(
         default=None,
-        description="Not looked for, or not everywhere: why, and what to ask instead.",
+        description="Not searched for, or only in part: why, and what to ask instead.",
     )
 
 
@@ -208,7 +208,7 @@ class TrialsAnswer(NotedAnswer):
         default=None, description="Standard deviation of the scores of like trials."
     )
     best_is_better: bool | None = Field(
-        default=None, description="Than the next, beyond what repeats differ; null: not shown."
+        default=None, description="By more than the spread of repeats; null: unknown."
     )
     verdict: str | None = None
 

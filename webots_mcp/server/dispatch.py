@@ -143,7 +143,7 @@ class Dispatcher:
         """Nobody waits any more; a run that has begun ends now, as its `then` says, or a step."""
         with self._recording.writer() as connection:
             queue = CommandQueue(connection)
-            goes_on = queue.leave(command.id, "the asker went away")
+            goes_on = queue.leave(command.id, "the client disconnected")
             if goes_on and command.action in LOOPING:
                 params, asker = {"command_id": command.id}, self._recording.asker
                 queue.enqueue(command.robot_id, "cancel_run", params, requested_by=asker)
@@ -220,7 +220,7 @@ def _hint(view: View, command: Command) -> str | None:
         return _instructions(view, command.action)
     if command.status == "claimed":
         return (
-            "the controller is still at it: go on waiting with webots_wait_for_command, "
+            "the controller is still busy with it: keep waiting with webots_wait_for_command, "
             f"command_id {command.id}; do not send it again"
         )
     if command.status == "lost":
@@ -258,4 +258,4 @@ def _after_no_answer(view: View) -> str:
     silent_s = session.age_s(session.last_poll_wall_time_s, view.now_s)
     if silent_s > HEARTBEAT_LATE_S:
         return f"its loop runs, but last called bridge.get_command() {silent_s:.0f} s ago"
-    return "its loop is alive but did not come to it in time: ask again with a longer timeout_s"
+    return "its loop runs but did not take it in time: ask again with a longer timeout_s"

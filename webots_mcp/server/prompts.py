@@ -73,7 +73,7 @@ def explain_stretch(
         f"1. webots_get_timeline({stretch}): commands, changes of modes and flags, log lines.\n"
         f"2. webots_find_events({stretch}): what nobody noted, such as standstills and jumps.\n"
         f"3. webots_get_trends({stretch}): what each signal did in words.\n"
-        f'4. webots_plot(kind="trajectory", {stretch}): the way it took.\n'
+        f'4. webots_plot(kind="trajectory", {stretch}): the path it took.\n'
         "Tell it in chronological order, cause before effect; what led to it may lie before the "
         f"stretch: look there if the cause is not inside it. {_TRUTH}"
     )

@@ -49,7 +49,7 @@ _NOTHING_SEEN: Final = (
     "the recording does not show it yet: a controller that hangs, or an extern one that is "
     "missing, stops the time of a simulation that runs"
 )
-_NONE_LIVES: Final = "no controller lives of the robots that were recorded"
+_NONE_LIVES: Final = "none of the recorded robots has a live controller"
 _NO_FORCE: Final = "force=true would press Webots' own keys"
 
 
@@ -126,7 +126,7 @@ class Attempt(Request):
         named = None if self.port is None else WebotsAddress("127.0.0.1", self.port)
         if named is None or (found.is_there and found.address == named):
             return found
-        why = f"no controller that lives records from the Webots at port {self.port}"
+        why = f"no live controller records from the Webots at port {self.port}"
         return Situation(None, False, why, named, Moment(None, None), is_there=True)
 
     async def _by_bridge(self, situation: Situation, claiming_s: float = math.inf) -> CommandAnswer:
@@ -413,7 +413,7 @@ def _only(ours: list[Instance], running: list[Instance]) -> Instance:
 
 def _no_way(order: Order, told: str) -> str:
     return (
-        f"no way to {order} the simulation works. {told}. Press {KEYS[order].spoken} in "
+        f"no route to {order} the simulation works. {told}. Press {KEYS[order].spoken} in "
         "Webots, start Webots with --stream, or open the world with an observer in it (made by "
         "'webots-mcp init --observer WORLD'): both let it be steered without a controller"
     )

@@ -253,7 +253,7 @@ def told_of_run(view: View, command: Command) -> dict[str, Any]:
 
 def _why_stopped(command: Command, result: Mapping[str, Any]) -> tuple[str | None, str | None]:
     if command.status == "claimed":
-        return "out of wall time", "it goes on, and ends as it was asked to"
+        return "out of wall time", "it continues, and ends as requested"
     if command.status == "lost":
         return "run ended", command.error
     return result.get("ended"), result.get("why")

@@ -50,7 +50,7 @@ from webots_mcp.trials.plan import SCHEDULER, Plan, WorldPlan, combinations
 
 CANCELLED: Final = "it was cancelled"
 _TABLE_BUDGET: Final = 5_400
-_GOES_ON: Final = "the command 'webots-mcp trials PLAN' goes on with it"
+_GOES_ON: Final = "the command 'webots-mcp trials PLAN' continues it"
 _FROM_ELSEWHERE: Final = "came from another recording, and its robot did not: begin a new set"
 _LONGEST_WHY: Final = 120
 _FIGURES: Final = ("score", "range", "scored", "pruned", "failed", "why", "runs")
@@ -190,7 +190,7 @@ def _goes_on(found: TrialSet) -> str:
     """How a set goes on whose trials have simulators of their own."""
     scheduler = json.loads(found.plan).get(SCHEDULER)
     again = f"webots_run_trials(trial_set={found.id}, scheduler={scheduler or 'tcp://...'!r})"
-    return f"{again} goes on with it" if scheduler else f"{_GOES_ON}, or {again} on a cluster"
+    return f"{again} continues it" if scheduler else f"{_GOES_ON}, or {again} on a cluster"
 
 
 def go_on(recording: Recording, set_id: int) -> None:

@@ -221,7 +221,7 @@ class TrialWorker(threading.Thread):
         """It does not run, or ends now."""
         with self._job.writer() as connection:
             queue = CommandQueue(connection)
-            if not queue.cancel(command.id, "its trial was ended"):
+            if not queue.cancel(command.id, "its trial was stopped"):
                 params = {"command_id": command.id}
                 queue.enqueue(command.robot_id, "cancel_run", params, requested_by=_ASKER)
 
@@ -449,6 +449,6 @@ def _require_untouched(
 
 def _reached(connection: sqlite3.Connection, run_id: int | None) -> str:
     if run_id is None:
-        return "its run did not begin"
+        return "its run did not start"
     reached_s = connection.execute(_REACHED, (run_id,)).fetchone()[0]
     return f"never reached its end, but {reached_s:.3f} s"

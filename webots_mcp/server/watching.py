@@ -100,7 +100,7 @@ def _told(way: Way) -> dict[str, Any] | None:
     if len(times) < 2:
         return None
     length = way.length
-    sampled = f"that of a position each {way.sampled_s:.2g} s" if way.sampled_s else None
+    sampled = f"from one position every {way.sampled_s:.2g} s" if way.sampled_s else None
     notes = "; ".join(filter(None, (sampled, doubt_of_length(length))))
     first, last = ((float(x[row]), float(y[row])) for row in (0, -1))
     return {

@@ -151,7 +151,7 @@ def _require_ours(file: Path, archive: zipfile.ZipFile) -> None:
     names = [entry.filename for entry in entries]
     if DATABASE_NAME not in names:
         raise InvalidInputError(
-            f"{file} holds no {DATABASE_NAME}: it is no bundle of 'webots-mcp export -o RUN.zip'"
+            f"{file} holds no {DATABASE_NAME}: it is not a bundle of 'webots-mcp export -o RUN.zip'"
         )
     for entry in entries:
         if not _is_ours(entry):

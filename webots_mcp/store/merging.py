@@ -165,11 +165,10 @@ def _require_fit(connection: sqlite3.Connection, source: Path, run_id: int | Non
     subject = f"{source}" if run_id is None else f"run {run_id}"
     if recording:
         where = subject if run_id else f"in {subject}"
-        raise InvalidInputError(f"a controller still records {where}: take it when it is over")
+        raise InvalidInputError(f"a controller still records {where}: merge it when that has ended")
     if nameless:
         raise InvalidInputError(
-            f"{subject} has no UUID, which each bridge gives: no recording "
-            "could tell whether it is there already"
+            f"{subject} has no UUID, so nobody could tell whether it was merged before"
         )
 
 
@@ -325,9 +324,9 @@ def _copy_pictures(
             continue  # deleted since: its row stays as it was there, and says so when asked
         target = data_dir / _path_here(path, run_uuid)
         if not target.resolve().is_relative_to(data_dir.resolve()):
-            raise InvalidInputError(f"{path!r} would lie outside the data folder and is not taken")
+            raise InvalidInputError(f"{path!r} lies outside the data folder and is not copied")
         if target.suffix.lower() not in PICTURES:
-            raise InvalidInputError(f"{path!r} is no picture's name and is not taken")
+            raise InvalidInputError(f"{path!r} is not the name of a picture and is not copied")
         if target.exists():
             continue  # a whole one, from an import that was killed
         make_folder(target.parent)

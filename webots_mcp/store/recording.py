@@ -42,16 +42,16 @@ from webots_mcp.waiting_file import adopt, waiting_paths
 
 GETTING_STARTED: Final = (
     "Add two lines to a controller: 'from webots_mcp import MCPBridge' and, where it has made its "
-    "robot, 'bridge = MCPBridge.attach(robot)', which records what the devices say at each step; "
+    "robot, 'bridge = MCPBridge.attach(robot)', which records the devices' values at each step; "
     "then start the simulation. 'webots-mcp demo' shows it without Webots. If controllers record "
     "elsewhere, start the server with --data-dir or --database."
 )
 
 _NO_DATABASE: Final = "file is not a database"  # SQLite's words
-_FROZEN: Final = "the file cannot be written from here: read as it lies on the disk"
+_FROZEN: Final = "the file cannot be written from here: read as it is on the disk"
 _NOT_IN: Final = (
-    "; without what waits beside it in {} files named ...-waiting-...: a copy of all of them where "
-    "one can write, opened by webots-mcp serve, takes it in"
+    "; without the rows in {} waiting files next to it (...-waiting-...): copy all of them to a "
+    "writable folder and open the copy with webots-mcp serve to include them"
 )
 
 
@@ -245,8 +245,8 @@ class Recording:
         """Bring an older schema forward, once; importing Alembic costs a second."""
         if self.read_only:
             raise SchemaTooOldError(
-                f"the database at {name_of(self.database)} has an older schema, and what only "
-                "reads does not migrate it: run 'webots-mcp migrate'"
+                f"the database at {name_of(self.database)} has an older schema, which a reader "
+                "does not migrate: run 'webots-mcp migrate'"
             )
         self.migrate()
 
@@ -307,7 +307,7 @@ def _explain(error: Exception, database: Database) -> str:
         return f"the database at {name} holds a value that cannot be read: {text}"
     if "interrupted" in text:
         return (
-            f"reading the database at {name} was ended: one statement took longer than "
+            f"reading the database at {name} was stopped: one statement took longer than "
             f"{LONGEST_READ_S:g} s; ask for less, by run and time"
         )
     if _NO_DATABASE in text:

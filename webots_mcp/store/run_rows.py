@@ -234,7 +234,7 @@ def _key(value: Any, parts: list[str], path: str) -> tuple[str | int, int]:
         if parts[0].isdecimal() and int(parts[0]) < len(items):
             return int(parts[0]), 1
         raise InvalidInputError(f"path {path!r}: {len(items)} items have no index {parts[0]!r}")
-    raise InvalidInputError(f"path {path!r}: {parts[0]!r} asks for a part of a single value")
+    raise InvalidInputError(f"path {path!r}: {parts[0]!r} is below a single value")
 
 
 def put_back(value: Any, parts: list[str], replaced: object) -> None:

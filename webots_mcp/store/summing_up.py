@@ -60,7 +60,7 @@ def sum_up(
     if is_frozen:
         return _left(last - first, "the file cannot be written from here")
     if holder.startswith("server "):
-        return _left(last - first, "the server that maintains the recording is at it")
+        return _left(last - first, "the server that maintains the recording is rolling them up")
     until_s, mark, why = time.monotonic() + limit_s, first, ""
     try:
         with recording.writer() as connection, _checkpoints(recording):
@@ -73,7 +73,7 @@ def sum_up(
                 if done:
                     return ""
                 if called_off() or time.monotonic() > until_s:
-                    why = "ask again to go on with it"
+                    why = "ask again to continue"
     except DatabaseError as error:
         why = str(error)
     return _left(last - mark, why) if last - mark >= LEAST_ROWS else ""
@@ -94,4 +94,4 @@ def _checkpoints(recording: Recording) -> Generator[None]:
 
 
 def _left(rows: int, why: str) -> str:
-    return f"{rows} of the newest rows are in no rollup yet: {why}"
+    return f"the newest {rows} rows are not rolled up yet: {why}"

@@ -196,10 +196,10 @@ def _require_free(connection: sqlite3.Connection, robot_id: int) -> None:
             )
         is_left = found.stop_reason is None and next_trial(connection, set_id) is not None
         if is_left or found.former_values is not None:
-            why = found.stop_reason or "it was left by a server that ended"
+            why = found.stop_reason or "its server ended"
             raise CommandRefusedError(
                 f"trial set {set_id} of this robot is not over ({why}): "
-                f"webots_run_trials(trial_set={set_id}) goes on with it, cancel=true ends it"
+                f"webots_run_trials(trial_set={set_id}) continues it, cancel=true ends it"
             )
 
 

@@ -14,10 +14,10 @@ from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.json_folder import import_folder
 
 BAD = [
-    ("status.json", '{"pose": [1, 2,\n  }', r"status\.json, line 2, column 3: no JSON"),
-    ("status.json", "", r"status\.json is empty: its controller was ended"),
+    ("status.json", '{"pose": [1, 2,\n  }', r"status\.json, line 2, column 3: not valid JSON"),
+    ("status.json", "", r"status\.json is empty: its controller ended"),
     ("status.json", "[1, 2]", r"status\.json: a state is an object, this is a list"),
-    ("status.json", b'{"a": "\xff"}', r"status\.json: no JSON"),
+    ("status.json", b'{"a": "\xff"}', r"status\.json: not valid JSON"),
     ("status.json", '{"timestamp": "yesterday"}', "timestamp 'yesterday' is not an ISO 8601 time"),
     ("logs/controller.log", "no time\n", r"controller\.log, line 1: expected '\[HH:MM:SS\]"),
     ("logs/controller.log", "\n[12:00:00] a\n[12:61:00] b\n", r"line 3: \[12:61:00\] is not a"),
@@ -25,9 +25,13 @@ BAD = [
     ("camera/frame_0000.png", b"", r"frame_0000\.png is not a usable PNG"),
     ("commands.json", '[{"action": "a"}, 3]', r"commands\.json: a command is an object"),
     ("commands.json", "{", r"commands\.json, line 1, column 2"),
-    ("status.json", '{"x": ' + "9" * 100_000 + "}", r"status\.json: no JSON: Exceeds the limit"),
+    (
+        "status.json",
+        '{"x": ' + "9" * 100_000 + "}",
+        r"not valid JSON: Exceeds the limit",
+    ),
     ("status.json", '{"x": ' + "[" * 900 + "]" * 900 + "}", "nested over 100 levels, at 'x'"),
-    ("status.json", '{"x": ' + "[" * 90_000, r"status\.json: no JSON"),
+    ("status.json", '{"x": ' + "[" * 90_000, r"status\.json: not valid JSON"),
     ("status.json", '{"x": "' + "y" * 16_000_000 + '"}', "16,000,000 is the limit"),
     ("status.json", '{"timestamp": "' + "9" * 9000 + '"}', r"timestamp '9{50,99} is not an ISO"),
     ("commands.json", '{"action": {"a": ' + "[" * 900 + "]" * 900 + "}}", "nested over 100"),
@@ -98,7 +102,7 @@ def test_a_picture_whose_name_is_no_text_is_refused(
 ) -> None:
     picture = peer.picture("camera/frame.png")
     picture.rename(os.fsdecode(os.fsencode(picture.with_name("frame")) + b"\xff.png"))
-    with pytest.raises(InvalidInputError, match="is no text: rename the file"):
+    with pytest.raises(InvalidInputError, match="is not valid text: rename the file"):
         import_folder(database, peer.folder, data_dir)
 
 

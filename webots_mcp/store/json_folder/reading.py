@@ -178,16 +178,16 @@ def _read_json(file: Path) -> Any:
     text = file.read_bytes()
     if not text.strip():
         raise InvalidInputError(
-            f"{file} is empty: its controller was ended while it wrote it; delete the file and "
+            f"{file} is empty: its controller ended while writing it; delete the file and "
             "import the rest"
         )
     try:
         return json.loads(text)
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
-        raise InvalidInputError(f"{file}, {where}: no JSON: {error.msg}") from error
+        raise InvalidInputError(f"{file}, {where}: not valid JSON: {error.msg}") from error
     except (ValueError, RecursionError) as error:  # no UTF-8, a number of 5,000 digits
-        raise InvalidInputError(f"{file}: no JSON: {error}") from error
+        raise InvalidInputError(f"{file}: not valid JSON: {error}") from error
 
 
 def _clean(value: Any, path: tuple[str, ...], odd: dict[str, str], file: Path) -> Any:
@@ -341,7 +341,7 @@ def _read_pictures(folder: Path) -> Iterator[FoundPicture]:
 def _pictures_in(kind: str, files: Iterable[Path]) -> Iterator[FoundPicture]:
     for file in files:
         if not is_text(file.name):
-            raise InvalidInputError(f"the name of {str(file)!r} is no text: rename the file")
+            raise InvalidInputError(f"the name of {str(file)!r} is not valid text: rename the file")
         is_there(file)
         status = file.stat()
         yield FoundPicture(status.st_mtime, kind, file, *_picture_size(file), status.st_size)

@@ -150,7 +150,7 @@ def _copy(picture: FoundPicture, file: Path, made: list[Path]) -> Path:
     if file == picture.file:
         return file
     if file.exists():
-        raise InvalidInputError(f"{file} is there already: move it away first")
+        raise InvalidInputError(f"{file} already exists: move it away first")
     made.append(file)
     try:
         make_folder(file.parent)

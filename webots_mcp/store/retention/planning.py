@@ -345,7 +345,7 @@ class _Planner:
                 kept[step] = 1 if step.owner_id in owners else waiting[step]
         self._spared += _spared({step: kept[step] for step in steps}, "not shipped yet")
         lost = {step: max(waiting[step] - kept[step], 0) for step in steps}
-        self._unshipped += _spared(lost, "not shipped, and more waits than is kept for it")
+        self._unshipped += _spared(lost, "not shipped: beyond what is kept for shipping")
         return (
             replace(
                 step,

@@ -97,8 +97,8 @@ class Retention:
         waiting = self.unshipped
         if waiting.size_bytes is None or (waiting.rows, waiting.age_s) != (None, None):
             raise InvalidInputError(
-                "what waits to be shipped is kept up to a size, so that a pool that is away does "
-                "not fill the disk: --keep-until-shipped 2GB"
+                "rows that wait to be shipped are kept up to a size, so that an unreachable pool "
+                "does not fill the disk: --keep-until-shipped 2GB"
             )
 
 

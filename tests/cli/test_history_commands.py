@@ -64,7 +64,7 @@ def test_history_of_few_rows_shows_the_rows(say: Say) -> None:
 
 def test_trends_say_what_each_signal_did(say: Say) -> None:
     text = say("trends", "--run", "1")
-    assert "every 2 s" in line_with(text, "heading")
+    assert "period 2 s" in line_with(text, "heading")
     assert "cruise 76.9, avoid 35.0" in line_with(text, "mode")
     assert "more signals" in say("trends", "--run", "1", "-n", "2")
 
@@ -203,7 +203,7 @@ def test_questions_load_neither_the_server_nor_matplotlib(story: Path) -> None:
     program = (
         "import sys\nfrom webots_mcp.cli import main\n"
         f"main(['trends', '--database', {str(story)!r}])\n"
-        "print({'mcp', 'matplotlib', 'pydantic', 'sqlmodel'} & set(sys.modules), file=sys.stderr)"
+        "print({'mcp', 'matplotlib', 'sqlmodel'} & set(sys.modules), file=sys.stderr)"
     )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert ended.stderr.strip() == "set()"

@@ -14,9 +14,9 @@ from tests.bridge.conftest import Recording
 from tests.processes.conftest import CONTROLLER, Start, has_states
 from webots_mcp.connection import connect
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.server.target import find_target
 from webots_mcp.standin import Mode, Simulation
 from webots_mcp.standin.in_process import DEFAULT_WORLD
+from webots_mcp.steering.target import find_target
 from webots_mcp.store.recording import look
 
 LOOP = """

@@ -22,7 +22,7 @@ from tests.server.conftest import Connect, ask, fail
 from tests.store.test_queue import claim
 from webots_mcp.connection import connect as connect_database
 from webots_mcp.queue import CommandQueue, fetch_command, list_commands
-from webots_mcp.server.dispatch import Dispatcher
+from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import Recording
 
 pytestmark = pytest.mark.anyio

@@ -11,7 +11,7 @@ from tests.recordings.rows import Recorded
 from tests.server.conftest import DATA_TOOLS, Connect, ask, fail
 from webots_mcp.bridge.encoding import encode
 from webots_mcp.questions.shortening import compact_json
-from webots_mcp.server.sensing import unnamed_devices
+from webots_mcp.steering.sensing import unnamed_devices
 
 pytestmark = pytest.mark.anyio
 DEFAULT_LIMIT = 8_000  # characters: about 2,000 tokens

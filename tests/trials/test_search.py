@@ -13,7 +13,7 @@ from typing import Any, get_args
 import pytest
 
 from tests.trials.conftest import Run, command, rows, wait_for_trial
-from webots_mcp.server.trial_sets import told_of_set
+from webots_mcp.steering.trial_sets import told_of_set
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Trial
 from webots_mcp.trials.plan import Plan, Search

@@ -15,8 +15,11 @@ import sys
 from collections.abc import Sequence
 from typing import Any, Final
 
+from cyclopts import CycloptsError
+
 from webots_mcp.cli import (
     breakpoints,
+    commands,
     contents,
     data,
     diagnosing,
@@ -34,8 +37,8 @@ from webots_mcp.cli import (
 from webots_mcp.cli.command import COMMANDS
 from webots_mcp.cli.ending import ended_by, ending_by_signals
 from webots_mcp.cli.terminal import spelling_out
-from webots_mcp.cli.wording import as_typed, speak_of
-from webots_mcp.errors import WebotsMCPError
+from webots_mcp.cli.wording import as_typed, speak_of, speak_of_command
+from webots_mcp.errors import InvalidInputError, WebotsMCPError
 from webots_mcp.naming import spelled_out
 from webots_mcp.plugins import command_modules
 
@@ -71,6 +74,9 @@ _EPILOG: Final = "'webots-mcp COMMAND --help' explains a command. Try 'webots-mc
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     try:
+        given = list(sys.argv[1:] if argv is None else argv)
+        if given[:1] and given[0] in commands.COMMANDS:
+            return _run(given)
         with ending_by_signals():
             arguments = _parser().parse_args(argv)
             speak_of(arguments.arguments)
@@ -92,6 +98,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:
         return _end(EXIT_SYSTEM, str(error))
     return 0
+
+
+def _run(argv: Sequence[str]) -> int:
+    """Call the command that was given."""
+    speak_of_command(argv[0])
+    with ending_by_signals(), spelling_out():
+        app = commands.app_for(argv)
+        try:
+            code = app(argv, exit_on_error=False, print_error=False, result_action="return_value")
+        except CycloptsError as error:
+            raise InvalidInputError(str(error)) from error
+        sys.stdout.flush()
+    return code or 0
 
 
 def _end(code: int, text: str) -> int:

@@ -53,7 +53,7 @@ def breakpoint_(arguments: argparse.Namespace) -> None:
 
 
 def _list(arguments: argparse.Namespace) -> None:
-    from webots_mcp.server.arming import COLUMNS, breakpoint_rows
+    from webots_mcp.steering.arming import COLUMNS, breakpoint_rows
     from webots_mcp.store.recording import look
 
     with reading(arguments) as connection:
@@ -71,7 +71,7 @@ def _set(arguments: argparse.Namespace) -> BreakpointAnswer:
 
     import anyio
 
-    from webots_mcp.server.arming import set_breakpoint
+    from webots_mcp.steering.arming import set_breakpoint
 
     ask = partial(
         set_breakpoint,
@@ -88,7 +88,7 @@ def _remove(arguments: argparse.Namespace) -> BreakpointAnswer:
 
     import anyio
 
-    from webots_mcp.server.arming import remove_breakpoint
+    from webots_mcp.steering.arming import remove_breakpoint
 
     ask = partial(remove_breakpoint, robot=arguments.robot)
     return anyio.run(ask, writable(arguments), show_progress, arguments.breakpoint_id)

@@ -70,7 +70,7 @@ def _show(arguments: argparse.Namespace, action: str, params: dict[str, Any]) ->
 def _asked(arguments: argparse.Namespace, action: str, params: dict[str, Any]) -> dict[str, Any]:
     import anyio
 
-    from webots_mcp.server.scene import ask_scene
+    from webots_mcp.steering.scene import ask_scene
 
     async def ask() -> CommandAnswer:
         recording = writable(arguments)

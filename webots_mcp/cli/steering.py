@@ -75,7 +75,7 @@ def run(arguments: argparse.Namespace) -> None:
     """
     import anyio
 
-    from webots_mcp.server.running import require_possible
+    from webots_mcp.steering.running import require_possible
 
     recording, until, for_s = writable(arguments), arguments.until, arguments.for_s
     require_possible(recording, arguments.robot, until, for_s, reset=arguments.reset)
@@ -165,7 +165,7 @@ def wait(arguments: argparse.Namespace) -> None:
 async def _ask(
     recording: Recording, arguments: argparse.Namespace, action: str, params: dict[str, Any]
 ) -> CommandAnswer:
-    from webots_mcp.server.dispatch import Dispatcher
+    from webots_mcp.steering.dispatch import Dispatcher
 
     with _line_of_progress():
         dispatcher = Dispatcher(recording, show_progress)
@@ -173,7 +173,7 @@ async def _ask(
 
 
 async def _wait(recording: Recording, arguments: argparse.Namespace) -> CommandAnswer:
-    from webots_mcp.server.dispatch import Dispatcher
+    from webots_mcp.steering.dispatch import Dispatcher
 
     with _line_of_progress():
         dispatcher = Dispatcher(recording, show_progress)

@@ -23,7 +23,7 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError
 
 if TYPE_CHECKING:
     from webots_mcp.questions.answers import CommandAnswer
-    from webots_mcp.server.tuning import When
+    from webots_mcp.steering.tuning import When
     from webots_mcp.store.recording import Recording
 
 
@@ -65,7 +65,7 @@ def _set(arguments: argparse.Namespace) -> CommandAnswer:
     import anyio
 
     from webots_mcp.contract import resolve_database
-    from webots_mcp.server.tuning import set_parameters
+    from webots_mcp.steering.tuning import set_parameters
     from webots_mcp.store.recording import Recording
 
     recording = Recording(*resolve_database(arguments.database, arguments.data_dir))
@@ -77,7 +77,7 @@ def _set(arguments: argparse.Namespace) -> CommandAnswer:
 
 def parameters_of(recording: Recording, arguments: argparse.Namespace) -> dict[str, Any]:
     """The typed settings as values of the kinds that the living controller declares."""
-    from webots_mcp.server.tuning import settable
+    from webots_mcp.steering.tuning import settable
 
     declared = settable(recording, arguments.robot)
     kinds = {name: each.declaration.kind for name, each in declared.items()}

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 if TYPE_CHECKING:
     from webots_mcp.cli.command import Argument
@@ -43,12 +43,37 @@ BY_TOOL: Final = {  # by tool
     "world_reset": "send reset",
 }
 _TOOL: Final = re.compile(r"webots_(\w+)(?:,? \(?command_id( \d+)\)?)?")
-_running: ContextVar[tuple[Argument, ...]] = ContextVar("running", default=())
+_running: ContextVar[tuple[Argument | Typed, ...]] = ContextVar("running", default=())
 
 
 def speak_of(arguments: Iterable[Argument]) -> None:
     """Let `as_typed` speak of these arguments: those of the command that runs."""
     _running.set(tuple(arguments))
+
+
+def speak_of_command(name: str) -> None:
+    """Let `as_typed` speak of the options of the question that a command asks."""
+    from webots_mcp.cli.commands import COMMANDS
+    from webots_mcp.questions.declaring import Question
+
+    found = COMMANDS[name].declared()
+    if isinstance(found, Question):
+        from webots_mcp.cli.asking import option_of
+
+        _running.set(
+            tuple(
+                Typed(each.name, option_of(found, each.name), each.name.upper())
+                for each in found.parameters
+            )
+        )
+
+
+class Typed(NamedTuple):
+    """An argument, as a person types it."""
+
+    name: str
+    typed: str
+    value_name: str
 
 
 def as_typed(text: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from pydantic import BaseModel, Field, PrivateAttr
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,13 @@ class ShownPicture:
     format: str
 
 
-class Table(BaseModel):
+class Part(BaseModel):
+    """A part of an answer."""
+
+    model_config = ConfigDict(defer_build=True)  # most processes use one kind of answer
+
+
+class Table(Part):
     """Rows under column names; a name says its unit."""
 
     columns: list[str]
@@ -30,7 +36,7 @@ class Table(BaseModel):
     )
 
 
-class Answer(BaseModel):
+class Answer(Part):
     """The header of every answer: about what, as of when, and whether time is moving."""
 
     robot: str | None = None

@@ -7,17 +7,10 @@ from typing import Annotated, Final
 from pydantic import AfterValidator, Field, WithJsonSchema
 
 from webots_mcp import contract
-from webots_mcp.store.detection.registry import KINDS, kind_names
 
 # Clients put a call aside after two minutes; some of this time is for a busy database.
 MAX_WAIT_S: Final = 90
 LONGEST_NAME: Final = 200
-
-
-def _as_kind(name: str) -> str:
-    if name not in kind_names():
-        raise ValueError(f"be one of {', '.join(map(repr, kind_names()))}")
-    return name
 
 
 def _as_id(value: int) -> int:
@@ -86,22 +79,6 @@ MaxPoints = Annotated[
         le=500,
         description="The most buckets, or rows with raw.",
     ),
-]
-Kind = Annotated[
-    str,
-    AfterValidator(_as_kind),
-    Field(json_schema_extra={"enum": [*kind_names()]}),
-]
-Kinds = Annotated[
-    list[Kind] | None,
-    Field(
-        description="Only these; by default all but image. "
-        f"{'; '.join(f'{kind.name}: {kind.means}' for kind in KINDS if kind.means)}."
-    ),
-]
-TimelineKinds = Annotated[
-    list[Annotated[str, AfterValidator(_as_kind)]] | None,
-    Field(description="Of those of webots_find_events; by default all that were stored."),
 ]
 ShownLimit = Annotated[
     int | None,

@@ -13,9 +13,9 @@ from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRec
 from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.questions.argument_types import MAX_WAIT_S, RobotName, TimeoutS
 from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, question
-from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.routes import Attempt
-from webots_mcp.server.target import find_target
+from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.steering.routes import Attempt
+from webots_mcp.steering.target import find_target
 from webots_mcp.store.recording import Recording, look
 from webots_mcp.webots.stream import Order
 

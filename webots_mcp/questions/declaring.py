@@ -33,7 +33,7 @@ from webots_mcp.store.reading.ranges import Scope
 from webots_mcp.store.recording import Recording
 
 if TYPE_CHECKING:
-    from webots_mcp.server.launcher import Companions
+    from webots_mcp.steering.launcher import Companions
 
 Report = Callable[[float, float | None, str], Awaitable[None]]
 Client = Literal["mcp", "cli"]
@@ -158,8 +158,13 @@ class Question:
         info: FieldInfo = self.arguments.model_fields[argument]
         return info.description or ""
 
+    @property
+    def has_caller(self) -> bool:
+        """Whether it wants to know who asks."""
+        return self._parameter_of(Caller) is not None
+
     async def ask(
-        self, recording: Recording, arguments: Mapping[str, Any], caller: Caller
+        self, recording: Recording, arguments: Mapping[str, Any], caller: Caller | None
     ) -> Reply:
         """The answer to valid arguments.
 
@@ -190,14 +195,14 @@ class Question:
         return _with_left_out(reply, invalid.described())
 
     async def _call(
-        self, recording: Recording, arguments: Mapping[str, Any], caller: Caller
+        self, recording: Recording, arguments: Mapping[str, Any], caller: Caller | None
     ) -> Reply:
         given = dict(arguments)
         if scope := self._parameter_of(Scope):
             given[scope] = Scope(**{name: given.pop(name, None) for name in SCOPE})
         if asker := self._parameter_of(Caller):
             given[asker] = caller
-        client = _client.set(caller.client)
+        client = _client.set(caller.client if caller else "cli")
         try:
             if inspect.iscoroutinefunction(self.function):
                 answer = await self.function(recording, **given)

@@ -5,13 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import Table
 from webots_mcp.questions.argument_types import (
     AnyNames,
-    Kinds,
     LogLevel,
     Mode,
     Position,
@@ -34,12 +33,36 @@ from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.history_answers import EventsAnswer, KindVerdicts
 from webots_mcp.questions.shortening import DETAIL_BUDGET, shorten
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold, both_of
+from webots_mcp.store.detection.registry import KINDS, kind_names
 from webots_mcp.store.detection.threshold import thresholds_on
 from webots_mcp.store.detection.verdict import Verdicts
 from webots_mcp.store.questions.events import Events, Found, search_events
 from webots_mcp.store.reading.ranges import Scope, TimeRange
 from webots_mcp.store.recording import Recording, View
 
+
+def _as_kind(name: str) -> str:
+    if name not in kind_names():
+        raise ValueError(f"be one of {', '.join(map(repr, kind_names()))}")
+    return name
+
+
+Kind = Annotated[
+    str,
+    AfterValidator(_as_kind),
+    Field(json_schema_extra={"enum": [*kind_names()]}),
+]
+Kinds = Annotated[
+    list[Kind] | None,
+    Field(
+        description="Only these; by default all but image. "
+        f"{'; '.join(f'{kind.name}: {kind.means}' for kind in KINDS if kind.means)}."
+    ),
+]
+TimelineKinds = Annotated[
+    list[Annotated[str, AfterValidator(_as_kind)]] | None,
+    Field(description="Of those of webots_find_events; by default all that were stored."),
+]
 EVENT_COLUMNS: Final = (
     "kind", "count", "run_id", "start_s", "duration_s", "ongoing", "name", "details",
 )  # fmt: skip
@@ -47,7 +70,7 @@ DEFAULT_LIMIT: Final = 50
 _GROUP_BUDGET: Final = 640  # characters
 
 
-@question("Find events", READS)
+@question("Find events", READS, command="events", core=True)
 def webots_find_events(
     recording: Recording,
     scope: Scope,

@@ -16,7 +16,7 @@ from webots_mcp.questions.budget import seconds, some
 from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.questions.pictures import load_picture, load_sheet
 from webots_mcp.questions.shortening import compact_json
-from webots_mcp.server.dispatch import Dispatcher
+from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.images import StoredImage, camera_frames, cameras, inside
 from webots_mcp.store.reading.kept import kept_stretches
 from webots_mcp.store.reading.ranges import just_after

@@ -9,12 +9,11 @@ from webots_mcp.questions.argument_types import (
     LogLevel,
     ShownLimit,
     TextCursor,
-    TimelineKinds,
 )
 from webots_mcp.questions.bounds import range_in
 from webots_mcp.questions.budget import BUDGET, LARGE_BUDGET, answer_about, notes_of, size_of
 from webots_mcp.questions.declaring import READS, question
-from webots_mcp.questions.find_events import events_table, verdicts_of
+from webots_mcp.questions.find_events import TimelineKinds, events_table, verdicts_of
 from webots_mcp.questions.history_answers import TimelineAnswer
 from webots_mcp.store.detection.event import EventOptions
 from webots_mcp.store.detection.registry import stored_kinds

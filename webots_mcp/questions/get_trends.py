@@ -42,7 +42,7 @@ _SHOWN_VALUES: Final = 6
 _SHOWN_CONSTANTS: Final = 20
 
 
-@question("Get the trends", READS)
+@question("Get the trends", READS, command="trends", positional=("signals",), core=True)
 def webots_get_trends(
     recording: Recording,
     scope: Scope,

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-from pydantic import BaseModel, Field
+from pydantic import Field
 
-from webots_mcp.questions.answers import Answer, CommandAnswer, Table
+from webots_mcp.questions.answers import Answer, CommandAnswer, Part, Table
 
 
 class NotedAnswer(Answer):
@@ -27,7 +27,7 @@ class SignalsAnswer(NotedAnswer):
     cursor: int | None = Field(default=None, description="Ask again with this cursor for more.")
 
 
-class NumberSeries(BaseModel):
+class NumberSeries(Part):
     """A numeric signal: one item per bucket in each list, null where it has no value."""
 
     unit: str | None = None
@@ -51,7 +51,7 @@ class NumberSeries(BaseModel):
     )
 
 
-class ChangeSeries(BaseModel):
+class ChangeSeries(Part):
     """A text or boolean signal: its values, each with the time from which on it had it."""
 
     since_s: list[float | None] = Field(
@@ -62,7 +62,7 @@ class ChangeSeries(BaseModel):
     time_by_value_s: dict[str, float]
 
 
-class RunSeries(BaseModel):
+class RunSeries(Part):
     """The part of an answer that is about one run."""
 
     run_id: int
@@ -85,7 +85,7 @@ class RunSeries(BaseModel):
     )
 
 
-class RowColumns(BaseModel):
+class RowColumns(Part):
     """Rows as they were recorded, as columns."""
 
     run_id: list[int] | None = Field(default=None, description="Where it is not the header's.")
@@ -104,7 +104,7 @@ class HistoryAnswer(NotedAnswer):
     )
 
 
-class RunTrendTables(BaseModel):
+class RunTrendTables(Part):
     """The trends of one run."""
 
     run_id: int
@@ -129,7 +129,7 @@ class TrendsAnswer(NotedAnswer):
     runs: list[RunTrendTables] | None = None
 
 
-class KindVerdicts(BaseModel):
+class KindVerdicts(Part):
     """What became of each kind that was asked for."""
 
     found: dict[str, int] | None = Field(

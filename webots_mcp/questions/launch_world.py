@@ -15,9 +15,9 @@ from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.questions.argument_types import RobotName, TimeoutS
 from webots_mcp.questions.declaring import CHANGES, DESTROYS, Caller, question
 from webots_mcp.questions.shortening import cut_text
-from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.launcher import project_of
-from webots_mcp.server.worlds import WorldRequest
+from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.steering.launcher import project_of
+from webots_mcp.steering.worlds import WorldRequest
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.starting import Mode, Start, free_port
 

@@ -20,7 +20,7 @@ from webots_mcp.questions.declaring import READS, Caller, question
 from webots_mcp.questions.find_events import fitting_events, not_shown_of, verdicts_of
 from webots_mcp.questions.get_trends import MOST_SIGNALS, trend_tables
 from webots_mcp.questions.history_answers import MonitorAnswer
-from webots_mcp.server.watching import Window, movement, window_from
+from webots_mcp.steering.watching import Window, movement, window_from
 from webots_mcp.store.detection.event import Event, EventOptions
 from webots_mcp.store.detection.registry import asked_kinds
 from webots_mcp.store.detection.verdict import Verdicts

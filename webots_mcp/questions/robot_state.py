@@ -18,7 +18,7 @@ from webots_mcp.questions.shortening import (
     cut_text,
     shorten,
 )
-from webots_mcp.server.sensing import sensor_part, unnamed_devices
+from webots_mcp.steering.sensing import sensor_part, unnamed_devices
 from webots_mcp.store.reading.kept import newest_kept
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.run_rows import State, newest_events, select

@@ -15,8 +15,8 @@ from webots_mcp.questions.budget import seconds
 from webots_mcp.questions.declaring import DESTROYS, Caller, question
 from webots_mcp.questions.history_answers import RunAnswer
 from webots_mcp.questions.pictures import load_picture
-from webots_mcp.server.dispatch import Dispatcher
-from webots_mcp.server.running import ACTION, require_possible
+from webots_mcp.steering.dispatch import Dispatcher
+from webots_mcp.steering.running import ACTION, require_possible
 from webots_mcp.store.images import camera_frames, inside
 from webots_mcp.store.recording import Recording
 

@@ -14,7 +14,7 @@ from webots_mcp.questions.budget import condensed
 from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.questions.shortening import DETAIL_BUDGET, cut_text, shorten
 from webots_mcp.queue import Command, list_commands
-from webots_mcp.server.dispatch import Dispatcher, shown_result
+from webots_mcp.steering.dispatch import Dispatcher, shown_result
 from webots_mcp.store.recording import Recording, View
 
 COMMAND_COLUMNS: Final = (

@@ -10,7 +10,7 @@ from webots_mcp.contract import BreakpointAction
 from webots_mcp.questions.answers import BreakpointAnswer, BreakpointsAnswer, Table
 from webots_mcp.questions.argument_types import Id, RobotName
 from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
-from webots_mcp.server import arming
+from webots_mcp.steering import arming
 from webots_mcp.store.recording import Recording
 
 BreakpointId = Annotated[Id, Field(description="From webots_breakpoint.")]

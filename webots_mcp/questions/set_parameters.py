@@ -15,7 +15,7 @@ from webots_mcp.questions.argument_types import RobotName, RunId, TimeoutS, Valu
 from webots_mcp.questions.budget import fitting, seconds, without_empty
 from webots_mcp.questions.declaring import CHANGES, READS, Caller, question
 from webots_mcp.questions.shortening import DETAIL_BUDGET, WHOLE, shorten
-from webots_mcp.server.tuning import SET_WAIT_S, When, set_parameters
+from webots_mcp.steering.tuning import SET_WAIT_S, When, set_parameters
 from webots_mcp.store.parameters import COLUMNS, described
 from webots_mcp.store.recording import Recording, View
 

@@ -17,11 +17,11 @@ from webots_mcp.contract import Database
 from webots_mcp.liveness import reap_if_dead
 from webots_mcp.maintenance import Maintainer
 from webots_mcp.questions import all_questions
-from webots_mcp.server.launcher import Companions, Launcher
 from webots_mcp.server.prompts import add_prompts
 from webots_mcp.server.resources import add_resources
 from webots_mcp.server.tools import tool_of
-from webots_mcp.server.trial_worker import TrialWorkers
+from webots_mcp.steering.launcher import Companions, Launcher
+from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.retention import Asked, Upkeep
 from webots_mcp.store.retention.limits import ask_where_unset

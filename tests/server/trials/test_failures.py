@@ -95,7 +95,7 @@ async def test_a_trial_without_a_score_or_an_end_failed_and_is_not_zero(
 async def test_a_loop_that_hangs_fails_its_trial_with_the_time_that_it_reached(
     connect: Connect, tunable: TunableDriver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("webots_mcp.server.trial_worker._PATIENCE_S", 0.1)
+    monkeypatch.setattr("webots_mcp.steering.trial_worker._PATIENCE_S", 0.1)
     async with connect() as client:
         answer = await trials(client, parameters={"kp": [HANGS_AT]}, trial_timeout_s=1)
         (row,) = rows_of(answer["ranked"])

@@ -9,8 +9,8 @@ from anyio import to_thread
 
 from webots_mcp.parameter import Value, require_known
 from webots_mcp.questions.answers import CommandAnswer
-from webots_mcp.server.dispatch import Dispatcher, Report
-from webots_mcp.server.target import find_target
+from webots_mcp.steering.dispatch import Dispatcher, Report
+from webots_mcp.steering.target import find_target
 from webots_mcp.store.parameters import Declared, declared_by
 from webots_mcp.store.recording import Recording
 

@@ -12,7 +12,7 @@ from anyio import to_thread
 from webots_mcp.contract import OBSERVER
 from webots_mcp.errors import AmbiguousRobotError, CommandRefusedError, InvalidInputError
 from webots_mcp.questions.answers import CommandAnswer
-from webots_mcp.server.dispatch import Dispatcher, Report
+from webots_mcp.steering.dispatch import Dispatcher, Report
 from webots_mcp.store.recording import Recording, look
 from webots_mcp.store.robots import list_robots
 from webots_mcp.store.sessions import Session

@@ -16,9 +16,9 @@ from webots_mcp.questions.answers import CommandAnswer
 from webots_mcp.questions.history_answers import RunAnswer
 from webots_mcp.questions.shortening import RESULT_BUDGET, WHOLE, cut_text, shorten
 from webots_mcp.queue import Command, CommandQueue, fetch_command
-from webots_mcp.server.running import ACTION as RUN
-from webots_mcp.server.running import progress_of, told_of_run
-from webots_mcp.server.target import find_target
+from webots_mcp.steering.running import ACTION as RUN
+from webots_mcp.steering.running import progress_of, told_of_run
+from webots_mcp.steering.target import find_target
 from webots_mcp.store.recording import Recording, View, look
 from webots_mcp.store.robots import robot_name
 from webots_mcp.store.status import handler_at_work

@@ -14,8 +14,8 @@ from webots_mcp.contract import BreakpointAction
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.questions.answers import BreakpointAnswer, CommandAnswer
 from webots_mcp.questions.shortening import cut_text
-from webots_mcp.server.dispatch import Dispatcher, Report
-from webots_mcp.server.running import holds_since
+from webots_mcp.steering.dispatch import Dispatcher, Report
+from webots_mcp.steering.running import holds_since
 from webots_mcp.store.reading.subject import Subject
 from webots_mcp.store.recording import Recording, View
 from webots_mcp.store.signals.catalogue import catalogue

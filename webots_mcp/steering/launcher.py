@@ -9,7 +9,7 @@ from pathlib import Path
 from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, find_project
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
 from webots_mcp.launch import Launch
-from webots_mcp.server.trial_worker import TrialWorkers
+from webots_mcp.steering.trial_worker import TrialWorkers
 from webots_mcp.store.recording import Recording
 from webots_mcp.webots.starting import Start
 from webots_mcp.webots.stream import WebotsLine

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from webots_mcp.contract import HEARTBEAT_LATE_S
 from webots_mcp.questions.answers import CommandAnswer
-from webots_mcp.server.dispatch import Dispatcher
+from webots_mcp.steering.dispatch import Dispatcher
 from webots_mcp.store.recording import Recording
 
 CLAIMING_S: Final = HEARTBEAT_LATE_S + 0.5  # by then a loop that has just stopped is known as such

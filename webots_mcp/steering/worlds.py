@@ -14,9 +14,9 @@ from anyio import to_thread
 from webots_mcp.errors import CommandRefusedError
 from webots_mcp.launch import Launch, SessionStart, newest_in, starts_since
 from webots_mcp.questions.answers import CommandAnswer
-from webots_mcp.server.launcher import Launcher
-from webots_mcp.server.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
-from webots_mcp.server.routes import Situation, look_around, webots_meant, why_no_word
+from webots_mcp.steering.launcher import Launcher
+from webots_mcp.steering.request import CLAIMING_S, LEAST_S, UNCLAIMED, Request
+from webots_mcp.steering.routes import Situation, look_around, webots_meant, why_no_word
 from webots_mcp.webots.instances import instance_at
 from webots_mcp.webots.stream import ANSWER_S, WebotsAddress, address_of, load_world
 

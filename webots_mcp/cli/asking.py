@@ -1,0 +1,219 @@
+"""Questions as commands: options and help, the call, and the answer in a terminal.
+
+All of it comes from the question's declaration; nothing here knows any single question.
+"""
+
+from __future__ import annotations
+
+import inspect
+import json
+import sys
+import types
+from collections.abc import Callable, Generator, Iterable, Mapping
+from contextlib import contextmanager
+from typing import Annotated, Any, Final, Literal, Union, cast, get_args, get_origin
+
+import anyio
+from cyclopts import Parameter
+from pydantic import ValidationError
+from pydantic.json_schema import SkipJsonSchema
+
+from webots_mcp.cli.recordings import Json, Where, sum_up_first
+from webots_mcp.cli.rendering import print_answer
+from webots_mcp.cli.terminal import rewrite
+from webots_mcp.cli.values import settings_of, value_of
+from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
+from webots_mcp.questions.declaring import Caller, Question, Reply
+from webots_mcp.questions.faults import faults_of
+from webots_mcp.store.recording import Recording
+
+# How options are called whose argument has another name in all questions.
+OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
+    {
+        "run_id": "--run",
+        "last_s": "--last",
+        "start_s": "--start",
+        "end_s": "--end",
+        "for_s": "--for",
+        "timeout_s": "--timeout",
+        "kinds": "--kind",
+        "signals": "--signal",
+        "limit": "-n",
+    }
+)
+_NOT_DONE: Final = ("failed", "expired", "cancelled", "lost", "claimed")
+
+
+def command_of(question: Question) -> Callable[..., None]:
+    """The function that the command line calls for a question."""
+
+    def run(
+        *positional: Any, recorded: Where | None = None, json: bool = False, **options: Any
+    ) -> None:
+        given = dict(zip(question.positional, positional, strict=False)) | options
+        reply = ask(question, given, recorded or Where())
+        show(question, reply, as_json=json)
+
+    parameters = [_parameter(question, each) for each in question.parameters if _is_shown(each)]
+    parameters.sort(key=lambda each: each.kind)
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    parameters += [
+        inspect.Parameter("json", keyword, default=False, annotation=Json),
+        inspect.Parameter("recorded", keyword, default=Where(), annotation=Where),
+    ]
+    vars(run)["__signature__"] = inspect.Signature(parameters)
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    run.__name__ = question.command or question.name
+    run.__doc__ = inspect.getdoc(question.function)
+    return run
+
+
+def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
+    """Ask a question as a person does: of any length of recording, for as long as it takes.
+
+    Raises:
+        InvalidInputError: An argument is out of bounds.
+        NothingRecordedError: There is nothing to ask about.
+        WebotsMCPError: As the question says.
+    """
+    recording = where.recording(read_only=question.effect.reads)
+    if question.has_scope:
+        sum_up_first(recording)
+    valid = _valid(question, given)
+    with _line_of_progress(), _caller(question, recording) as caller:
+        return anyio.run(question.ask, recording, valid, caller)
+
+
+@contextmanager
+def _caller(question: Question, recording: Recording) -> Generator[Caller | None]:
+    """Who asks, where the question wants to know; what it starts ends with the command."""
+    if not question.has_caller:
+        yield None
+        return
+    from webots_mcp.steering.launcher import Companions, Launcher
+    from webots_mcp.steering.trial_worker import TrialWorkers
+
+    companions = Companions(TrialWorkers(recording), Launcher(recording))
+    try:
+        yield Caller("cli", _show_progress, companions)
+    finally:
+        companions.stop()
+
+
+def _valid(question: Question, given: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments as the question takes them; what was not given is left to their defaults."""
+    meant: dict[str, Any] = {}
+    for parameter in question.parameters:
+        if parameter.name not in given or given[parameter.name] is None:
+            continue
+        value, kind = given[parameter.name], _plain(parameter.annotation)
+        if _is_mapping(kind):
+            value = settings_of(value)
+        elif _is_json(kind) and isinstance(value, str):
+            value = value_of(value)
+        meant[parameter.name] = value
+    try:
+        model = question.arguments.model_validate(meant)
+    except ValidationError as error:
+        raise InvalidInputError(faults_of(error)) from error
+    return {name: getattr(model, name) for name in question.arguments.model_fields}
+
+
+def show(question: Question, reply: Reply, *, as_json: bool) -> None:
+    """Print an answer.
+
+    Raises:
+        CommandRefusedError: It is of a command that was not done.
+        NothingRecordedError: Nothing was recorded: the answer is only why.
+    """
+    data = reply.data
+    if data is None:
+        return print(*(each for each in reply.shown if isinstance(each, str)), sep="\n")
+    if data.get("status") == "never seen" and set(data) == {"status", "hint"}:
+        raise NothingRecordedError(data["hint"])
+    if data.get("outcome") in _NOT_DONE:
+        why = "; ".join(filter(None, (data.get("error"), data.get("hint")))) or "no answer in time"
+        action = data.get("action") or question.name
+        raise CommandRefusedError(f"{action} is not done ({data['outcome']}): {why}")
+    if as_json:
+        print(json.dumps(data, ensure_ascii=False))
+    else:
+        print_answer(data)
+
+
+def option_of(question: Question, argument: str) -> str:
+    """The option of an argument, as it is typed."""
+    own = question.options or {}
+    return own.get(argument) or OPTIONS.get(argument) or f"--{argument.replace('_', '-')}"
+
+
+def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Parameter:
+    name, kind = declared.name, _plain(declared.annotation)
+    if _is_mapping(kind):
+        kind = list[str] | None
+    elif _is_json(kind):
+        kind = str if declared.default is inspect.Parameter.empty else str | None
+    text = question.described(name)
+    default = declared.default if isinstance(declared.default, bool) else None
+    if declared.default is inspect.Parameter.empty:
+        default = inspect.Parameter.empty
+    elif declared.default not in (None, "", False, True):
+        text = f"{text} ({declared.default})"
+    if default is None and type(None) not in get_args(kind):
+        kind = Union[kind, None]  # noqa: UP007
+    if name in question.positional:
+        shown = Parameter(name.upper(), help=text, negative=())
+        place = inspect.Parameter.POSITIONAL_ONLY
+    else:
+        negative = f"--no-{name.replace('_', '-')}" if default is True else ()
+        shown = Parameter(option_of(question, name), help=text, negative=negative)
+        place = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(name, place, default=default, annotation=Annotated[kind, shown])
+
+
+def _is_shown(declared: inspect.Parameter) -> bool:
+    """Whether it is no parameter that only other servers' clients give."""
+    return not any(
+        isinstance(each, cast("type", SkipJsonSchema)) for each in _metadata(declared.annotation)
+    )
+
+
+def _metadata(annotation: Any) -> Iterable[Any]:
+    return getattr(annotation, "__metadata__", ())
+
+
+def _plain(annotation: Any) -> Any:
+    """The type without what pydantic is told beside it."""
+    if get_origin(annotation) is Annotated:
+        return _plain(get_args(annotation)[0])
+    if get_origin(annotation) in (Union, types.UnionType):
+        return Union[tuple(_plain(each) for each in get_args(annotation))]  # noqa: UP007
+    if get_origin(annotation) is list:
+        return list[_plain(get_args(annotation)[0])]
+    return annotation
+
+
+def _is_mapping(kind: Any) -> bool:
+    each = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    kinds = [one for one in each if one is not type(None)]
+    return len(kinds) == 1 and get_origin(kinds[0]) is dict
+
+
+def _is_json(kind: Any) -> bool:
+    """Whether several kinds of values are possible, of which the one typed is found by JSON."""
+    each = get_args(kind) if get_origin(kind) in (Union, types.UnionType) else (kind,)
+    kinds = [one for one in each if one is not type(None)]
+    return kinds == [Any] or (len(kinds) > 1 and all(get_origin(k) is not Literal for k in kinds))
+
+
+@contextmanager
+def _line_of_progress() -> Generator[None]:
+    try:
+        yield
+    finally:
+        rewrite(sys.stderr)
+
+
+async def _show_progress(progress: float, total: float | None, text: str) -> None:
+    """On a terminal one line that changes; in a pipe nothing, as for all commands."""
+    rewrite(sys.stderr, text)

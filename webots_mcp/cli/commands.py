@@ -1,0 +1,60 @@
+"""Every command: its group in the help, and the question or the function that it calls.
+
+Only the command that is called is imported, so that it answers at once.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Sequence
+from typing import Any, Final, NamedTuple
+
+from cyclopts import App, Group
+
+from webots_mcp.questions.declaring import Question
+
+
+class Command(NamedTuple):
+    """Where a command is found."""
+
+    group: str
+    module: str
+    name: str
+
+    def declared(self) -> Question | Callable[..., Any]:
+        """What the module has under its name."""
+        return getattr(importlib.import_module(self.module), self.name)
+
+    def load(self) -> Callable[..., Any]:
+        """Its function, with the parameters that are its options."""
+        from webots_mcp.cli.asking import command_of
+
+        found = self.declared()
+        return command_of(found) if isinstance(found, Question) else found
+
+
+NOW, PAST, STEER, DATA, SETUP = (
+    "What is recorded now", "The past", "Steering", "Recordings", "Setting up and running",
+)  # fmt: skip
+GROUPS: Final = (SETUP, NOW, PAST, STEER, DATA)
+_Q: Final = "webots_mcp.questions"
+COMMANDS: Final[dict[str, Command]] = {}
+_HELP: Final = """Flight recorder and remote control for Webots simulations.
+
+Controllers record into one SQLite database, an AI assistant reads it and steers the simulation
+over MCP. Try `webots-mcp demo` first; `webots-mcp COMMAND --help` explains a command.
+"""
+
+
+def app_for(argv: Sequence[str]) -> App:
+    """The application with the command that is called; with all of them for help and completion."""
+    from webots_mcp import __version__
+
+    app = App(name="webots-mcp", help=_HELP, version=__version__, version_flags=["--version"])
+    called = argv[0] if argv else ""
+    names = [called] if called in COMMANDS else list(COMMANDS)
+    for name in names:
+        command = COMMANDS[name]
+        group = Group(command.group, sort_key=GROUPS.index(command.group))
+        app.command(command.load(), name=name, group=group)
+    return app

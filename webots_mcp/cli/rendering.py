@@ -1,0 +1,189 @@
+"""Answers as text: what an assistant reads as JSON, for a person in a terminal.
+
+Tables fit the terminal, by folding their cells; in a pipe each row is one line. Notes are wrapped
+and never cut. Nothing of a recording is written that a terminal would obey.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, TextIO, cast
+
+from webots_mcp.cli.wording import as_typed
+from webots_mcp.naming import spelled_out
+
+_PARAGRAPH: Final = 100  # characters of a line of text, where the terminal has more
+_SHORT: Final = 48
+_INDENT: Final = "  "
+_ENDLESS: Final = 100_000
+_HEAD: Final = {
+    "robot": "{}",
+    "run_id": "run {}",
+    "sim_time_s": "at {} s",
+    "status": "{}",
+    "age_s": "{} s old",
+}
+_NOTES: Final = ("why", "storage", "notes", "hint", "left_out")
+
+
+def print_answer(answer: Mapping[str, Any]) -> None:
+    """Print an answer on stdout, its notes last."""
+    for line in answer_lines(answer, width=terminal_width(sys.stdout)):
+        print(line)
+
+
+def answer_lines(
+    answer: Mapping[str, Any], *, width: int = _PARAGRAPH, most_rows: int | None = None
+) -> Iterator[str]:
+    """Whom and when the answer is about in one line, then part by part what it says.
+
+    Args:
+        answer: As JSON knows it.
+        width: Of the lines, characters.
+        most_rows: Of tables; it is said how many more there are. None for all.
+    """
+    layout = _Layout(width, most_rows)
+    head = [text.format(text_of(answer[name])) for name, text in _HEAD.items() if name in answer]
+    if head:
+        yield ", ".join(head)
+    apart = (*_HEAD, *_NOTES)
+    yield from layout.members({k: v for k, v in answer.items() if k not in apart})
+    for name in _NOTES:
+        value = answer.get(name)
+        texts = cast("list[str]", value if isinstance(value, list) else [value] if value else [])
+        for text in texts:
+            yield from note_lines(text, width)
+
+
+def note_lines(text: str, width: int = _PARAGRAPH) -> list[str]:
+    """What there is to know about an answer, whole."""
+    lines = textwrap.wrap(
+        f"note: {printable(as_typed(text))}", min(width, _PARAGRAPH), subsequent_indent=_INDENT
+    )
+    return lines if width < _ENDLESS else [" ".join(map(str.strip, lines))]
+
+
+def print_notes(notes: Iterable[str], file: TextIO | None = None) -> None:
+    """What there is to know about an answer, below it; on stdout, or in that file."""
+    for note in notes:
+        for line in note_lines(note, terminal_width(file or sys.stdout)):
+            print(line, file=file)
+
+
+def print_table(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print rows under their column names; columns that are empty throughout are left out."""
+    for line in table_lines(columns, rows, terminal_width(sys.stdout)):
+        print(line)
+
+
+def table_lines(
+    columns: Sequence[str], rows: Sequence[Sequence[Any]], width: int = _ENDLESS
+) -> Iterator[str]:
+    """The lines of a table that is no wider than so many characters; what is longer is folded."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    kept = [i for i in range(len(columns)) if any(row[i] is not None for row in rows)]
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_edge=False)
+    for index in kept:
+        numbers = all(isinstance(row[index], (int, float, type(None))) for row in rows)
+        table.add_column(
+            Text(printable(columns[index])),
+            justify="right" if numbers else "left",
+            overflow="fold",
+            no_wrap=width >= _ENDLESS,
+        )
+    for row in rows:
+        table.add_row(*(Text(text_of(row[index])) for index in kept))
+    console = Console(width=width, color_system=None, highlight=False, markup=False, emoji=False)
+    with console.capture() as captured:
+        console.print(table)
+    return (line.rstrip() for line in captured.get().splitlines())
+
+
+def text_of(value: Any) -> str:
+    """A value in one line; what a terminal would obey is spelled out instead."""
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return _number_text(value)
+    if isinstance(value, dict):
+        members = cast("dict[str, Any]", value).items()
+        return printable(", ".join(f"{name} {text_of(member)}" for name, member in members))
+    return printable(value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
+
+
+def printable(text: str) -> str:
+    """A text in one line, with what a terminal would obey spelled out."""
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return spelled_out(line)
+
+
+def terminal_width(stream: TextIO) -> int:
+    """The characters of a line; no limit where nobody looks at it."""
+    return shutil.get_terminal_size().columns if stream.isatty() else _ENDLESS
+
+
+def _number_text(value: float) -> str:
+    """4 significant digits, but never coarser than a thousandth."""
+    if not math.isfinite(value):
+        return str(value)
+    return f"{value:.3f}".rstrip("0").rstrip(".") if abs(value) >= 1 else f"{value:.4g}"
+
+
+class _Layout:
+    """How the parts of an answer stand below each other."""
+
+    def __init__(self, width: int, most_rows: int | None) -> None:
+        self._width = width
+        self._paragraph = min(width, _PARAGRAPH)
+        self._most_rows = most_rows
+
+    def members(self, members: Mapping[str, Any]) -> Iterator[str]:
+        """Short members stand together in a paragraph, each other one on lines of its own."""
+        short = list[str]()
+        for name, value in members.items():
+            line = "" if _has_members(value) else f"{name} {text_of(value)}"
+            if 0 < len(line) <= _SHORT:
+                short.append(line)
+                continue
+            yield from self._wrapped(short)
+            short = []
+            yield from self._wrapped([line]) if line else self._part(name, value)
+        yield from self._wrapped(short)
+
+    def _part(self, name: str, value: Any) -> Iterator[str]:
+        for part in cast("list[dict[str, Any]]", value if isinstance(value, list) else [value]):
+            line = f"{name}: " + ", ".join(f"{each} {text_of(part[each])}" for each in part)
+            if len(line) <= self._paragraph and not any(map(_has_members, part.values())):
+                yield line
+                continue
+            yield f"{name}:"
+            inner = self._table(part) if {"columns", "rows"} <= part.keys() else self.members(part)
+            yield from (_INDENT + line for line in inner)
+
+    def _table(self, table: Mapping[str, Any]) -> Iterator[str]:
+        rows = table["rows"]
+        shared = table.get("in_every_row")
+        if shared:
+            yield from self._wrapped(f"{name} {text_of(value)}" for name, value in shared.items())
+        yield from table_lines(
+            table["columns"], rows[: self._most_rows], self._width - len(_INDENT)
+        )
+        if self._most_rows is not None and len(rows) > self._most_rows:
+            yield f"... and {len(rows) - self._most_rows} more"
+
+    def _wrapped(self, texts: Iterable[str]) -> list[str]:
+        return textwrap.wrap(", ".join(texts), self._paragraph, subsequent_indent=_INDENT)
+
+
+def _has_members(value: Any) -> bool:
+    """Whether it is an object, or a list of such."""
+    each = cast("list[Any]", value)[:1] if isinstance(value, list) else [value]
+    return any(isinstance(one, dict) for one in each)

@@ -11,8 +11,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from webots_mcp.contract import DATABASE_NAME
-from webots_mcp.diagnosis.finding import Finding
-from webots_mcp.diagnosis.registry import CHECKS, SERVER, diagnose, subject_of
+from webots_mcp.diagnosis.doctor import Finding, all_checks, diagnose, subject_of
 from webots_mcp.store.recording import Recording
 
 Look = Callable[..., Finding]
@@ -20,7 +19,7 @@ Look = Callable[..., Finding]
 
 def found(file: Path, check: str, *server: str) -> Finding:
     """What a check says of a recording; its server may be another program."""
-    (asked,) = [each for each in (*CHECKS, SERVER) if each.name == check]
+    (asked,) = [each for each in all_checks(with_server=True) if each.name == check]
     subject = subject_of(Recording(file, file.parent), "the test")
     subject = replace(subject, project=file.parent, server=server or subject.server)
     ((_, finding),) = diagnose(subject, (asked,))

@@ -7,8 +7,16 @@ from pathlib import Path
 
 from tests.diagnosis.conftest import found
 from webots_mcp.contract import MemoryDatabase
-from webots_mcp.diagnosis.finding import PAGE, Check, Finding, Subject, worst
-from webots_mcp.diagnosis.registry import CHECKS, SERVER, diagnose, subject_of
+from webots_mcp.diagnosis.doctor import (
+    PAGE,
+    Check,
+    Examined,
+    Finding,
+    all_checks,
+    diagnose,
+    subject_of,
+    worst,
+)
 from webots_mcp.store.recording import Recording
 
 CHECKOUT = Path(__file__).parents[2]
@@ -18,8 +26,8 @@ ELSEWHERE = {"Webots", "Clients", "Recording now", "Free space"}
 
 def test_each_check_has_its_part_of_the_page_and_each_part_its_check() -> None:
     headings = re.findall(r"^## (.+)$", (CHECKOUT / PAGE).read_text("utf-8"), re.MULTILINE)
-    assert headings == [check.name for check in (*CHECKS, SERVER)]
-    assert CHECKS[3].page == "docs/troubleshooting.md#data-folder"
+    assert headings == [check.name for check in all_checks(with_server=True)]
+    assert all_checks()[3].page == "docs/troubleshooting.md#data-folder"
 
 
 def test_a_recording_of_a_robot_that_has_finished_is_well(bridge_recording: Path) -> None:
@@ -41,10 +49,10 @@ def test_a_recording_in_memory_is_looked_at_as_well() -> None:
 
 
 def test_a_check_that_fails_says_so_and_the_others_go_on(tmp_path: Path) -> None:
-    def fails(_: Subject) -> Finding:
+    def fails(_: Examined) -> Finding:
         raise PermissionError("nobody may look there")
 
-    def well(_: Subject) -> Finding:
+    def well(_: Examined) -> Finding:
         return Finding("ok", "all well")
 
     subject = subject_of(Recording(tmp_path / "webots.db", tmp_path), "the test")
@@ -62,6 +70,6 @@ def test_of_several_findings_those_that_are_well_are_left_out() -> None:
 
 def test_nothing_is_made_where_nothing_is(tmp_path: Path) -> None:
     file = tmp_path / "nowhere" / "webots.db"
-    for check in CHECKS:
+    for check in all_checks():
         found(file, check.name)
     assert not file.parent.exists()

@@ -18,7 +18,7 @@ def test_a_server_that_starts_and_answers_is_well(look: Look, recorded: Recorded
     recorded.robot().state(1.0, {"x": 1})
     found = look("Server")
     assert found.verdict == "ok", found
-    assert "tools, one answer" in found.seen
+    assert "tools that only read, one answer" in found.seen
 
 
 def test_a_server_that_answers_that_it_cannot_read_the_recording_is_not_to_blame(

@@ -9,7 +9,7 @@ import pytest
 
 from tests.recordings.rows import Recorded
 from tests.server.conftest import Connect, Driver, ask
-from webots_mcp.diagnosis.registry import CHECKS
+from webots_mcp.diagnosis.doctor import all_checks
 
 pytestmark = pytest.mark.anyio
 
@@ -41,7 +41,7 @@ async def test_each_check_is_told_once_also_where_nothing_was_recorded(connect: 
     names = [each["check"] for each in answer["not_well"]]
     for listed in (answer["well"], *answer["not_looked_at"].values()):
         names += listed.split(", ")
-    assert sorted(names) == sorted(check.name for check in CHECKS)
+    assert sorted(names) == sorted(check.name for check in all_checks())
 
 
 async def test_the_answer_stays_short_however_much_is_wrong(

@@ -11,7 +11,7 @@ from webots_mcp.cli.command import DATA_DIR, DATABASE, JSON, argument, command
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
-    from webots_mcp.diagnosis.finding import Checked, Subject
+    from webots_mcp.diagnosis.doctor import Checked, Examined
 
 _WRONG = 1
 
@@ -29,10 +29,9 @@ def doctor(arguments: argparse.Namespace) -> int:
     Nothing is changed. Exit code 0: nothing is wrong (there may be warnings). 1: something is
     wrong. 2: it could not look.
     """
-    from webots_mcp.diagnosis.registry import CHECKS, SERVER, diagnose
+    from webots_mcp.diagnosis.doctor import all_checks, diagnose
 
-    checks = CHECKS if arguments.no_server else (*CHECKS, SERVER)
-    checked = diagnose(_subject(arguments), checks)
+    checked = diagnose(_subject(arguments), all_checks(with_server=not arguments.no_server))
     if arguments.json:
         _print_json(checked)
     else:
@@ -40,9 +39,9 @@ def doctor(arguments: argparse.Namespace) -> int:
     return _WRONG if any(each.finding.verdict == "wrong" for each in checked) else 0
 
 
-def _subject(arguments: argparse.Namespace) -> Subject:
+def _subject(arguments: argparse.Namespace) -> Examined:
     from webots_mcp.contract import choose_data_dir, resolve_database
-    from webots_mcp.diagnosis.registry import subject_of
+    from webots_mcp.diagnosis.doctor import subject_of
     from webots_mcp.store.recording import Recording
 
     try:

@@ -67,7 +67,7 @@ _ENDED_BY: Final = (
 )
 _MOST_ERROR_CHARACTERS: Final = 300
 _RELOADED_EXTERN: Final = f"the world was reloaded, which ended its controller; {EXTERN}"
-# From inside these look alike; `diagnosis.simulation` looks at it from outside.
+# From inside these look alike; `diagnosis.webots_checks` looks at it from outside.
 SILENT: Final = (
     "its controller process lives but its loop is silent: paused by hand in Webots, at a "
     "breakpoint, another controller looping, or an extern controller missing; from inside the "

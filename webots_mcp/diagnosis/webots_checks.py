@@ -1,8 +1,8 @@
-"""Why is it not running? What a status tells from inside, narrowed down from outside.
+"""Which Webots there are, and why a simulation does not go on.
 
-A loop that is silent inside `step` looks the same whoever keeps it there. The machine tells more:
-which controller's process computes, and how many robots of the world wait for a controller that
-somebody has to start.
+What a status tells from inside is narrowed down from outside. A loop that is silent inside `step`
+looks the same whoever keeps it there. The machine tells more: which controller's process computes,
+and how many robots of the world wait for a controller that somebody has to start.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from webots_mcp.contract import UNSEEN, host_name
-from webots_mcp.diagnosis.finding import Finding, Subject, last_seen_s, worst
+from webots_mcp.diagnosis.doctor import Examined, Finding, check, last_seen_s, worst
+from webots_mcp.errors import CommandRefusedError
 from webots_mcp.pauses import PAUSED, SEEN_PAUSED, SEEN_RUNNING
 from webots_mcp.store.recording import View
 from webots_mcp.store.sessions import Session, companions
 from webots_mcp.store.status import SILENT
+from webots_mcp.webots.installations import Installation, find_webots, installations
 from webots_mcp.webots.stream import address_of
 
 if TYPE_CHECKING:
@@ -41,7 +43,8 @@ _RELOAD: Final = "end or mend that controller, then reload the world (Ctrl+Shift
 _OBEYS: Final = "{}; or webots_simulation_control('{}'): this Webots obeys it by its WebSocket"
 
 
-def simulation(subject: Subject) -> Finding:
+@check("Simulation", needs_recording=True)
+def simulation(subject: Examined) -> Finding:
     """Whether time moves, and why it does not."""
     concerned = subject.live or _last_seen(subject.views)
     if not concerned:
@@ -66,7 +69,7 @@ def _last_seen(views: list[View]) -> list[View]:
     return [newest] if newest else []
 
 
-def _judged(subject: Subject, view: View) -> Finding:
+def _judged(subject: Examined, view: View) -> Finding:
     name, status = view.robot.name, view.status
     seen = f"{name}: {status.text}{f' ({status.why})' if status.why else ''}"
     session = view.session
@@ -97,7 +100,7 @@ def _ended(view: View, seen: str) -> Finding:
     return Finding("wrong", seen, fix)
 
 
-def _narrowed(subject: Subject, view: View, session: Session) -> Finding:
+def _narrowed(subject: Examined, view: View, session: Session) -> Finding:
     """Of the reasons that look alike from inside, the one that shows from outside."""
     head = f"{view.robot.name}: {view.status.text}"
     webots = _webots_of(subject, session)
@@ -131,7 +134,7 @@ def _also_by_websocket(fix: str, order: str, webots: Instance | None) -> str:
     return _OBEYS.format(fix, order) if is_open else fix
 
 
-def _webots_of(subject: Subject, session: Session) -> Instance | None:
+def _webots_of(subject: Examined, session: Session) -> Instance | None:
     """The Webots that a session belongs to, where it runs here."""
     address = address_of(session.instance)
     return next((w for w in subject.running_webots if address and w.port == address.port), None)
@@ -206,7 +209,7 @@ def _named(process: psutil.Process) -> str:
         return "a controller"
 
 
-def _missing_externs(subject: Subject, view: View, webots: Instance | None) -> str | None:
+def _missing_externs(subject: Examined, view: View, webots: Instance | None) -> str | None:
     """That the world has more extern robots than record; by its text, so only perhaps."""
     world = (view.run and view.run.world) or (webots and webots.world)
     count = _externs_in(Path(world)) if world else 0
@@ -229,3 +232,55 @@ def _externs_in(world: Path) -> int:
         return len(_EXTERN.findall(world.read_text("utf-8", "replace")))
     except OSError:
         return 0
+
+
+@check("Webots")
+def installed(_: Examined) -> Finding:
+    """Which Webots there are."""
+    found = installations()
+    if found:
+        return worst([_complete(each) for each in found])
+    try:
+        find_webots()
+    except CommandRefusedError as error:
+        seen, fix = str(error).rsplit(": ", 1)
+        return Finding("warning", seen, fix)
+    return Finding("not looked at", "it was installed while this looked")
+
+
+def _complete(webots: Installation) -> Finding:
+    where = webots.home or webots.program
+    seen = f"{webots.version or 'a Webots without a version'} at {where} (by {webots.found_by})"
+    missing = [
+        name
+        for name, path in (
+            ("webots-controller", webots.launcher),
+            ("lib/controller/python", webots.python_api),
+        )
+        if path is None
+    ]
+    if webots.home is None or not missing:
+        return Finding("ok", seen)
+    fix = "install Webots again, or set WEBOTS_HOME to the folder of a whole one"
+    return Finding("warning", f"{seen} lacks {' and '.join(missing)}", fix)
+
+
+@check("Running Webots")
+def running(subject: Examined) -> Finding:
+    """Which of them run, and whether they can be steered from outside."""
+    if not subject.running_webots:
+        return Finding("ok", "no Webots runs on this machine")
+    return worst([_reachable(each) for each in subject.running_webots])
+
+
+def _reachable(webots: Instance) -> Finding:
+    world = f", {webots.world.name}" if webots.world else ""
+    seen = f"port {webots.port} (process {webots.pid}{world}, mode {webots.mode or 'of its own'})"
+    if not webots.is_listening:
+        return Finding(
+            "warning",
+            f"{seen} was not seen to listen there",
+            "wait until it has started; of another user's process this is not told",
+        )
+    obeys = "obeys" if webots.streams else "was started without --stream and does not obey"
+    return Finding("ok", f"{seen} {obeys} orders from outside")

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 
 from webots_mcp.connection import connect, is_there, journal_mode
 from webots_mcp.contract import HEARTBEAT_LATE_S, SCHEMA_VERSION
-from webots_mcp.diagnosis.finding import Finding, Subject, ago, last_seen_s, worst
+from webots_mcp.diagnosis.doctor import Examined, Finding, ago, check, last_seen_s, worst
 from webots_mcp.errors import NoDatabaseError, SchemaTooNewError, SchemaTooOldError
 from webots_mcp.schema import schema_version
 from webots_mcp.store.recording import GETTING_STARTED, View, name_of
@@ -28,7 +28,8 @@ _UNFINISHED: Final = (
 )
 
 
-def database(subject: Subject) -> Finding:
+@check("Database")
+def database(subject: Examined) -> Finding:
     """Whether there is one that can be read, and that readers and writers can share."""
     if isinstance(subject.unread, NoDatabaseError):
         seen = f"nothing was recorded at {name_of(subject.recording.database)} yet"
@@ -47,7 +48,8 @@ def database(subject: Subject) -> Finding:
     return Finding("ok", seen)
 
 
-def schema(subject: Subject) -> Finding:
+@check("Schema")
+def schema(subject: Examined) -> Finding:
     """Whether the database has the tables of this version."""
     if subject.unread is not None and not _is_about_schema(subject):
         return Finding("not looked at", "there is no recording that can be read")
@@ -64,11 +66,12 @@ def schema(subject: Subject) -> Finding:
     return Finding("ok", f"{version}")
 
 
-def _is_about_schema(subject: Subject) -> bool:
+def _is_about_schema(subject: Examined) -> bool:
     return isinstance(subject.unread, (SchemaTooOldError, SchemaTooNewError))
 
 
-def recording_now(subject: Subject) -> Finding:
+@check("Recording now", needs_recording=True)
+def recording_now(subject: Examined) -> Finding:
     """Who writes, and how old the newest is."""
     if subject.live:
         return Finding("ok", "; ".join(_described(view) for view in subject.live))
@@ -93,7 +96,8 @@ def _described(view: View) -> str:
     )
 
 
-def rows(subject: Subject) -> Finding:
+@check("Rows", needs_recording=True)
+def rows(subject: Examined) -> Finding:
     """What was recorded and is not in the database."""
     findings = [_lost(view) for view in subject.views if view.session is not None]
     findings += _left_waiting(subject)
@@ -125,7 +129,7 @@ def _lost(view: View) -> Finding:
     return Finding("ok", name)
 
 
-def _left_waiting(subject: Subject) -> list[Finding]:
+def _left_waiting(subject: Examined) -> list[Finding]:
     """Files that no living controller will empty."""
     if subject.file is None:
         return []
@@ -155,7 +159,8 @@ class _Unfinished(NamedTuple):
     claimed_s: float
 
 
-def commands(subject: Subject) -> Finding:
+@check("Commands", needs_recording=True)
+def commands(subject: Examined) -> Finding:
     """What waits for a controller, and for how long."""
     unfinished = [_Unfinished(*row) for row in subject.opened.execute(_UNFINISHED)]
     by_robot = {view.robot.id: view for view in subject.views}
@@ -194,7 +199,8 @@ def _claimed(command: _Unfinished, view: View, what: str) -> Finding:
     return Finding("warning", seen, "wait for it, or send cancel_run; a handler must return soon")
 
 
-def get_command(subject: Subject) -> Finding:
+@check("get_command", needs_recording=True)
+def get_command(subject: Examined) -> Finding:
     """Whether the loops of the living controllers ask for commands."""
     findings = [_polled(view, view.session) for view in subject.live if view.session]
     return worst(findings or [Finding("ok", "no controller lives that could be asked")])

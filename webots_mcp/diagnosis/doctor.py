@@ -1,4 +1,9 @@
-"""What a check is, what it is given, and what it says."""
+"""Each link between a controller and its asker, looked at by itself: checks, and how they are run.
+
+A check is one function of what is `Examined` that returns a `Finding`, declared by `@check(NAME)`
+in one of the modules of this package. What it says goes on in docs/troubleshooting.md, under a
+heading of its name. A diagnosis changes nothing.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +11,18 @@ import sqlite3
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from contextlib import ExitStack
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple
 
+from webots_mcp.contract import PROJECT_DATA_FOLDER, full_path
 from webots_mcp.errors import WebotsMCPError
 from webots_mcp.store.recording import Recording, View, view_of
 from webots_mcp.store.robots import list_robots
+from webots_mcp.transactions import is_damage, text_of
 
 if TYPE_CHECKING:
     from webots_mcp.webots.instances import Instance
@@ -22,6 +31,11 @@ Verdict = Literal["ok", "warning", "wrong", "not looked at"]
 
 _WORST_FIRST: Final[tuple[Verdict, ...]] = ("wrong", "warning", "not looked at", "ok")
 PAGE: Final = "docs/troubleshooting.md"
+_RECOVER: Final = (
+    "stop what records there, save rows with 'sqlite3 FILE .recover', and move the file away"
+)
+# From the controller's machine to the client; within a module the order is that of its functions.
+_IN_ORDER: Final = ("machine_checks", "recording_checks", "webots_checks", "client_checks")
 
 
 @dataclass(frozen=True)
@@ -34,7 +48,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Subject:
+class Examined:
     """What is looked at.
 
     Attributes:
@@ -84,18 +98,21 @@ class Subject:
         return instances()
 
 
-class Check(NamedTuple):
+@dataclass(frozen=True)
+class Check:
     """A link of the chain.
 
     Attributes:
         name: In one word or a few; the heading of its part of the page.
         look: Looks at it.
         needs_recording: It is not looked at where there is no recording that can be read.
+        starts_process: It takes seconds: a server does not ask it of itself.
     """
 
     name: str
-    look: Callable[[Subject], Finding]
+    look: Callable[[Examined], Finding]
     needs_recording: bool = False
+    starts_process: bool = False
 
     @property
     def page(self) -> str:
@@ -113,6 +130,25 @@ class Checked(NamedTuple):
     def is_well(self) -> bool:
         """Whether there is nothing to mend."""
         return self.finding.verdict == "ok"
+
+
+def check(
+    name: str, *, needs_recording: bool = False, starts_process: bool = False
+) -> Callable[[Callable[[Examined], Finding]], Check]:
+    """Declare a function as a check; a `Check` has what is to be given."""
+    return lambda look: Check(name, look, needs_recording, starts_process)
+
+
+def all_checks(*, with_server: bool = False) -> list[Check]:
+    """All that the modules declare, in the order of the chain.
+
+    Args:
+        with_server: Those as well that start a process of their own.
+    """
+    modules = [import_module(f"{__package__}.{name}") for name in _IN_ORDER]
+    declared = [each for module in modules for each in vars(module).values()]
+    checks = [each for each in declared if isinstance(each, Check)]
+    return [each for each in checks if with_server or not each.starts_process]
 
 
 def worst(findings: Sequence[Finding]) -> Finding:
@@ -136,3 +172,39 @@ def ago(seconds: float) -> str:
         if seconds >= 2 * size or (unit == "minutes" and seconds >= size):
             return f"{seconds / (60 if unit == 'minutes' else size):.0f} {unit} ago"
     return f"{max(seconds, 0.0):.1f} s ago"
+
+
+def diagnose(subject: Examined, checks: Sequence[Check] | None = None) -> list[Checked]:
+    """Run the checks, all but those that start a process; what cannot be looked at says why."""
+    with ExitStack() as stack:
+        try:
+            connection = stack.enter_context(subject.recording.reader())
+            subject = replace(subject, connection=connection)
+        except WebotsMCPError as error:
+            subject = replace(subject, unread=error)
+        return [Checked(each, _look(each, subject)) for each in checks or all_checks()]
+
+
+def _look(check: Check, subject: Examined) -> Finding:
+    """One check that fails says so, and the others go on."""
+    if check.needs_recording and subject.connection is None:
+        return Finding("not looked at", "there is no recording that can be read")
+    try:
+        return check.look(subject)
+    except ModuleNotFoundError as error:
+        return Finding("not looked at", f"the Python package {error.name!r} is missing")
+    except Exception as error:  # noqa: BLE001  (it is told)
+        if is_damage(error):
+            return Finding("wrong", f"the database is damaged: {text_of(error)}", _RECOVER)
+        return Finding("not looked at", f"{type(error).__name__}: {error}")
+
+
+def subject_of(recording: Recording, chosen_by: str) -> Examined:
+    """What is looked at of a recording: also the folder that the asker is in."""
+    return Examined(replace(recording, read_only=True), chosen_by, _project(recording))
+
+
+def _project(recording: Recording) -> Path:
+    """The folder above `mcp_data/`, where a project's recording lies, else the current one."""
+    folder = full_path(recording.data_dir)
+    return folder.parent if folder.name == PROJECT_DATA_FOLDER else Path.cwd()

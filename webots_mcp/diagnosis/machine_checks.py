@@ -1,17 +1,79 @@
-"""Where the recording lies: its folder, and what kind of file system that is on."""
+"""What this machine brings along: its Python, and the file system on which the recording lies."""
 
 from __future__ import annotations
 
 import os
 import platform
 import shutil
+import sqlite3
+import sys
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Final, NamedTuple
 
+from webots_mcp.connection import OLDEST_SQLITE
 from webots_mcp.contract import DATA_DIR_VARIABLE
-from webots_mcp.diagnosis.finding import Finding, Subject
+from webots_mcp.diagnosis.doctor import Examined, Finding, check
+from webots_mcp.requirements import install_line, missing_requirements, package_of
+
+_OLDEST_PYTHON: Final = (3, 10)
+_NEWEST_PYTHON: Final = (3, 13)  # that it was tried with
+# Two connections that write or checkpoint at once could damage a file before these versions
+# (sqlite.org/wal.html, "The WAL-reset bug"); the two older branches were mended as well.
+_WAL_RESET_MENDED: Final = (3, 51, 3)
+_WAL_RESET_MENDED_IN_BRANCH: Final = {(3, 44): 6, (3, 50): 7}
+
+
+@check("Python")
+def python(_: Examined) -> Finding:
+    """The Python that runs this; that of the controllers is said by `Recording now`."""
+    seen = f"{platform.python_version()} at {sys.executable}"
+    if sys.version_info[:2] < _OLDEST_PYTHON:
+        return Finding("wrong", seen, "use Python 3.10 or newer")
+    if sys.version_info[:2] > _NEWEST_PYTHON:
+        return Finding("warning", f"{seen}: newer than what this was tried with", "use Python 3.13")
+    return Finding("ok", seen)
+
+
+@check("Packages")
+def packages(_: Examined) -> Finding:
+    """What the server and most commands need; a bridge does without."""
+    missing = missing_requirements()
+    if not missing:
+        return Finding("ok", "all that the server needs are installed")
+    seen = f"missing: {', '.join(map(package_of, missing))} (a bridge does without)"
+    return Finding("wrong", seen, f"run {install_line(missing)}")
+
+
+@check("SQLite")
+def sqlite(_: Examined) -> Finding:
+    """The SQLite of this Python."""
+    return judge_sqlite(sqlite3.sqlite_version_info)
+
+
+def judge_sqlite(version: tuple[int, ...]) -> Finding:
+    """Whether a version can be used."""
+    seen = ".".join(map(str, version))
+    if version < OLDEST_SQLITE:
+        return Finding(
+            "wrong",
+            f"{seen} is too old: 3.38 is needed",
+            "use a Python with a newer one (python.org, conda and Debian 12 have it)",
+        )
+    if has_wal_reset_bug(version):
+        seen += (
+            ", which has the WAL-reset bug: webots-mcp checkpoints so that it cannot strike; let "
+            "no other program write to the file while a robot records"
+        )
+    return Finding("ok", seen)
+
+
+def has_wal_reset_bug(version: tuple[int, ...]) -> bool:
+    """Whether a checkpoint beside a commit can damage a file."""
+    mended = _WAL_RESET_MENDED_IN_BRANCH.get((version[0], version[1]))
+    return version < _WAL_RESET_MENDED and (mended is None or version[2] < mended)
+
 
 # Names of file systems as the operating systems have them; in none does SQLite share memory.
 _NETWORK: Final = (
@@ -37,7 +99,8 @@ class Mount(NamedTuple):
     is_remote: bool = False
 
 
-def data_folder(subject: Subject) -> Finding:
+@check("Data folder")
+def data_folder(subject: Examined) -> Finding:
     """Whether it is there, and may be written."""
     if subject.file is None:
         return Finding("ok", "the recording is in memory")
@@ -71,7 +134,8 @@ def _why_unwritable(folder: Path) -> str | None:
         return error.strerror or str(error)
 
 
-def file_system(subject: Subject) -> Finding:
+@check("File system")
+def file_system(subject: Examined) -> Finding:
     """Whether processes can share memory there, which WAL needs."""
     if subject.file is None:
         return Finding("ok", "the recording is in memory")
@@ -134,7 +198,8 @@ def _is_in(path: str, point: str) -> bool:
     return f"{path}/".startswith(f"{point.rstrip('/')}/")
 
 
-def free_space(subject: Subject) -> Finding:
+@check("Free space")
+def free_space(subject: Examined) -> Finding:
     """Whether there is room for what will be recorded."""
     if subject.file is None:
         return Finding("ok", "the recording is in memory")

@@ -6,7 +6,9 @@ fixtures that use it.
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import sys
 from collections.abc import Iterable, Iterator
 from contextlib import closing
@@ -19,7 +21,10 @@ if TYPE_CHECKING:
     from webots_mcp import MCPBridge, MemoryDatabase
     from webots_mcp.contract import Database
     from webots_mcp.standin import InProcessSupervisor
-    from webots_mcp.testing import Recording, RobotFactory, SimulationFactory
+    from webots_mcp.testing import RobotFactory, RobotRecording, SimulationFactory
+
+_PACKAGE = str(Path(__file__).parent) + os.sep
+_TESTING = _PACKAGE + "testing" + os.sep
 
 
 @pytest.fixture
@@ -109,11 +114,11 @@ def webots_bridge(
 
 
 @pytest.fixture
-def webots_recording(webots_database: MemoryDatabase) -> Recording:
+def webots_recording(webots_database: MemoryDatabase) -> RobotRecording:
     """What was recorded in `webots_database`, and the way to send commands."""
-    from webots_mcp.testing import Recording
+    from webots_mcp.testing import RobotRecording
 
-    return Recording(webots_database)
+    return RobotRecording(webots_database)
 
 
 @pytest.fixture
@@ -149,7 +154,30 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_assertrepr_compare(op: str, left: object, right: object) -> list[str] | None:
     """Show a command's status with the reason, which pytest itself would cut off."""
-    commands = sys.modules.get("webots_mcp.testing.commands")
-    if commands is None or not isinstance(left, commands.Status):
+    asked = sys.modules.get("webots_mcp.testing.robot_recording")
+    if asked is None or not isinstance(left, asked.CommandStatus):
         return None
     return [f"{left!r} {op} {right!r}"]
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> None:
+    """End the traceback at the test's own line where an error of this package explains a failure.
+
+    Any other exception within the package is a defect of it, and keeps its frames; so does every
+    one with `--full-trace` or `--pdb`.
+    """
+    failure = call.excinfo
+    if failure is None or item.config.getoption("fulltrace") or item.config.getoption("usepdb"):
+        return
+    error = failure.value
+    own_frames = _TESTING if isinstance(error, (AssertionError, TimeoutError)) else _PACKAGE
+    is_own = own_frames == _TESTING or type(error).__module__.startswith("webots_mcp.")
+    entry, line = failure.tb, failure.tb  # the newest frame, and the newest of the user's
+    while entry.tb_next is not None:
+        entry = entry.tb_next
+        if not entry.tb_frame.f_code.co_filename.startswith((_PACKAGE, contextlib.__file__)):
+            line = entry
+    if is_own and entry.tb_frame.f_code.co_filename.startswith(own_frames):
+        line.tb_next = None
+        error.__cause__, error.__suppress_context__ = None, True  # the message tells of it

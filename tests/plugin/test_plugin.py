@@ -85,6 +85,62 @@ while True:
 """
 
 
+def test_a_failure_ends_at_the_users_own_line(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(failing="exit(3)", stuck=STUCK)
+    pytester.makepyfile(
+        """
+        import pytest
+
+        @pytest.fixture
+        def driven(webots_robot, webots_bridge, webots_recording):
+            webots_robot.step(16)
+            webots_bridge.publish({"front_m": 0.05})
+            return webots_recording
+
+        def test_unknown_signal(driven):
+            driven.signal("front")
+
+        def test_limit(driven):
+            driven.signal("front_m").assert_never_below(0.1)
+
+        def test_never(driven):
+            driven.signal("front_m").first_time_s(3.0)
+
+        def test_not_looked_for(driven):
+            driven.find_events("stuck")
+
+        def test_condition(driven):
+            driven.held("front_m <")
+
+        def test_world(webots_simulation):
+            webots_simulation("missing.wbt")
+
+        def test_failing_controller(webots_simulation):
+            webots_simulation(controllers={"rover": "failing.py"}).run_for(0.1)
+
+        def test_hanging_controller(webots_simulation):
+            webots_simulation(controllers={"rover": "stuck.py"}).run_for(1, timeout_s=2)
+        """
+    )
+    result = pytester.runpytest_subprocess("-p", "no:cacheprovider")
+    result.assert_outcomes(failed=8)
+    said = result.stdout.str()
+    assert re.findall(r"^\S*webots_mcp\S*\.py:\d+:", said, re.MULTILINE) == []
+    assert len(re.findall(r"^test_\w+\.py:\d+: \w+", said, re.MULTILINE)) == 8
+
+
+def test_an_error_that_the_package_does_not_explain_keeps_its_frames(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        def test_it(webots_bridge, webots_recording):
+            webots_bridge.publish({"n": 1})
+            webots_recording.signal(3)
+        """
+    )
+    said = pytester.runpytest_subprocess("-p", "no:cacheprovider").stdout.str()
+    assert "robot_recording.py:" in said
+
+
 def test_a_marker_that_no_parameter_takes_fails_its_test(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """

@@ -11,13 +11,13 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.standin import InProcessSupervisor
-from webots_mcp.testing import Recording
+from webots_mcp.testing import RobotRecording
 
 
 @pytest.fixture
 def story(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
-) -> Recording:
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
+) -> RobotRecording:
     """Ten rows, 0.1 s apart: front sinks from 0.9 to 0.0 m, the mode changes twice."""
     modes = ["cruise"] * 4 + ["turn"] * 3 + ["cruise"] * 3
     for step, mode in enumerate(modes):
@@ -28,7 +28,7 @@ def story(
     return webots_recording
 
 
-def test_a_signal_gives_all_its_values_and_their_times(story: Recording) -> None:
+def test_a_signal_gives_all_its_values_and_their_times(story: RobotRecording) -> None:
     front = story.signal("sensors.front_m")
     assert front.values() == pytest.approx([0.9, 0.8, None, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.0])
     assert front.times_s() == pytest.approx([0.096 * (step + 1) for step in range(10)])
@@ -38,7 +38,7 @@ def test_a_signal_gives_all_its_values_and_their_times(story: Recording) -> None
 
 
 def test_a_condition_is_asked_of_the_run_and_of_the_running_robot(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
     webots_bridge.breakpoint("front_m < 0.5 for 0.2", action="log")
     for step in range(10):
@@ -53,7 +53,7 @@ def test_a_condition_is_asked_of_the_run_and_of_the_running_robot(
         webots_recording.held("fornt_m > 2")
 
 
-def test_changes_leave_repetitions_out(story: Recording) -> None:
+def test_changes_leave_repetitions_out(story: RobotRecording) -> None:
     mode = story.signal("mode")
     assert mode.changes() == ["cruise", "turn", "cruise"]
     assert mode.first_time_s("turn") == pytest.approx(5 * 0.096)
@@ -61,7 +61,7 @@ def test_changes_leave_repetitions_out(story: Recording) -> None:
     assert story.signal("blind").changes() == [False, True, False]
 
 
-def test_a_broken_limit_says_when_how_often_how_far_and_where(story: Recording) -> None:
+def test_a_broken_limit_says_when_how_often_how_far_and_where(story: RobotRecording) -> None:
     front = story.signal("sensors.front_m")
     with pytest.raises(AssertionError) as failure:
         front.assert_never_below(0.25)
@@ -77,21 +77,23 @@ def test_a_broken_limit_says_when_how_often_how_far_and_where(story: Recording) 
         story.signal("mode").assert_never("turn")
 
 
-def test_a_kept_limit_is_silent(story: Recording) -> None:
+def test_a_kept_limit_is_silent(story: RobotRecording) -> None:
     front = story.signal("sensors.front_m")
     front.assert_never_below(0.0)
     front.assert_never_above(0.9)
     story.signal("mode").assert_never("stuck")
 
 
-def test_a_limit_on_a_signal_without_numbers_proves_nothing_and_fails(story: Recording) -> None:
+def test_a_limit_on_a_signal_without_numbers_proves_nothing_and_fails(
+    story: RobotRecording,
+) -> None:
     with pytest.raises(AssertionError, match=r"mode holds no number in the 10 rows .* nothing sho"):
         story.signal("mode").assert_never_below(1)
     with pytest.raises(NothingRecordedError, match="mode holds no number"):
         story.signal("mode").min()
 
 
-def test_a_value_that_never_came_is_told_with_those_that_did(story: Recording) -> None:
+def test_a_value_that_never_came_is_told_with_those_that_did(story: RobotRecording) -> None:
     with pytest.raises(NothingRecordedError, match=r"never 'back_up' in the 10 .*'cruise', 'turn'"):
         story.signal("mode").first_time_s("back_up")
     with pytest.raises(
@@ -100,13 +102,13 @@ def test_a_value_that_never_came_is_told_with_those_that_did(story: Recording) -
         story.signal("mode").at(0)
 
 
-def test_an_unknown_signal_is_told_with_near_names(story: Recording) -> None:
+def test_an_unknown_signal_is_told_with_near_names(story: RobotRecording) -> None:
     with pytest.raises(UnknownSignalError, match=r"no signal 'sensors.frnt'.* sensors.front_m"):
         story.signal("sensors.frnt")
 
 
 def test_a_signal_seen_only_at_the_beginning_is_known(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
     for step in range(300):
         webots_robot.step(16)
@@ -115,7 +117,7 @@ def test_a_signal_seen_only_at_the_beginning_is_known(
 
 
 def test_a_name_that_means_several_signals_is_refused_by_signal_and_taken_by_signals(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
     webots_robot.step(16)
     webots_bridge.publish({"pose": [1.0, 2.0]})
@@ -124,13 +126,13 @@ def test_a_name_that_means_several_signals_is_refused_by_signal_and_taken_by_sig
     assert [signal.last for signal in webots_recording.signals("pose.*")] == [1.0, 2.0]
 
 
-def test_states_come_as_they_were_published(story: Recording) -> None:
+def test_states_come_as_they_were_published(story: RobotRecording) -> None:
     states = story.states()
     assert len(states) == 10
     assert states[2] == {"mode": "cruise", "sensors": {"front_m": "nan"}, "blind": True}
 
 
-def test_events_and_logs_come_in_order_and_by_kind(story: Recording) -> None:
+def test_events_and_logs_come_in_order_and_by_kind(story: RobotRecording) -> None:
     assert [event.kind for event in story.events()] == ["start"] + ["change"] * 4
     changed = [event.details()["to"] for event in story.events("change") if event.name == "mode"]
     assert changed == ["turn", "cruise"]
@@ -141,7 +143,7 @@ def test_events_and_logs_come_in_order_and_by_kind(story: Recording) -> None:
 
 
 def test_what_the_values_show_can_be_asked_for(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
     for step in range(120):
         webots_robot.step(96)
@@ -155,7 +157,7 @@ def test_what_the_values_show_can_be_asked_for(
 
 
 def test_what_could_not_be_looked_for_is_not_told_to_be_absent(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
     for step in range(20):
         webots_robot.step(96)

@@ -13,11 +13,11 @@ from webots_mcp.errors import (
     UnknownSignalError,
 )
 from webots_mcp.standin import InProcessSupervisor, WouldBlockError
-from webots_mcp.testing import Recording, RobotFactory
+from webots_mcp.testing import RobotFactory, RobotRecording
 
 
 def test_a_command_is_followed_from_sending_to_its_answer(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
     webots_bridge.register_command("aim", lambda command: command["angle"] * 2)
     sent = webots_recording.send("aim", angle=1.5)
@@ -32,7 +32,7 @@ def test_a_command_is_followed_from_sending_to_its_answer(
 
 
 def test_each_run_is_a_recording_of_its_own(
-    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: Recording
+    webots_robot: InProcessSupervisor, webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
     for step in range(5):
         webots_robot.step(32)
@@ -46,7 +46,9 @@ def test_each_run_is_a_recording_of_its_own(
 
 
 def test_two_robots_share_a_world_and_a_database(
-    webots_robot_factory: RobotFactory, webots_database: MemoryDatabase, webots_recording: Recording
+    webots_robot_factory: RobotFactory,
+    webots_database: MemoryDatabase,
+    webots_recording: RobotRecording,
 ) -> None:
     world = Path(__file__).parents[2] / "examples" / "worlds" / "arena_referee.wbt"
     rover = webots_robot_factory("rover", world=world, supervisor=False)
@@ -64,7 +66,9 @@ def test_two_robots_share_a_world_and_a_database(
 
 
 def test_a_whole_loop_ends_after_the_time_that_it_was_given(
-    webots_robot_factory: RobotFactory, webots_database: MemoryDatabase, webots_recording: Recording
+    webots_robot_factory: RobotFactory,
+    webots_database: MemoryDatabase,
+    webots_recording: RobotRecording,
 ) -> None:
     robot = webots_robot_factory(duration_s=1.0)
     with MCPBridge(robot, throttle_interval=1, database=webots_database) as bridge:
@@ -77,10 +81,10 @@ def test_a_whole_loop_ends_after_the_time_that_it_was_given(
 def test_a_pause_that_nobody_can_end_is_an_error_and_no_endless_wait(
     webots_robot: InProcessSupervisor,
     webots_bridge: MCPBridge,
-    webots_recording: Recording,
+    webots_recording: RobotRecording,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("webots_mcp.testing.rehearsal.HOLD_LIMIT_S", 0.05)
+    monkeypatch.setattr("webots_mcp.testing.recorded_simulation.HOLD_LIMIT_S", 0.05)
     webots_recording.send("pause")
     webots_robot.step(16)
     with pytest.raises(WouldBlockError, match="send 'resume' before"):
@@ -92,7 +96,7 @@ def test_what_a_bridge_cannot_record_is_raised(webots_bridge: MCPBridge) -> None
         webots_bridge.publish([1, 2, 3])  # type: ignore[arg-type]
 
 
-def test_a_recording_without_a_bridge_says_what_to_do(webots_recording: Recording) -> None:
+def test_a_recording_without_a_bridge_says_what_to_do(webots_recording: RobotRecording) -> None:
     with pytest.raises(NothingRecordedError, match="make an MCPBridge on it"):
         webots_recording.signal("mode")
     with pytest.raises(NothingRecordedError, match="make an MCPBridge on it"):
@@ -100,7 +104,7 @@ def test_a_recording_without_a_bridge_says_what_to_do(webots_recording: Recordin
 
 
 def test_a_bridge_that_published_nothing_is_told_as_such(
-    webots_bridge: MCPBridge, webots_recording: Recording
+    webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
     with pytest.raises(UnknownSignalError, match="no state row with values"):
         webots_recording.signal("mode")
@@ -108,7 +112,7 @@ def test_a_bridge_that_published_nothing_is_told_as_such(
 
 @pytest.mark.webots_parameters(kp=3.0)
 def test_parameters_begin_as_the_marker_says_and_are_set_in_between(
-    webots_bridge: MCPBridge, webots_recording: Recording
+    webots_bridge: MCPBridge, webots_recording: RobotRecording
 ) -> None:
     kp = webots_bridge.parameter("kp", 2.0, high=10)
     assert webots_recording.parameters() == {"kp": 3.0}

@@ -14,7 +14,7 @@ from webots_mcp.errors import (
     NoDatabaseError,
 )
 from webots_mcp.standin import StandInError
-from webots_mcp.testing import Recording, RobotFactory, SimulationFactory
+from webots_mcp.testing import RobotFactory, RobotRecording, SimulationFactory
 
 CONTROLLER = """
 from controller import Supervisor
@@ -134,7 +134,7 @@ def test_a_simulation_that_never_ran_has_no_recording(webots_simulation: Simulat
 def test_a_robot_without_rights_cannot_pause(
     webots_robot_factory: RobotFactory,
     webots_database: MemoryDatabase,
-    webots_recording: Recording,
+    webots_recording: RobotRecording,
 ) -> None:
     robot = webots_robot_factory(supervisor=False)
     with MCPBridge(robot, throttle_interval=1, database=webots_database) as bridge:

@@ -3,19 +3,21 @@
 The pytest plugin (`webots_mcp.pytest_plugin`) offers these as fixtures; they need no pytest.
 """
 
-from webots_mcp.testing.commands import RecordedCommand
-from webots_mcp.testing.factories import RobotFactory, SimulationFactory
-from webots_mcp.testing.recording import Recording
-from webots_mcp.testing.rehearsal import Rehearsal
-from webots_mcp.testing.signals import RecordedSignal
-from webots_mcp.testing.simulation import RecordedSimulation
+from webots_mcp.testing.recorded_signal import RecordedSignal
+from webots_mcp.testing.recorded_simulation import (
+    RecordedSimulation,
+    Rehearsal,
+    RobotFactory,
+    SimulationFactory,
+)
+from webots_mcp.testing.robot_recording import RecordedCommand, RobotRecording
 
 __all__ = [
     "RecordedCommand",
     "RecordedSignal",
     "RecordedSimulation",
-    "Recording",
     "Rehearsal",
     "RobotFactory",
+    "RobotRecording",
     "SimulationFactory",
 ]

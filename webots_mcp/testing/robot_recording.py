@@ -1,7 +1,8 @@
-"""What a robot recorded, as a test asks about it."""
+"""What a robot recorded, as a test asks about it, and the commands that a test sends."""
 
 from __future__ import annotations
 
+import json
 import math
 import sqlite3
 import sys
@@ -13,7 +14,7 @@ from webots_mcp.connection import Role, connect
 from webots_mcp.contract import LOG_LEVELS, Database
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import Value
-from webots_mcp.queue import CommandQueue, list_commands
+from webots_mcp.queue import Command, CommandQueue, fetch_command, list_commands
 from webots_mcp.schema import require_current, schema_version
 from webots_mcp.store.detection.event import Event as FoundEvent
 from webots_mcp.store.detection.event import EventOptions
@@ -28,14 +29,17 @@ from webots_mcp.store.rollup.rolling import roll
 from webots_mcp.store.run_rows import Event, fetch_state, newest_events, runs_of, states_of
 from webots_mcp.store.signals.catalogue import resolve_signals
 from webots_mcp.store.signals.registry import Signal, registered
-from webots_mcp.testing.commands import RecordedCommand
-from webots_mcp.testing.signals import RecordedSignal
+from webots_mcp.testing.recorded_signal import RecordedSignal
 
 COMMAND_TIME_TO_LIVE_S: Final = 60.0  # a test on a busy machine is slower than a person
 _NO_LIMIT: Final = -1
+_UNFINISHED: Final = {
+    "pending": "no get_command() of its controller has come to it yet",
+    "claimed": "its handler has not returned yet",
+}
 
 
-class Recording:
+class RobotRecording:
     """A database of a test, read anew with each question.
 
     Questions are about the newest run of the only robot; `robot` and `runs` narrow that down.
@@ -55,15 +59,15 @@ class Recording:
         self._robot = robot
         self._run_id = run_id
 
-    def robot(self, name: str) -> Recording:
+    def robot(self, name: str) -> RobotRecording:
         """What the robot of that name recorded."""
-        return Recording(self.database, robot=name)
+        return RobotRecording(self.database, robot=name)
 
-    def runs(self) -> list[Recording]:
+    def runs(self) -> list[RobotRecording]:
         """The recording of each run of the robot, oldest first: a reset begins the next one."""
         with self._subject() as (connection, subject):
             runs = runs_of(connection, subject.robot_id)
-        return [Recording(self.database, robot=subject.robot, run_id=run.id) for run in runs]
+        return [RobotRecording(self.database, robot=subject.robot, run_id=run.id) for run in runs]
 
     # -- what was published --------------------------------------------------------------------
 
@@ -246,3 +250,74 @@ class Recording:
         with closing(self._connect("reader")) as connection:
             state = fetch_state(connection, state_id)
         return state.data if state else "deleted since"
+
+
+class CommandStatus(str):
+    """A command's status; wherever an assertion shows it, it says why it is not `done`."""
+
+    reason: str
+
+    def __new__(cls, status: str, reason: str) -> CommandStatus:
+        """A text as any other, with the reason beside it."""
+        made = super().__new__(cls, status)
+        made.reason = reason
+        return made
+
+    def __repr__(self) -> str:
+        return f"{str(self)!r} ({self.reason})" if self.reason else f"{str(self)!r}"
+
+
+class RecordedCommand:
+    """A command in the queue; `status`, `result` and `error` are read anew each time."""
+
+    def __init__(self, database: Database, command_id: int) -> None:
+        self._database = database
+        self.id = command_id
+
+    def __repr__(self) -> str:
+        command = self._fetch()
+        fate = command.error if command.result is None else command.result
+        return f"<command {self.id}: {command.action} {command.params}, {command.status}, {fate}>"
+
+    @property
+    def action(self) -> str:
+        """What was asked."""
+        return self._fetch().action
+
+    @property
+    def params(self) -> dict[str, Any]:
+        """With which parameters."""
+        return json.loads(self._fetch().params)
+
+    @property
+    def status(self) -> CommandStatus:
+        """`pending`, `claimed`, then `done`, `failed`, `expired`, `cancelled` or `lost`."""
+        command = self._fetch()
+        return CommandStatus(command.status, _why_not_done(command))
+
+    @property
+    def is_final(self) -> bool:
+        """Whether its fate is settled."""
+        return self._fetch().is_final
+
+    @property
+    def result(self) -> Any:
+        """What the handler answered; None before that."""
+        text = self._fetch().result
+        return None if text is None else json.loads(text)
+
+    @property
+    def error(self) -> str | None:
+        """Why it failed, or what of its result had to be replaced; else None."""
+        return self._fetch().error
+
+    def _fetch(self) -> Command:
+        with closing(connect(self._database, "reader")) as connection:
+            return fetch_command(connection, self.id)
+
+
+def _why_not_done(command: Command) -> str:
+    """What a person has to know of a command that is not done; empty for one that is."""
+    if command.status == "done":
+        return ""
+    return command.error or _UNFINISHED.get(command.status, "")

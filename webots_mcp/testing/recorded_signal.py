@@ -124,7 +124,6 @@ class RecordedSignal:
         Raises:
             AssertionError: With when, how often, and the whole state at the first time.
         """
-        __tracebackhide__ = True
         bad = [row for row, held in enumerate(self._values) if held == value]
         self._fail_at(bad, f"was {value!r}", bad[0] if bad else 0)
 
@@ -134,7 +133,6 @@ class RecordedSignal:
         Raises:
             AssertionError: With when, how often, how far, and the whole state at the first time.
         """
-        __tracebackhide__ = True
         self._assert_each(lambda number: number < limit, f"fell below {limit:g}", min)
 
     def assert_never_above(self, limit: float) -> None:
@@ -143,7 +141,6 @@ class RecordedSignal:
         Raises:
             AssertionError: With when, how often, how far, and the whole state at the first time.
         """
-        __tracebackhide__ = True
         self._assert_each(lambda number: number > limit, f"rose above {limit:g}", max)
 
     def _assert_each(
@@ -152,7 +149,6 @@ class RecordedSignal:
         what: str,
         worst_of: Callable[[list[float]], float],
     ) -> None:
-        __tracebackhide__ = True
         rows, numbers = usable_numbers(range(len(self._values)), self._values)
         if not numbers:
             raise AssertionError(f"{self._no_number()}, so nothing shows that it never {what}")
@@ -163,7 +159,6 @@ class RecordedSignal:
         self._fail_at(list(bad), what, next((row for row in bad if bad[row] == worst), 0))
 
     def _fail_at(self, bad: Sequence[int], what: str, worst: int) -> None:
-        __tracebackhide__ = True
         if not bad:
             return
         times, values, first = self._columns.times, self._values, bad[0]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from webots_mcp.conditions import parse_condition
-from webots_mcp.conditions.scanning import MAX_CHARACTERS
+from webots_mcp.conditions.syntax import MAX_CHARACTERS
 from webots_mcp.errors import ConditionFailedError, InvalidConditionError
 
 _PIECES = """

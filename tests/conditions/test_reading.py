@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from webots_mcp.bridge import cleaning, encoding
 from webots_mcp.bridge.encoding import encode, plain
-from webots_mcp.conditions.reading import reader
+from webots_mcp.conditions.signal_values import reader
 from webots_mcp.naming import flatten
 
 

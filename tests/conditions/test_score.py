@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from webots_mcp.conditions.score import Facts, Scored, parse_score
+from webots_mcp.conditions.scoring import Facts, Scored, parse_score
 from webots_mcp.errors import InvalidConditionError, UnknownSignalError
 
 STATES = [

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from tests.observer.conftest import STEP_MS
-from webots_mcp.observer import pace
-from webots_mcp.observer.pace import Pace
+from webots_mcp.observer import observe
+from webots_mcp.observer.observe import StepPace
 
 
 class Simulator:
@@ -55,11 +55,11 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
         def sleep(_: float) -> None:
             now[0] += 0.5
 
-    monkeypatch.setattr(pace, "time", Time)
+    monkeypatch.setattr(observe, "time", Time)
 
 
 def rounds(simulator: Any, count: int = 10) -> list[int]:
-    looping = Pace(simulator, STEP_MS)
+    looping = StepPace(simulator, STEP_MS)
     for _ in range(count):
         assert looping.go_on()
     return simulator.asked

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from webots_mcp.conditions.condition import parse_condition
-from webots_mcp.observer.words import word_of
+from webots_mcp.conditions.compiler import parse_condition
+from webots_mcp.observer.bodies import word_of
 
 
 @pytest.mark.parametrize(

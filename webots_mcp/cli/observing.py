@@ -12,7 +12,7 @@ from webots_mcp.cli.command import DATA_DIR, argument, command
 from webots_mcp.cli.setting_up import apply_change, diff_of, print_json, require_yes
 from webots_mcp.contract import OBSERVER_NAME, find_project
 from webots_mcp.errors import CommandRefusedError
-from webots_mcp.observer.pace import PERIOD_MS, checked_period
+from webots_mcp.observer.observe import PERIOD_MS, checked_period
 
 if TYPE_CHECKING:
     from webots_mcp.setup.file_changes import FileChange

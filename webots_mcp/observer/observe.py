@@ -1,4 +1,11 @@
-"""The observer's controller: its loop, and what it answers when it is asked."""
+"""The observer's controller: its loop, and what it answers when it is asked.
+
+The loop must neither hold up the world nor hang in a pause. `step(n)` of a paused simulation does
+not return, so that whoever waits in it cannot resume. A robot without synchronization need not
+wait: it asks `step(0)`, which is answered at once, again and again. That Webots tells the time in
+these answers is tried, not assumed; where it does not, and in fast mode, where a moment would be
+long in simulation time, the loop makes steps like any other.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +17,81 @@ from typing import Any, Final
 from webots_mcp.bridge.mcp_bridge import MCPBridge
 from webots_mcp.contract import LOOK_AT, MODE_EVENT, OBSERVER, WORLD_EVENT
 from webots_mcp.errors import CommandRefusedError, InvalidInputError
-from webots_mcp.observer.body import Body
-from webots_mcp.observer.pace import LONGEST_PERIOD_MS, PERIOD_MS, Pace, checked_period
-from webots_mcp.observer.world import World
+from webots_mcp.observer.bodies import ObservedBody, ObservedWorld
 
-_TELL_AGAIN_S: Final = 3600.0  # of wall time: old events are purged
+PERIOD_MS: Final = 100  # of simulation time between two rows, unless another is asked for
+LONGEST_PERIOD_MS: Final = 60_000
+
+_ROUND_S: Final = 0.01  # of wall time
+_TRIAL_S: Final = 1.0  # of wall time in which time ought to have moved
+_RECORD_AGAIN_S: Final = 3600.0  # of wall time: old events are purged
 _MOST_CONTACTS: Final = 30
 _DIGITS: Final = 6
 _NO_RIGHTS: Final = (
     "the observer needs a robot with 'supervisor TRUE': {!r} is none. 'webots-mcp init --observer "
     "WORLD' adds one to a copy of a world"
 )
+
+
+def checked_period(period_ms: int) -> int:
+    """A period that can be kept to.
+
+    Raises:
+        InvalidInputError: It cannot.
+    """
+    if not 1 <= period_ms <= LONGEST_PERIOD_MS:
+        raise InvalidInputError(f"the period is from 1 to {LONGEST_PERIOD_MS} ms, not {period_ms}")
+    return period_ms
+
+
+class StepPace:
+    """Makes the rounds of a loop.
+
+    Args:
+        robot: The observer's own Supervisor.
+        period_ms: The step that it makes where it makes one.
+    """
+
+    def __init__(self, robot: Any, period_ms: int) -> None:
+        self._robot = robot
+        self._period_ms = period_ms
+        self._may_pump = not robot.getSynchronization()
+        self._tells_time: bool | None = None
+        self._time_s = float(robot.getTime())
+        self._stood_since_s = time.monotonic()
+
+    def go_on(self) -> bool:
+        """One round; False where Webots wants the controller to end."""
+        if not self._may_pump or self._tells_time is False or self._is_fast():
+            return self._robot.step(self._period_ms) != -1
+        if self._tells_time is None and self._has_stood():
+            return self._try_step()
+        answer = self._robot.step(0)
+        self._note()
+        time.sleep(_ROUND_S)
+        return answer != -1
+
+    def _is_fast(self) -> bool:
+        return self._robot.simulationGetMode() == self._robot.SIMULATION_MODE_FAST
+
+    def _note(self) -> None:
+        now_s = float(self._robot.getTime())
+        if now_s != self._time_s:
+            self._time_s, self._tells_time = now_s, True
+
+    def _has_stood(self) -> bool:
+        if self._robot.simulationGetMode() == self._robot.SIMULATION_MODE_PAUSE:
+            self._stood_since_s = time.monotonic()
+        return time.monotonic() - self._stood_since_s > _TRIAL_S
+
+    def _try_step(self) -> bool:
+        """Where more time passed than a step takes, it went on unseen."""
+        before_s, self._stood_since_s = self._time_s, time.monotonic()
+        answer = self._robot.step(self._period_ms)
+        self._time_s = float(self._robot.getTime())
+        if self._time_s - before_s > 2 * self._period_ms / 1000:
+            self._tells_time = False
+        return answer != -1
 
 
 class ObserverBridge(MCPBridge):
@@ -96,11 +167,11 @@ class Observer:
         self._robot = robot
         self.bridge = ObserverBridge(robot, throttle_interval=1, keep_last_s=0, **options)
         self.bridge.count_steps_by_time()
-        self.world = World(robot, self._period_ms, self._warn)
-        self._pace = Pace(robot, self._period_ms)
+        self.world = ObservedWorld(robot, self._period_ms, self._warn)
+        self._pace = StepPace(robot, self._period_ms)
         self._due_s = -math.inf
         self._mode = -1
-        self._tell_again_s = math.inf
+        self._record_again_s = math.inf
         self.bridge.register_command(LOOK_AT, self.look_at)
 
     def __enter__(self) -> Observer:
@@ -126,20 +197,20 @@ class Observer:
         if self.bridge.detect_reload():
             self.world.begin_run()
             self._due_s = -math.inf
-        self._tell()
+        self._record_news()
         if sim_time_s >= self._due_s and (seen := self.world.look(sim_time_s)):
             self._due_s = sim_time_s + self._period_ms / 1000 - 1e-6
             self.bridge.publish(seen)
 
-    def _tell(self) -> None:
-        """Record the mode and what there is where they are others than before, or long untold."""
-        is_due, mode = time.monotonic() > self._tell_again_s, int(self._robot.simulationGetMode())
+    def _record_news(self) -> None:
+        """Record the mode and what there is where they are not as before, or long ago."""
+        is_due, mode = time.monotonic() > self._record_again_s, int(self._robot.simulationGetMode())
         if mode != self._mode or is_due:
             self._mode = mode
             self.bridge.record_mode()
         self.world.go_on()
         if self.world.is_new or is_due:
-            self._tell_again_s = time.monotonic() + _TELL_AGAIN_S
+            self._record_again_s = time.monotonic() + _RECORD_AGAIN_S
             self.bridge.record_world(self.world.describe())
 
     def _warn(self, text: str) -> None:
@@ -157,16 +228,16 @@ class Observer:
         return _looked_at(body, self._robot)
 
 
-def _looked_at(body: Body, robot: Any) -> dict[str, Any]:
+def _looked_at(body: ObservedBody, robot: Any) -> dict[str, Any]:
     node = body.scene.node
     velocity = [round(float(value), _DIGITS) for value in node.getVelocity()]
-    told: dict[str, Any] = {
+    answer: dict[str, Any] = {
         "key": body.key,
         "position_m": [round(float(value), _DIGITS) for value in node.getPosition()],
         "velocity_mps": velocity[:3],
         "angular_velocity_radps": velocity[3:],
     }
-    return told | _standing(node, robot)
+    return answer | _standing(node, robot)
 
 
 def _standing(node: Any, robot: Any) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from typing import Any, Final, NamedTuple, cast
 
 from webots_mcp.conditions import Condition, parse_condition
-from webots_mcp.conditions.memory import SAME_TIME_S
+from webots_mcp.conditions.signal_values import SAME_TIME_S
 from webots_mcp.contract import MAX_RUN_S
 from webots_mcp.errors import (
     CommandRefusedError,

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any, Final
 
-from webots_mcp.conditions.score import parse_score
+from webots_mcp.conditions.scoring import parse_score
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.parameter import require_known
 from webots_mcp.questions.budget import (

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final, Literal, cast, get_args
 
 from webots_mcp.conditions import parse_condition
-from webots_mcp.conditions.score import parse_score
+from webots_mcp.conditions.scoring import parse_score
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.store.analysis.ranking import Best
 from webots_mcp.trials.ranges import Range, as_plain, read_ranges, require_kinds

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any, Final
 
 from webots_mcp.conditions import Condition, parse_condition
-from webots_mcp.conditions.condition import POSITION
+from webots_mcp.conditions.compiler import POSITION
 from webots_mcp.errors import UnknownSignalError
 from webots_mcp.naming import NO_POSITION, Value
 from webots_mcp.store.detection.event import Event, EventOptions

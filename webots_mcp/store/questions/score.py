@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
-from webots_mcp.conditions.score import Facts, Score, Scored, parse_score
+from webots_mcp.conditions.scoring import Facts, Score, Scored, parse_score
 from webots_mcp.errors import InvalidInputError, NothingRecordedError
 from webots_mcp.naming import listed, nearest_first
 from webots_mcp.store.detection.event import EventOptions

@@ -1,4 +1,4 @@
-"""The whole world as a Supervisor sees it: which robots and solids there are, and where they are.
+"""The bodies of a world as a Supervisor sees it: which robots and solids there are, and where.
 
 Poses come with the steps (`enablePoseTracking`), so that fifty robots cost no more requests than
 one. The tree is walked a few milliseconds at a time: at the start, where something has vanished or
@@ -7,15 +7,23 @@ the number of nodes has changed, and every few seconds.
 
 from __future__ import annotations
 
+import keyword
+import math
+import re
 import time
-from collections.abc import Generator
-from typing import Any, Final, TypeAlias
+import unicodedata
+from collections.abc import Collection, Generator
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple, TypeAlias
 
 from webots_mcp.bridge.scene import MOST_NODES, SceneNode, read_value, walk
-from webots_mcp.naming import SOLIDS, WORLD
-from webots_mcp.observer.body import Body, Place, body_of, is_followed
-from webots_mcp.observer.words import word_of
+from webots_mcp.naming import SEEN_SPEED, SOLIDS, WORLD
 
+_DIGITS: Final = 6  # of metres and radians that are recorded
+_MOVED_M: Final = 0.001
+_TURNED_RAD: Final = 0.01
+_NO_WORD: Final = re.compile(r"\W")
+_LONGEST_WORD: Final = 60  # characters
 MOST_ROBOTS: Final = 200
 MOST_SOLIDS: Final = 100
 _WALK_S: Final = 0.004  # of wall time in one look
@@ -24,7 +32,141 @@ Seen: TypeAlias = "dict[str, dict[str, dict[str, float | None]]]"
 _STALE_M: Final = 0.01
 
 
-class World:
+class BodyPose(NamedTuple):
+    """Where a body is at a moment."""
+
+    sim_time_s: float
+    x_m: float
+    y_m: float
+    z_m: float
+    heading_rad: float
+
+    def distance_m(self, position: list[float]) -> float:
+        """How far away another position is."""
+        return math.dist((self.x_m, self.y_m, self.z_m), position)
+
+    def is_elsewhere(self, other: BodyPose) -> bool:
+        """Whether a body has moved or turned between the two."""
+        turned = abs(math.remainder(self.heading_rad - other.heading_rad, math.tau))
+        return self.distance_m([*other[1:4]]) > _MOVED_M or turned > _TURNED_RAD
+
+
+@dataclass
+class ObservedBody:
+    """A node whose pose is followed.
+
+    Attributes:
+        key: What it is called in signals.
+        scene: Its node, where it stands in the tree.
+        name: Its field `name`.
+        controller: The controller of a robot; "" of another solid.
+        is_robot: Whether it is a robot.
+        place: Where it was seen last.
+        has_moved: Whether it was ever seen to move.
+        speed_mps: Between the two places that were seen last; None before.
+    """
+
+    key: str
+    scene: SceneNode
+    name: str
+    controller: str
+    is_robot: bool
+    place: BodyPose | None = None
+    has_moved: bool = False
+    speed_mps: float | None = None
+    _first: BodyPose | None = field(default=None, repr=False)
+
+    @property
+    def is_published(self) -> bool:
+        """A robot always; another solid once it has moved."""
+        return self.is_robot or self.has_moved
+
+    def look(self, sim_time_s: float) -> bool:
+        """See where it is now; False where its node is not there any more, or has no place."""
+        node: Any = self.scene.node
+        if int(node.getId()) != self.scene.id:  # what the library knows is of another node now
+            return False
+        pose = node.getPose()
+        if not math.isfinite(pose[3]):
+            return False
+        place = BodyPose(sim_time_s, pose[3], pose[7], pose[11], math.atan2(pose[4], pose[0]))
+        self._go_on(place)
+        return True
+
+    def _go_on(self, place: BodyPose) -> None:
+        before = self.place
+        if before is None or place.sim_time_s < before.sim_time_s:  # the beginning, or a reset
+            self._first, self.speed_mps, self.has_moved = place, None, False
+        elif place.sim_time_s > before.sim_time_s:
+            distance_m = place.distance_m([*before[1:4]])
+            self.speed_mps = distance_m / (place.sim_time_s - before.sim_time_s)
+        self.place = place
+        self.has_moved = self.has_moved or place.is_elsewhere(self._first or place)
+
+    def signals(self) -> dict[str, float | None]:
+        """What is recorded of it at a moment."""
+        if self.place is None:
+            return {}
+        _, x, y, z, heading = (round(value, _DIGITS) for value in self.place)
+        speed = None if self.speed_mps is None else round(self.speed_mps, _DIGITS)
+        return {"x_m": x, "y_m": y, "z_m": z, "heading_rad": heading, SEEN_SPEED: speed}
+
+    def describe(self) -> dict[str, object]:
+        """What does not change of it: where it is, too, as long as it has not moved."""
+        carrier = robot_around(self.scene)
+        described = {
+            "key": self.key,
+            "type": self.scene.type_name,
+            "def": _other_than(self.key, self.scene.definition),
+            "name": _other_than(self.key, self.name),
+            "controller": self.controller or None,
+            "on_robot": carrier.name if carrier else None,
+        }
+        place = {} if self.is_published else self.signals() | {SEEN_SPEED: None}
+        return {what: value for what, value in (described | place).items() if value is not None}
+
+
+def is_followed(scene: SceneNode) -> bool:
+    """Robots, and solids with a DEF name that are no part of a robot nor of a PROTO node."""
+    if scene.base_type != "Solid":
+        return scene.base_type == "Robot"
+    return bool(scene.definition) and not scene.hidden and robot_around(scene) is None
+
+
+def robot_around(scene: SceneNode) -> SceneNode | None:
+    """The robot that a node is a part of, or stands on."""
+    around = scene.parent
+    while around is not None and around.base_type != "Robot":
+        around = around.parent
+    return around
+
+
+def _other_than(key: str, name: str) -> str | None:
+    return name if name and name != key else None
+
+
+def body_of(scene: SceneNode, key: str) -> ObservedBody:
+    """The body of a node that stands in the tree; its fields are asked for."""
+    is_robot = scene.base_type == "Robot"
+    controller = read_value(scene.node, "controller") if is_robot else None
+    return ObservedBody(key, scene, scene.name, str(controller or ""), is_robot)
+
+
+def word_of(name: str, taken: Collection[str]) -> str:
+    """The name as a word that is not taken yet: `2nd robot` becomes `_2nd_robot`.
+
+    Conditions and positions can name it without quotes. A number is appended to one that is taken.
+    """
+    word = _NO_WORD.sub("_", unicodedata.normalize("NFKC", name))[:_LONGEST_WORD] or "robot"
+    if word[0].isdigit() or keyword.iskeyword(word):
+        word = f"_{word}"
+    number, free = 2, word
+    while free in taken:
+        number, free = number + 1, f"{word}_{number}"
+    return free
+
+
+class ObservedWorld:
     """The bodies of a world, as far as they have been found.
 
     Args:
@@ -47,15 +189,15 @@ class World:
         self._next_walk_s = 0.0
         self._count = -1
         self._is_tracking = True
-        self._seen_at_walk: dict[str, Place] = {}
+        self._seen_at_walk: dict[str, BodyPose] = {}
         self._is_cut = False
         self._is_walked = False
         self._is_new = False
-        self.bodies: dict[str, Body] = {}
+        self.bodies: dict[str, ObservedBody] = {}
 
     @property
     def is_new(self) -> bool:
-        """A walk has found something else than `describe` has told."""
+        """A walk has found something else than `describe` has said."""
         return self._is_new and self._is_walked
 
     def look(self, sim_time_s: float) -> Seen:
@@ -65,7 +207,7 @@ class World:
             self._lose(key)
         seen: Seen = {}
         for body in self.bodies.values():
-            if body.is_told and (signals := body.signals()):
+            if body.is_published and (signals := body.signals()):
                 seen.setdefault(WORLD if body.is_robot else SOLIDS, {})[body.key] = signals
         return seen
 
@@ -91,16 +233,16 @@ class World:
         for body in self.bodies.values():
             body.look(float(self._robot.getTime()))
         bodies = self.bodies.values()
-        told: dict[str, object] = {
+        described: dict[str, object] = {
             "title": self._title(),
             "file": str(self._robot.getWorldPath()),
             "basic_time_step_ms": float(self._robot.getBasicTimeStep()),
             "robots": [body.describe() for body in bodies if body.is_robot],
             "solids": [body.describe() for body in bodies if not body.is_robot],
         }
-        return told | ({"more": True} if self._is_cut else {})
+        return described | ({"more": True} if self._is_cut else {})
 
-    def find(self, name: object) -> Body | None:
+    def find(self, name: object) -> ObservedBody | None:
         """The body of that word, DEF name or name."""
         named = [body for body in self.bodies.values() if body.key == name]
         named += [body for body in self.bodies.values() if body.scene.definition == name]
@@ -195,7 +337,7 @@ class World:
         return next((read_value(node, "title") or None for node in infos), None)
 
 
-def _is_stale(body: Body, before: Place | None) -> bool:
+def _is_stale(body: ObservedBody, before: BodyPose | None) -> bool:
     """Whether it stood since then by what is tracked, and not by what is asked for."""
     place = body.place
     if place is None or before is None or place.sim_time_s <= before.sim_time_s:

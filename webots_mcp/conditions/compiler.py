@@ -1,6 +1,6 @@
-"""A parsed condition as closures: each node that is allowed has one place here, no other has any.
+"""A condition: its tree as closures, and whether it holds as one state follows another.
 
-Nothing is evaluated as Python.
+Each node that is allowed has one place here, no other has any. Nothing is evaluated as Python.
 """
 
 from __future__ import annotations
@@ -8,16 +8,29 @@ from __future__ import annotations
 import ast
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any, Final, TypeAlias, cast
 
-from webots_mcp.conditions.memory import Changed, Displacement, Lasting, Memory, Rate
-from webots_mcp.conditions.nodes import FLAGS, Nodes, function_of, is_signal
-from webots_mcp.conditions.reading import Plain, PositionReader, Read, State, reader
-from webots_mcp.conditions.scanning import Scanned
-from webots_mcp.naming import Value, nearest_first
+from webots_mcp.conditions.signal_values import (
+    SAME_TIME_S,
+    Changed,
+    Displacement,
+    Lasting,
+    Memory,
+    Plain,
+    PositionReader,
+    Rate,
+    Read,
+    State,
+    reader,
+)
+from webots_mcp.conditions.syntax import FLAGS, Nodes, Scanned, function_of, is_signal, parse, scan
+from webots_mcp.naming import NO_POSITION, Value, find_position, flatten, nearest_first
 
+POSITION: Final = "the position"  # what a displacement reads, whatever its signals are called
+_MOST_OFFERED: Final = 3
 MAX_DURATION_S: Final = 3600.0
 _MOST_TIMES_AS_OLD: Final = 2.0  # a displacement takes a place that is so many times as old
 MAX_NAME_CHARACTERS: Final = 200
@@ -45,6 +58,140 @@ OF_NUMBERS: Final[dict[str, Callable[..., Any]]] = {"abs": abs, "min": min, "max
 _GIVING_FLAGS: Final = ("changed", "missing")
 _ALWAYS_OR_NEVER: Final = "it would always be true or always be false"
 FUNCTIONS: Final = (*OF_NUMBERS, *_GIVING_FLAGS, "rate", "displacement", "signal")
+
+
+def _as_it_is(value: Any) -> Any:
+    return value
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition of the language in docs/conditions.md.
+
+    Attributes:
+        text: Without the spaces around it.
+        signals: The names of those that it reads, in order, without the position's.
+        asks_position: Whether it asks where the robot is.
+        remembers_s: How far back in time what it says of a state may reach.
+    """
+
+    text: str
+    signals: tuple[str, ...]
+    asks_position: bool
+    remembers_s: float
+    _scanned: Scanned = field(repr=False, compare=False)
+    _tree: ast.expr = field(repr=False, compare=False)
+
+    def evaluator(self, plain: Plain = _as_it_is) -> Evaluator:
+        """Something that follows one robot from state to state.
+
+        Args:
+            plain: The counterpart that a row holds, in JSON's terms, of a value that is not plain
+                JSON; recorded rows hold no others.
+        """
+        return Evaluator(Compiler(self._scanned, self._tree, plain), plain)
+
+    def describe_unknown(self, known: Collection[str]) -> list[str]:
+        """A sentence for each of its signals, and the position, not among the known ones."""
+        return [
+            *(
+                f"{name} is missing as long as it is not published; there is {near}"
+                for name, near in self.nearest_to_unknown(known)
+            ),
+            *self.describe_lost(known),
+        ]
+
+    def describe_lost(self, known: Collection[str]) -> list[str]:
+        """That it asks where the robot is, and none of the known names is a place."""
+        lost = self.asks_position and find_position(known) is None
+        return [f"displacement has no value: {NO_POSITION}"] * lost
+
+    def nearest_to_unknown(self, known: Collection[str]) -> list[tuple[str, str]]:
+        """Each of its signals that is not among the known ones, and the names that are near."""
+        unknown = [name for name in self.signals if name not in known]
+        return [(name, _nearest(name, known)) for name in unknown]
+
+
+class Evaluator:
+    """Whether a condition holds, with each state that follows.
+
+    Attributes:
+        sim_time_s: Of the state that was taken in last; None at the begin of a run.
+    """
+
+    def __init__(self, compiled: Compiler, plain: Plain) -> None:
+        self._root = compiled.root
+        self._memories = tuple(compiled.memories)
+        self._readers = compiled.readers
+        self._position = compiled.position
+        self._plain = plain
+        self.sim_time_s: float | None = None
+
+    def holds(self, state: State, sim_time_s: float) -> bool:
+        """Take in the next state. A time that goes back begins a new run: all before is forgotten.
+
+        Raises:
+            ConditionFailedError: The values are not of the kinds that it can be asked of.
+        """
+        if self.sim_time_s is not None and sim_time_s < self.sim_time_s - SAME_TIME_S:
+            self.forget()
+        self.sim_time_s = sim_time_s
+        if state.__class__ is not dict:
+            state = self._as_dict(state)
+        for memory in self._memories:
+            memory.update(state, sim_time_s)
+        return self._root(state)
+
+    def forget(self) -> None:
+        """A new run begins."""
+        self.sim_time_s = None
+        for memory in self._memories:
+            memory.forget()
+
+    def values(self, state: State) -> dict[str, Value]:
+        """The signals of the condition as they are in a state; None where they are missing."""
+        state = self._as_dict(state)
+        names = self._position.names if self._position is not None else None
+        place = self._position.read(state) if self._position is not None else None
+        values = {name: read(state) for name, read in self._readers.items()}
+        return values | dict(zip(names, place or (None, None), strict=True)) if names else values
+
+    def lacks(self, state: State) -> set[str]:
+        """What the condition reads and a state has no value of: signals, and `POSITION`."""
+        state = self._as_dict(state)
+        lacking = {name for name, read in self._readers.items() if read(state) is None}
+        if self._position is not None and self._position.read(state) is None:
+            lacking.add(POSITION)
+        return lacking
+
+    def names_in(self, state: State) -> list[str]:
+        """The names of all values of a state, null or not."""
+        return list(flatten(self._plain(self._as_dict(state))))
+
+    def _as_dict(self, state: State) -> dict[Any, Any]:
+        if state.__class__ is dict:
+            return state
+        plain = self._plain(state)
+        return plain if plain.__class__ is dict else {}
+
+
+def parse_condition(text: str) -> Condition:
+    """Read a condition.
+
+    Raises:
+        InvalidConditionError: It is not of the language; the text names the column and what would
+            be possible there.
+    """
+    scanned = scan(text)
+    tree = parse(scanned)
+    compiled = Compiler(scanned, tree, _as_it_is)
+    asks_position = compiled.position is not None
+    told = (tuple(compiled.readers), asks_position, compiled.remembers_s)
+    return Condition(scanned.original, *told, scanned, tree)
+
+
+def _nearest(name: str, known: Collection[str]) -> str:
+    return ", ".join(nearest_first(name, known)[:_MOST_OFFERED]) or "nothing yet"
 
 
 class Compiler(Nodes):
@@ -82,9 +229,10 @@ class Compiler(Nodes):
     def _condition(self, node: ast.expr) -> Holds:
         if isinstance(node, ast.BoolOp):
             parts = tuple(self._condition(value) for value in node.values)
-            return _all_of(parts) if isinstance(node.op, ast.And) else _any_of(parts)
+            return reduce(_both if isinstance(node.op, ast.And) else _either, parts)
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not):
-            return _not(self._condition(node.operand))
+            inner = self._condition(node.operand)
+            return lambda state: not inner(state)
         if isinstance(node, ast.Compare):
             return self._comparison(node)
         if isinstance(node, ast.Tuple):
@@ -107,7 +255,10 @@ class Compiler(Nodes):
             (read, self._compare(op, side))
             for read, op, side in zip(reads[1:], node.ops, sides, strict=False)
         ]
-        return _pair(reads[0], *steps[0]) if len(steps) == 1 else _chain(reads[0], tuple(steps))
+        if len(steps) > 1:
+            return _chain(reads[0], tuple(steps))
+        left, (right, compare) = reads[0], steps[0]
+        return lambda state: compare(left(state), right(state))
 
     def _compare(self, op: ast.cmpop, left: ast.expr) -> Compare:
         sign, compare = _COMPARISONS[type(op)]
@@ -177,7 +328,9 @@ class Compiler(Nodes):
             return self._arithmetic(node)
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, (ast.USub, ast.UAdd)):
             number = self._number(node.operand)
-            return number if isinstance(node.op, ast.UAdd) else _negative(number)
+            if isinstance(node.op, ast.UAdd):
+                return number
+            return lambda state: None if (value := number(state)) is None else -value
         if isinstance(node, ast.Call):
             return self._call(node)
         self._refuse(node, "a number, a text or a signal is needed here")
@@ -236,7 +389,13 @@ class Compiler(Nodes):
             hint = "" if name == "abs" else f"; of a long array there is ranges.{name}"
             self._refuse(node, f"{name} takes {count}{hint}")
         numbers = tuple(self._number(each) for each in node.args)
-        return _applied(OF_NUMBERS[name], numbers)
+        function = OF_NUMBERS[name]
+
+        def applied(state: State) -> Number | None:
+            values = [number(state) for number in numbers]
+            return None if None in values else function(*values)
+
+        return applied
 
     def _keep(self, memory: Any) -> Any:
         """After those that it is made of: they are up to date when it is its turn."""
@@ -304,26 +463,6 @@ def _constant(value: Any) -> Callable[[State], Any]:
     return lambda state: value
 
 
-def _negative(number: ReadNumber) -> ReadNumber:
-    def negative(state: State) -> Number | None:
-        value = number(state)
-        return None if value is None else -value
-
-    return negative
-
-
-def _applied(function: Callable[..., Any], numbers: tuple[ReadNumber, ...]) -> ReadNumber:
-    def applied(state: State) -> Number | None:
-        values = [number(state) for number in numbers]
-        return None if None in values else function(*values)
-
-    return applied
-
-
-def _pair(left: Read, right: Read, compare: Compare) -> Holds:
-    return lambda state: compare(left(state), right(state))
-
-
 def _chain(first: Read, steps: tuple[tuple[Read, Compare], ...]) -> Holds:
     """`0 < x < 1`: each value is read once."""
 
@@ -337,18 +476,6 @@ def _chain(first: Read, steps: tuple[tuple[Read, Compare], ...]) -> Holds:
         return True
 
     return holds
-
-
-def _not(condition: Holds) -> Holds:
-    return lambda state: not condition(state)
-
-
-def _all_of(conditions: tuple[Holds, ...]) -> Holds:
-    return reduce(_both, conditions)
-
-
-def _any_of(conditions: tuple[Holds, ...]) -> Holds:
-    return reduce(_either, conditions)
 
 
 def _both(left: Holds, right: Holds) -> Holds:

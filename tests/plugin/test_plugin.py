@@ -129,7 +129,9 @@ def test_a_failure_ends_at_the_users_own_line(pytester: pytest.Pytester) -> None
     assert len(re.findall(r"^test_\w+\.py:\d+: \w+", said, re.MULTILINE)) == 8
 
 
-def test_an_error_that_the_package_does_not_explain_keeps_its_frames(pytester: pytest.Pytester) -> None:
+def test_an_error_that_the_package_does_not_explain_keeps_its_frames(
+    pytester: pytest.Pytester,
+) -> None:
     pytester.makepyfile(
         """
         def test_it(webots_bridge, webots_recording):

@@ -19,7 +19,7 @@ import pytest
 from tests.processes.stopping import stop_between_writes
 from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.liveness import process_identity
-from webots_mcp.trials.simulators import Simulator
+from webots_mcp.trials.trial_run import TrialSimulator
 from webots_mcp.webots.starting import CommandLine
 
 Write = Callable[[str], Path]
@@ -37,10 +37,10 @@ time.sleep(600)
 # Dies between the start of the simulator's process and the note of its pid, or after that.
 RUNNER = """
 import os, pathlib, signal, sys, time
-from webots_mcp.trials.simulators import Simulator
+from webots_mcp.trials.trial_run import TrialSimulator
 from webots_mcp.webots.starting import CommandLine
 command = CommandLine([sys.executable, "simulator.py"], [])
-simulator = Simulator(command, pathlib.Path(), {})
+simulator = TrialSimulator(command, pathlib.Path(), {})
 print(simulator.pid, flush=True)
 if "start" in sys.argv:
     simulator.start()
@@ -95,7 +95,7 @@ def test_a_simulator_whose_keeper_is_killed_ends(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "simulator.py").write_text(SIMULATOR.format(deaf=deaf))
     simulator, told = (
-        Simulator(CommandLine([sys.executable, "simulator.py"], []), tmp_path, {}),
+        TrialSimulator(CommandLine([sys.executable, "simulator.py"], []), tmp_path, {}),
         Path("simulator.txt"),
     )
     simulator.start()

@@ -16,22 +16,21 @@ from tests.trials.conftest import Run, command, rows, wait_for_trial
 from webots_mcp.steering.trial_sets import told_of_set
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Trial
-from webots_mcp.trials.plan import Plan, Search
-from webots_mcp.trials.ranges import Range
-from webots_mcp.trials.searching import next_parameters
+from webots_mcp.trials.plan import Range, Search, TrialPlan
+from webots_mcp.trials.set_runner import next_parameters
 
 Write = Callable[[str], Path]
 PARAMETERS = "SELECT parameters FROM trial ORDER BY number"
 
 
-def a_plan(search: Search = "tpe", **more: Any) -> Plan:
+def a_plan(search: Search = "tpe", **more: Any) -> TrialPlan:
     """Of no world: no simulator is started."""
     ranges: dict[str, Any] = {"kp": Range(0.0, 10.0), "gait": Range(choices=["trot", "walk"])}
     given: dict[str, Any] = {"ranges": ranges, "sets": 40, "seed": 7} | more
-    return Plan(score="last(x)", for_s=1.0, search=search, **given)
+    return TrialPlan(score="last(x)", for_s=1.0, search=search, **given)
 
 
-def tried(plan: Plan, score: Callable[[dict[str, Any]], float]) -> list[Trial]:
+def tried(plan: TrialPlan, score: Callable[[dict[str, Any]], float]) -> list[Trial]:
     """All trials of a search, one after the other, with the scores that a robot would have got."""
     trials: list[Trial] = []
     while (values := next_parameters(plan, trials)) is not None:

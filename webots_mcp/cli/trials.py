@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.recording import Recording
     from webots_mcp.store.trials import Result, Trial
     from webots_mcp.trials.plan import WorldPlan
-    from webots_mcp.trials.running import Simulators
+    from webots_mcp.trials.trial_run import Simulators
 
 
 _RANK_EVERY_S: Final = 1.0
@@ -86,8 +86,7 @@ def trials(arguments: argparse.Namespace) -> None:
 
 def _run(plan: WorldPlan, arguments: argparse.Namespace) -> tuple[Recording, int]:
     """Run what is left of the plan's set; returns where it is recorded, and its id."""
-    from webots_mcp.trials.runner import Workshop, run_trials
-    from webots_mcp.trials.searching import next_parameters, require_optuna
+    from webots_mcp.trials.set_runner import SetRun, require_optuna, run_trials
 
     if plan.search:
         require_optuna()
@@ -95,10 +94,9 @@ def _run(plan: WorldPlan, arguments: argparse.Namespace) -> tuple[Recording, int
         recording = replace(open_recording(arguments), read_only=False)
         recording.create()
         set_id = _set_of(recording, plan, arguments)
-        search = next_parameters if plan.search else None
-        workshop = Workshop(recording, plan, simulators, threading.Event(), search)
-        with ending_by_event(workshop.stopping):
-            run_trials(workshop, set_id, _Progress(recording, set_id, plan).tell)
+        set_run = SetRun(recording, plan, simulators, threading.Event())
+        with ending_by_event(set_run.stopping):
+            run_trials(set_run, set_id, _Progress(recording, set_id, plan).tell)
     return recording, set_id
 
 
@@ -106,8 +104,7 @@ def _simulators(
     arguments: argparse.Namespace, plan: WorldPlan
 ) -> AbstractContextManager[Simulators]:
     """Where the trials run; that there is such a program is seen before anything is written."""
-    from webots_mcp.trials.running import LocalSimulators
-    from webots_mcp.trials.simulators import stand_in, webots
+    from webots_mcp.trials.trial_run import LocalSimulators, stand_in, webots
 
     if arguments.scheduler is not None:
         return _cluster(arguments, plan)

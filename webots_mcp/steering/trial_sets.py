@@ -46,7 +46,7 @@ from webots_mcp.store.trials import (
     stop_trial_set,
     trials_of,
 )
-from webots_mcp.trials.plan import SCHEDULER, Plan, WorldPlan, combinations
+from webots_mcp.trials.plan import SCHEDULER, TrialPlan, WorldPlan, combinations
 
 CANCELLED: Final = "it was cancelled"
 _TABLE_BUDGET: Final = 5_400
@@ -80,7 +80,7 @@ def begin_set(
         recording: Of the robot.
         parameters: Sets of values, or a grid whose every combination is tried.
         robot: Whose controller; None for the only live one.
-        asked: The other fields of a `Plan`.
+        asked: The other fields of a `TrialPlan`.
 
     Raises:
         InvalidInputError: The controller does not declare a parameter or not with such a value,
@@ -94,7 +94,7 @@ def begin_set(
     checked = _as_declared(settable(recording, robot), sets)
     with recording.reader() as connection:
         view = find_target(connection, robot, ACTION)
-        plan = Plan(parameters=checked, robot=view.robot.name, **asked)
+        plan = TrialPlan(parameters=checked, robot=view.robot.name, **asked)
         _require_scorable(connection, plan, view)
     with recording.writer() as connection:
         return create_trial_set(connection, plan.text, plan.trials, view.robot.id)
@@ -137,7 +137,7 @@ def enter_cluster_set(recording: Recording, plan: WorldPlan, scheduler: str) -> 
         return create_trial_set(connection, text, plan.trials)
 
 
-def _require_scorable(connection: sqlite3.Connection, plan: Plan, view: View) -> None:
+def _require_scorable(connection: sqlite3.Connection, plan: TrialPlan, view: View) -> None:
     score = parse_score(plan.score)
     require_kinds(connection, score, view.require_run().id)
     if known := known_names(view):

@@ -40,7 +40,7 @@ from webots_mcp.store.trials import (
     take_up,
     trials_of,
 )
-from webots_mcp.trials.plan import Plan, WorldPlan, stored_plan
+from webots_mcp.trials.plan import TrialPlan, WorldPlan, stored_plan
 
 _LOOK_EVERY_S: Final = 0.02
 # So long that a controller that knows a reset only by its time having gone back notices the next.
@@ -92,7 +92,7 @@ class TrialWorker(threading.Thread):
             self._job = Job(recording, take_up(connection, set_id))
             self._set = fetch_trial_set(connection, set_id)
             self._robot = robot_name(connection, self._set.robot_id or 0)
-        self._plan: Plan = stored_plan(self._set.plan)
+        self._plan: TrialPlan = stored_plan(self._set.plan)
 
     def stop(self) -> None:
         """End the trial that runs, which waits to be run again, and leave the set as it is."""

@@ -6,6 +6,7 @@ import itertools
 import json
 import math
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -14,19 +15,74 @@ from typing import Any, Final, Literal, cast, get_args
 from webots_mcp.conditions import parse_condition
 from webots_mcp.conditions.scoring import parse_score
 from webots_mcp.errors import InvalidInputError
+from webots_mcp.naming import nearest_first
 from webots_mcp.store.analysis.ranking import Best
-from webots_mcp.trials.ranges import Range, as_plain, read_ranges, require_kinds
 
 Search = Literal["tpe", "random"]
 MOST_TRIALS: Final = 10_000
 _MOST_SEED: Final = 2**63
 SCHEDULER: Final = "scheduler"  # in the text of a plan that an assistant has begun on a cluster
+_STEPS_TOLERANCE: Final = 1e-9
 _GRID: Final = "grid"
 _REQUIRED: Final = ("world", "score")
 
 
+@dataclass(frozen=True)
+class Range:
+    """What may be tried of one parameter: the numbers of a range, or one of some choices.
+
+    Attributes:
+        low: The least number.
+        high: The greatest number.
+        step: Only so many more than `low` are tried; where both are whole, whole numbers.
+        log: Numbers are spread evenly over orders of magnitude.
+        choices: Instead of numbers.
+    """
+
+    low: float | None = None
+    high: float | None = None
+    step: float | None = None
+    log: bool = False
+    choices: list[Any] | None = None
+
+    def __post_init__(self) -> None:
+        if self.choices is not None:
+            return self._require_choices()
+        if self.low is None or self.high is None:
+            raise InvalidInputError("it needs low and high, or choices")
+        if not -math.inf < self.low < self.high < math.inf:
+            raise InvalidInputError(f"low={self.low} must be less than high={self.high}")
+        if self.log and self.low <= 0:
+            raise InvalidInputError(f"low={self.low} must be above 0 with log = true")
+        if self.step is not None:
+            self._require_steps(self.low, self.high, self.step)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether only whole numbers are tried."""
+        return isinstance(self.low, int) and isinstance(self.step, int)
+
+    def _require_choices(self) -> None:
+        if (self.low, self.high, self.step, self.log) != (None, None, None, False):
+            raise InvalidInputError("choices stand alone, without low, high, step and log")
+        choices = self.choices
+        if not choices or not all(isinstance(each, (int, float, str)) for each in choices):
+            raise InvalidInputError("choices must be an array of numbers, flags or texts")
+        if len({repr(each) for each in choices}) < len(choices):
+            raise InvalidInputError("the same choice is given twice")
+
+    def _require_steps(self, low: float, high: float, step: float) -> None:
+        if not 0 < step < math.inf:
+            raise InvalidInputError(f"step={step} must be a number above 0")
+        if self.log and not (self.is_whole and step == 1):
+            raise InvalidInputError("log and step go together only as whole numbers with step = 1")
+        steps = round((high - low) / step)
+        if steps < 1 or not math.isclose(low + steps * step, high, rel_tol=_STEPS_TOLERANCE):
+            raise InvalidInputError(f"high={high} must be a number of steps={step} above low={low}")
+
+
 @dataclass(frozen=True, kw_only=True)
-class Plan:
+class TrialPlan:
     """What is tried, wherever it runs.
 
     Attributes:
@@ -100,7 +156,7 @@ class Plan:
     @property
     def text(self) -> str:
         """All of it, always written alike: by it a set is found again."""
-        said = asdict(self) | {"ranges": as_plain(self.ranges)}
+        said = asdict(self) | {"ranges": _as_plain(self.ranges)}
         return json.dumps(said, sort_keys=True, ensure_ascii=False)
 
     @property
@@ -119,7 +175,7 @@ class Plan:
 
 
 @dataclass(frozen=True, kw_only=True)
-class WorldPlan(Plan):
+class WorldPlan(TrialPlan):
     """A plan whose trials each run in a simulator of their own.
 
     Attributes:
@@ -154,9 +210,9 @@ def read_plan(file: Path, search: Search | None = None) -> WorldPlan:
         raise InvalidInputError(f"{file}: {error}") from error
 
 
-def stored_plan(text: str) -> Plan:
+def stored_plan(text: str) -> TrialPlan:
     """What the text of a plan says whose trials run in a robot's simulation."""
-    return Plan(**json.loads(text))
+    return TrialPlan(**json.loads(text))
 
 
 def stored_world_plan(text: str) -> tuple[WorldPlan, bool]:
@@ -172,12 +228,12 @@ def stored_world_plan(text: str) -> tuple[WorldPlan, bool]:
     is_stand_in = bool(found.pop("stand_in", False))
     found = {name: value for name, value in found.items() if name != SCHEDULER}
     if found["ranges"]:
-        found["ranges"] = read_ranges(found["ranges"])
+        found["ranges"] = _read_ranges(found["ranges"])
     return WorldPlan(**found), is_stand_in
 
 
 def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> WorldPlan:
-    require_kinds(found, _KINDS)
+    _require_kinds(found, _KINDS)
     if len(given := [_WRITTEN[name] for name in _WRITTEN if name in found]) != 1:
         raise InvalidInputError(_HOW_MANY + (f", not {' and '.join(given)}" if given else ""))
     if _GRID in found:
@@ -187,7 +243,7 @@ def _plan_of(found: dict[str, Any], folder: Path, search: Search | None) -> Worl
         if name not in found:
             raise InvalidInputError(f"{name} is missing")
     if "ranges" in found:
-        found["ranges"] = read_ranges(found["ranges"])
+        found["ranges"] = _read_ranges(found["ranges"])
     found["world"] = str((folder / found["world"]).resolve())
     return WorldPlan(**found, search=search)
 
@@ -221,6 +277,56 @@ def _require_tables(parameters: list[Any]) -> None:
         raise InvalidInputError("the same parameters are given twice: use repeats")
 
 
+def _read_ranges(tables: dict[str, Any]) -> dict[str, Range]:
+    """The ranges of `[ranges]` in a plan.
+
+    Raises:
+        InvalidInputError: One is none; the text names it.
+    """
+    if not tables:
+        raise InvalidInputError("[ranges] names no parameter")
+    return {name: _range_of(name, table) for name, table in tables.items()}
+
+
+def _range_of(name: str, table: Any) -> Range:
+    try:
+        if not isinstance(table, dict):
+            raise InvalidInputError("write { low = 0.5, high = 10.0 } or { choices = [...] }")
+        found = cast("dict[str, Any]", table)
+        _require_kinds(found, _RANGE_KINDS)
+        return Range(**found)
+    except InvalidInputError as error:
+        raise InvalidInputError(f"[ranges] {name}: {error}") from error
+
+
+def _require_kinds(table: dict[str, Any], kinds: Mapping[str, Any]) -> None:
+    """See that a table of a plan has only keys that are known, with values of their kinds.
+
+    Raises:
+        InvalidInputError: It has others.
+    """
+    for key, value in table.items():
+        if key not in kinds:
+            near = ", ".join(nearest_first(key, list(kinds))[:3])
+            raise InvalidInputError(f"unknown {key!r}; there is {near}")
+        if not isinstance(value, kinds[key]) or (
+            isinstance(value, bool) and kinds[key] is not bool
+        ):
+            raise InvalidInputError(f"{key}={value!r} is a {type(value).__name__}")
+
+
+def _as_plain(ranges: dict[str, Range]) -> dict[str, Any]:
+    """In JSON's terms, without what is not given."""
+    return {
+        name: {key: value for key, value in asdict(each).items() if value not in (None, False)}
+        for name, each in ranges.items()
+    }
+
+
+_NUMBER: Final = (int, float)
+_RANGE_KINDS: Final[dict[str, Any]] = {
+    "low": _NUMBER, "high": _NUMBER, "step": _NUMBER, "log": bool, "choices": list,
+}  # fmt: skip
 _KINDS: Final[dict[str, Any]] = {
     "world": str, "score": str, "parameters": list, "best": str, "for_s": (int, float),
     "until": str, "repeats": int, "robot": str, "timeout_s": (int, float), "prune": str,

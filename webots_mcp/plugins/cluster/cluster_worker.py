@@ -14,9 +14,8 @@ from webots_mcp.plugins.cluster.dask_cluster import cluster
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result, Trial
 from webots_mcp.trials.plan import WorldPlan
-from webots_mcp.trials.runner import Workshop, run_taken_up, taken_up
-from webots_mcp.trials.running import StoppedError
-from webots_mcp.trials.searching import next_parameters
+from webots_mcp.trials.set_runner import SetRun, run_taken_up, taken_up
+from webots_mcp.trials.trial_run import StoppedError
 
 ALLOWED_VARIABLE: Final = "DASK_SCHEDULER_ADDRESS"  # Dask's own name for the one to use
 _END_PATIENCE_S: Final = 5.0
@@ -47,8 +46,7 @@ class ClusterWorker(threading.Thread):
         self.set_id = 0
         self._open = ExitStack()
         simulators = self._open.enter_context(cluster(scheduler, plan, is_stand_in=is_stand_in))
-        search = next_parameters if plan.search else None
-        self._workshop = Workshop(recording, plan, simulators, self._stopping, search)
+        self._set_run = SetRun(recording, plan, simulators, self._stopping)
 
     def begin(self, enter: Callable[[], int]) -> int:
         """Work on a set; returns its id, as `enter` gives it.
@@ -58,7 +56,7 @@ class ClusterWorker(threading.Thread):
         """
         try:
             self.set_id = enter()
-            self._workshop = taken_up(self._workshop, self.set_id)
+            self._set_run = taken_up(self._set_run, self.set_id)
         except BaseException:
             self._open.close()
             raise
@@ -74,7 +72,7 @@ class ClusterWorker(threading.Thread):
         """Run what is left of the set; why it does not go on is noted in it."""
         with self._open:
             try:
-                run_taken_up(self._workshop, self.set_id, _tell_nobody)
+                run_taken_up(self._set_run, self.set_id, _tell_nobody)
             except StoppedError:
                 pass
             except LeaseLostError as error:

@@ -35,8 +35,14 @@ from webots_mcp.store.bundle import pack, unpack
 from webots_mcp.store.recording import Recording
 from webots_mcp.store.trials import Result
 from webots_mcp.trials.plan import WorldPlan
-from webots_mcp.trials.running import Attempt, Command, StoppedError, run_attempt
-from webots_mcp.trials.simulators import stand_in, webots
+from webots_mcp.trials.trial_run import (
+    Command,
+    StoppedError,
+    TrialAttempt,
+    run_attempt,
+    stand_in,
+    webots,
+)
 
 RESOURCE: Final = "simulator"
 MOST_BYTES: Final = 100_000_000  # of a recording as it is returned, packed: it passes the scheduler
@@ -158,7 +164,7 @@ def run_here(asked: dict[str, Any], plan_text: str) -> Returned:
         with tempfile.TemporaryDirectory(prefix="trial-", dir=worker.local_directory) as name:
             folder = Path(name) / "data"
             folder.mkdir()
-            attempt = Attempt(plan, plan.parameters[0], folder, unwanted, _note_nothing)
+            attempt = TrialAttempt(plan, plan.parameters[0], folder, unwanted, _note_nothing)
             result = run_attempt(attempt, needs.command)
             if result.run_id is None:
                 return Returned(result)
@@ -272,7 +278,7 @@ class ClusterSimulators:
             raise CommandRefusedError(_no_workers(self._address, "any more"))
         return max(1, min(self._count, self._most or self._count))
 
-    def run(self, attempt: Attempt) -> Result:
+    def run(self, attempt: TrialAttempt) -> Result:
         """As `Simulators.run`."""
         attempt.begun(None)
         text = _alone(attempt.plan, attempt.values).text

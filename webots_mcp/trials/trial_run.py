@@ -1,0 +1,376 @@
+"""Runs one trial: in a simulator of its own, watched until it is over, and scored.
+
+What it recorded stays in its folder. Nothing here knows of the set, or of the recording that takes
+it in, so that it runs on another machine as well.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Literal, NamedTuple, Protocol, TypeAlias
+
+from webots_mcp.conditions import Evaluator, parse_condition
+from webots_mcp.contract import DATA_DIR_VARIABLE, DATABASE_NAME, ENDED_BY, PARAMETERS_VARIABLE
+from webots_mcp.errors import (
+    CommandRefusedError,
+    ConditionFailedError,
+    InvalidInputError,
+    NoDatabaseError,
+)
+from webots_mcp.store.logs import LogFilter, Window, newest_lines
+from webots_mcp.store.merging import settled
+from webots_mcp.store.questions.runs import run_info
+from webots_mcp.store.questions.score import score_run
+from webots_mcp.store.recording import Recording
+from webots_mcp.store.signals.flatten import parse
+from webots_mcp.store.trials import Result
+from webots_mcp.trials.plan import TrialPlan, WorldPlan
+from webots_mcp.webots.starting import CommandLine, KeptProgram, Start, any_port
+
+CONSOLE: Final = "simulator.log"
+_LOOK_EVERY_S: Final = 0.05
+_SAME_TIME_S: Final = 1e-6
+_ROBOTS: Final = "SELECT id, name FROM robot ORDER BY id"
+_FIRST_RUN: Final = "SELECT id, started_sim_time_s FROM run WHERE robot_id = ? ORDER BY id LIMIT 1"
+_NEWEST: Final = "SELECT max(sim_time_s) FROM state WHERE run_id = ?"
+_ROWS: Final = "SELECT id, sim_time_s, data FROM state WHERE run_id = ? AND id > ? ORDER BY id"
+_START_VALUES: Final = (
+    "SELECT name, value FROM parameter_value WHERE run_id = ? AND id IN "
+    "(SELECT min(id) FROM parameter_value WHERE run_id = ? GROUP BY name)"
+)
+_DECLARED: Final = "SELECT name, low, high, choices FROM parameter WHERE robot_id = ?"
+
+Command = Callable[[str], CommandLine]
+Ending: TypeAlias = Literal["for_s", "until", "prune"]
+
+
+class StoppedError(Exception):
+    """Somebody wants the trials to stop."""
+
+
+class Stopping(Protocol):
+    """Whether somebody wants a trial to stop: a `threading.Event`, or what looks like one."""
+
+    def wait(self, timeout: float | None = None, /) -> bool:
+        """Wait until somebody does, or the time is over; returns which."""
+        ...
+
+
+@dataclass(frozen=True)
+class TrialAttempt:
+    """One trial that is to be run.
+
+    Attributes:
+        plan: When it ends, and how it is scored.
+        values: Its parameters.
+        folder: An empty one, in which its recording is left.
+        stopping: Once it is set, the trial ends soon.
+        begun: Called with the pid of its simulator before that does anything; with None where it
+            was handed to another machine.
+    """
+
+    plan: WorldPlan
+    values: dict[str, Any]
+    folder: Path
+    stopping: Stopping
+    begun: Callable[[int | None], object]
+
+
+class Simulators(Protocol):
+    """Where trials are run."""
+
+    @property
+    def count(self) -> int:
+        """How many can run at once, now."""
+        ...
+
+    def run(self, attempt: TrialAttempt) -> Result:
+        """Run a trial; its recording is in its folder then, and the result has its run's id there.
+
+        Raises:
+            StoppedError: Somebody wanted it to stop.
+            InvalidInputError: No trial of the set can succeed.
+            CommandRefusedError: No trial can be run there any more.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class LocalSimulators:
+    """Processes of this machine.
+
+    Attributes:
+        command: Of a world's simulator.
+        count: How many run at once.
+    """
+
+    command: Command
+    count: int
+
+    def run(self, attempt: TrialAttempt) -> Result:
+        """As `Simulators.run`."""
+        return run_attempt(attempt, self.command)
+
+
+def stand_in(world: str) -> CommandLine:
+    """The command of the stand-in."""
+    return CommandLine([sys.executable, "-m", "webots_mcp.standin", world, "--mode", "fast"], [])
+
+
+def webots(world: str) -> CommandLine:
+    """The command of Webots, with a port that was free a moment ago.
+
+    Raises:
+        CommandRefusedError: There is no Webots.
+    """
+    start = Start(Path(world), "fast", headless=True, streams=False, port=any_port())
+    try:
+        return start.command_line()
+    except CommandRefusedError as error:
+        raise CommandRefusedError(f"{error}; or try on the stand-in with --stand-in") from error
+
+
+class TrialSimulator(KeptProgram):
+    """A simulator that prints to a file of its folder."""
+
+    def __init__(self, command: CommandLine, folder: Path, environment: Mapping[str, str]) -> None:
+        with (folder / CONSOLE).open("wb") as console:
+            super().__init__(command, environment, console, subprocess.STDOUT)
+        self._folder = folder
+
+    def last_line(self) -> str:
+        """What it printed last; empty if nothing."""
+        text = (self._folder / CONSOLE).read_bytes()[-2000:].decode("utf-8", "replace")
+        return next((line for line in reversed(text.splitlines()) if line.strip()), "")
+
+
+# -- one trial --------------------------------------------------------------------------------
+
+
+def run_attempt(attempt: TrialAttempt, command: Command) -> Result:
+    """Run a trial in a simulator of this machine.
+
+    Raises:
+        StoppedError: Somebody wanted it to stop.
+        InvalidInputError: No trial of the set can succeed.
+    """
+    folder, plan, values = attempt.folder, attempt.plan, attempt.values
+    parameters = {plan.robot: values} if plan.robot else values
+    environment = {DATA_DIR_VARIABLE: str(folder), PARAMETERS_VARIABLE: json.dumps(parameters)}
+    simulator = TrialSimulator(command(plan.world), folder, environment)
+    watch = TrialWatch(plan)
+    try:
+        attempt.begun(simulator.pid)
+        simulator.start()
+        end, why = _watched(attempt, watch, simulator)
+    finally:
+        simulator.end()
+    return _concluded(attempt, watch, end, why)
+
+
+def recorded_result(plan: TrialPlan, values: dict[str, Any], folder: Path) -> Result | None:
+    """Of a trial that had come to its end before somebody was killed; None where it had not."""
+    watch = TrialWatch(plan)
+    recording = _settled(folder)
+    if recording is None:
+        return None
+    with recording.reader() as connection:
+        end = watch.look(connection)
+        return _scored(connection, plan, values, watch, end) if end else None
+
+
+def _watched(
+    attempt: TrialAttempt, watch: TrialWatch, simulator: TrialSimulator
+) -> tuple[End | None, str]:
+    """Until the trial is over; the end that it reached, or why it reached none."""
+    folder, timeout_s = attempt.folder, attempt.plan.timeout_s
+    recording = Recording(folder / DATABASE_NAME, folder, read_only=True)
+    until_s = time.monotonic() + timeout_s
+    while True:
+        over = simulator.is_over  # before the look: what came last is seen
+        try:
+            with recording.reader() as connection:
+                end = watch.look(connection)
+        except NoDatabaseError:
+            end = None
+        except ConditionFailedError as error:
+            return None, str(error)
+        if end is not None:
+            return end, ""
+        if over:
+            return None, f"its simulator ended ({simulator.last_line()})"
+        if time.monotonic() > until_s:
+            last = simulator.last_line() if watch.run_id is None else ""
+            said = f" (its simulator printed last: {last})" if last else ""
+            return None, f"it took longer than {timeout_s:g} s of wall time{said}"
+        if attempt.stopping.wait(_LOOK_EVERY_S):
+            raise StoppedError
+        ended = _ended(recording, watch)
+        if ended is not None:
+            return None, ended
+
+
+def _ended(recording: Recording, watch: TrialWatch) -> str | None:
+    """Why the run cannot go on: its controller's process is gone."""
+    if watch.run_id is None:
+        return None
+    with recording.reader() as connection:
+        reason = run_info(connection, watch.run_id).end_reason
+        if reason is None or watch.look(connection) is not None:
+            return None
+    return f"its run ended ({reason})"
+
+
+def _concluded(attempt: TrialAttempt, watch: TrialWatch, end: End | None, why: str) -> Result:
+    recording = _settled(attempt.folder)
+    if recording is None:
+        said = "the controller recorded nothing in its data folder: does it name another one?"
+        return Result(None, None, f"{why}; {said}" if why else said)
+    with recording.reader() as connection:
+        end = end or watch.look(connection)  # what waited beside the database is in it now
+        if end is not None:
+            return _scored(connection, attempt.plan, attempt.values, watch, end)
+        why = _ending_line(connection, watch.run_id) or why
+    reached = "nothing" if watch.reached_s is None else f"{watch.reached_s:.3f} s"
+    return Result(watch.run_id, None, f"never reached its end, but {reached}: {why}")
+
+
+def _ending_line(connection: sqlite3.Connection, run_id: int | None) -> str | None:
+    """By which exception the controller ended, where it did."""
+    wanted = LogFilter(run_id, Window(-math.inf, math.inf), ENDED_BY, "error")
+    found = newest_lines(connection, wanted, 1) if run_id is not None else []
+    return found[0].message if found else None
+
+
+def _scored(
+    connection: sqlite3.Connection,
+    plan: TrialPlan,
+    values: dict[str, Any],
+    watch: TrialWatch,
+    end: End,
+) -> Result:
+    assert watch.run_id is not None  # it has an end
+    ended: tuple[Any, Any] = (end.by, end.sim_time_s)
+    try:
+        watch.require_parameters(connection, values)
+    except ValueError as error:
+        return Result(watch.run_id, None, str(error), *ended)
+    if end.by == "prune":
+        why = f"{plan.prune!r} held at {end.sim_time_s:.3f} s"
+        return Result(watch.run_id, None, why, *ended, pruned=True)
+    scored = score_run(connection, watch.run_id, plan.score, end_s=end.sim_time_s)
+    return Result(watch.run_id, scored.value, scored.why, *ended)
+
+
+def _settled(folder: Path) -> Recording | None:
+    """The recording of a trial whose processes are gone, with all that waited beside it."""
+    try:
+        return settled(folder / DATABASE_NAME)
+    except NoDatabaseError:
+        return None
+
+
+# -- where it ends ----------------------------------------------------------------------------
+
+
+class End(NamedTuple):
+    """The simulation time at which a trial was over, and by what."""
+
+    sim_time_s: float
+    by: Ending
+
+
+class TrialWatch:
+    """Follows the recording of one trial."""
+
+    def __init__(self, plan: TrialPlan) -> None:
+        self._plan = plan
+        self._last_id = 0
+        self._evaluators: list[tuple[Ending, Evaluator]] = []
+        if plan.until is not None:
+            self._evaluators.append(("until", parse_condition(plan.until).evaluator()))
+        if plan.prune is not None:
+            self._evaluators.append(("prune", parse_condition(plan.prune).evaluator()))
+        self.robot_id: int | None = None
+        self.run_id: int | None = None
+        self.reached_s: float | None = None
+        self._started_s = 0.0
+
+    def look(self, connection: sqlite3.Connection) -> End | None:
+        """Its end, as far as it is recorded; None before.
+
+        Raises:
+            InvalidInputError: Nobody can tell which robot is meant, or its controller does not
+                have the parameters that are to be tried.
+            ConditionFailedError: `until` or `prune` cannot be asked of the signals.
+        """
+        if self.run_id is None and not self._find_run(connection):
+            return None
+        self.reached_s = connection.execute(_NEWEST, (self.run_id,)).fetchone()[0]
+        if not self._evaluators:
+            return self._by_time(self.reached_s)
+        for row_id, sim_time_s, data in connection.execute(_ROWS, (self.run_id, self._last_id)):
+            self._last_id = row_id
+            if (end := self._by_time(sim_time_s)) and sim_time_s > end.sim_time_s + _SAME_TIME_S:
+                return end
+            if by := self._condition_at(parse(data), sim_time_s):
+                return End(sim_time_s, by)
+        return self._by_time(self.reached_s)
+
+    def _condition_at(self, state: Any, sim_time_s: float) -> Ending | None:
+        """Which condition holds first; each of them takes in every state."""
+        held: list[Ending] = [by for by, each in self._evaluators if each.holds(state, sim_time_s)]
+        return held[0] if held else None
+
+    def require_parameters(self, connection: sqlite3.Connection, wanted: dict[str, Any]) -> None:
+        """See that the run began with the values that it should have begun with.
+
+        Raises:
+            InvalidInputError: The controller has not declared one.
+            ValueError: It did not take one.
+        """
+        if self.run_id is None:
+            return
+        taken = dict(connection.execute(_START_VALUES, (self.run_id, self.run_id)).fetchall())
+        declared = {row[0]: row[1:] for row in connection.execute(_DECLARED, (self.robot_id,))}
+        for name, value in wanted.items():
+            if name not in taken:
+                known = ", ".join(sorted(declared)) or "none"
+                raise InvalidInputError(
+                    f"the controller declares no parameter {name!r}: it declares {known}; see "
+                    "bridge.parameter() in docs/trials.md"
+                )
+            if json.loads(taken[name]) != value:
+                low, high, choices = declared.get(name, (None, None, None))
+                allowed = f"choices {choices}" if choices else f"from {low} to {high}"
+                raise ValueError(
+                    f"{name}={value!r} was not taken ({allowed}); it ran with {taken[name]}"
+                )
+
+    def _by_time(self, sim_time_s: float | None) -> End | None:
+        if self._plan.for_s is None or sim_time_s is None:
+            return None
+        end_s = self._started_s + self._plan.for_s
+        return End(end_s, "for_s") if sim_time_s >= end_s - _SAME_TIME_S else None
+
+    def _find_run(self, connection: sqlite3.Connection) -> bool:
+        robots = connection.execute(_ROBOTS).fetchall()
+        wanted = self._plan.robot
+        chosen = [row for row in robots if wanted in (None, row[1])]
+        if wanted is None and len(robots) > 1:
+            names = ", ".join(name for _, name in robots)
+            raise InvalidInputError(f"several robots record ({names}): name one as robot = '...'")
+        for robot_id, _ in chosen:
+            row = connection.execute(_FIRST_RUN, (robot_id,)).fetchone()
+            if row is not None:
+                self.robot_id = robot_id
+                self.run_id, self._started_s = row
+        return self.run_id is not None

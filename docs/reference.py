@@ -14,6 +14,8 @@ import webots_mcp
 from webots_mcp import MemoryDatabase, pytest_plugin, testing
 from webots_mcp.cli import COMMANDS
 from webots_mcp.cli.command import Argument
+from webots_mcp.cli.commands import described
+from webots_mcp.cli.wording import as_typed
 from webots_mcp.connection import connect
 from webots_mcp.schema import create_schema
 from webots_mcp.server import create_server
@@ -75,10 +77,19 @@ def _default(schema: dict[str, Any], required: bool) -> str:
 
 def commands(_page: str = "") -> str:
     """Each command with its arguments, as `--help` has them."""
+    shown = {
+        name: (
+            as_typed(each.text),
+            [[f"`{typed}`", said] for typed, said in each.arguments.items()],
+        )
+        for name, each in described().items()
+    } | {
+        each.name: (inspect.getdoc(each.run) or "", list(map(_argument, each.arguments)))
+        for each in COMMANDS
+    }
     return "## Reference\n\n" + "\n".join(
-        f"### {each.name}\n\n{as_markdown(inspect.getdoc(each.run) or '')}\n\n"
-        + (_table(["argument", "meaning"], list(map(_argument, each.arguments))) or "")
-        for each in sorted(COMMANDS)
+        f"### {name}\n\n{as_markdown(text)}\n\n{_table(['argument', 'meaning'], rows)}"
+        for name, (text, rows) in sorted(shown.items())
     )
 
 

@@ -14,7 +14,7 @@ from webots_mcp import MCPBridge, MemoryDatabase, testing
 from webots_mcp.bridge.backlog import MAX_WAITING_BYTES, MAX_WAITING_ROWS
 from webots_mcp.bridge.devices import MOST_OBJECTS, SECTORS
 from webots_mcp.bridge.printed_lines import MOST_LINES_PER_S
-from webots_mcp.cli import COMMANDS
+from webots_mcp.cli import names
 from webots_mcp.connection import OLDEST_SQLITE
 from webots_mcp.contract import BUILT_IN_ACTIONS, KEEP_AFTER_S
 from webots_mcp.questions.argument_types import MAX_WAIT_S
@@ -46,8 +46,8 @@ def test_the_page_of_the_tools_names_every_tool_and_no_other() -> None:
 
 
 def test_the_page_of_the_command_line_names_every_command() -> None:
-    for command in COMMANDS:
-        assert re.search(rf"`{command.name}\b", page("command-line.md")), command.name
+    for name in names():
+        assert re.search(rf"`{name}\b", page("command-line.md")), name
 
 
 def test_the_page_of_the_bridge_names_every_method() -> None:

@@ -9,7 +9,8 @@ import pytest
 
 from docs import reference
 from webots_mcp import MemoryDatabase
-from webots_mcp.cli import COMMANDS
+from webots_mcp.cli import COMMANDS, names
+from webots_mcp.cli.commands import described
 from webots_mcp.schema import SCHEMA_FILE
 from webots_mcp.server import create_server
 
@@ -35,10 +36,13 @@ def test_each_tool_has_its_parameters_with_their_meaning() -> None:
 
 def test_each_command_has_its_options() -> None:
     shown = parts(reference.commands())
-    assert shown.keys() == {command.name for command in COMMANDS}
+    assert sorted(shown) == names()
     for command in COMMANDS:
         for argument in command.arguments:
             assert f"`{argument.typed}" in shown[command.name], command.name
+    for name, command in described().items():
+        for typed in command.arguments:
+            assert f"`{typed}`" in shown[name], name
 
 
 def test_each_table_and_view_has_its_columns_and_every_comment_of_the_schema() -> None:

@@ -37,9 +37,9 @@ def test_signals_have_their_kind_and_range(say: Say) -> None:
     some = say("signals", "po*", "--run", "1")
     assert "pose.0" in some
     assert "mode" not in some
-    assert "more signals: -n shows them" in say("signals", "-n", "1")
+    assert "1 of 15: go on with --after" in say("signals", "-n", "1")
     told = json.loads(say("signals", "pose.0", "--run", "1", "--json"))
-    assert [(each["name"], each["kind"]) for each in told["signals"]] == [("pose.0", "num")]
+    assert [row[:2] for row in told["signals"]["rows"]] == [["pose.0", "num"]]
 
 
 def test_logs_are_those_of_all_runs_or_of_a_range(tmp_path: Path, say: Say) -> None:

@@ -91,8 +91,7 @@ def test_every_command_that_reads_reads_it_and_says_how(artifact: Path, tmp_path
     ended = run("-c", MAIN, json.dumps(lines))
     for name, *_ in commands:
         assert f"{name} 0\n" in ended.stdout, ended.stderr
-    assert ended.stdout.count(SAID) == 1  # the status
-    assert ended.stderr.count(SAID) == len(commands) - 1
+    assert (ended.stdout + ended.stderr).count(SAID) == len(commands)
     assert (tmp_path / "x.csv").read_text().count("\n") == 51
 
 

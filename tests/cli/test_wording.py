@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tests.recordings.rows import Recorded
-from webots_mcp.cli import COMMANDS, main
-from webots_mcp.cli.wording import BY_TOOL, as_typed, speak_of
+from webots_mcp.cli import COMMANDS, main, names
+from webots_mcp.cli.wording import BY_TOOL, as_typed, speak_of, speak_of_command
 
 
 @pytest.fixture
@@ -24,14 +24,17 @@ def data_dir(tmp_path: Path) -> Iterator[Path]:
 @pytest.mark.parametrize(
     ("typed", "answered"),
     [
-        ("trends --robot rover --last -3", "--last -3.0 must be"),
+        ("trends --robot rover --last -3", "--last must be greater than 0, not -3"),
         ("trends --robot rover --start 9 --end 3", "--start 9 must be less than --end 3"),
         ("trends --robot rover --last 3 --since 0", "use --start and --end (simulation time)"),
         ("trends --robot rover --last 3 --since 0", "or --since and --until (wall time)"),
-        ("trends", "say which one with --robot NAME"),
+        ("trends", "say which one with --robot ROBOT"),
         ("trends --run 77", "no run 77: the newest runs are"),
         ("compare 77 78", "no run 77"),
-        ("history mode --robot rover --points 5000", "--points 5000 must be from 1 to 500"),
+        (
+            "history mode --robot rover --points 5000",
+            "--points must be less than or equal to 500, not 5000",
+        ),
         ("runs -n 5000", "-n 5000 must be from 1 to"),
         ("events --robot rover --above 1 --below 3", "--above and --below need signals"),
         ("events --robot rover --for 3", "--for 3 needs a limit: give --above or --below"),
@@ -58,14 +61,11 @@ def test_a_hint_names_commands_instead_of_tools() -> None:
 
 
 def test_each_command_that_stands_for_a_tool_exists() -> None:
-    assert {command.partition(" ")[0] for command in BY_TOOL.values()} <= {
-        command.name for command in COMMANDS
-    }
+    assert {command.partition(" ")[0] for command in BY_TOOL.values()} <= {*names()}
 
 
 def test_a_quoted_name_is_somebodys_data() -> None:
-    (trends,) = (command for command in COMMANDS if command.name == "trends")
-    speak_of(trends.arguments)
+    speak_of_command("trends")
     assert as_typed("no signal 'last_s'; last_s=3 is too much since the start") == (
         "no signal 'last_s'; --last 3 is too much since the start"
     )

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import contextlib
 import inspect
+import json
 import os
 import sys
 from collections.abc import Sequence
@@ -71,21 +72,30 @@ _DESCRIPTION: Final = (
 _EPILOG: Final = "'webots-mcp COMMAND --help' explains a command. Try 'webots-mcp demo' first."
 
 
+def names() -> list[str]:
+    """Of all commands."""
+    return sorted({*commands.COMMANDS, *(each.name for each in COMMANDS)})
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
+    given = list(sys.argv[1:] if argv is None else argv)
     try:
-        given = list(sys.argv[1:] if argv is None else argv)
         if given[:1] and given[0] in commands.COMMANDS:
             return _run(given)
         with ending_by_signals():
-            arguments = _parser().parse_args(argv)
+            arguments = _parser(given).parse_args(argv)
             speak_of(arguments.arguments)
             with spelling_out():
                 code = arguments.run(arguments) or 0
                 sys.stdout.flush()
             return code
     except WebotsMCPError as error:
-        return _end(EXIT_BAD_INPUT, as_typed(str(error)))
+        said = as_typed(str(error))
+        if "--json" in given and given[0] in commands.COMMANDS:
+            with contextlib.suppress(OSError):
+                print(spelled_out(json.dumps({"error": said}, ensure_ascii=False)))
+        return _end(EXIT_BAD_INPUT, said)
     except UnicodeEncodeError as error:  # bytes of the command line that are no text
         said = f"{error.object!r} cannot be written as {error.encoding}: {error.reason}"
         return _end(EXIT_BAD_INPUT, said)
@@ -103,7 +113,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(argv: Sequence[str]) -> int:
     """Call the command that was given."""
     speak_of_command(argv[0])
-    with ending_by_signals(), spelling_out():
+    is_help = not {"--help", "-h"}.isdisjoint(argv)  # nothing of a recording, and may have colours
+    with ending_by_signals(), contextlib.nullcontext() if is_help else spelling_out():
         app = commands.app_for(argv)
         try:
             code = app(argv, exit_on_error=False, print_error=False, result_action="return_value")
@@ -137,7 +148,7 @@ def _discard_output() -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
     from webots_mcp import __version__
 
     parser = argparse.ArgumentParser("webots-mcp", description=_DESCRIPTION, epilog=_EPILOG)
@@ -145,6 +156,10 @@ def _parser() -> argparse.ArgumentParser:
     subparsers = parser.add_subparsers(
         metavar="COMMAND", required=True, parser_class=_AnyOrderParser
     )
+    if not given or given[0] not in {each.name for each in COMMANDS}:  # for the list of commands
+        for name, command in commands.COMMANDS.items():
+            text = inspect.getdoc(command.load()) or ""
+            subparsers.add_parser(name, help=text.partition("\n")[0].rstrip("."))
     for name, run, arguments in sorted(COMMANDS):
         text = run.__doc__ or ""
         subparser = subparsers.add_parser(

@@ -9,7 +9,7 @@ import inspect
 import json
 import sys
 import types
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Annotated, Any, Final, Literal, Union, cast, get_args, get_origin
 
@@ -39,8 +39,11 @@ OPTIONS: Final[Mapping[str, str]] = types.MappingProxyType(
         "kinds": "--kind",
         "signals": "--signal",
         "limit": "-n",
+        "cursor": "--after",
+        "trial_set": "--trials",
     }
 )
+_OF_SIGNALS: Final = frozenset({"signals", "pattern"})  # of what summaries are made of
 _NOT_DONE: Final = ("failed", "expired", "cancelled", "lost", "claimed")
 
 
@@ -50,7 +53,7 @@ def command_of(question: Question) -> Callable[..., None]:
     def run(
         *positional: Any, recorded: Where | None = None, json: bool = False, **options: Any
     ) -> None:
-        given = dict(zip(question.positional, positional, strict=False)) | options
+        given = _named(question, positional) | options
         reply = ask(question, given, recorded or Where())
         show(question, reply, as_json=json)
 
@@ -68,6 +71,28 @@ def command_of(question: Question) -> Callable[..., None]:
     return run
 
 
+def _named(question: Question, positional: Sequence[Any]) -> dict[str, Any]:
+    """What was typed without options, by the names of the arguments; the last takes the rest."""
+    *single, last = question.positional or ("",)
+    named = dict(zip(single, positional, strict=False))
+    rest = positional[len(single) :]
+    if rest:
+        named[last] = list(rest) if _is_list(question, last) else rest[0]
+    return named
+
+
+def _is_list(question: Question, argument: str) -> bool:
+    (declared,) = (each for each in question.parameters if each.name == argument)
+    return get_origin(_without_none(_plain(declared.annotation))) is list
+
+
+def _without_none(kind: Any) -> Any:
+    """Of something that may be left out, what it is otherwise."""
+    kinds = [each for each in get_args(kind) if each is not type(None)]
+    is_optional = get_origin(kind) in (Union, types.UnionType) and len(kinds) == 1
+    return kinds[0] if is_optional else kind
+
+
 def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
     """Ask a question as a person does: of any length of recording, for as long as it takes.
 
@@ -77,7 +102,7 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
         WebotsMCPError: As the question says.
     """
     recording = where.recording(read_only=question.effect.reads)
-    if question.has_scope:
+    if not _OF_SIGNALS.isdisjoint(each.name for each in question.parameters):
         sum_up_first(recording)
     valid = _valid(question, given)
     with _line_of_progress(), _caller(question, recording) as caller:
@@ -115,7 +140,11 @@ def _valid(question: Question, given: Mapping[str, Any]) -> dict[str, Any]:
     try:
         model = question.arguments.model_validate(meant)
     except ValidationError as error:
-        raise InvalidInputError(faults_of(error)) from error
+        raise InvalidInputError(
+            faults_of(
+                error, {each.name: option_of(question, each.name) for each in question.parameters}
+            )
+        ) from error
     return {name: getattr(model, name) for name in question.arguments.model_fields}
 
 
@@ -142,15 +171,23 @@ def show(question: Question, reply: Reply, *, as_json: bool) -> None:
 
 
 def option_of(question: Question, argument: str) -> str:
-    """The option of an argument, as it is typed."""
+    """The option of an argument, as it is typed; of one without an option how the help calls it."""
     own = question.options or {}
-    return own.get(argument) or OPTIONS.get(argument) or f"--{argument.replace('_', '-')}"
+    if argument in own:
+        return own[argument]
+    if argument in question.positional:
+        return argument.upper()
+    words = argument.replace("_", "-")
+    is_on = question.arguments.model_fields[argument].default is True
+    return OPTIONS.get(argument) or (f"--no-{words}" if is_on else f"--{words}")
 
 
 def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Parameter:
     name, kind = declared.name, _plain(declared.annotation)
     if _is_mapping(kind):
         kind = list[str] | None
+    elif number := _number_of_items(question, name):
+        kind = tuple[(str,) * number]
     elif _is_json(kind):
         kind = str if declared.default is inspect.Parameter.empty else str | None
     text = question.described(name)
@@ -161,13 +198,18 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
         text = f"{text} ({declared.default})"
     if default is None and type(None) not in get_args(kind):
         kind = Union[kind, None]  # noqa: UP007
-    if name in question.positional:
-        shown = Parameter(name.upper(), help=text, negative=())
+    option = option_of(question, name)
+    place = inspect.Parameter.KEYWORD_ONLY
+    if name in question.positional and _is_list(question, name):
+        kind, default = get_args(_without_none(kind))[0], inspect.Parameter.empty
+        shown, place = Parameter(option, help=text), inspect.Parameter.VAR_POSITIONAL
+    elif name in question.positional:
+        shown = Parameter(option, help=text, negative=())
         place = inspect.Parameter.POSITIONAL_ONLY
+    elif default is True:  # its option is the one that turns it off
+        shown = Parameter(f"--{name.replace('_', '-')}", help=text, negative=option)
     else:
-        negative = f"--no-{name.replace('_', '-')}" if default is True else ()
-        shown = Parameter(option_of(question, name), help=text, negative=negative)
-        place = inspect.Parameter.KEYWORD_ONLY
+        shown = Parameter(option, help=text, negative=())
     return inspect.Parameter(name, place, default=default, annotation=Annotated[kind, shown])
 
 
@@ -191,6 +233,16 @@ def _plain(annotation: Any) -> Any:
     if get_origin(annotation) is list:
         return list[_plain(get_args(annotation)[0])]
     return annotation
+
+
+def _number_of_items(question: Question, argument: str) -> int | None:
+    """Of an argument that always has the same number of them."""
+    bounds = question.arguments.model_fields[argument].metadata
+    least, most = (
+        next((getattr(each, name) for each in bounds if hasattr(each, name)), None)
+        for name in ("min_length", "max_length")
+    )
+    return most if most == least else None
 
 
 def _is_mapping(kind: Any) -> bool:

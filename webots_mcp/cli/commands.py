@@ -6,10 +6,11 @@ Only the command that is called is imported, so that it answers at once.
 from __future__ import annotations
 
 import importlib
+import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
-from cyclopts import App, Group
+from cyclopts import App, Argument, Group
 
 from webots_mcp.questions.declaring import Question
 
@@ -38,7 +39,12 @@ NOW, PAST, STEER, DATA, SETUP = (
 )  # fmt: skip
 GROUPS: Final = (SETUP, NOW, PAST, STEER, DATA)
 _Q: Final = "webots_mcp.questions"
-COMMANDS: Final[dict[str, Command]] = {}
+COMMANDS: Final[dict[str, Command]] = {
+    "events": Command(PAST, f"{_Q}.find_events", "webots_find_events"),
+    "history": Command(PAST, f"{_Q}.query_history", "webots_query_history"),
+    "signals": Command(PAST, f"{_Q}.list_signals", "webots_list_signals"),
+    "trends": Command(PAST, f"{_Q}.get_trends", "webots_get_trends"),
+}
 _HELP: Final = """Flight recorder and remote control for Webots simulations.
 
 Controllers record into one SQLite database, an AI assistant reads it and steers the simulation
@@ -58,3 +64,35 @@ def app_for(argv: Sequence[str]) -> App:
         group = Group(command.group, sort_key=GROUPS.index(command.group))
         app.command(command.load(), name=name, group=group)
     return app
+
+
+class Described(NamedTuple):
+    """A command as its help describes it; arguments by how they are typed."""
+
+    text: str
+    arguments: dict[str, str]
+
+
+def described() -> dict[str, Described]:
+    """Every command by its name."""
+    app = app_for([])
+    return {
+        name: Described(
+            inspect.getdoc(command.load()) or "",
+            {
+                _typed(each): each.parameter.help or ""
+                for each in app[name].assemble_argument_collection()
+                if each.show
+            },
+        )
+        for name, command in sorted(COMMANDS.items())
+    }
+
+
+def _typed(argument: Argument) -> str:
+    """All names of an option, with a word for its value."""
+    names = argument.names
+    if argument.hint is bool or not names[0].startswith("-"):
+        return ", ".join(names)
+    value = names[-1].lstrip("-").replace("-", "_").upper()
+    return ", ".join(f"{name} {value}" for name in names)

@@ -19,18 +19,16 @@ from webots_mcp.cli.command import (
     open_recording,
     question,
     reading,
-    reading_long,
 )
 from webots_mcp.cli.looking import wait
 from webots_mcp.cli.ranges import RUN, SIMULATION_TIMES
-from webots_mcp.cli.tables import print_json, print_notes, print_result, print_table
+from webots_mcp.cli.tables import print_notes, print_result, print_table
 from webots_mcp.contract import LOG_LEVELS, LOG_SOURCES
 
 if TYPE_CHECKING:
     import sqlite3
 
     from webots_mcp.store.logs import LogFilter, LogLine
-    from webots_mcp.store.signals.catalogue import SignalInfo
 
 _SIGNAL_COLUMNS: Final = (
     "signal", "kind", "unit", "last", "min", "max", "first_s", "last_s", "missing",
@@ -38,33 +36,6 @@ _SIGNAL_COLUMNS: Final = (
 _LOG_COLUMNS: Final = ("sim_time_s", "level", "run", "message")
 _LOOK_S: Final = 0.5
 _MOST_AT_ONCE: Final = 500
-
-
-@question(
-    "signals", DATA_DIR, DATABASE, ROBOT, RUN, JSON,
-    argument("pattern", nargs="?", default="*", metavar="PATTERN", help="only these, with '*'"),
-    count("-n", "the first N by name", default=100),
-)  # fmt: skip
-def signals(arguments: argparse.Namespace) -> None:
-    """List what was published in a run: kind, last value, range, rows without a value."""
-    from webots_mcp.store.signals.catalogue import list_signals
-
-    with reading_long(arguments) as connection:
-        found = list_signals(
-            connection, robot=arguments.robot, run_id=arguments.run_id,
-            pattern=arguments.pattern, limit=arguments.limit,
-        )  # fmt: skip
-    if arguments.json:
-        return print_json(found)
-    print_table(_SIGNAL_COLUMNS, [_signal_row(info) for info in found.signals])
-    left = found.total - len(found.signals)
-    print_notes([*found.notes, *[f"{left} more signals: -n shows them"] * bool(left)])
-
-
-def _signal_row(info: SignalInfo) -> list[Any]:
-    last = bool(info.last) if info.kind == "bool" and info.last is not None else info.last
-    figures = (info.min, info.max, info.first_s, info.last_s, info.missing or None)
-    return [info.name, info.kind, info.unit, last, *figures]
 
 
 @question(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,18 +21,13 @@ from webots_mcp.cli.command import (
     settings_of,
 )
 from webots_mcp.cli.comparison import print_comparison
-from webots_mcp.cli.ranges import RANGE, range_of, scope_of
+from webots_mcp.cli.ranges import RANGE, scope_of
 from webots_mcp.cli.tables import clock_text, print_json, print_notes, print_table, printable
 from webots_mcp.contract import whole_file
 from webots_mcp.errors import InvalidInputError
 
 if TYPE_CHECKING:
     from webots_mcp.plotting import Picture
-    from webots_mcp.store.detection.event import EventOptions
-    from webots_mcp.store.detection.verdict import Verdicts
-    from webots_mcp.store.questions.series import ChangeColumns, RunHistory
-    from webots_mcp.store.questions.trends import RunTrends, StateTrend
-    from webots_mcp.store.reading.changes import Point
 
 
 def _id_or_signal(text: str) -> int | str:
@@ -77,110 +71,11 @@ def runs(arguments: argparse.Namespace) -> None:
     print_notes([f"{found.total} runs in all: -n shows more"] if found.cursor else [])
 
 
-@question(
-    "history", DATA_DIR, DATABASE, *RANGE, JSON,
-    argument("signals", nargs="+", metavar="SIGNAL", help="names, with '*'"),
-    count("--points", "at most N buckets", default=20, dest="max_points"),
-)  # fmt: skip
-def history(arguments: argparse.Namespace) -> None:
-    """Show signals over time: mean, minimum and maximum of each bucket; changes of modes and flags.
-
-    Without a range the whole newest run is shown.
-    """
-    from webots_mcp.store.questions.series import query_history
-
-    with reading_long(arguments) as connection:
-        found = query_history(
-            connection, range_of(connection, arguments), arguments.signals,
-            max_points=arguments.max_points,
-        )  # fmt: skip
-    if arguments.json:
-        return print_json(found)
-    for run in found.runs:
-        _print_history(run)
-    print_notes(found.notes)
-
-
-@question(
-    "trends", DATA_DIR, DATABASE, *RANGE, JSON, SIGNALS,
-    count("-n", "the N that changed most", default=20),
-)  # fmt: skip
-def trends(arguments: argparse.Namespace) -> None:
-    """Say in one line each what the signals did; what changed most comes first."""
-    from webots_mcp.store.questions.trends import trends as find_trends
-
-    with reading_long(arguments) as connection:
-        found = find_trends(
-            connection, range_of(connection, arguments), arguments.signals or ["*"],
-            limit=arguments.limit,
-        )  # fmt: skip
-    if arguments.json:
-        return print_json(found)
-    for run in found.runs:
-        _print_trends(run)
-    print_notes(found.notes)
-
-
 MOTION: Final[tuple[Argument, ...]] = (
     argument("--position", nargs=2, metavar=("X", "Y"),
              help="the signals of the position, if their names do not tell"),
     argument("--mode", metavar="NAME", help="the signal of the mode, a text or a number"),
 )  # fmt: skip
-
-
-@question(
-    "events", DATA_DIR, DATABASE, *RANGE, JSON,
-    argument("--kind", action="append", metavar="KIND", help="only this kind; may be repeated"),
-    argument("--signal", action="append", metavar="NAME", help="only this signal; with '*'"),
-    argument("--where", metavar="CONDITION",
-             help="where a condition held, such as 'front_m < 0.1 for 0.5'"),
-    argument("--above", type=float, metavar="X", help="where the signals were above X"),
-    argument("--below", type=float, metavar="X", help="where the signals were below X"),
-    argument("--for", type=float, default=0.0, dest="for_s", metavar="S",
-             help="for at least S simulated seconds"),
-    argument("--silent", type=float, default=1.0, dest="silent_s", metavar="S",
-             help="silent is who has no value for at least S simulated seconds (1)"),
-    *MOTION,
-    argument("--one-by-one", action="store_false", dest="group",
-             help="alike events too, many of which are told as one else"),
-    count("-n", "at most N events", default=50),
-    argument("--after", metavar="CURSOR", help="what an answer with that cursor left out"),
-)  # fmt: skip
-def events(arguments: argparse.Namespace) -> None:
-    """Find what happened: changes, stuck, standstills, gaps, jumps, silent sensors, warnings."""
-    from webots_mcp.store.questions.events import find_events
-
-    with reading_long(arguments) as connection:
-        found = find_events(
-            connection, range_of(connection, arguments), _options(arguments), limit=arguments.limit,
-            group=arguments.group, after=arguments.after,
-        )  # fmt: skip
-    if arguments.json:
-        return print_json(found)
-    several = len({event.run_id for event in found.events}) > 1
-    rows = [
-        [
-            event.run_id if several else None, event.start_s,
-            (event.count == 1 and event.duration_s) or None, event.kind,
-            event.name, event.details or None,
-        ]
-        for event in found.events
-    ]  # fmt: skip
-    print_table(("run", "start_s", "duration_s", "kind", "name", "details"), rows)
-    left_out = [
-        f"left out: {each.count} of kind {kind} {each.span}"
-        for kind, each in found.left_out.items()
-    ]
-    left_out += [f"--after '{found.cursor}' shows them, -n more at once"] if found.cursor else []
-    print_notes([*_verdicts(found.verdicts), *found.notes, *left_out])
-
-
-def _verdicts(verdicts: Verdicts) -> list[str]:
-    """What became of the kinds that are not in the table, or not all."""
-    near = [f"{kind} ({what})" for kind, what in verdicts.came_near.items()]
-    absent = [*verdicts.far, *near]
-    unsearched = [f"not looked for: {kinds}: {why}" for kinds, why in verdicts.gaps.items()]
-    return [f"looked for and absent: {', '.join(absent)}"] * bool(absent) + unsearched
 
 
 @question(
@@ -265,90 +160,3 @@ def compare(arguments: argparse.Namespace) -> None:
     if arguments.json:
         return print_json(found)
     print_comparison(found)
-
-
-def _options(arguments: argparse.Namespace) -> EventOptions:
-    from webots_mcp.store.detection.event import EventOptions, both_of
-    from webots_mcp.store.detection.threshold import thresholds_on
-
-    limits = thresholds_on(
-        arguments.signal or (), arguments.above, arguments.below, arguments.for_s
-    )
-    given = ("threshold",) * bool(limits) + ("condition",) * (arguments.where is not None)
-    return EventOptions(
-        kinds=tuple(arguments.kind or given),
-        signals=tuple(arguments.signal or "*"),
-        thresholds=limits,
-        where=arguments.where,
-        silent_s=arguments.silent_s,
-        position=both_of(arguments.position),
-        mode=arguments.mode,
-    )
-
-
-def _print_heading(run_id: int, start_s: float, end_s: float, more: str = "") -> None:
-    print(f"run {run_id}, {start_s:.3f} to {end_s:.3f} s{more}")
-
-
-def _print_history(run: RunHistory) -> None:
-    step = f", a row is {run.step_s:g} s" if run.step_s else ""
-    _print_heading(run.run_id, run.start_s, run.end_s, step)
-    columns = ["sim_time_s"]
-    series: list[Sequence[float | None]] = [run.sim_time_s]
-    for number in run.numbers:
-        if run.step_s is None:
-            columns.append(number.name)
-            series.append(number.last)
-        else:
-            columns += [f"{number.name} mean", "min", "max"]
-            series += [number.mean, number.min, number.max]
-    if run.numbers:
-        print_table(columns, list(zip(*series, strict=True)))
-    changes = [
-        [states.name, _since(states, point), "null" if point.value is None else point.value]
-        for states in run.changes
-        for point in states.points
-    ]
-    if changes:
-        print_table(("signal", "since_s", "value"), changes)
-    print_notes([f"no row from {gap.start_s:.3f} to {gap.end_s:.3f} s" for gap in run.gaps[:10]])
-    print_notes(_unread(run.cut_at_s))
-
-
-def _print_trends(run: RunTrends) -> None:
-    _print_heading(run.run_id, run.start_s, run.end_s, f", {run.rows} rows")
-    numbers = [
-        [trend.name, trend.says, trend.mean, trend.deviation, trend.unit] for trend in run.numbers
-    ]
-    if numbers:
-        print_table(("signal", "what it did", "mean", "deviation", "unit"), numbers)
-    states = [
-        [state.name, state.changes, _spelled(state.last), state.since_s, _times(state)]
-        for state in run.states
-    ]
-    if states:
-        print_table(("signal", "changes", "last", "since_s", "seconds in each value"), states)
-    left = run.total - len(run.numbers)
-    print_notes([f"{left} more signals that changed less: -n shows them"] if left else [])
-    print_notes(_unread(run.cut_at_s))
-
-
-def _since(states: ChangeColumns, point: Point) -> float | str:
-    first = states.since_before and states.total == len(states.points)
-    is_open = first and point is states.points[0]
-    return f"before {point.sim_time_s:.3f}" if is_open else point.sim_time_s
-
-
-def _unread(cut_at_s: float | None) -> list[str]:
-    """From where on the answer is not of all rows."""
-    if cut_at_s is None:
-        return []
-    return [f"not all was read from {cut_at_s:.3f} s on, the time was over: ask for less time"]
-
-
-def _times(state: StateTrend) -> str:
-    return ", ".join(f"{value} {time_s:.1f}" for value, time_s in state.time_by_value_s.items())
-
-
-def _spelled(value: object) -> object:
-    return "null" if value is None else value

@@ -28,6 +28,8 @@ _HEAD: Final = {
     "status": "{}",
     "age_s": "{} s old",
 }
+_TIMES: Final = ("sim_time_s", "since_s")  # lists of them
+_CALLED_ALIKE: Final = ("numbers", "signals")  # what they hold has names of its own
 _NOTES: Final = ("why", "storage", "notes", "hint", "left_out")
 
 
@@ -158,6 +160,15 @@ class _Layout:
             yield from self._wrapped([line]) if line else self._part(name, value)
         yield from self._wrapped(short)
 
+    def _series(self, part: Mapping[str, Any]) -> Iterator[str]:
+        """Lists that belong to a list of times are columns; what is left stands below them."""
+        columns = {name: part[name] for name in _TIMES if isinstance(part.get(name), list)}
+        (length,) = {len(each) for each in columns.values()}
+        rest = _without_lists(part, length, (), columns)
+        rows = [list(row) for row in zip(*columns.values(), strict=True)]
+        yield from self._table({"columns": list(columns), "rows": rows})
+        yield from self.members(rest)
+
     def _part(self, name: str, value: Any) -> Iterator[str]:
         for part in cast("list[dict[str, Any]]", value if isinstance(value, list) else [value]):
             line = f"{name}: " + ", ".join(f"{each} {text_of(part[each])}" for each in part)
@@ -165,8 +176,14 @@ class _Layout:
                 yield line
                 continue
             yield f"{name}:"
-            inner = self._table(part) if {"columns", "rows"} <= part.keys() else self.members(part)
-            yield from (_INDENT + line for line in inner)
+            yield from (_INDENT + line for line in self._inside(part))
+
+    def _inside(self, part: Mapping[str, Any]) -> Iterator[str]:
+        if {"columns", "rows"} <= part.keys():
+            return self._table(part)
+        if any(isinstance(part.get(name), list) for name in _TIMES):
+            return self._series(part)
+        return self.members(part)
 
     def _table(self, table: Mapping[str, Any]) -> Iterator[str]:
         rows = table["rows"]
@@ -181,6 +198,30 @@ class _Layout:
 
     def _wrapped(self, texts: Iterable[str]) -> list[str]:
         return textwrap.wrap(", ".join(texts), self._paragraph, subsequent_indent=_INDENT)
+
+
+def _without_lists(
+    part: Mapping[str, Any], length: int, path: tuple[str, ...], columns: dict[str, list[Any]]
+) -> dict[str, Any]:
+    """The part without lists of that length, which become columns; without what is empty then."""
+    rest: dict[str, Any] = {}
+    for name, value in part.items():
+        if isinstance(value, dict):
+            members = cast("dict[str, Any]", value)
+            is_series = any(isinstance(members.get(each), list) for each in _TIMES)
+            inner = (*path, *([] if name in _CALLED_ALIKE else [name]))
+            left = members if is_series else _without_lists(members, length, inner, columns)
+            if left:
+                rest[name] = left
+        elif isinstance(value, list) and len(cast("list[Any]", value)) == length:
+            values = cast("list[Any]", value)
+            if not _has_members(values):
+                columns[" ".join((*path, name))] = values
+                continue
+            rest[name] = values
+        else:
+            rest[name] = value
+    return rest
 
 
 def _has_members(value: Any) -> bool:

@@ -57,15 +57,12 @@ def speak_of_command(name: str) -> None:
     from webots_mcp.questions.declaring import Question
 
     found = COMMANDS[name].declared()
-    if isinstance(found, Question):
+    asked = found if isinstance(found, Question) else getattr(found, "question", None)
+    if asked is not None:
         from webots_mcp.cli.asking import option_of
 
-        _running.set(
-            tuple(
-                Typed(each.name, option_of(found, each.name), each.name.upper())
-                for each in found.parameters
-            )
-        )
+        typed = {each.name: option_of(asked, each.name) for each in asked.parameters}
+        _running.set(tuple(Typed(each, typed[each], each.upper()) for each in typed))
 
 
 class Typed(NamedTuple):
@@ -85,13 +82,19 @@ def as_typed(text: str) -> str:
     text = _TOOL.sub(_command_for, text)
     typed = {each.name: each.typed for each in _running.get()}
     for each in _running.get():
-        text = re.sub(rf"{_UNQUOTED}{each.name}=\.\.\.", f"{each.typed} {each.value_name}", text)
+        shown = f"{each.typed} {each.value_name}" if each.typed.startswith("-") else each.typed
+        text = re.sub(rf"{_UNQUOTED}{each.name}=(\[['.]+\]|\.\.\.)", shown, text)
         text = re.sub(rf"{_UNQUOTED}{each.name}=", f"{each.typed} ", text)
         if "_" in each.name:
             text = re.sub(rf"{_UNQUOTED}{each.name}{_NOT_ON}", each.typed, text)
     words = "|".join(name for name in typed if "_" not in name)
     if not words:
         return text
+    for form in (
+        rf"(?<=\bwith )(?:this )?({words}){_NOT_ON}",
+        rf"{_UNQUOTED}({words})(?= for more)",
+    ):
+        text = re.sub(form, lambda found: typed[found[1]], text)
     joined = rf"{_UNQUOTED}({words}) (and|or) ({words}){_NOT_ON}"
     return re.sub(joined, lambda found: f"{typed[found[1]]} {found[2]} {typed[found[3]]}", text)
 

@@ -10,8 +10,10 @@ from typing import Any, Final, TypeVar
 from webots_mcp.errors import AmbiguousRobotError, NothingRecordedError
 from webots_mcp.naming import listed
 from webots_mcp.questions.answers import Answer, Table
+from webots_mcp.questions.declaring import is_for_a_person
 from webots_mcp.questions.shortening import (
     DETAIL_BUDGET,
+    Limits,
     compact_json,
     cut_text,
     round_number,
@@ -22,6 +24,8 @@ from webots_mcp.store.recording import View, look, storage
 
 BUDGET: Final = 5_000  # characters of JSON: 1,250 tokens; the header and the verdicts have 1,000
 LARGE_BUDGET: Final = 40_000  # where the asker said how much: clients put longer answers aside
+_FOR_A_PERSON: Final = 10_000_000
+_AT_LENGTH: Final = (Limits(items=2000, text=20_000, keys=1000, depth=20),)
 LONGEST_NAME: Final = 80
 _LONGEST_NOTE: Final = 300
 _MOST_NOTES: Final = 5
@@ -48,6 +52,29 @@ def header_of_only(connection: sqlite3.Connection) -> dict[str, Any]:
         return {**storage(connection)}
 
 
+def room(asked: int | None = None) -> int:
+    """The characters of an answer: more where it was said how much, in a terminal as many as come.
+
+    Args:
+        asked: The most rows or points that were asked for.
+    """
+    if is_for_a_person():
+        return _FOR_A_PERSON
+    return BUDGET if asked is None else LARGE_BUDGET
+
+
+def cut_for_a_model(text: str, longest: int) -> str:
+    """A text that is cut where it would fill a model's context."""
+    return text if is_for_a_person() else cut_text(text, longest)
+
+
+def detailed(value: Any, budget: int = DETAIL_BUDGET) -> Any:
+    """A value of any kind, rounded, and for a model cut where it is long."""
+    if is_for_a_person():
+        return shorten(value, _FOR_A_PERSON, _AT_LENGTH).value
+    return shorten(value, budget).value
+
+
 def figure(value: float | None) -> float | None:
     """A number as it is shown; None where there is none, or none that JSON could hold.
 
@@ -67,13 +94,13 @@ def figures(values: Sequence[float | None]) -> list[float | None]:
 
 
 def shown(value: Any) -> Any:
-    """A value of any kind, rounded, and cut where it is long."""
-    return shorten(value, DETAIL_BUDGET).value
+    """A value of any kind, rounded, and for a model cut where it is long."""
+    return detailed(value)
 
 
 def short_name(name: str | None) -> str | None:
     """A name; an absurdly long one is cut."""
-    return name and cut_text(name, LONGEST_NAME)
+    return name and cut_for_a_model(name, LONGEST_NAME)
 
 
 def size_of(answer: Any) -> int:
@@ -81,8 +108,9 @@ def size_of(answer: Any) -> int:
     return len(compact_json(answer))
 
 
-def fitting(items: Sequence[_T], budget: int = BUDGET) -> list[_T]:
+def fitting(items: Sequence[_T], budget: int | None = None) -> list[_T]:
     """The first items whose JSON fits the budget, at least one."""
+    budget = room() if budget is None else budget
     kept: list[_T] = []
     for item in items:
         budget -= size_of(item) + 1
@@ -119,12 +147,15 @@ def condensed(columns: Sequence[str], rows: Sequence[list[Any]]) -> Table | None
 
 
 def notes_of(notes: Sequence[str]) -> list[str] | None:
-    """The notes of an answer, of many the first and how many more; None without any."""
+    """The notes of an answer, for a model of many the first and how many more; None without any."""
+    if is_for_a_person():
+        return [*notes] or None
     left_out = len(notes) - _MOST_NOTES
     more = [f"and {left_out} more notes"] if left_out > 0 else []
     return [cut_text(note, _LONGEST_NOTE) for note in notes[:_MOST_NOTES]] + more or None
 
 
 def some(names: Sequence[str], most: int = 10) -> str:
-    """The first names, and how many more there are."""
-    return listed([cut_text(name, LONGEST_NAME) for name in names], most)
+    """The first names, and how many more there are; for a person all."""
+    most = len(names) if is_for_a_person() else most
+    return listed([cut_for_a_model(name, LONGEST_NAME) for name in names], most)

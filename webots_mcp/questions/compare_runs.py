@@ -25,8 +25,6 @@ from webots_mcp.questions.argument_types import (
     Value,
 )
 from webots_mcp.questions.budget import (
-    BUDGET,
-    LARGE_BUDGET,
     answer_about,
     condensed,
     figure,
@@ -34,6 +32,7 @@ from webots_mcp.questions.budget import (
     fitting,
     header_of_only,
     notes_of,
+    room,
     seconds,
     short_name,
     shown,
@@ -262,11 +261,9 @@ def _compared(
     differing = [each for each in found.differences if _differs(each)]
     groups, measures = _groups(found), _measures(found)
     told = [str(table.rows) for table in (groups, measures) if table]
-    room = (
-        (BUDGET if limit is None else LARGE_BUDGET) - len("".join(told)) - len(str(found.not_known))
-    )
+    left = room(limit) - len("".join(told)) - len(str(found.not_known))
     rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
-    rows = fitting(rows, room)
+    rows = fitting(rows, left)
     only_in = list(found.only_in.items())
     return {
         "groups": groups,

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import difflib
 import re
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final
 
 from pydantic import ValidationError
@@ -13,18 +15,26 @@ from webots_mcp.naming import same_in_meaning
 
 _MOST_FAULTS: Final = 3
 _LONGEST_VALUE: Final = 80
+_AS_DECLARED: Final[Mapping[str, str]] = MappingProxyType({})
 
 
-def faults_of(error: ValidationError) -> str:
-    """The first things that are wrong: the argument, what is asked of it, and its value."""
-    faults = {str(each["loc"][0]): _fault(each) for each in reversed(error.errors())}
+def faults_of(error: ValidationError, typed: Mapping[str, str] = _AS_DECLARED) -> str:
+    """The first things that are wrong: the argument, what is asked of it, and its value.
+
+    Args:
+        error: What pydantic said.
+        typed: How the arguments are called where they were typed, if not by their names.
+    """
+    faults = {str(each["loc"][0]): _fault(each, typed) for each in reversed(error.errors())}
     return "; ".join(list(faults.values())[:_MOST_FAULTS])
 
 
-def _fault(error: ErrorDetails) -> str:
+def _fault(error: ErrorDetails, typed: Mapping[str, str]) -> str:
     """One thing that is wrong: the parameter, what is asked of it, and what came."""
-    parameter, *inside = error["loc"]  # a name after it is a type that the value might have had
-    name = ".".join(map(str, (parameter, *(item for item in inside if isinstance(item, int)))))
+    first, *inside = error["loc"]  # a name after it is a type that the value might have had
+    if str(first) in typed:
+        first, inside = typed[str(first)], []  # each item of a list has been typed by itself
+    name = ".".join(map(str, (first, *(item for item in inside if isinstance(item, int)))))
     if error["type"] == "missing":
         return f"{name} is missing"
     asked = re.sub(r"^(Value error, |\w+ should )", "must ", error["msg"])

@@ -19,10 +19,10 @@ from webots_mcp.questions.argument_types import (
 )
 from webots_mcp.questions.bounds import range_in
 from webots_mcp.questions.budget import (
-    BUDGET,
-    LARGE_BUDGET,
     answer_about,
+    detailed,
     notes_of,
+    room,
     seconds,
     short_name,
     shown,
@@ -31,7 +31,7 @@ from webots_mcp.questions.budget import (
 )
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.history_answers import EventsAnswer, KindVerdicts
-from webots_mcp.questions.shortening import DETAIL_BUDGET, shorten
+from webots_mcp.questions.shortening import DETAIL_BUDGET
 from webots_mcp.store.detection.event import Event, EventOptions, Threshold, both_of
 from webots_mcp.store.detection.registry import KINDS, kind_names
 from webots_mcp.store.detection.threshold import thresholds_on
@@ -70,7 +70,13 @@ DEFAULT_LIMIT: Final = 50
 _GROUP_BUDGET: Final = 640  # characters
 
 
-@question("Find events", READS, command="events", core=True)
+@question(
+    "Find events",
+    READS,
+    command="events",
+    options={"group": "--one-by-one", "cursor": "--after", "silent_s": "--silent"},
+    core=True,
+)
 def webots_find_events(
     recording: Recording,
     scope: Scope,
@@ -149,8 +155,7 @@ def _found(
     cursor: str,
 ) -> dict[str, Any]:
     found = search_events(view.connection, asked, options, group=group, after=cursor or None)
-    budget = BUDGET if limit is None else LARGE_BUDGET
-    told, events = fitting_events(found, limit or DEFAULT_LIMIT, budget, view)
+    told, events = fitting_events(found, limit or DEFAULT_LIMIT, room(limit), view)
     hints = ["ask again with this cursor for what is not shown"] if told.cursor else []
     if any(event.count > 1 for event in told.events):
         hints.append(
@@ -223,4 +228,4 @@ def events_table(events: Sequence[Event], view: View) -> Table | None:
 def _details_of(event: Event) -> Any:
     """What stands for many events may be longer: it stands once."""
     budget = DETAIL_BUDGET if event.count == 1 else _GROUP_BUDGET
-    return shorten(event.details, budget).value
+    return detailed(event.details, budget)

@@ -11,7 +11,7 @@ from webots_mcp.questions.argument_types import (
     TextCursor,
 )
 from webots_mcp.questions.bounds import range_in
-from webots_mcp.questions.budget import BUDGET, LARGE_BUDGET, answer_about, notes_of, size_of
+from webots_mcp.questions.budget import answer_about, notes_of, room, size_of
 from webots_mcp.questions.declaring import READS, question
 from webots_mcp.questions.find_events import TimelineKinds, events_table, verdicts_of
 from webots_mcp.questions.history_answers import TimelineAnswer
@@ -53,7 +53,7 @@ def _found(
     view: View, asked: TimeRange, options: EventOptions, limit: int | None, cursor: str
 ) -> dict[str, Any]:
     """A page; a shorter one where it would be too long."""
-    budget = BUDGET if limit is None else LARGE_BUDGET
+    budget = room(limit)
     entries = limit or DEFAULT_LIMIT
     while True:
         page = timeline(view.connection, asked, options, limit=entries, after=cursor or None)

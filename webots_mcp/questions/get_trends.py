@@ -11,21 +11,21 @@ from webots_mcp.questions.argument_types import (
 )
 from webots_mcp.questions.bounds import range_in
 from webots_mcp.questions.budget import (
-    BUDGET,
-    LARGE_BUDGET,
     answer_about,
+    cut_for_a_model,
     figure,
     fitting,
     notes_of,
+    room,
     seconds,
     short_name,
     shown,
     some,
     table,
 )
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.declaring import READS, is_for_a_person, question
 from webots_mcp.questions.history_answers import RunTrendTables, TrendsAnswer
-from webots_mcp.questions.shortening import compact_json, cut_text
+from webots_mcp.questions.shortening import compact_json
 from webots_mcp.store.questions.trend import Trend
 from webots_mcp.store.questions.trends import RunTrends, StateTrend, trends
 from webots_mcp.store.reading.ranges import Scope, TimeRange
@@ -42,7 +42,14 @@ _SHOWN_VALUES: Final = 6
 _SHOWN_CONSTANTS: Final = 20
 
 
-@question("Get the trends", READS, command="trends", positional=("signals",), core=True)
+@question(
+    "Get the trends",
+    READS,
+    command="trends",
+    positional=("signals",),
+    options={"signals": "SIGNAL"},
+    core=True,
+)
 def webots_get_trends(
     recording: Recording,
     scope: Scope,
@@ -64,7 +71,7 @@ def webots_get_trends(
 
 def _found(view: View, asked: TimeRange, names: Sequence[str], limit: int | None) -> dict[str, Any]:
     found = trends(view.connection, asked, names, limit=MOST_SIGNALS)
-    budget = (BUDGET if limit is None else LARGE_BUDGET) // max(len(found.runs), 1)
+    budget = room(limit) // max(len(found.runs), 1)
     recorded = [run for run in found.runs if run.rows or run.cut_at_s is not None]
     runs = [trend_tables(run, limit or DEFAULT_LIMIT, budget) for run in recorded]
     return {
@@ -120,7 +127,7 @@ def _trend_row(trend: Trend) -> list[Any]:
     """A number as a row under `TREND_COLUMNS`: extremes with their times are in what it says."""
     return [
         short_name(trend.name),
-        cut_text(trend.says, _LONGEST_SAYING),
+        cut_for_a_model(trend.says, _LONGEST_SAYING),
         figure(trend.summary.last),
         figure(trend.mean),
         figure(trend.deviation),
@@ -137,7 +144,7 @@ def _state_row(state: StateTrend) -> list[Any]:
         state.changes,
         shown(state.last),
         seconds(state.since_s),
-        dict(times[:_SHOWN_VALUES]),
+        dict(times[: None if is_for_a_person() else _SHOWN_VALUES]),
     ]
 
 

@@ -16,12 +16,11 @@ from webots_mcp.questions.argument_types import (
 )
 from webots_mcp.questions.bounds import range_in
 from webots_mcp.questions.budget import (
-    BUDGET,
-    LARGE_BUDGET,
     answer_about,
     figure,
     figures,
     notes_of,
+    room,
     seconds,
     short_name,
     shown,
@@ -53,7 +52,13 @@ _CELL_CHARACTERS: Final = 28  # of a bucket of a numeric signal: min, max, mean 
 _SIGNAL_CHARACTERS: Final = 200  # of a signal, beside its buckets
 
 
-@question("Query the history", READS)
+@question(
+    "Query the history",
+    READS,
+    command="history",
+    positional=("signals",),
+    options={"signals": "SIGNAL", "max_points": "--points"},
+)
 def webots_query_history(
     recording: Recording,
     scope: Scope,
@@ -86,7 +91,7 @@ def _series(
     view: View, asked: TimeRange, names: Sequence[str], max_points: int | None
 ) -> dict[str, Any]:
     """As many buckets as were asked for, or as fit; fewer where the answer would be too long."""
-    budget = BUDGET if max_points is None else LARGE_BUDGET
+    budget = room(max_points)
     points = min(max_points or DEFAULT_POINTS, _likely_points(view, asked, names, budget))
     while True:
         history = query_history(view.connection, asked, names, max_points=points)
@@ -208,7 +213,7 @@ def _page(
     page = query_rows(
         view.connection, asked, names, limit=limit or DEFAULT_POINTS, after_id=after_id
     )
-    budget = BUDGET if limit is None else LARGE_BUDGET
+    budget = room(limit)
     rows = _most(lambda rows: size_of(_row_columns(page, rows, view).model_dump()), page, budget)
     cursor = page.ids[rows - 1] if 0 < rows < len(page.ids) else page.cursor
     return {

@@ -340,7 +340,7 @@ def _read_cursor(text: str) -> dict[str, Place | None]:
         return {kind: place and read_place(place) for kind, place in read.items()}
     except (ValueError, TypeError, AttributeError) as error:
         raise InvalidInputError(
-            f"after={text[:80]!r} is not a cursor: give the `cursor` of an answer unchanged"
+            f"cursor={text[:80]!r} is not a cursor: give the `cursor` of an answer unchanged"
         ) from error
 
 

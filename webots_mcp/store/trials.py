@@ -335,9 +335,7 @@ def best_of(plan: Mapping[str, Any]) -> Best:
 
 def count_planned(plan: Mapping[str, Any], trials: Sequence[Trial]) -> int:
     """How many trials a set has in the end; those of a search are entered as it goes on."""
-    sets, repeats = int(plan.get("sets") or 0), int(plan.get("repeats") or 1)
-    again = repeats == 1 and sets > 0 and any(each.score is not None for each in trials)
-    return max(len(trials), sets * repeats + again)
+    return max(len(trials), int(plan.get("sets") or 0) * int(plan.get("repeats") or 1))
 
 
 def progress_of(connection: sqlite3.Connection, set_id: int) -> tuple[float, float, str]:

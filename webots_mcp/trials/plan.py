@@ -92,8 +92,7 @@ class TrialPlan:
         for_s: A trial ends after this many simulated seconds ...
         until: ... or when this condition holds, whichever comes first.
         prune: A trial in which this condition holds is ended early, without a score.
-        repeats: How often each set is tried. With 1, the first one is tried twice nevertheless:
-            that tells by how much like trials differ.
+        repeats: How often each set is tried.
         robot: Whose signals, events and parameters are meant, where a world has several.
         timeout_s: A trial that takes longer, in wall time, has failed.
         ranges: What is searched, by parameter.
@@ -134,7 +133,7 @@ class TrialPlan:
         if self.search or self.ranges or self.sets or self.seed:
             self._require_searchable()
         _require_tables(self.parameters)
-        if not 1 <= self.repeats * (self.sets or len(self.parameters)) <= MOST_TRIALS:
+        if not 1 <= self.trial_count <= MOST_TRIALS:
             raise InvalidInputError(f"there must be 1 to {MOST_TRIALS} trials")
 
     def _require_searchable(self) -> None:
@@ -165,13 +164,12 @@ class TrialPlan:
 
         All sets come once before any is repeated.
         """
-        once = self.parameters[:1] if self.repeats == 1 else []
-        return [*(each for _ in range(self.repeats) for each in self.parameters), *once]
+        return [each for _ in range(self.repeats) for each in self.parameters]
 
     @property
     def trial_count(self) -> int:
         """How many trials there are in the end."""
-        return (self.sets or len(self.parameters)) * self.repeats + (self.repeats == 1)
+        return (self.sets or len(self.parameters)) * self.repeats
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -40,7 +40,6 @@ from webots_mcp.store.trials import (
     finish_trial,
     lay_down,
     put_back,
-    ranking_of,
     stop_trial_set,
     take_up,
     trials_of,
@@ -169,7 +168,7 @@ def _require_wanted(set_run: SetRun, set_id: int) -> None:
 
 
 def _next_trial(set_run: SetRun, set_id: int, left: deque[Trial]) -> Trial | None:
-    """One that waits, or a new one of a search; None where there is none, or none yet."""
+    """One that waits, or a new one of a search; None where there is none."""
     if left:
         return left.popleft()
     if set_run.plan.search is None:
@@ -274,18 +273,15 @@ def require_optuna() -> None:
 
 
 def next_parameters(plan: TrialPlan, trials: Sequence[Trial]) -> dict[str, Any] | None:
-    """The parameters of the trial after these; None where there is none, or none yet.
+    """The parameters of the trial after these; None where there is none.
 
-    Each set is tried `plan.repeats` times in a row; with 1, the best is tried again at the end.
+    Each set is tried `plan.repeats` times in a row.
     """
     number = len(trials)
-    if number < plan.sets * plan.repeats:
-        first = number - number % plan.repeats
-        return trials[first].values if first < number else _suggested(plan, trials)
-    if plan.repeats > 1 or number > plan.sets or not all(each.is_over for each in trials):
+    if number >= plan.trial_count:
         return None
-    best = ranking_of(list(trials), plan.best).sets[0]
-    return best.parameters if best.scores else None
+    first = number - number % plan.repeats
+    return trials[first].values if first < number else _suggested(plan, trials)
 
 
 def _suggested(plan: TrialPlan, trials: Sequence[Trial]) -> dict[str, Any]:

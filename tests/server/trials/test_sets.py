@@ -89,7 +89,7 @@ async def test_a_trial_in_which_prune_holds_ends_there_and_ranks_below_those_wit
         assert "there is distance" in said
 
 
-async def test_without_repeats_one_set_is_tried_twice_to_measure_the_noise(
+async def test_without_repeats_each_set_is_tried_once_and_nothing_is_said_of_noise(
     connect: Connect, tunable: TunableDriver
 ) -> None:
     async with connect() as client:
@@ -98,9 +98,11 @@ async def test_without_repeats_one_set_is_tried_twice_to_measure_the_noise(
             score="duration", for_s=None,
         )  # fmt: skip
         best, other = rows_of(answer["ranked"])
-        assert [best["scored"], other["scored"]] == [2, 1]
+        assert (best["kp"], other["kp"]) == (3.0, 1.0)
         assert best["score"] < other["score"] == pytest.approx(0.304)
-        assert answer["noise"] == 0
+        assert answer["over"] == answer["trials"] == 2
+        assert "noise" not in answer
+        assert "were not both repeated" in answer["verdict"]
 
 
 async def test_out_of_wall_time_they_go_on_and_a_second_call_waits(
@@ -200,9 +202,9 @@ async def test_trials_of_a_robot_that_only_moved_before_them_say_so_before_they_
         await ask(client, "webots_run", for_s=1)
         answer = await trials(client, parameters={"kp": [1.0, 2.0]}, score="max(pose[0])", for_s=1)
     driving.stop()
-    assert answer["verdict"] == "all 3 scores are 0: no tried value changed the score"
+    assert answer["verdict"] == "all 2 scores are 0: no tried value changed the score"
     (note,) = answer["notes"]
-    assert "in run 1, before the trials, and stood still in all 3" in note
+    assert "in run 1, before the trials, and stood still in all 2" in note
     assert list(answer).index("notes") < list(answer).index("ranked")
 
 
@@ -280,7 +282,7 @@ async def test_a_trial_that_nobody_ran_because_the_controller_ended_says_why(
                 connection.execute("UPDATE command SET expires_wall_time_s = 1.0")
             answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=30)
             assert "no live controller" in answer["state"]
-            assert (answer["over"], answer["trials"]) == (0, 2)
+            assert (answer["over"], answer["trials"]) == (0, 1)
 
 
 async def test_a_hundred_trials_are_told_in_a_short_answer(
@@ -291,7 +293,7 @@ async def test_a_hundred_trials_are_told_in_a_short_answer(
         answer = await trials(client, parameters=grid, for_s=0.032, timeout_s=90)
         while answer["state"] == "under way":
             answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=90)
-        assert answer["over"] == 101
+        assert answer["over"] == 100
         assert len(json.dumps(answer, separators=(",", ":"))) < 8_000
         kps = [row["kp"] for row in rows_of(answer["ranked"])]
         assert len(kps) == 100
@@ -307,7 +309,7 @@ async def test_of_many_trials_that_fail_the_first_are_told_and_how_many_more(
         answer = await trials(client, parameters=grid, score=score, for_s=0.02, timeout_s=90)
         while answer["state"] == "under way":
             answer = await ask(client, "webots_run_trials", trial_set=1, timeout_s=90)
-        assert answer["failed"] == 101, answer
+        assert answer["failed"] == 100, answer
         assert answer["verdict"] == "no trial has a score"
         assert len(json.dumps(answer, separators=(",", ":"))) < 8_000
         shown = len(rows_of(answer["ranked"]))

@@ -187,7 +187,10 @@ def test_a_name_alone_is_that_of_a_world_of_the_project_around_here(
         (["worlds/arna.wbt"], "arna.wbt; in {}/worlds there is arena.wbt"),
         (["controllers/rover/rover.py"], "is no world: its name does not end with .wbt"),
         (["../lonely.wbt"], "lies in no Webots project: that is a folder with worlds/ and"),
-        (["worlds/arena.wbt", "--port", "70000"], "'70000' is no port: it is from 1 to 65535"),
+        (
+            ["worlds/arena.wbt", "--port", "70000"],
+            'Invalid value "70000" for --port. Must be <= 65535.',
+        ),
     ],
 )
 def test_a_world_that_cannot_be_meant_is_refused(
@@ -248,3 +251,27 @@ def test_what_webots_says_is_recorded_also_where_no_controller_ever_recorded(
         return subprocess.run(asking, capture_output=True, text=True, check=False).stdout
 
     wait_until(lambda: "console: ValueError: no arm" in told())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_stand_in_runs_a_world_where_no_webots_is(
+    launch: Launch, project: Callable[..., Path], number: signal.Signals, tmp_path: Path
+) -> None:
+    process = launch(project(), "--stand-in", "--mode", "fast")
+    assert process.stdout is not None
+    assert any("ready" in line for line in process.stdout)  # printed when it records already
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(number)
+    out, rest = process.communicate(timeout=60)
+    wait_until(lambda: not any(each.is_running() for each in family))
+    assert process.returncode == 0
+    assert "Traceback" not in out + rest
+    assert (tmp_path / "project" / "mcp_data" / "webots.db").exists()
+
+
+def test_what_only_webots_has_is_refused_for_the_stand_in(
+    launch: Launch, project: Callable[..., Path]
+) -> None:
+    process = launch(project(), "--stand-in", "--stream")
+    _, told = process.communicate(timeout=60)
+    assert (process.returncode, "--stream and --port are Webots' own" in told) == (2, True)

@@ -16,16 +16,12 @@ import sys
 from collections.abc import Sequence
 from typing import Any, Final
 
-from cyclopts import CycloptsError
-
 from webots_mcp.cli import (
     breakpoints,
-    commands,
     contents,
     data,
     diagnosing,
     history,
-    launching,
     looking,
     observing,
     scene,
@@ -49,7 +45,6 @@ __all__ = ["COMMANDS", "main"]
 FAMILIES: Final = (
     serving,
     setting_up,
-    launching,
     observing,
     looking,
     diagnosing,
@@ -74,6 +69,8 @@ _EPILOG: Final = "'webots-mcp COMMAND --help' explains a command. Try 'webots-mc
 
 def names() -> list[str]:
     """Of all commands."""
+    from webots_mcp.cli import commands
+
     return sorted({*commands.COMMANDS, *(each.name for each in COMMANDS)})
 
 
@@ -81,8 +78,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
     given = list(sys.argv[1:] if argv is None else argv)
     try:
-        if given[:1] and given[0] in commands.COMMANDS:
-            return _run(given)
+        if found := _run(given):
+            return found[0]
         with ending_by_signals():
             arguments = _parser(given).parse_args(argv)
             speak_of(arguments.arguments)
@@ -92,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return code
     except WebotsMCPError as error:
         said = as_typed(str(error))
-        if "--json" in given and given[0] in commands.COMMANDS:
+        if "--json" in given and is_declared(given[0]):
             with contextlib.suppress(OSError):
                 print(spelled_out(json.dumps({"error": said}, ensure_ascii=False)))
         return _end(EXIT_BAD_INPUT, said)
@@ -110,18 +107,32 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _run(argv: Sequence[str]) -> int:
-    """Call the command that was given."""
+def is_declared(name: str) -> bool:
+    """Whether a command is one of `commands`."""
+    from webots_mcp.cli.commands import COMMANDS
+
+    return name in COMMANDS
+
+
+def _run(argv: Sequence[str]) -> tuple[int] | None:
+    """Call the command that was given; None where it is none of `commands`."""
+    from cyclopts import CycloptsError
+
+    from webots_mcp.cli.commands import COMMANDS, app_for
+
+    if not argv or argv[0] not in COMMANDS:
+        return None
     speak_of_command(argv[0])
     is_help = not {"--help", "-h"}.isdisjoint(argv)  # nothing of a recording, and may have colours
     with ending_by_signals(), contextlib.nullcontext() if is_help else spelling_out():
-        app = commands.app_for(argv)
         try:
-            code = app(argv, exit_on_error=False, print_error=False, result_action="return_value")
+            code = app_for(argv)(
+                argv, exit_on_error=False, print_error=False, result_action="return_value"
+            )
         except CycloptsError as error:
             raise InvalidInputError(str(error)) from error
         sys.stdout.flush()
-    return code or 0
+    return (code or 0,)
 
 
 def _end(code: int, text: str) -> int:
@@ -157,7 +168,9 @@ def _parser(given: Sequence[str]) -> argparse.ArgumentParser:
         metavar="COMMAND", required=True, parser_class=_AnyOrderParser
     )
     if not given or given[0] not in {each.name for each in COMMANDS}:  # for the list of commands
-        for name, command in commands.COMMANDS.items():
+        from webots_mcp.cli.commands import COMMANDS as DECLARED
+
+        for name, command in DECLARED.items():
             text = inspect.getdoc(command.load()) or ""
             subparsers.add_parser(name, help=text.partition("\n")[0].rstrip("."))
     for name, run, arguments in sorted(COMMANDS):

@@ -10,7 +10,7 @@ import inspect
 from collections.abc import Callable, Sequence
 from typing import Any, Final, NamedTuple
 
-from cyclopts import App, Argument, Group
+from cyclopts import App, Argument, Group, Parameter
 
 from webots_mcp.questions.declaring import Question
 
@@ -44,6 +44,7 @@ COMMANDS: Final[dict[str, Command]] = {
     "history": Command(PAST, f"{_Q}.query_history", "webots_query_history"),
     "signals": Command(PAST, f"{_Q}.list_signals", "webots_list_signals"),
     "trends": Command(PAST, f"{_Q}.get_trends", "webots_get_trends"),
+    "launch": Command(SETUP, "webots_mcp.cli.launching", "launch"),
 }
 _HELP: Final = """Flight recorder and remote control for Webots simulations.
 
@@ -56,7 +57,14 @@ def app_for(argv: Sequence[str]) -> App:
     """The application with the command that is called; with all of them for help and completion."""
     from webots_mcp import __version__
 
-    app = App(name="webots-mcp", help=_HELP, version=__version__, version_flags=["--version"])
+    app = App(
+        name="webots-mcp",
+        help=_HELP,
+        version=__version__,
+        version_flags=["--version"],
+        suppress_keyboard_interrupt=False,
+        default_parameter=Parameter(negative=(), show_default=False),
+    )
     called = argv[0] if argv else ""
     names = [called] if called in COMMANDS else list(COMMANDS)
     for name in names:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import math
 import os
 import sys
 import time
 from contextlib import ExitStack
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
-from webots_mcp.cli.command import argument, command
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from webots_mcp.errors import InvalidInputError
+from webots_mcp.plugins import stand_in_simulator
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -20,31 +23,53 @@ if TYPE_CHECKING:
     from webots_mcp.webots.stream import WebotsLine
 
 _LOOK_EVERY_S: Final = 0.2
-_PORTS: Final = range(1, 1 << 16)
+MAX_PORT: Final = 65_535
 
 
-def _port(text: str) -> int:
-    if text.isascii() and text.isdecimal() and int(text) in _PORTS:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"{text!r} is no port: it is from 1 to {_PORTS[-1]}")
-
-
-@command(
-    "launch",
-    argument("world", metavar="WORLD", help="a .wbt file in a Webots project"),
-    argument("--headless", action="store_true", help="without its window and its 3D view"),
-    argument("--mode", choices=["fast", "realtime", "pause"],
-             help="the mode that it begins with (default: that of Webots' preferences)"),
-    argument("--stream", action="store_true",
-             help="let it be steered from outside without a controller of ours; at its port the "
-             "project's files can then be read, from the network too"),
-    argument("--port", type=_port, metavar="N", help="(default: the first free one from 1234 on)"),
-    argument("--data-dir", metavar="DIR",
-             help="where controllers record (default: mcp_data/ of the world's project)"),
-    argument("--patience", type=float, default=30.0, metavar="S", dest="patience_s",
-             help="say after S seconds why nobody has recorded yet (30)"),
-)  # fmt: skip
-def launch(arguments: argparse.Namespace) -> int:
+def launch(
+    world: Annotated[str, Parameter("WORLD", help="A .wbt file in a Webots project.")],
+    /,
+    *,
+    headless: Annotated[
+        bool, Parameter("--headless", help="Without its window and its 3D view.")
+    ] = False,
+    mode: Annotated[
+        Literal["fast", "realtime", "pause"] | None,
+        Parameter("--mode", help="The mode that it begins with; else that of its preferences."),
+    ] = None,
+    stream: Annotated[
+        bool,
+        Parameter(
+            "--stream",
+            help="Let it be steered from outside without a controller of ours; at its port the "
+            "project's files can then be read, from the network too.",
+        ),
+    ] = False,
+    port: Annotated[
+        int | None,
+        Parameter(
+            "--port",
+            validator=Number(gte=1, lte=MAX_PORT),
+            help="Else the first free one from 1234 on.",
+        ),
+    ] = None,
+    stand_in: Annotated[
+        bool,
+        Parameter(
+            "--stand-in",
+            help="Run the world on the stand-in simulator that comes with webots-mcp, where no "
+            "Webots is installed; it ends with Ctrl-C.",
+        ),
+    ] = False,
+    data_dir: Annotated[
+        str | None,
+        Parameter("--data-dir", help="Where controllers record; else mcp_data/ of the project."),
+    ] = None,
+    patience_s: Annotated[
+        float,
+        Parameter("--patience", help="Say after so many seconds why nobody has recorded yet (30)."),
+    ] = 30.0,
+) -> int:
     """Start Webots on a world, show and record its console, say when the first controller records.
 
     Webots opens no dialogs and ends with this command, however that ends: by Ctrl-C, by SIGTERM,
@@ -57,28 +82,32 @@ def launch(arguments: argparse.Namespace) -> int:
     from webots_mcp.launch import Launch, require_world
     from webots_mcp.webots.starting import Start, free_port
 
-    world, project = require_world(arguments.world)
-    recording = _recording(arguments, project)
-    port = arguments.port or free_port()
-    start = Start(world, arguments.mode, arguments.headless, arguments.stream, port)
+    file, project = require_world(world)
+    recording = _recording(data_dir, project)
+    if stand_in:
+        if stream or port is not None:
+            raise InvalidInputError("--stream and --port are Webots' own: leave them out")
+        os.environ[DATA_DIR_VARIABLE] = str(recording.data_dir)
+        return stand_in_simulator()(file, mode or "realtime")
+    start = Start(file, mode, headless, stream, port or free_port())
     environment = {DATA_DIR_VARIABLE: str(recording.data_dir)}
     console = _Console()
     launched = Launch(recording, start, environment, console.show)
     with _Recorder(launched, recording) as recorder:
         try:
-            return _follow(launched, arguments.patience_s, console, recorder)
+            return _follow(launched, patience_s, console, recorder)
         finally:
             if not launched.webots.is_over:
                 _say("ending Webots")
             launched.webots.end()
 
 
-def _recording(arguments: argparse.Namespace, project: Path) -> Recording:
+def _recording(data_dir: str | None, project: Path) -> Recording:
     """Where the controllers of the project record, whatever folder this one is started in."""
     from webots_mcp.contract import DATA_DIR_VARIABLE, PROJECT_DATA_FOLDER, resolve_database
     from webots_mcp.store.recording import Recording
 
-    named = arguments.data_dir or os.environ.get(DATA_DIR_VARIABLE)
+    named = data_dir or os.environ.get(DATA_DIR_VARIABLE)
     return Recording(*resolve_database(None, named or project / PROJECT_DATA_FOLDER), asker="cli")
 
 

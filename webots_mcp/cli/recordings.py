@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from webots_mcp.store.recording import Recording
 
 _SUM_UP_S: Final = 300.0  # a million rows of 40 values take 100 s
-Json: TypeAlias = Annotated[bool, Parameter("--json", negative=(), help="Print JSON.")]
+Json: TypeAlias = Annotated[bool, Parameter("--json", help="Print JSON.")]
 
 
 @Parameter(name="*")

@@ -9,9 +9,10 @@ that `webots-mcp --help` and a server start as fast as without.
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -57,12 +58,15 @@ class Plugin(NamedTuple):
         questions: Modules that declare questions (`questions.declaring`), which are MCP tools.
         formats: Of exports.
         cluster: Where else trials can run.
+        stand_in: Runs a world without Webots, in the foreground: `run(world, mode)`, which returns
+            the exit code.
     """
 
     commands: tuple[str, ...] = ()
     questions: tuple[str, ...] = ()
     formats: tuple[ExportFormat, ...] = ()
     cluster: Cluster | None = None
+    stand_in: str | None = None
 
 
 @cache
@@ -95,3 +99,8 @@ def export_formats() -> tuple[ExportFormat, ...]:
 def cluster_offered() -> Cluster:
     """Where trials run on other machines."""
     return next(plugin.cluster for plugin in plugins() if plugin.cluster is not None)
+
+
+def stand_in_simulator() -> Callable[[Path, str], int]:
+    """What runs a world where no Webots is."""
+    return load(next(each.stand_in for each in plugins() if each.stand_in))

@@ -6,7 +6,8 @@ import argparse
 import signal
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from types import FrameType
 
 from webots_mcp.standin import Simulation, StandInError
@@ -19,6 +20,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         The exit status: that of `simulationQuit`, 0 otherwise, 2 for a world that cannot be used.
     """
     options = _parser().parse_args(arguments)
+    return run_world(options.world, options.mode, options.duration, dict(options.robot))
+
+
+def run_world(
+    world: str | Path,
+    mode: str = "realtime",
+    duration_s: float | None = None,
+    controllers: Mapping[str, str] | None = None,
+) -> int:
+    """Run a world in the foreground.
+
+    Args:
+        world: A .wbt file.
+        mode: pause, realtime or fast.
+        duration_s: It ends after so much simulated time.
+        controllers: Files that control robots, by name, instead of what the world says.
+
+    Returns:
+        The exit status: that of `simulationQuit`, 0 otherwise, 2 for a world that cannot be used.
+    """
     stopped = threading.Event()
 
     def stop(number: int, frame: FrameType | None) -> None:
@@ -28,16 +49,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         signal.signal(number, stop)
     try:
         simulation = Simulation(
-            options.world,
-            mode=options.mode,
-            console=_show,
-            controllers=dict(options.robot),
+            world, mode=mode, console=_show, controllers=dict(controllers or {})
         )
     except StandInError as error:
         print(f"webots_mcp.standin: {error}", file=sys.stderr)  # noqa: T201 - a command
         return 2
     with simulation:
-        _wait(simulation, stopped, options.duration)
+        _wait(simulation, stopped, duration_s)
         status = simulation.exit_status
     return status or 0
 

@@ -1,5 +1,8 @@
-"""The main job from end to end on the stand-in: `webots-mcp demo`."""
+"""The main job without Webots: `webots-mcp demo` and `webots-mcp launch --stand-in`."""
 
 from webots_mcp.plugins import Plugin
 
-PLUGIN = Plugin(commands=(f"{__name__}.demo_command",))
+PLUGIN = Plugin(
+    commands=(f"{__name__}.demo_command",),
+    stand_in="webots_mcp.standin.__main__:run_world",
+)

@@ -35,7 +35,7 @@ from webots_mcp.webots.stream import (
     ANSWER_S,
     RESTARTING,
     Order,
-    Reply,
+    OrderReply,
     WebotsAddress,
     address_of,
     give_order,
@@ -187,9 +187,9 @@ class Attempt(Request):
             return None
         return await self._answered(situation, "websocket", seen)
 
-    async def _give(self, address: WebotsAddress) -> tuple[Reply, int]:
+    async def _give(self, address: WebotsAddress) -> tuple[OrderReply, int]:
         """Once, or as many steps as are asked for; the last reply, and how many were heard."""
-        reply, made = Reply(None, is_alive=False), 0
+        reply, made = OrderReply(None, is_alive=False), 0
         while made < self._wanted and (made == 0 or self._left_s > LEAST_S):
             timeout_s = min(ANSWER_S, self._left_s)
             reply = await to_thread.run_sync(give_order, address, self.order, timeout_s)
@@ -202,7 +202,7 @@ class Attempt(Request):
     def _wanted(self) -> int:
         return int(self.params.get("steps", 1))
 
-    async def _obeyed(self, situation: Situation, reply: Reply, made: int) -> CommandAnswer:
+    async def _obeyed(self, situation: Situation, reply: OrderReply, made: int) -> CommandAnswer:
         """Webots has said so; the recording soon shows it as well, where controllers record."""
         said = f"Webots said {reply.heard!r}" if reply.heard else "Webots obeyed"
         if self._wanted > 1:
@@ -357,7 +357,7 @@ _SIGNS: Final[dict[Order, Callable[[Moment, View], str | None]]] = {
 }
 
 
-def why_no_word(address: WebotsAddress, reply: Reply) -> str:
+def why_no_word(address: WebotsAddress, reply: OrderReply) -> str:
     """Why Webots said nothing to an order: how it was started shows it, where it runs here."""
     found = instance_at(address.port)
     if reply.is_alive and found is not None and found.address == address and found.streams:

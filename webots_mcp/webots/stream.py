@@ -78,7 +78,7 @@ class WebotsLine(NamedTuple):
     text: str
 
 
-class Reply(NamedTuple):
+class OrderReply(NamedTuple):
     """What came of an order.
 
     Attributes:
@@ -334,7 +334,7 @@ def connected(address: WebotsAddress, timeout_s: float) -> Generator[Stream]:
         stream.close()
 
 
-def give_order(address: WebotsAddress, order: Order, timeout_s: float = ANSWER_S) -> Reply:
+def give_order(address: WebotsAddress, order: Order, timeout_s: float = ANSWER_S) -> OrderReply:
     """Send Webots an order, and return its reply.
 
     Raises:
@@ -344,7 +344,7 @@ def give_order(address: WebotsAddress, order: Order, timeout_s: float = ANSWER_S
     return _give(address, words, answers, timeout_s, late=order in RESTARTING)
 
 
-def load_world(address: WebotsAddress, file_name: str, timeout_s: float = ANSWER_S) -> Reply:
+def load_world(address: WebotsAddress, file_name: str, timeout_s: float = ANSWER_S) -> OrderReply:
     """Have Webots open another world of the folder of the present one.
 
     Raises:
@@ -355,7 +355,7 @@ def load_world(address: WebotsAddress, file_name: str, timeout_s: float = ANSWER
 
 def _give(
     address: WebotsAddress, words: str, answers: tuple[str, ...], timeout_s: float, *, late: bool
-) -> Reply:
+) -> OrderReply:
     until_s = time.monotonic() + timeout_s
     is_alive, other = False, None
     with connected(address, timeout_s) as stream:
@@ -364,17 +364,17 @@ def _give(
         while (message := stream.receive(until_s)) is not None:
             line = message.text.partition("\n")[0][:_LONGEST_WORDS]
             if line.startswith(answers):
-                return Reply(line, is_alive=True)
+                return OrderReply(line, is_alive=True)
             if not (message.is_pong or line.startswith(_SAID_TO_ALL)):
                 other = other or line[:_LONGEST_OTHER]
             is_alive = is_alive or message.is_pong
             if is_alive and not late:
                 # Words are answered in their order: what comes now is about something else.
                 until_s = min(until_s, time.monotonic() + _CLOSING_S)
-    return Reply(None, is_alive, other)
+    return OrderReply(None, is_alive, other)
 
 
-def why_not_obeyed(address: WebotsAddress, reply: Reply) -> str:
+def why_not_obeyed(address: WebotsAddress, reply: OrderReply) -> str:
     """Why Webots did not answer an order, as far as that is known."""
     if reply.other is not None:
         return (

@@ -34,8 +34,8 @@ _EXAMPLES: Final = CHECKOUT / "examples"
 CONTROLLER: Final = _EXAMPLES / "e_puck" / "controllers" / "e_puck_avoid" / "e_puck_avoid.py"
 """What bridges take for the program that they run in."""
 
-_COMMANDS_TOOK: Final = (
-    "UPDATE command SET claimed_wall_time_s = created_wall_time_s + 0.000001, "  # before the pictures of its step
+_COMMANDS_TOOK: Final = (  # claimed before the pictures of its step, however slow the machine is
+    "UPDATE command SET claimed_wall_time_s = created_wall_time_s + 0.000001, "
     "finished_wall_time_s = created_wall_time_s + 0.03"
 )
 _TRIED: Final = (  # speed, gait, score; without a score it fell over

@@ -78,17 +78,17 @@ def test_sql_reads_and_a_null_is_seen(say: Say) -> None:
     assert line_with(table, "1", "NULL", "inf")
     assert "only the first 1 rows" in say("sql", "SELECT id FROM run", "-n", "1")
     told = json.loads(say("sql", "SELECT 1e999, 'a'", "--json"))
-    assert told["rows"] == [["inf", "a"]]
+    assert told["result"]["rows"] == [["inf", "a"]]
     assert "no row" in say("sql", "SELECT id FROM run WHERE id > 99")
 
 
 def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, say: Say) -> None:
     database = copy_of(story, tmp_path / "webots.db")
     given = say("label", "2", "kp 3", "--note", "on ice", database=database)
-    assert line_with(given, "2", "rover", "kp 3", "on ice")
-    assert line_with(say("runs", database=database), "  2  rover", "kp 3")
+    assert "run_id 2, robot rover, label kp 3" in given and "note on ice" in given
+    assert line_with(say("runs", database=database), "  2  kp 3", "on ice")
     told = json.loads(say("label", "2", "-", "--json", database=database))
-    assert (told["label"], told["note"]) == (None, "on ice")
+    assert (told["run"].get("label"), told["run"]["note"]) == (None, "on ice")
 
 
 @pytest.mark.parametrize(
@@ -102,11 +102,11 @@ def test_a_label_is_given_shown_and_taken_away(story: Path, tmp_path: Path, say:
         (["sql", "DELETE FROM run"], "only one reading statement"),
         (["sql", "WITH a AS (SELECT 1) DELETE FROM run"], "only reading is allowed"),
         (["sql", "SELECT lable FROM run"], "label"),
-        (["sql", "SELECT 1", "-n", "5000"], "-n 5000 must be from 1 to 1000"),
+        (["sql", "SELECT 1", "-n", "5000"], "-n must be less than or equal to 500, not 5000"),
         (["label", "1"], "give a label or a note"),
         (["label", "99", "x"], "newest runs are"),
         (["label", "1", "x" * 101], "at most 100"),
-        (["label", "1", "\udcff"], "cannot be written as utf-8"),
+        (["label", "1", "\udcff"], "TEXT must be a valid string"),
         (["logs", "--text", "\udcff"], "cannot be written as utf-8"),
     ],
 )

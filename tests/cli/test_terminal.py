@@ -73,7 +73,8 @@ def test_no_command_lets_a_recording_steer_the_terminal(
 
 def test_json_is_the_same_data(recorded: Recorded, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["runs", "--json", "--database", "webots.db"]) == 0
-    (run,) = json.loads(capsys.readouterr().out)["runs"]
+    runs = json.loads(capsys.readouterr().out)["runs"]
+    run = dict(zip(runs["columns"], runs["rows"][0], strict=True))
     assert run["robot"] == run["label"] == HOSTILE
 
 

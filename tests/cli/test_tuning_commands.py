@@ -56,7 +56,8 @@ def test_a_text_that_looks_like_a_number_stays_a_text(
     assert tag.value == "true"
     capsys.readouterr()
     assert main(["runs", *where, "--parameter", "tag=7", "--parameter", "kp=3", "--json"]) == 0
-    assert [run["run_id"] for run in json.loads(capsys.readouterr().out)["runs"]] == [1]
+    runs = json.loads(capsys.readouterr().out)["runs"]
+    assert [row[runs["columns"].index("run_id")] for row in runs["rows"]] == [1]
 
 
 @pytest.mark.usefixtures("tunable")

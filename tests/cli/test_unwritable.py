@@ -109,7 +109,7 @@ def test_what_waits_beside_it_is_said_not_to_be_in_it(recorded: Recorded) -> Non
     with unprivileged.unwritable(recorded.database.parent):
         ended = run("-m", "webots_mcp", "runs", "--database", str(recorded.database))
     assert ended.returncode == 0
-    assert "without the rows in 1 waiting files" in ended.stderr
+    assert "without the rows in 1 waiting files" in ended.stdout
 
 
 async def test_a_read_only_server_answers_from_it_and_says_how(artifact: Path) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import sys
 import types
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
@@ -14,7 +15,7 @@ from contextlib import contextmanager
 from typing import Annotated, Any, Final, Literal, Union, cast, get_args, get_origin
 
 import anyio
-from cyclopts import Parameter
+from cyclopts import Parameter, Token
 from pydantic import ValidationError
 from pydantic.json_schema import SkipJsonSchema
 
@@ -22,6 +23,7 @@ from webots_mcp.cli.recordings import Json, Where, sum_up_first
 from webots_mcp.cli.rendering import print_answer
 from webots_mcp.cli.terminal import rewrite
 from webots_mcp.cli.values import settings_of, value_of
+from webots_mcp.cli.wording import as_typed
 from webots_mcp.errors import CommandRefusedError, InvalidInputError, NothingRecordedError
 from webots_mcp.questions.declaring import Caller, Question, Reply
 from webots_mcp.questions.faults import faults_of
@@ -58,7 +60,7 @@ def command_of(question: Question) -> Callable[..., None]:
         show(question, reply, as_json=json)
 
     parameters = [_parameter(question, each) for each in question.parameters if _is_shown(each)]
-    parameters.sort(key=lambda each: each.kind)
+    parameters.sort(key=lambda each: (each.kind, *_place(question, each.name)))
     keyword = inspect.Parameter.KEYWORD_ONLY
     parameters += [
         inspect.Parameter("json", keyword, default=False, annotation=Json),
@@ -67,7 +69,7 @@ def command_of(question: Question) -> Callable[..., None]:
     vars(run)["__signature__"] = inspect.Signature(parameters)
     run.__annotations__ = {each.name: each.annotation for each in parameters}
     run.__name__ = question.command or question.name
-    run.__doc__ = inspect.getdoc(question.function)
+    run.__doc__ = as_typed(inspect.getdoc(question.function) or "")
     return run
 
 
@@ -104,7 +106,7 @@ def ask(question: Question, given: Mapping[str, Any], where: Where) -> Reply:
     recording = where.recording(read_only=question.effect.reads)
     if not _OF_SIGNALS.isdisjoint(each.name for each in question.parameters):
         sum_up_first(recording)
-    valid = _valid(question, given)
+    valid = _valid(question, given, recording)
     with _line_of_progress(), _caller(question, recording) as caller:
         return anyio.run(question.ask, recording, valid, caller)
 
@@ -125,7 +127,7 @@ def _caller(question: Question, recording: Recording) -> Generator[Caller | None
         companions.stop()
 
 
-def _valid(question: Question, given: Mapping[str, Any]) -> dict[str, Any]:
+def _valid(question: Question, given: Mapping[str, Any], recording: Recording) -> dict[str, Any]:
     """The arguments as the question takes them; what was not given is left to their defaults."""
     meant: dict[str, Any] = {}
     for parameter in question.parameters:
@@ -133,7 +135,7 @@ def _valid(question: Question, given: Mapping[str, Any]) -> dict[str, Any]:
             continue
         value, kind = given[parameter.name], _plain(parameter.annotation)
         if _is_mapping(kind):
-            value = settings_of(value)
+            value = settings_of(value, _kinds_in(recording))
         elif _is_json(kind) and isinstance(value, str):
             value = value_of(value)
         meant[parameter.name] = value
@@ -146,6 +148,14 @@ def _valid(question: Question, given: Mapping[str, Any]) -> dict[str, Any]:
             )
         ) from error
     return {name: getattr(model, name) for name in question.arguments.model_fields}
+
+
+def _kinds_in(recording: Recording) -> Mapping[str, str]:
+    """Of the parameters that robots have, by name."""
+    from webots_mcp.store.parameters import kinds_of
+
+    with recording.reader() as connection:
+        return kinds_of(connection)
 
 
 def show(question: Question, reply: Reply, *, as_json: bool) -> None:
@@ -190,7 +200,7 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
         kind = tuple[(str,) * number]
     elif _is_json(kind):
         kind = str if declared.default is inspect.Parameter.empty else str | None
-    text = question.described(name)
+    text = as_typed(question.described(name))
     default = declared.default if isinstance(declared.default, bool) else None
     if declared.default is inspect.Parameter.empty:
         default = inspect.Parameter.empty
@@ -202,15 +212,40 @@ def _parameter(question: Question, declared: inspect.Parameter) -> inspect.Param
     place = inspect.Parameter.KEYWORD_ONLY
     if name in question.positional and _is_list(question, name):
         kind, default = get_args(_without_none(kind))[0], inspect.Parameter.empty
-        shown, place = Parameter(option, help=text), inspect.Parameter.VAR_POSITIONAL
+        converter = _whole_number if kind is int else None
+        shown = Parameter(option, help=text, converter=converter)
+        place = inspect.Parameter.VAR_POSITIONAL
     elif name in question.positional:
-        shown = Parameter(option, help=text, negative=())
+        shown = Parameter(
+            option, help=text, negative=(), allow_leading_hyphen=True, validator=_refuse_options,
+            converter=_whole_number if _without_none(kind) is int else None,
+        )  # fmt: skip
         place = inspect.Parameter.POSITIONAL_ONLY
     elif default is True:  # its option is the one that turns it off
         shown = Parameter(f"--{name.replace('_', '-')}", help=text, negative=option)
     else:
-        shown = Parameter(option, help=text, negative=())
+        converter = _whole_number if _without_none(kind) is int else None
+        shown = Parameter(option, help=text, negative=(), converter=converter)
     return inspect.Parameter(name, place, default=default, annotation=Annotated[kind, shown])
+
+
+def _place(question: Question, argument: str) -> list[int]:
+    """Where it stands among those without an option's name."""
+    return [place for place, name in enumerate(question.positional) if name == argument]
+
+
+def _whole_number(_kind: Any, tokens: Sequence[Token]) -> int:
+    """Cyclopts by itself would round 1.5."""
+    text = tokens[0].value
+    if not re.fullmatch(r"[+-]?[0-9]+", text):
+        raise ValueError(f"{text!r} is no whole number")
+    return int(text)
+
+
+def _refuse_options(_kind: Any, value: Any) -> None:
+    """Of what begins with a hyphen only the hyphen itself is a value ("take it away")."""
+    if isinstance(value, str) and value.startswith("-") and value != "-":
+        raise ValueError(f"unknown option {value}")
 
 
 def _is_shown(declared: inspect.Parameter) -> bool:

@@ -41,8 +41,12 @@ GROUPS: Final = (SETUP, NOW, PAST, STEER, DATA)
 _Q: Final = "webots_mcp.questions"
 COMMANDS: Final[dict[str, Command]] = {
     "events": Command(PAST, f"{_Q}.find_events", "webots_find_events"),
+    "compare": Command(PAST, f"{_Q}.compare_runs", "webots_compare_runs"),
     "history": Command(PAST, f"{_Q}.query_history", "webots_query_history"),
+    "label": Command(DATA, f"{_Q}.compare_runs", "webots_annotate_run"),
+    "runs": Command(PAST, f"{_Q}.compare_runs", "webots_list_runs"),
     "signals": Command(PAST, f"{_Q}.list_signals", "webots_list_signals"),
+    "sql": Command(PAST, f"{_Q}.query_sql", "webots_query_sql"),
     "trends": Command(PAST, f"{_Q}.get_trends", "webots_get_trends"),
     "launch": Command(SETUP, "webots_mcp.cli.launching", "launch"),
 }

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import subprocess
 from dataclasses import asdict, replace
 from typing import TYPE_CHECKING, Any, Final
 
@@ -22,7 +21,7 @@ from webots_mcp.cli.command import (
 )
 from webots_mcp.cli.looking import wait
 from webots_mcp.cli.ranges import RUN, SIMULATION_TIMES
-from webots_mcp.cli.tables import print_notes, print_result, print_table
+from webots_mcp.cli.tables import print_notes, print_table
 from webots_mcp.contract import LOG_LEVELS, LOG_SOURCES
 
 if TYPE_CHECKING:
@@ -141,32 +140,3 @@ def _log_row(line: LogLine) -> list[Any]:
     logger = f"[{line.logger}] " if line.logger and line.source == "controller" else ""
     source = "" if line.source == "controller" else f"{line.source}: "
     return [line.sim_time_s, line.level, line.run_id, f"{logger}{source}{line.message}"]
-
-
-@question(
-    "sql", DATA_DIR, DATABASE, JSON,
-    argument("sql", metavar="STATEMENT", help="one SELECT, in quotes"),
-    count("-n", "at most N rows, up to 1000", default=100, dest="max_rows"),
-)  # fmt: skip
-def sql(arguments: argparse.Namespace) -> None:
-    """Read by SQL (SQLite) what the other commands do not cover; nothing but reading is allowed.
-
-    It ends after some seconds, and values are cut to 200 characters; 'sqlite3 webots.db' has no
-    such limits.
-
-    webots-mcp sql 'SELECT id, rows, label FROM run'
-    """
-    from webots_mcp.store.questions.sql import MAX_BYTES, require_select
-    from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, as_file, decode
-    from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
-
-    require_select(arguments.sql)
-    with reading(arguments), as_file(open_recording(arguments).database) as file:
-        asked = Statement(
-            str(file), arguments.sql, arguments.max_rows, MAX_BYTES, QUESTION_DEADLINE_S
-        )
-        ended = subprocess.run(
-            LINE, input=asked.encoded(), stdout=subprocess.PIPE, cwd=FOLDER, check=False
-        )
-        found = decode(ended.stdout, ended.returncode, asked)
-    print_result(found, as_json=arguments.json)

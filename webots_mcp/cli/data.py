@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 from webots_mcp.cli.command import (
     DATA_DIR,
     DATABASE,
-    JSON,
     argument,
     command,
     open_recording,
@@ -26,7 +25,7 @@ from webots_mcp.cli.command import (
 from webots_mcp.cli.limits import LIMITS, limits_of
 from webots_mcp.cli.progress import shown_progress
 from webots_mcp.cli.ranges import RANGE, range_of, scope_of
-from webots_mcp.cli.tables import id_ranges, print_json, print_notes, print_table
+from webots_mcp.cli.tables import id_ranges, print_notes, print_table
 from webots_mcp.cli.terminal import binary_stdout
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.plugins import export_formats
@@ -270,26 +269,6 @@ def retain(arguments: argparse.Namespace) -> None:
     with writing(arguments) as (_, connection):
         mark_kept(connection, arguments.run_ids, keep=not arguments.release)
         set_limits(connection, limits, "retain")
-
-
-@command(
-    "label", DATA_DIR, DATABASE, JSON,
-    argument("run_id", type=row_id, metavar="RUN", help="as 'webots-mcp runs' lists them"),
-    argument("label", nargs="?", metavar="TEXT", help="short; '-' takes it away"),
-    argument("--note", metavar="TEXT", help="any text; '-' takes it away"),
-)  # fmt: skip
-def label(arguments: argparse.Namespace) -> None:
-    """Give a run a label to find it by, or a note; nothing of such a run is ever pruned."""
-    from webots_mcp.store.questions.runs import annotate_run, run_info
-
-    said = {name: getattr(arguments, name) for name in ("label", "note")}
-    changes = {name: "" if text == "-" else text for name, text in said.items()}
-    with writing(arguments) as (_, connection):
-        annotate_run(connection, arguments.run_id, **changes)
-        run = run_info(connection, arguments.run_id)
-    if arguments.json:
-        return print_json(run)
-    print_table(("run", "robot", "label", "note"), [[run.run_id, run.robot, run.label, run.note]])
 
 
 def _prune(recording: Recording, connection: sqlite3.Connection, retention: Retention) -> Purged:

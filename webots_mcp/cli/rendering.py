@@ -30,6 +30,7 @@ _HEAD: Final = {
 }
 _TIMES: Final = ("sim_time_s", "since_s")  # lists of them
 _CALLED_ALIKE: Final = ("numbers", "signals")  # what they hold has names of its own
+_AS_READ: Final = "result"  # rows of a database, where null is a value
 _NOTES: Final = ("why", "storage", "notes", "hint", "left_out")
 
 
@@ -172,10 +173,15 @@ class _Layout:
     def _part(self, name: str, value: Any) -> Iterator[str]:
         for part in cast("list[dict[str, Any]]", value if isinstance(value, list) else [value]):
             line = f"{name}: " + ", ".join(f"{each} {text_of(part[each])}" for each in part)
-            if len(line) <= self._paragraph and not any(map(_has_members, part.values())):
+            is_flat = "columns" not in part and not any(map(_has_members, part.values()))
+            if is_flat and len(line) <= self._paragraph:
                 yield line
                 continue
             yield f"{name}:"
+            if name == _AS_READ:
+                part = part | {
+                    "rows": [["NULL" if v is None else v for v in row] for row in part["rows"]]
+                }
             yield from (_INDENT + line for line in self._inside(part))
 
     def _inside(self, part: Mapping[str, Any]) -> Iterator[str]:

@@ -25,6 +25,7 @@ from webots_mcp.questions.argument_types import (
     Value,
 )
 from webots_mcp.questions.budget import (
+    LARGE_BUDGET,
     answer_about,
     condensed,
     figure,
@@ -38,7 +39,7 @@ from webots_mcp.questions.budget import (
     shown,
     without_empty,
 )
-from webots_mcp.questions.declaring import CHANGES, READS, question
+from webots_mcp.questions.declaring import CHANGES, READS, is_for_a_person, question
 from webots_mcp.questions.history_answers import ComparisonAnswer, RunsAnswer
 from webots_mcp.questions.shortening import DETAIL_BUDGET, WHOLE, shorten
 from webots_mcp.store.analysis.spread import MATTERS_SD, Spread
@@ -83,7 +84,7 @@ _GOING_ON: Final = "going on"
 _TAKE_AWAY: Final = "-"
 
 
-@question("List the runs", READS)
+@question("List the runs", READS, command="runs", options={"parameters": "--parameter"})
 def webots_list_runs(
     recording: Recording,
     limit: Limit = 20,
@@ -120,7 +121,13 @@ def webots_list_runs(
         )
 
 
-@question("Compare runs", READS)
+@question(
+    "Compare runs",
+    READS,
+    command="compare",
+    positional=("run_ids",),
+    options={"run_ids": "RUN", "matters_sd": "--matters"},
+)
 def webots_compare_runs(
     recording: Recording,
     run_ids: RunIds = None,
@@ -160,7 +167,13 @@ def _first_run(recording: Recording, set_id: int) -> int:
         return next(iter(scored_runs(connection, set_id).values()))[0]
 
 
-@question("Annotate a run", CHANGES)
+@question(
+    "Annotate a run",
+    CHANGES,
+    command="label",
+    positional=("run_id", "label"),
+    options={"run_id": "RUN", "label": "TEXT"},
+)
 def webots_annotate_run(
     recording: Recording,
     label: Annotated[
@@ -203,7 +216,8 @@ def _no_runs(parameters: dict[str, Any] | None) -> str:
 
 def _values_of(parameters: Mapping[str, Any]) -> Any:
     """Values of parameters as they are, of many the first."""
-    return shorten(dict(parameters), DETAIL_BUDGET, WHOLE).value or None
+    budget = LARGE_BUDGET if is_for_a_person() else DETAIL_BUDGET
+    return shorten(dict(parameters), budget, WHOLE).value or None
 
 
 def _run_row(run: RunInfo) -> list[Any]:
@@ -265,6 +279,7 @@ def _compared(
     rows = [_difference_row(each, with_extremes=names is not None) for each in differing]
     rows = fitting(rows, left)
     only_in = list(found.only_in.items())
+    most = len(only_in) if is_for_a_person() else _MOST_ONLY_IN
     return {
         "groups": groups,
         "compared_s": seconds(found.compared_s),
@@ -272,9 +287,9 @@ def _compared(
         "not_known": found.not_known or None,
         "differences": without_empty(DIFFERENCE_COLUMNS, rows),
         "total": found.total,
-        "only_in": {name: list(groups) for name, groups in only_in[:_MOST_ONLY_IN]} or None,
+        "only_in": {name: list(groups) for name, groups in only_in[:most]} or None,
         "notes": notes_of(found.notes),
-        "hint": _hint(found, len(rows), len(differing), len(only_in)),
+        "hint": _hint(found, len(rows), len(differing), len(only_in) - most),
     }
 
 
@@ -373,5 +388,5 @@ def _hint(found: Comparison, told: int, differing: int, only_in: int) -> str | N
     hints += ["no numeric signal differs"] * (differing == 0)
     equal = 0 if more else found.total - differing
     hints += [f"mean and deviation of the other {equal} are equal"] * (equal > 0 and differing > 0)
-    hints += [f"{only_in} signals are in some groups only"] * (only_in > _MOST_ONLY_IN)
+    hints += [f"{only_in + _MOST_ONLY_IN} signals are in some groups only"] * (only_in > 0)
     return "; ".join(hints) or None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import AsyncGenerator
 from contextlib import asynccontextmanager
 from typing import Annotated, Any, Final
@@ -14,10 +15,9 @@ from pydantic import Field
 from webots_mcp.errors import InvalidInputError
 from webots_mcp.questions.answers import Table
 from webots_mcp.questions.argument_types import ShownLimit
-from webots_mcp.questions.budget import LONGEST_NAME, header_of_only
-from webots_mcp.questions.declaring import READS, question
+from webots_mcp.questions.budget import LONGEST_NAME, cut_for_a_model, header_of_only
+from webots_mcp.questions.declaring import READS, is_for_a_person, question
 from webots_mcp.questions.history_answers import SqlAnswer
-from webots_mcp.questions.shortening import cut_text
 from webots_mcp.store.questions.sql import Cell, Result, require_select
 from webots_mcp.store.questions.sql_process import FOLDER, LINE, Statement, as_file, decode
 from webots_mcp.store.reading.deadline import QUESTION_DEADLINE_S
@@ -26,6 +26,7 @@ from webots_mcp.store.recording import Recording
 DEFAULT_ROWS: Final = 100
 _BUDGET_BYTES: Final = 4_400  # of values: quotes and brackets come to it
 _LARGE_BUDGET_BYTES: Final = 20_000
+_BYTES_FOR_A_PERSON: Final = 10_000_000
 _MOST_COLUMNS: Final = 60
 _AT_ONCE: Final = 2
 _LONGEST_WAIT_S: Final = 30.0
@@ -33,7 +34,7 @@ _PROCESS_TIMEOUT_S: Final = 20.0  # its own deadline counts from when it has sta
 _turns: Final[RunVar[anyio.Semaphore]] = RunVar("statements that may run at once")
 
 
-@question("Query by SQL", READS)
+@question("Query by SQL", READS, command="sql", positional=("sql",), options={"sql": "STATEMENT"})
 async def webots_query_sql(
     recording: Recording,
     sql: Annotated[str, Field(min_length=1, max_length=10_000, description="One SELECT.")],
@@ -49,12 +50,15 @@ async def webots_query_sql(
     json_extract(data, '$.pose[0]'). All columns: the resource webots://schema.
     """
     budget = _BUDGET_BYTES if limit is None else _LARGE_BUDGET_BYTES
+    most_columns = _MOST_COLUMNS
+    if is_for_a_person():
+        budget, most_columns = _BYTES_FOR_A_PERSON, sys.maxsize
     require_select(sql)
     header = await to_thread.run_sync(_header, recording)
     found = await _run(recording, sql, limit or DEFAULT_ROWS, budget)
-    columns = [cut_text(name, LONGEST_NAME) for name in found.columns[:_MOST_COLUMNS]]
-    rows = [list(row[:_MOST_COLUMNS]) for row in found.rows]
-    more = len(found.columns) > _MOST_COLUMNS
+    columns = [cut_for_a_model(name, LONGEST_NAME) for name in found.columns[:most_columns]]
+    rows = [list(row[:most_columns]) for row in found.rows]
+    more = len(found.columns) > most_columns
     return SqlAnswer(
         **header,
         result=Table(columns=columns, rows=rows),
